@@ -1,0 +1,1 @@
+"""What machines, map server and clients share: readings, samples, messages, keys, queries, coordinates, errors."""

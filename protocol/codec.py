@@ -1,0 +1,226 @@
+"""Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from protocol.arrays import Table
+from protocol.errors import MessageError, Refusal
+from protocol.messages import VERSION, Ack, Health, Pose, Refused, SampleBatch, SensorBundle
+from protocol.readings import KINDS, Reading, columns, parse_reading
+from protocol.samples import COLUMNS, SAMPLE_DTYPE, check_samples
+from protocol.site import NAME
+
+MAX_BATCH_BYTES = 4 * 2**20
+MAX_BATCH_SAMPLES = 20_000
+MAX_BUNDLE_BYTES = 2**20
+MAX_SMALL_BYTES = 64 * 2**10
+MAX_U64 = 2**64 - 1
+MAX_SEQ = 2**62
+
+
+def pack(table: dict[str, Any]) -> bytes:
+    """MessagePack with the protocol's version in front."""
+    packed: bytes = msgpack.packb({"v": VERSION, **table})
+    return packed
+
+
+def unpack(data: bytes, limit: int) -> dict[str, Any]:
+    """Undo `pack`; refuses what is too long, no MessagePack map, or of another version."""
+    if len(data) > limit:
+        raise MessageError(Refusal.TOO_LARGE, f"{len(data)} bytes, at most {limit} are allowed")
+    try:
+        table = msgpack.unpackb(data)
+    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
+        raise MessageError(Refusal.NOT_MSGPACK, f"not MessagePack, or cut off: {error}") from None
+    if not isinstance(table, dict):
+        raise MessageError(Refusal.NOT_MSGPACK, "not a MessagePack map")
+    if (version := take(table, "v", int)) != VERSION:
+        raise MessageError(Refusal.VERSION, f"{version}: this side speaks version {VERSION}", field="v")
+    return table
+
+
+def take(table: dict[str, Any], name: str, kind: type[Any], default: Any = None) -> Any:
+    """Take one field of the given type; a default makes it optional."""
+    value: Any = table.get(name, default)
+    if value is None:
+        raise MessageError(Refusal.MISSING_FIELD, "missing", field=name)
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        raise MessageError(Refusal.WRONG_TYPE, f"{kind.__name__} expected, not {type(value).__name__}", field=name)
+    if kind is float and not math.isfinite(value):
+        raise MessageError(Refusal.NOT_FINITE, f"{value} is not finite", field=name)
+    return value
+
+
+def _take_int(table: dict[str, Any], name: str, low: int, high: int, reason: Refusal = Refusal.OUT_OF_RANGE) -> int:
+    value: int = take(table, name, int)
+    if not low <= value <= high:
+        raise MessageError(reason, f"{value} is not between {low} and {high}", field=name)
+    return value
+
+
+def _take_name(table: dict[str, Any]) -> str:
+    name: str = take(table, "machine", str)
+    if not NAME.fullmatch(name):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{name[:70]!r} is not a name", field="machine")
+    return name
+
+
+# --- samples ---------------------------------------------------------------------------------------------------------
+
+
+def encode_batch(batch: SampleBatch) -> bytes:
+    """Columns of little-endian binary, one per name of SAMPLE_DTYPE."""
+    table: dict[str, Any] = {
+        "machine": batch.machine,
+        "spool_id": batch.spool_id,
+        "first_seq": batch.first_seq,
+        "n": len(batch.rows),
+        "frame": batch.frame,
+        "cols": {name: np.ascontiguousarray(batch.rows[name]).tobytes() for name in COLUMNS},
+    }
+    if batch.lost_before:
+        table["lost_before"] = batch.lost_before
+    return pack(table)
+
+
+def decode_batch(data: bytes, extent_m: float) -> SampleBatch:
+    """Decode and judge a batch, wholly: one bad sample refuses it, with field and row named.
+
+    extent_m: how far from the origin a position may lie. Unknown columns and fields are ignored.
+    """
+    table = unpack(data, MAX_BATCH_BYTES)
+    n = _take_int(table, "n", 0, MAX_BATCH_SAMPLES, Refusal.TOO_LARGE)
+    first_seq = _take_int(table, "first_seq", 1, MAX_SEQ, Refusal.FIRST_SEQ)
+    lost_before = _take_int({"lost_before": 0, **table}, "lost_before", 0, first_seq - 1)
+    rows = _decode_rows(take(table, "cols", dict), n)
+    check_samples(rows, extent_m)
+    return SampleBatch(
+        machine=_take_name(table),
+        spool_id=_take_int(table, "spool_id", 1, MAX_U64),
+        first_seq=first_seq,
+        rows=rows,
+        frame=take(table, "frame", str),
+        lost_before=lost_before,
+    )
+
+
+def _decode_rows(cols: dict[str, Any], n: int) -> Table:
+    rows = np.zeros(n, SAMPLE_DTYPE)
+    for name in COLUMNS:
+        dtype = SAMPLE_DTYPE[name]
+        data: bytes = take(cols, name, bytes)
+        if len(data) != n * dtype.itemsize:
+            problem = f"{len(data)} bytes, {n} samples take {n * dtype.itemsize}"
+            raise MessageError(Refusal.COLUMN_LENGTH, problem, field=f"cols.{name}")
+        rows[name] = np.frombuffer(data, dtype)
+    return rows
+
+
+def encode_reply(reply: Ack | Refused) -> bytes:
+    """The server's answer to a batch."""
+    if isinstance(reply, Ack):
+        return pack({"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed})
+    return pack({"ack": False, "reason": reply.reason, "problem": reply.problem, "expected": reply.expected})
+
+
+def decode_reply(data: bytes) -> Ack | Refused:
+    """Undo `encode_reply`."""
+    table = unpack(data, MAX_SMALL_BYTES)
+    if take(table, "ack", bool):
+        numbers = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
+        return Ack(*numbers)
+    return Refused(take(table, "reason", str), take(table, "problem", str), _take_int(table, "expected", 0, MAX_SEQ))
+
+
+# --- readings --------------------------------------------------------------------------------------------------------
+
+
+def encode_bundle(bundle: SensorBundle) -> bytes:
+    """Readings as columns per sensor."""
+    groups: dict[tuple[str, str], list[Reading]] = {}
+    for reading in bundle.readings:
+        groups.setdefault((reading.sensor, reading.kind), []).append(reading)
+    sensors = [_encode_group(sensor, kind, readings) for (sensor, kind), readings in groups.items()]
+    return pack({"machine": bundle.machine, "counter": bundle.counter, "last": bundle.last, "sensors": sensors})
+
+
+def _encode_group(sensor: str, kind: str, readings: list[Reading]) -> dict[str, Any]:
+    cols = {name: np.array([getattr(r, name) for r in readings], "<f8").tobytes() for name in columns(kind)}
+    stamps = np.array([r.stamp_ns for r in readings], "<i8").tobytes()
+    return {"sensor": sensor, "kind": kind, "n": len(readings), "cols": {"stamp_ns": stamps, **cols}}
+
+
+def decode_bundle(data: bytes) -> SensorBundle:
+    """Decode a bundle; readings in the order of their stamps.
+
+    A malformed bundle is refused whole; a single implausible reading is left out and counted in `refused`.
+    """
+    table = unpack(data, MAX_BUNDLE_BYTES)
+    refused: Counter[str] = Counter()
+    readings: list[Reading] = []
+    for group in take(table, "sensors", list):
+        if not isinstance(group, dict):
+            raise MessageError(Refusal.WRONG_TYPE, "map expected", field="sensors")
+        readings += _decode_group(group, refused)
+    readings.sort(key=lambda r: r.stamp_ns)
+    return SensorBundle(
+        machine=_take_name(table),
+        counter=_take_int(table, "counter", 1, MAX_SEQ),
+        readings=tuple(readings),
+        last=take(table, "last", bool, default=False),
+        refused=dict(refused),
+    )
+
+
+def _decode_group(group: dict[str, Any], refused: Counter[str]) -> list[Reading]:
+    sensor, kind = take(group, "sensor", str), take(group, "kind", str)
+    if kind not in KINDS:
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{kind[:40]!r} is none of {', '.join(KINDS)}", field="kind")
+    n, cols = _take_int(group, "n", 0, MAX_BATCH_SAMPLES), take(group, "cols", dict)
+    arrays = []
+    for name in ("stamp_ns", *columns(kind)):
+        data: bytes = take(cols, name, bytes)
+        if len(data) != 8 * n:
+            raise MessageError(Refusal.COLUMN_LENGTH, f"{len(data)} bytes for {n} readings", field=f"{sensor}.{name}")
+        arrays.append(np.frombuffer(data, "<i8" if name == "stamp_ns" else "<f8").tolist())
+    readings = []
+    for stamp_ns, *values in zip(*arrays, strict=True):
+        try:
+            readings.append(parse_reading(kind, sensor, stamp_ns, tuple(values)))
+        except MessageError as error:
+            refused[error.reason] += 1
+    return readings
+
+
+# --- live pose and health --------------------------------------------------------------------------------------------
+
+
+def encode_pose(pose: Pose) -> bytes:
+    """One live position."""
+    return pack({name: getattr(pose, name) for name in Pose.__dataclass_fields__})
+
+
+def decode_pose(data: bytes) -> Pose:
+    """Undo `encode_pose`."""
+    table = unpack(data, MAX_SMALL_BYTES)
+    numbers = (take(table, name, float) for name in list(Pose.__dataclass_fields__)[2:])
+    return Pose(_take_name(table), take(table, "stamp_ns", int), *numbers)
+
+
+def encode_health(health: Health) -> bytes:
+    """One health report."""
+    return pack({"machine": health.machine, "stamp_ns": health.stamp_ns, "values": dict(health.values)})
+
+
+def decode_health(data: bytes) -> Health:
+    """Undo `encode_health`."""
+    table = unpack(data, MAX_SMALL_BYTES)
+    return Health(_take_name(table), take(table, "stamp_ns", int), take(table, "values", dict))

@@ -1,0 +1,81 @@
+"""TOML files into frozen dataclasses: types checked, unknown keys refused by name, every error with its place."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from protocol.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file; errors name the file and the line."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(path, "no such file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(path, f"not valid TOML: {error}") from None
+
+
+def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """Build the dataclass `cls` from a TOML table.
+
+    `where` is the place that errors name, for example `site.toml [server]`. A `ValueError` from `__post_init__`
+    (a value out of range) becomes a ConfigError at that place.
+    """
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    if unknown := sorted(set(table) - set(fields)):
+        raise ConfigError(where, f"unknown key `{unknown[0]}`; known: {', '.join(fields)}")
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in table:
+            raise ConfigError(where, f"key `{name}` is missing")
+    values = {name: _convert(value, hints[name], f"{where} {name}") for name, value in table.items()}
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise ConfigError(where, str(error)) from None
+
+
+def section(table: dict[str, Any], name: str, where: str) -> dict[str, Any]:
+    """Take the sub-table `name` out of `table`, empty where it is absent."""
+    value = table.pop(name, {})
+    if not isinstance(value, dict):
+        raise ConfigError(f"{where} {name}", f"a table is expected, not {type(value).__name__}")
+    return value
+
+
+def _convert(value: Any, hint: Any, where: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _convert(value, next(a for a in typing.get_args(hint) if a is not type(None)), where)
+    if origin is tuple:
+        return _convert_tuple(value, typing.get_args(hint), where)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        if not isinstance(value, dict):
+            raise ConfigError(where, f"a table is expected, not {type(value).__name__}")
+        return from_table(hint, value, where)
+    if hint is float and type(value) is int:
+        return float(value)
+    if type(value) is not hint:
+        raise ConfigError(where, f"{hint.__name__} is expected, not {type(value).__name__} ({value!r})")
+    return value
+
+
+def _convert_tuple(value: Any, args: tuple[Any, ...], where: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise ConfigError(where, f"a list is expected, not {type(value).__name__}")
+    if args[-1] is Ellipsis:
+        return tuple(_convert(v, args[0], f"{where}[{i}]") for i, v in enumerate(value))
+    if len(value) != len(args):
+        raise ConfigError(where, f"{len(args)} values are expected, not {len(value)}")
+    return tuple(_convert(v, a, f"{where}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True)))

@@ -1,0 +1,86 @@
+"""The error tree. Each error makes its own one-line message: what is wrong, where, and what to do where that helps."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+
+
+class Refusal(StrEnum):
+    """Why something was refused; the value is also the name of the counter that `info` and health show."""
+
+    TOO_LARGE = "too_large"
+    NOT_MSGPACK = "not_msgpack"
+    VERSION = "version"
+    MISSING_FIELD = "missing_field"
+    WRONG_TYPE = "wrong_type"
+    COLUMN_LENGTH = "column_length"
+    NOT_FINITE = "not_finite"
+    OUT_OF_RANGE = "out_of_range"
+    COVARIANCE = "covariance"
+    OUTSIDE_SITE = "outside_site"
+    FIRST_SEQ = "first_seq"
+    GAP = "gap"
+    WRONG_FRAME = "wrong_frame"
+    WRONG_MACHINE = "wrong_machine"
+    WALL_CLOCK = "wall_clock"
+    OVERLOADED = "overloaded"
+    STORE = "store"
+    UNKNOWN_PARAMETER = "unknown_parameter"
+    UNKNOWN_LAYER = "unknown_layer"
+    UNKNOWN_QUERY = "unknown_query"
+    AFTER_TIMEOUT = "after_timeout"
+
+
+class SitegridError(Exception):
+    """Base of all errors that this project raises on purpose."""
+
+
+class ConfigError(SitegridError):
+    """A configuration file, or a value in it, is wrong."""
+
+    def __init__(self, where: str | Path, problem: str) -> None:
+        super().__init__(f"{where}: {problem}")
+
+
+class LogFolderError(SitegridError):
+    """A log folder or its manifest cannot be read."""
+
+    def __init__(self, where: str | Path, problem: str) -> None:
+        super().__init__(f"{where}: {problem}")
+
+
+class MessageError(SitegridError):
+    """A message, or one value in it, is refused.
+
+    reason: the counter it belongs to. field, row: the place in the message, where there is one (rows count from 0).
+    """
+
+    def __init__(self, reason: Refusal, problem: str, *, field: str | None = None, row: int | None = None) -> None:
+        place = f"{field}[{row}]" if field is not None and row is not None else field
+        super().__init__(f"{place}: {problem}" if place else problem)
+        self.reason = reason
+        self.field = field
+        self.row = row
+
+
+class QueryError(SitegridError):
+    """A map query is malformed, or the server refused it."""
+
+    def __init__(self, reason: Refusal | str, problem: str) -> None:
+        super().__init__(problem)
+        self.reason = str(reason)
+
+
+class LinkError(SitegridError):
+    """Nobody answered on the network."""
+
+    def __init__(self, endpoint: str, problem: str) -> None:
+        super().__init__(f"{endpoint}: {problem}")
+
+
+class StoreError(SitegridError):
+    """A database or snapshot on disk cannot be used."""
+
+    def __init__(self, path: str | Path, problem: str) -> None:
+        super().__init__(f"{path}: {problem}")

@@ -1,0 +1,79 @@
+"""Grid geometry, in pure functions: cells, blocks, tiles, bounds.
+
+Cell (0, 0) has its south-west corner at the origin of `map`; columns grow to the east, rows to the north. Blocks of
+16 x 16 cells are the unit of memory; tiles are the unit on the wire.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocol.arrays import Floats, Ints
+
+BLOCK_CELLS = 16
+MAX_CELLS = 16_000_000  # of one region query: 64 MB a layer
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """A rectangle in `map` [m]: west <= x < east, south <= y < north."""
+
+    west_m: float
+    south_m: float
+    east_m: float
+    north_m: float
+
+    def __post_init__(self) -> None:
+        values = (self.west_m, self.south_m, self.east_m, self.north_m)
+        if not all(math.isfinite(v) for v in values):
+            raise ValueError("bounds: not finite")
+        if self.west_m >= self.east_m or self.south_m >= self.north_m:
+            raise ValueError("bounds: west must be below east and south below north")
+
+
+@dataclass(frozen=True)
+class CellWindow:
+    """A rectangle of cells: first column and row, number of columns and rows."""
+
+    column: int
+    row: int
+    columns: int
+    rows: int
+
+
+@dataclass(frozen=True)
+class GridGeometry:
+    """How positions map to cells."""
+
+    cell_m: float = 1.0
+    tile_cells: int = 64
+
+    def cell_of(self, position_m: Floats) -> Ints:
+        """Column or row of positions along one axis."""
+        return np.floor(position_m / self.cell_m).astype(np.int64)
+
+    def window(self, bounds: Bounds) -> CellWindow:
+        """Return the smallest window of whole cells that holds the bounds."""
+        column, row = (math.floor(v / self.cell_m) for v in (bounds.west_m, bounds.south_m))
+        end_column, end_row = (math.ceil(v / self.cell_m) for v in (bounds.east_m, bounds.north_m))
+        return CellWindow(column, row, end_column - column, end_row - row)
+
+    def bounds(self, window: CellWindow) -> Bounds:
+        """Outer edges of a window [m]."""
+        return Bounds(
+            window.column * self.cell_m,
+            window.row * self.cell_m,
+            (window.column + window.columns) * self.cell_m,
+            (window.row + window.rows) * self.cell_m,
+        )
+
+    def centres(self, first: int, count: int) -> Floats:
+        """Centres [m] of `count` cells along one axis."""
+        return (np.arange(first, first + count, dtype=np.float64) + 0.5) * self.cell_m
+
+    def tile_of(self, cell: int) -> int:
+        """Tile index of a column or row."""
+        return cell // self.tile_cells

@@ -1,0 +1,87 @@
+"""All key expressions, built and parsed here and nowhere else (DESIGN, "Keys")."""
+
+from __future__ import annotations
+
+from protocol.errors import ConfigError
+from protocol.site import NAME
+
+ROOT = "sitegrid"
+
+
+def check_name(name: str, what: str) -> str:
+    """Return the name of a site, machine or station if it may stand in a key; a wildcard never may."""
+    if not NAME.fullmatch(name):
+        raise ConfigError(what, f"{name!r} is not a name: use lower-case letters, digits, - and _, at most 63")
+    return name
+
+
+def ingest(site: str, machine: str) -> str:
+    """Samples of one machine: query with payload, the reply is the acknowledgement."""
+    return f"{ROOT}/{check_name(site, 'site')}/ingest/{check_name(machine, 'machine')}"
+
+
+def ingest_all(site: str) -> str:
+    """What the map server of a site answers."""
+    return f"{ROOT}/{check_name(site, 'site')}/ingest/*"
+
+
+def pose(site: str, machine: str) -> str:
+    """Live position."""
+    return _machine(site, machine, "pose")
+
+
+def poses_all(site: str) -> str:
+    """Live positions of every machine."""
+    return f"{ROOT}/{check_name(site, 'site')}/machine/*/pose"
+
+
+def health(site: str, machine: str) -> str:
+    """Health of one agent."""
+    return _machine(site, machine, "health")
+
+
+def health_all(site: str) -> str:
+    """Health of every agent."""
+    return f"{ROOT}/{check_name(site, 'site')}/machine/*/health"
+
+
+def alive(site: str, machine: str) -> str:
+    """Liveliness token of one agent."""
+    return _machine(site, machine, "alive")
+
+
+def alive_all(site: str) -> str:
+    """Liveliness tokens of every agent."""
+    return f"{ROOT}/{check_name(site, 'site')}/machine/*/alive"
+
+
+def sensors(site: str, machine: str) -> str:
+    """Readings of a simulated machine or a remote driver."""
+    return _machine(site, machine, "sensors")
+
+
+def map_query(site: str, query: str) -> str:
+    """One of the map's queryables: point, region, info, ..."""
+    return f"{ROOT}/{check_name(site, 'site')}/map/{query}"
+
+
+def map_queries_all(site: str) -> str:
+    """Every queryable of a site's map."""
+    return f"{ROOT}/{check_name(site, 'site')}/map/*"
+
+
+def machine_of(key: str) -> str:
+    """Name of the machine in a key of `ingest/` or `machine/`; a ConfigError where there is none."""
+    parts = key.split("/")
+    if len(parts) >= 4 and parts[0] == ROOT and parts[2] in ("ingest", "machine"):
+        return check_name(parts[3], f"key {key}")
+    raise ConfigError(f"key {key}", "names no machine")
+
+
+def query_of(key: str) -> str:
+    """Name of the map query that a key asks for."""
+    return key.rsplit("/", 1)[-1]
+
+
+def _machine(site: str, machine: str, leaf: str) -> str:
+    return f"{ROOT}/{check_name(site, 'site')}/machine/{check_name(machine, 'machine')}/{leaf}"

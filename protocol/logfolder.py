@@ -1,0 +1,224 @@
+"""Log folders: CSV files and a manifest `log.toml` that says what they mean (docs/log-folders.md).
+
+The manifest may lie apart from the data, so that logs of others are described without touching them.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import heapq
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from protocol.config import from_table, load_toml, section
+from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal
+from protocol.machine import MachineConfig, SensorConfig
+from protocol.readings import Reading, columns, parse_reading
+from protocol.site import SiteConfig
+from protocol.units import factor, stamp_ns, stamp_scale
+
+MANIFEST = "log.toml"
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where one field of a reading comes from: a CSV column in a unit, or a constant."""
+
+    column: str = ""
+    unit: str = ""
+    value: float = 0.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """The CSV file of one sensor. fields: reading field -> Column; `stamp` is the time column."""
+
+    sensor: SensorConfig
+    file: str
+    stamp: Column
+    fields: dict[str, Column]
+
+
+@dataclass
+class LogFolder:
+    """A described recording. `refused` counts, while it is read, the rows that were left out, by reason."""
+
+    name: str
+    data: Path
+    start_ns: int
+    site: SiteConfig
+    machine: MachineConfig
+    sources: tuple[Source, ...]
+    refused: Counter[str] = field(default_factory=Counter)
+
+    def readings(self) -> Iterator[Reading]:
+        """All readings of the sensors in use, in the order of their stamps."""
+        streams = [self._read(source) for source in self.sources if source.sensor.use]
+        return heapq.merge(*streams, key=lambda r: r.stamp_ns)
+
+    def _read(self, source: Source) -> Iterator[Reading]:
+        path = self.data / source.file
+        try:
+            with _open_text(path) as text:
+                yield from self._parse(csv.DictReader(text), source, path)
+        except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
+            raise LogFolderError(path, f"cannot be read: {error}") from None
+
+    def _parse(self, rows: csv.DictReader[str], source: Source, path: Path) -> Iterator[Reading]:
+        names = columns(source.sensor.kind)
+        picks = [_pick(name, source.fields[name], rows, path) for name in names]
+        stamp_column, scale = _require(source.stamp.column, rows, path), stamp_scale(source.stamp.unit or "s")
+        newest = 0
+        for row in rows:
+            try:
+                stamp = self.start_ns + stamp_ns(row[stamp_column], scale)
+                values = tuple(float(row[c]) * k if c else k for c, k in picks)
+                reading = parse_reading(source.sensor.kind, source.sensor.name, stamp, values)
+            except (ValueError, TypeError, OverflowError):
+                self.refused[Refusal.WRONG_TYPE] += 1
+            except MessageError as error:
+                self.refused[error.reason] += 1
+            else:
+                if stamp < newest:  # the merge of the files needs each of them in order
+                    self.refused["stamp_goes_back"] += 1
+                    continue
+                newest = stamp
+                yield reading
+
+
+def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
+    """Read a manifest. manifest: the file, or the folder that holds it as `log.toml`; data: where the CSV files are."""
+    if manifest.is_dir():
+        manifest = manifest / MANIFEST
+    where = str(manifest)
+    table = load_toml(manifest)
+    log = section(table, "log", where)
+    machine = section(table, "machine", where)
+    site = section(table, "site", where)
+    tables = table.pop("sensor", [])
+    if table:
+        raise ConfigError(where, f"unknown key `{next(iter(table))}`; known: log, site, machine, sensor")
+    if not isinstance(tables, list) or not tables:
+        raise ConfigError(where, "no [[sensor]] is described")
+    sources = tuple(_parse_source(t, f"{where} [[sensor]] {i + 1}") for i, t in enumerate(tables))
+    body = from_table(MachineConfig, machine, f"{where} [machine]")
+    header = from_table(_Header, log, f"{where} [log]")
+    return LogFolder(
+        name=header.name,
+        data=data or manifest.parent,
+        start_ns=header.start_ns,
+        site=from_table(SiteConfig, site, f"{where} [site]"),
+        machine=_with_sensors(body, tuple(s.sensor for s in sources), where),
+        sources=sources,
+    )
+
+
+@dataclass(frozen=True)
+class _Header:
+    """The manifest's [log]. start_ns: the UTC instant that the time columns count from."""
+
+    name: str
+    start_ns: int = 0
+
+
+def _with_sensors(body: MachineConfig, sensors: tuple[SensorConfig, ...], where: str) -> MachineConfig:
+    values = {name: getattr(body, name) for name in MachineConfig.__dataclass_fields__} | {"sensors": sensors}
+    try:
+        return MachineConfig(**values)
+    except ValueError as error:
+        raise ConfigError(where, str(error)) from None
+
+
+def _parse_source(table: Any, where: str) -> Source:
+    if not isinstance(table, dict):
+        raise ConfigError(where, "a table is expected")
+    table = dict(table)
+    file, mapping = table.pop("file", None), section(table, "columns", where)
+    sensor = from_table(SensorConfig, table, where)
+    if not isinstance(file, str):
+        raise ConfigError(where, "key `file` is missing")
+    parsed = {name: _parse_column(value, f"{where} columns.{name}") for name, value in mapping.items()}
+    known = ("stamp", *columns(sensor.kind))
+    if unknown := sorted(set(parsed) - set(known)):
+        raise ConfigError(where, f"unknown column `{unknown[0]}`; a {sensor.kind} has {', '.join(known)}")
+    if missing := [name for name in known if name not in parsed]:
+        raise ConfigError(where, f"column `{missing[0]}` is not described")
+    for name, column in parsed.items():
+        _check_unit(name, column, f"{where} columns.{name}")
+    return Source(sensor, file, parsed.pop("stamp"), parsed)
+
+
+def _parse_column(value: Any, where: str) -> Column:
+    if isinstance(value, str):
+        return Column(column=value)
+    if isinstance(value, dict) and ("column" in value) != ("value" in value):
+        return from_table(Column, value, where)
+    raise ConfigError(where, 'write "name", { column = "name", unit = "deg" } or { value = 0.01 }')
+
+
+def _check_unit(name: str, column: Column, where: str) -> None:
+    try:
+        if name == "stamp":
+            stamp_scale(column.unit or "s")
+        elif column.unit:
+            factor(column.unit, name)
+    except ValueError as error:
+        raise ConfigError(where, str(error)) from None
+
+
+def _pick(name: str, column: Column, rows: csv.DictReader[str], path: Path) -> tuple[str, float]:
+    """Return a CSV column and the factor to the field's unit; or no column and a constant."""
+    if not column.column:
+        return "", column.value
+    return _require(column.column, rows, path), factor(column.unit, name) if column.unit else 1.0
+
+
+def _require(column: str, rows: csv.DictReader[str], path: Path) -> str:
+    if column not in (rows.fieldnames or ()):
+        raise LogFolderError(path, f"has no column `{column}`; it has {', '.join(rows.fieldnames or ())}")
+    return column
+
+
+def _open_text(path: Path) -> IO[str]:
+    if path.suffix == ".gz":
+        return gzip.open(path, "rt", encoding="utf-8", newline="")
+    return path.open(encoding="utf-8", newline="")
+
+
+def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig, readings: Iterable[Reading]) -> None:
+    """Write readings as a log folder that `open_log` reads back exactly."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files: dict[str, list[Reading]] = {s.name: [] for s in machine.sensors}
+    for reading in readings:
+        files[reading.sensor].append(reading)
+    for sensor in machine.sensors:
+        with (folder / f"{sensor.name}.csv").open("w", encoding="utf-8", newline="") as text:
+            writer = csv.writer(text)
+            names = columns(sensor.kind)
+            writer.writerow(["stamp_ns", *names])
+            writer.writerows([r.stamp_ns, *(repr(getattr(r, n)) for n in names)] for r in files[sensor.name])
+    (folder / MANIFEST).write_text(_manifest(name, site, machine), encoding="utf-8")
+
+
+def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
+    lines = ["[log]", f'name = "{name}"', "", "[site]", *_lines(site), "", "[machine]", *_lines(machine)]
+    for s in machine.sensors:
+        xyz, rpy = list(s.mount.xyz_m), list(s.mount.rpy_deg)
+        lines += ["", "[[sensor]]", *_lines(s), f'file = "{s.name}.csv"']
+        lines += [f"mount = {{ xyz_m = {xyz}, rpy_deg = {rpy} }}", "[sensor.columns]"]
+        lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(s.kind))]
+    return "\n".join(lines) + "\n"
+
+
+def _lines(config: Any) -> list[str]:
+    """Plain values of a dataclass as TOML."""
+    values = {name: getattr(config, name) for name in config.__dataclass_fields__}
+    plain = {n: v for n, v in values.items() if isinstance(v, bool | int | float | str)}
+    return [
+        f"{n} = {str(v).lower() if isinstance(v, bool) else repr(v).replace(chr(39), chr(34))}"
+        for n, v in plain.items()
+    ]

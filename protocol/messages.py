@@ -1,0 +1,86 @@
+"""The messages of the wire as frozen records. `codec.py` turns them into bytes and back; docs/protocol.md specifies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from protocol.arrays import Table
+from protocol.readings import Reading
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class SampleBatch:
+    """Samples first_seq, first_seq + 1, ... of one spool.
+
+    frame: the site frame of the positions (`SiteConfig.frame`). lost_before: how many samples directly before
+    first_seq the bounded spool dropped. An empty batch asks for the watermark.
+    """
+
+    machine: str
+    spool_id: int
+    first_seq: int
+    rows: Table
+    frame: str
+    lost_before: int = 0
+
+    @property
+    def last_seq(self) -> int:
+        """Sequence number of the last sample."""
+        return self.first_seq + len(self.rows) - 1
+
+
+@dataclass(frozen=True)
+class Ack:
+    """Everything up to `watermark` is on the server's disk. row: the journal row; trimmed: samples it had already."""
+
+    watermark: int
+    row: int
+    trimmed: int = 0
+
+
+@dataclass(frozen=True)
+class Refused:
+    """The server did not take a batch. expected: the next sequence number it would take, 0 where that is not known."""
+
+    reason: str
+    problem: str
+    expected: int = 0
+
+
+@dataclass(frozen=True)
+class SensorBundle:
+    """Readings of one machine over a short span. counter: 1, 2, 3... per stream; last: the stream ends here."""
+
+    machine: str
+    counter: int
+    readings: tuple[Reading, ...]
+    last: bool = False
+    refused: Mapping[str, int] = field(default_factory=dict)  # readings left out when decoding, by reason
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Live position of a machine in `map`."""
+
+    machine: str
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    cov_xx_m2: float
+    cov_xy_m2: float
+    cov_yy_m2: float
+
+
+@dataclass(frozen=True)
+class Health:
+    """What an agent says of itself. values: nested tables of plain values, shown as they are."""
+
+    machine: str
+    stamp_ns: int
+    values: Mapping[str, Any]

@@ -1,0 +1,154 @@
+"""Readings: what sensors say, the one door by which simulation, replayed logs and real drivers enter an agent.
+
+Each kind is a flat frozen dataclass whose fields are also the columns of log folders and of sensor bundles; the
+suffix of a field is its unit. Values are raw: in the sensor's own frame, before any correction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+from protocol.errors import MessageError, Refusal
+
+MAX_STAMP_NS = 4_102_444_800_000_000_000  # the year 2100
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One reading of one sensor. stamp_ns: UTC nanoseconds at which the quantity was true."""
+
+    kind: ClassVar[str] = ""
+    limits: ClassVar[dict[str, tuple[float, float]]] = {}
+
+    sensor: str
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Gps(Reading):
+    """A fix of one antenna, WGS 84, with the variances that the receiver states."""
+
+    kind: ClassVar[str] = "gps"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {
+        "lat_deg": (-90, 90),
+        "lon_deg": (-180, 180),
+        "height_m": (-1e4, 1e5),
+        "var_e_m2": (1e-8, 1e6),
+        "var_n_m2": (1e-8, 1e6),
+        "var_u_m2": (1e-8, 1e6),
+    }
+
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    var_e_m2: float
+    var_n_m2: float
+    var_u_m2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Imu(Reading):
+    """Angular rate and specific force (gravity included: +9.8 on the axis that points up at rest)."""
+
+    kind: ClassVar[str] = "imu"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {
+        **dict.fromkeys(("gyro_x_radps", "gyro_y_radps", "gyro_z_radps"), (-50.0, 50.0)),
+        **dict.fromkeys(("force_x_mps2", "force_y_mps2", "force_z_mps2"), (-500.0, 500.0)),
+    }
+
+    gyro_x_radps: float
+    gyro_y_radps: float
+    gyro_z_radps: float
+    force_x_mps2: float
+    force_y_mps2: float
+    force_z_mps2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude(Reading):
+    """Orientation `map_from_sensor` as a unit quaternion, from an attitude and heading reference."""
+
+    kind: ClassVar[str] = "attitude"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {
+        **dict.fromkeys(("qx", "qy", "qz", "qw"), (-1.001, 1.001)),
+        **dict.fromkeys(("var_roll_rad2", "var_pitch_rad2", "var_yaw_rad2"), (1e-12, 100.0)),
+    }
+
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+    var_roll_rad2: float
+    var_pitch_rad2: float
+    var_yaw_rad2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry(Reading):
+    """Velocity of the machine's own frame as its controller reports it."""
+
+    kind: ClassVar[str] = "odometry"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {
+        "speed_x_mps": (-100, 100),
+        "speed_y_mps": (-100, 100),
+        "rate_z_radps": (-50, 50),
+    }
+
+    speed_x_mps: float
+    speed_y_mps: float
+    rate_z_radps: float
+
+
+@dataclass(frozen=True, slots=True)
+class Encoder(Reading):
+    """Tick counts of the two wheels of one axle, counted up from start, down in reverse."""
+
+    kind: ClassVar[str] = "encoder"
+    limits: ClassVar[dict[str, tuple[float, float]]] = dict.fromkeys(("left_ticks", "right_ticks"), (-1e15, 1e15))
+
+    left_ticks: float
+    right_ticks: float
+
+
+@dataclass(frozen=True, slots=True)
+class Torque(Reading):
+    """Drive torque at the wheels, summed over all of them, positive when it drives forwards."""
+
+    kind: ClassVar[str] = "torque"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"torque_nm": (-1e7, 1e7)}
+
+    torque_nm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Articulation(Reading):
+    """Angle of the front frame against the rear frame, positive to the left."""
+
+    kind: ClassVar[str] = "articulation"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"angle_rad": (-math.pi, math.pi)}
+
+    angle_rad: float
+
+
+KINDS: dict[str, type[Reading]] = {
+    cls.kind: cls for cls in (Gps, Imu, Attitude, Odometry, Encoder, Torque, Articulation)
+}
+
+
+def columns(kind: str) -> tuple[str, ...]:
+    """Value columns of a kind, in the order of its fields, without sensor and stamp."""
+    return tuple(f.name for f in fields(KINDS[kind]))[2:]
+
+
+def parse_reading(kind: str, sensor: str, stamp_ns: int, values: tuple[float, ...]) -> Reading:
+    """Build a reading; a MessageError names the first value that is not finite or out of range."""
+    cls = KINDS[kind]
+    if not 0 < stamp_ns < MAX_STAMP_NS:
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{stamp_ns} is not a UTC stamp in ns", field=f"{sensor}.stamp_ns")
+    for (name, (low, high)), value in zip(cls.limits.items(), values, strict=True):
+        if not low <= value <= high:  # also false for NaN
+            reason = Refusal.OUT_OF_RANGE if math.isfinite(value) else Refusal.NOT_FINITE
+            raise MessageError(reason, f"{value!r} is not between {low:g} and {high:g}", field=f"{sensor}.{name}")
+    return cls(sensor, stamp_ns, *values)

@@ -1,0 +1,113 @@
+"""Samples: geotagged resistance and gradient, as structured rows; the same bytes on machine, wire and server."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocol.arrays import Bools, Floats, Table
+from protocol.errors import MessageError, Refusal
+from protocol.readings import MAX_STAMP_NS
+
+# Order, types and names are part of the wire (docs/protocol.md). Little-endian.
+SAMPLE_DTYPE = np.dtype(
+    [
+        ("stamp_ns", "<i8"),
+        ("x_m", "<f8"),
+        ("y_m", "<f8"),
+        ("cov_xx_m2", "<f4"),
+        ("cov_xy_m2", "<f4"),
+        ("cov_yy_m2", "<f4"),
+        ("heading_rad", "<f4"),
+        ("speed_mps", "<f4"),
+        ("distance_m", "<f4"),
+        ("c_rr", "<f4"),
+        ("c_rr_var", "<f4"),
+        ("grade_e", "<f4"),
+        ("grade_n", "<f4"),
+        ("grade_var", "<f4"),
+    ]
+)
+COLUMNS: tuple[str, ...] = SAMPLE_DTYPE.names or ()
+
+RESISTANCE = ("c_rr", "c_rr_var")  # may both be NaN
+GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Plausible range of one column."""
+
+    low: float
+    high: float
+
+
+LIMITS: dict[str, Limit] = {
+    "stamp_ns": Limit(1, MAX_STAMP_NS),
+    "cov_xx_m2": Limit(0.0, 1e6),
+    "cov_yy_m2": Limit(0.0, 1e6),
+    "cov_xy_m2": Limit(-1e6, 1e6),
+    "heading_rad": Limit(-7.0, 7.0),
+    "speed_mps": Limit(-100.0, 100.0),
+    "distance_m": Limit(0.0, 100.0),
+    "c_rr": Limit(-1.0, 5.0),
+    "c_rr_var": Limit(0.0, 100.0),
+    "grade_e": Limit(-5.0, 5.0),
+    "grade_n": Limit(-5.0, 5.0),
+    "grade_var": Limit(0.0, 100.0),
+}
+
+
+def empty(n: int = 0) -> Table:
+    """Return `n` zeroed samples."""
+    return np.zeros(n, SAMPLE_DTYPE)
+
+
+def content_hash(row: Table) -> str:
+    """Hash of one sample's exact bytes, for audits."""
+    return hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest()
+
+
+def check_samples(rows: Table, extent_m: float) -> None:
+    """Raise a MessageError that names field and row if any sample is not plausible.
+
+    extent_m: positions further than this from the site's origin, east or north, are refused.
+    """
+    _check_finite(rows)
+    for name in ("x_m", "y_m"):
+        _refuse(np.abs(rows[name]) > extent_m, rows, name, Refusal.OUTSIDE_SITE, f"beyond {extent_m:g} m of the origin")
+    for name, limit in LIMITS.items():
+        bad: Bools = np.asarray(
+            (rows[name] < limit.low) | (rows[name] > limit.high)
+        )  # NaN passes here: it was judged above
+        reason = Refusal.COVARIANCE if name.startswith("cov_") else Refusal.OUT_OF_RANGE
+        _refuse(bad, rows, name, reason, f"not between {limit.low:g} and {limit.high:g}")
+    _refuse(~_is_semidefinite(rows), rows, "cov_xy_m2", Refusal.COVARIANCE, "covariance is not positive semidefinite")
+
+
+def _check_finite(rows: Table) -> None:
+    for group in (RESISTANCE, GRADE):
+        nan = np.stack([np.isnan(rows[name]) for name in group])
+        partly = nan.any(axis=0) & ~nan.all(axis=0)
+        _refuse(partly, rows, group[0], Refusal.NOT_FINITE, f"{', '.join(group)} must be NaN together or not at all")
+    for name in COLUMNS[1:]:
+        may_be_nan = name in RESISTANCE or name in GRADE
+        bad = np.isinf(rows[name]) if may_be_nan else ~np.isfinite(rows[name])
+        _refuse(bad, rows, name, Refusal.NOT_FINITE, "not finite")
+
+
+def _is_semidefinite(rows: Table) -> Bools:
+    xx, xy, yy = (_double(rows, name) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
+    return xx * yy - xy * xy >= -1e-6 * np.maximum(xx * yy, 1e-12)  # single precision rounds the product
+
+
+def _double(rows: Table, name: str) -> Floats:
+    return rows[name].astype(np.float64)
+
+
+def _refuse(bad: Bools, rows: Table, field: str, reason: Refusal, problem: str) -> None:
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise MessageError(reason, f"{rows[field][row]!s}: {problem}", field=field, row=row)

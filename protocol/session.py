@@ -1,0 +1,70 @@
+"""Zenoh sessions as this project uses them (EVIDENCE: shared memory bypasses namespaces and can drop queries)."""
+
+from __future__ import annotations
+
+import json
+import socket
+from dataclasses import dataclass
+
+import zenoh
+
+from protocol.errors import LinkError
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+@dataclass(frozen=True)
+class SessionConfig:
+    """How a process joins the network.
+
+    mode: "client" connects to a router; "router" is the site's router and listens. wait_s: how long to wait for the
+    router; negative waits for ever, in the background.
+    """
+
+    endpoint: str = DEFAULT_ENDPOINT
+    mode: str = "client"
+    wait_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("client", "router"):
+            raise ValueError(f'mode: {self.mode!r} is neither "client" nor "router"')
+        if "/" not in self.endpoint:
+            raise ValueError(f"endpoint: {self.endpoint!r} is not like {DEFAULT_ENDPOINT}")
+
+
+def open_session(config: SessionConfig) -> zenoh.Session:
+    """Open a session; LinkError if the router cannot be reached, or the address not be listened on, in time."""
+    settings = zenoh.Config()
+    for key, value in _settings(config).items():
+        settings.insert_json5(key, json.dumps(value))
+    try:
+        return zenoh.open(settings)
+    except zenoh.ZError as error:
+        role = "listen here" if config.mode == "router" else "reach a router here: start one with `sitegrid router`"
+        raise LinkError(config.endpoint, f"cannot {role} ({str(error).splitlines()[0][:120]})") from None
+
+
+def _settings(config: SessionConfig) -> dict[str, object]:
+    settings: dict[str, object] = {
+        "mode": config.mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }
+    if config.mode == "router":
+        return settings | {"listen/endpoints": [config.endpoint]}
+    wait_ms = -1 if config.wait_s < 0 else int(config.wait_s * 1000)
+    return settings | {
+        "connect/endpoints": [config.endpoint],
+        "connect/timeout_ms": wait_ms,
+        "connect/exit_on_failure": config.wait_s >= 0,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
+        "listen/endpoints": [],
+    }
+
+
+def free_endpoint() -> str:
+    """Return an endpoint on loopback whose port is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

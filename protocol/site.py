@@ -1,0 +1,97 @@
+"""The site: its name, its frame `map` (metres east and north of the origin), and the way from latitude and longitude.
+
+The frame is a transverse Mercator projection at the origin with scale 1 (DESIGN, "Frames, units, time"): x, y are
+metres, every export has a true coordinate reference system, and all machines share it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from protocol.config import from_table, load_toml
+from protocol.geometry import GridGeometry
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+
+
+@dataclass(frozen=True)
+class SiteConfig:
+    """One construction site.
+
+    clock: "data" takes the newest accepted stamp as now, "wall" also refuses stamps beyond the wall clock.
+    extent_m: positions further than this from the origin, east or north, are refused.
+    """
+
+    name: str
+    origin_lat_deg: float
+    origin_lon_deg: float
+    origin_height_m: float = 0.0
+    cell_m: float = 1.0
+    tile_cells: int = 64
+    extent_m: float = 20_000.0
+    clock: str = "data"
+    clock_tolerance_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not NAME.fullmatch(self.name):
+            raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
+        if not (-80 <= self.origin_lat_deg <= 84 and -180 <= self.origin_lon_deg <= 180):
+            raise ValueError("origin_lat_deg, origin_lon_deg: not a place on Earth between 80 S and 84 N")
+        if not 0.05 <= self.cell_m <= 100:
+            raise ValueError(f"cell_m: {self.cell_m} is not between 0.05 and 100")
+        if self.tile_cells not in (16, 32, 64, 128, 256):
+            raise ValueError(f"tile_cells: {self.tile_cells} is not one of 16, 32, 64, 128, 256")
+        if not 10 <= self.extent_m <= 100_000:
+            raise ValueError(f"extent_m: {self.extent_m} is not between 10 and 100000")
+        if self.clock not in ("data", "wall"):
+            raise ValueError(f'clock: {self.clock!r} is neither "data" nor "wall"')
+        if self.clock_tolerance_s < 0:
+            raise ValueError("clock_tolerance_s: negative")
+
+    @property
+    def crs(self) -> str:
+        """The site frame as a PROJ string."""
+        return (
+            f"+proj=tmerc +lat_0={self.origin_lat_deg!r} +lon_0={self.origin_lon_deg!r} "
+            "+k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+        )
+
+    @property
+    def frame(self) -> str:
+        """Eight hex digits that tell site frames apart; batches carry them, so that frames never mix in one map."""
+        return hashlib.sha256(f"{self.crs} {self.origin_height_m!r}".encode()).hexdigest()[:8]
+
+    @cached_property
+    def geometry(self) -> GridGeometry:
+        """The grid of this site."""
+        return GridGeometry(self.cell_m, self.tile_cells)
+
+
+class Projection:
+    """Latitude, longitude, height to the site frame and back (pyproj; needs the `agent`, `server` or `sim` extra)."""
+
+    def __init__(self, site: SiteConfig) -> None:
+        from pyproj import Proj  # imported here: the client does not need it
+
+        self._proj: Any = Proj(site.crs)
+        self._height_m = site.origin_height_m
+
+    def to_map(self, lat_deg: float, lon_deg: float, height_m: float) -> tuple[float, float, float]:
+        """Position in `map` [m]."""
+        x, y = self._proj(lon_deg, lat_deg)
+        return float(x), float(y), height_m - self._height_m
+
+    def to_geodetic(self, x_m: float, y_m: float, z_m: float = 0.0) -> tuple[float, float, float]:
+        """Latitude and longitude [deg] and height [m]."""
+        lon, lat = self._proj(x_m, y_m, inverse=True)
+        return float(lat), float(lon), z_m + self._height_m
+
+
+def load_site(path: Path) -> SiteConfig:
+    """Read a `site.toml`."""
+    return from_table(SiteConfig, load_toml(path), str(path))

@@ -1,0 +1,51 @@
+"""Units that logs come in, and their factor to the unit that a field's suffix names."""
+
+from __future__ import annotations
+
+import math
+
+# unit -> {suffix of a field: factor from the unit to what the suffix means}
+_UNITS: dict[str, dict[str, float]] = {
+    "m": {"_m": 1.0},
+    "mm": {"_m": 1e-3},
+    "m2": {"_m2": 1.0},
+    "deg": {"_deg": 1.0, "_rad": math.pi / 180},
+    "rad": {"_rad": 1.0, "_deg": 180 / math.pi},
+    "rad2": {"_rad2": 1.0},
+    "deg2": {"_rad2": (math.pi / 180) ** 2},
+    "rad/s": {"_radps": 1.0},
+    "deg/s": {"_radps": math.pi / 180},
+    "m/s": {"_mps": 1.0},
+    "km/h": {"_mps": 1 / 3.6},
+    "m/s2": {"_mps2": 1.0},
+    "g": {"_mps2": 9.80665},
+    "Nm": {"_nm": 1.0},
+    "kNm": {"_nm": 1e3},
+    "ticks": {"_ticks": 1.0},
+}
+_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+
+
+def factor(unit: str, field: str) -> float:
+    """Factor from `unit` to the unit of `field`; ValueError if the unit is not known or does not fit."""
+    if unit not in _UNITS:
+        raise ValueError(f"unit `{unit}` is not known; known: {', '.join(_UNITS)}")
+    suffix = "_" + field.rsplit("_", 1)[-1]
+    if suffix not in _UNITS[unit]:
+        raise ValueError(f"unit `{unit}` does not fit `{field}`")
+    return _UNITS[unit][suffix]
+
+
+def stamp_scale(unit: str) -> int:
+    """Nanoseconds in one `unit`; ValueError if that is no unit of time."""
+    if unit not in _NS:
+        raise ValueError(f"unit `{unit}` is no unit of time; known: {', '.join(_NS)}")
+    return _NS[unit]
+
+
+def stamp_ns(text: str, scale: int) -> int:
+    """Parse a time; whole numbers exactly, because a double holds UTC nanoseconds only to 256 ns."""
+    try:
+        return int(text) * scale
+    except ValueError:
+        return round(float(text) * scale)
