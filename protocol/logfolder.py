@@ -16,7 +16,7 @@ from typing import IO, Any
 
 from protocol.config import from_table, load_toml, section
 from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal
-from protocol.machine import MachineConfig, SensorConfig
+from protocol.machine import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
 from protocol.readings import Reading, columns, parse_reading
 from protocol.site import SiteConfig
 from protocol.units import factor, stamp_ns, stamp_scale
@@ -105,14 +105,13 @@ def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
     if not isinstance(tables, list) or not tables:
         raise ConfigError(where, "no [[sensor]] is described")
     sources = tuple(_parse_source(t, f"{where} [[sensor]] {i + 1}") for i, t in enumerate(tables))
-    body = from_table(MachineConfig, machine, f"{where} [machine]")
     header = from_table(_Header, log, f"{where} [log]")
     return LogFolder(
         name=header.name,
         data=data or manifest.parent,
         start_ns=header.start_ns,
         site=from_table(SiteConfig, site, f"{where} [site]"),
-        machine=_with_sensors(body, tuple(s.sensor for s in sources), where),
+        machine=parse_machine(machine, tuple(s.sensor for s in sources), where),
         sources=sources,
     )
 
@@ -123,14 +122,6 @@ class _Header:
 
     name: str
     start_ns: int = 0
-
-
-def _with_sensors(body: MachineConfig, sensors: tuple[SensorConfig, ...], where: str) -> MachineConfig:
-    values = {name: getattr(body, name) for name in MachineConfig.__dataclass_fields__} | {"sensors": sensors}
-    try:
-        return MachineConfig(**values)
-    except ValueError as error:
-        raise ConfigError(where, str(error)) from None
 
 
 def _parse_source(table: Any, where: str) -> Source:
@@ -205,20 +196,8 @@ def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig,
 
 
 def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
-    lines = ["[log]", f'name = "{name}"', "", "[site]", *_lines(site), "", "[machine]", *_lines(machine)]
-    for s in machine.sensors:
-        xyz, rpy = list(s.mount.xyz_m), list(s.mount.rpy_deg)
-        lines += ["", "[[sensor]]", *_lines(s), f'file = "{s.name}.csv"']
-        lines += [f"mount = {{ xyz_m = {xyz}, rpy_deg = {rpy} }}", "[sensor.columns]"]
-        lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(s.kind))]
+    lines = ["[log]", f'name = "{name}"', "", "[site]", *plain_lines(site), "", "[machine]", *plain_lines(machine)]
+    for sensor in machine.sensors:
+        lines += ["", "[[sensor]]", *sensor_lines(sensor), f'file = "{sensor.name}.csv"', "[sensor.columns]"]
+        lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(sensor.kind))]
     return "\n".join(lines) + "\n"
-
-
-def _lines(config: Any) -> list[str]:
-    """Plain values of a dataclass as TOML."""
-    values = {name: getattr(config, name) for name in config.__dataclass_fields__}
-    plain = {n: v for n, v in values.items() if isinstance(v, bool | int | float | str)}
-    return [
-        f"{n} = {str(v).lower() if isinstance(v, bool) else repr(v).replace(chr(39), chr(34))}"
-        for n, v in plain.items()
-    ]

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
 from protocol.arrays import Floats
+from protocol.config import from_table
+from protocol.errors import ConfigError
 from protocol.readings import KINDS
 from protocol.site import NAME
 
@@ -35,15 +40,16 @@ class Mount:
 class SensorConfig:
     """One sensor of a machine.
 
-    name: as readings carry it. drift_std_m, drift_time_s: size and correlation time of the slow error of a GPS
-    receiver. ticks_per_rev: of an encoder. use: false leaves the sensor's readings aside.
+    name: as readings carry it. use: false leaves the sensor's readings aside. drift_share, drift_time_s: of a GPS
+    receiver, the share of its stated variance that is a slow error, and that error's correlation time.
+    ticks_per_rev: of an encoder.
     """
 
     name: str
     kind: str
     mount: Mount = field(default_factory=Mount)
     use: bool = True
-    drift_std_m: float = 1.7
+    drift_share: float = 0.75
     drift_time_s: float = 45.0
     ticks_per_rev: int = 100
 
@@ -52,8 +58,10 @@ class SensorConfig:
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
         if self.kind not in KINDS:
             raise ValueError(f"kind: {self.kind!r} is none of {', '.join(KINDS)}")
-        if self.drift_std_m < 0 or self.drift_time_s <= 0 or self.ticks_per_rev <= 0:
-            raise ValueError("drift_std_m must not be negative; drift_time_s and ticks_per_rev must be positive")
+        if not 0 <= self.drift_share <= 1:
+            raise ValueError(f"drift_share: {self.drift_share} is not between 0 and 1")
+        if self.drift_time_s <= 0 or self.ticks_per_rev <= 0:
+            raise ValueError("drift_time_s and ticks_per_rev must be positive")
 
 
 @dataclass(frozen=True)
@@ -87,3 +95,32 @@ class MachineConfig:
     def sensor(self, name: str) -> SensorConfig | None:
         """The sensor of that name."""
         return next((s for s in self.sensors if s.name == name), None)
+
+
+def parse_machine(table: Mapping[str, Any], sensors: tuple[SensorConfig, ...], where: str) -> MachineConfig:
+    """Build a machine from its TOML table and its sensors."""
+    try:
+        return replace(from_table(MachineConfig, table, f"{where} [machine]"), sensors=sensors)
+    except ValueError as error:
+        raise ConfigError(where, str(error)) from None
+
+
+def sensor_lines(sensor: SensorConfig) -> list[str]:
+    """The keys of one sensor as TOML."""
+    mount = f"mount = {{ xyz_m = {list(sensor.mount.xyz_m)}, rpy_deg = {list(sensor.mount.rpy_deg)} }}"
+    return [*plain_lines(sensor), mount]
+
+
+def machine_toml(machine: MachineConfig) -> str:
+    """A machine and its sensors as TOML, as an agent's configuration has them."""
+    lines = ["[machine]", *plain_lines(machine)]
+    for sensor in machine.sensors:
+        lines += ["", "[[sensor]]", *sensor_lines(sensor)]
+    return "\n".join(lines) + "\n"
+
+
+def plain_lines(config: Any) -> list[str]:
+    """The plain values of a dataclass as TOML keys."""
+    values = {f.name: getattr(config, f.name) for f in fields(config)}
+    plain = {name: value for name, value in values.items() if isinstance(value, bool | int | float | str)}
+    return [f"{name} = {json.dumps(value)}" for name, value in plain.items()]
