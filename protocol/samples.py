@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocol.arrays import Bools, Floats, Table
+from protocol.arrays import AnyArray, Bools, Floats, Table
 from protocol.errors import MessageError, Refusal
 from protocol.readings import MAX_STAMP_NS
 
@@ -89,13 +89,16 @@ def check_samples(rows: Table, extent_m: float) -> None:
 
 def _check_finite(rows: Table) -> None:
     for group in (RESISTANCE, GRADE):
-        nan = np.stack([np.isnan(rows[name]) for name in group])
-        partly = nan.any(axis=0) & ~nan.all(axis=0)
-        _refuse(partly, rows, group[0], Refusal.NOT_FINITE, f"{', '.join(group)} must be NaN together or not at all")
+        missing = np.stack([np.isnan(rows[name]) for name in group]).sum(axis=0)
+        _refuse((missing > 0) & (missing < len(group)), rows, group[0], Refusal.NOT_FINITE, f"{', '.join(group)} must be NaN together or not at all")
     for name in COLUMNS[1:]:
         may_be_nan = name in RESISTANCE or name in GRADE
-        bad = np.isinf(rows[name]) if may_be_nan else ~np.isfinite(rows[name])
-        _refuse(bad, rows, name, Refusal.NOT_FINITE, "not finite")
+        bad = np.isinf if may_be_nan else _is_not_finite
+        _refuse(bad(rows[name]), rows, name, Refusal.NOT_FINITE, "not finite")
+
+
+def _is_not_finite(values: AnyArray) -> Bools:
+    return ~np.isfinite(values)
 
 
 def _is_semidefinite(rows: Table) -> Bools:

@@ -1,0 +1,40 @@
+"""The map server's options (config/server.toml)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mapserver.fold import FoldConfig
+from mapserver.layers import ReadConfig
+
+
+@dataclass(frozen=True)
+class StoreConfig:
+    """Sizes of the writer's queue and its groups, and how often it makes a snapshot.
+
+    queue_batches: so many batches may wait before senders are told to wait. group_batches: at most so many are
+    committed together. snapshot_rows, snapshot_s: a snapshot is made after so many journal rows or seconds.
+    """
+
+    queue_batches: int = 256
+    group_batches: int = 64
+    snapshot_rows: int = 2000
+    snapshot_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if min(self.queue_batches, self.group_batches, self.snapshot_rows) < 1 or self.snapshot_s <= 0:
+            raise ValueError("queue_batches, group_batches, snapshot_rows and snapshot_s must be positive")
+
+
+@dataclass(frozen=True)
+class ServerConfig:
+    """All options, one table per component."""
+
+    store: StoreConfig = field(default_factory=StoreConfig)
+    fold: FoldConfig = field(default_factory=FoldConfig)
+    read: ReadConfig = field(default_factory=ReadConfig)
+    query_threads: int = 2
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.query_threads <= 64:
+            raise ValueError(f"query_threads: {self.query_threads} is not between 1 and 64")

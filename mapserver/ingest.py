@@ -1,0 +1,70 @@
+"""What may enter the journal: the rules of identity, as a pure function (DESIGN, "Samples, identity")."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from protocol.codec import decode_batch
+from protocol.errors import MessageError, Refusal
+from protocol.messages import SampleBatch
+from protocol.site import SiteConfig
+
+
+class GapError(MessageError):
+    """A batch starts beyond the next sample that the server expects, and does not say that those before are lost."""
+
+    def __init__(self, first_seq: int, expected: int) -> None:
+        problem = f"{first_seq}: sample {expected} is expected next; send from there, or say lost_before"
+        super().__init__(Refusal.GAP, problem, field="first_seq")
+        self.expected = expected
+
+
+@dataclass(frozen=True)
+class Admission:
+    """What of a batch is new. batch: trimmed to it; trimmed: samples it had already; lost: samples declared lost."""
+
+    batch: SampleBatch
+    trimmed: int
+    lost: int
+
+    @property
+    def watermark(self) -> int:
+        """The last sample that is on disk once this is committed."""
+        return self.batch.last_seq
+
+
+def parse(payload: bytes, machine: str, site: SiteConfig, now_ns: Callable[[], int]) -> SampleBatch:
+    """Decode and judge a batch that came in under the key of `machine`; MessageError says what is wrong with it."""
+    batch = decode_batch(payload, site.extent_m)
+    if batch.machine != machine:
+        problem = f"{batch.machine!r} sends under the key of {machine!r}"
+        raise MessageError(Refusal.WRONG_MACHINE, problem, field="machine")
+    if batch.frame != site.frame:
+        problem = f"{batch.frame[:16]!r}: the frame of site {site.name} is {site.frame!r}; compare the site files"
+        raise MessageError(Refusal.WRONG_FRAME, problem, field="frame")
+    if site.clock == "wall" and len(batch.rows):
+        row = int(batch.rows["stamp_ns"].argmax())
+        ahead_s = (int(batch.rows["stamp_ns"][row]) - now_ns()) * 1e-9
+        if ahead_s > site.clock_tolerance_s:
+            problem = f"{ahead_s:.1f} s ahead of the server's clock; set the machine's clock"
+            raise MessageError(Refusal.WALL_CLOCK, problem, field="stamp_ns", row=row)
+    return batch
+
+
+def admit(batch: SampleBatch, watermark: int) -> Admission:
+    """Trim what is at or below the watermark; GapError if samples between it and the batch are missing.
+
+    An empty batch asks for the watermark: it is admitted with nothing in it.
+    """
+    expected = watermark + 1
+    if not len(batch.rows):
+        return Admission(replace(batch, first_seq=expected), trimmed=0, lost=0)
+    missing = batch.first_seq - expected
+    if missing > batch.lost_before:
+        raise GapError(batch.first_seq, expected)
+    if missing >= 0:
+        return Admission(batch, trimmed=0, lost=missing)
+    trimmed = min(-missing, len(batch.rows))
+    rest = replace(batch, first_seq=max(batch.first_seq + trimmed, expected), rows=batch.rows[trimmed:], lost_before=0)
+    return Admission(rest, trimmed=trimmed, lost=0)

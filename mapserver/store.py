@@ -1,0 +1,134 @@
+"""The store of one site: journal, grid and snapshots. One thread owns it (see writer.py)."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mapserver import ingest, snapshot
+from mapserver.config import ServerConfig
+from mapserver.ingest import Admission, GapError
+from mapserver.journal import Journal
+from protocol.errors import MessageError, Refusal
+from protocol.messages import Ack, Refused, SampleBatch
+from protocol.site import SiteConfig
+
+JOURNAL_FILE = "journal.db"
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """A batch as it came in: the machine of its key, and its bytes."""
+
+    machine: str
+    payload: bytes
+
+
+class Store:
+    """Journal, grid, watermarks and counters of one site."""
+
+    def __init__(self, folder: Path, site: SiteConfig, config: ServerConfig, now_ns: Callable[[], int]) -> None:
+        self.site = site
+        self.config = config
+        self.counters: Counter[str] = Counter()
+        self.newest_ns = 0
+        self._folder = folder
+        self._now_ns = now_ns
+        self._journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
+        self.merged, self.grid = snapshot.load_newest(folder, self._journal.last_row, site.cell_m, config.fold)
+        self.snapshot_row = self.merged
+        self._fold_tail()
+
+    @property
+    def journalled(self) -> int:
+        """The last row on disk."""
+        return self._journal.last_row
+
+    def take(self, group: list[Incoming]) -> list[Ack | Refused]:
+        """Journal a group of batches in one commit, fold it, and return the answer to each.
+
+        Nothing is acknowledged before its commit; where the commit fails, every batch of the group is refused.
+        """
+        answers: list[Ack | Refused] = []
+        admitted: list[tuple[int, Admission]] = []
+        try:
+            self._journal.begin()
+            for incoming in group:
+                answer, admission = self._take_one(incoming)
+                answers.append(answer)
+                if admission:
+                    admitted.append((answer.row if isinstance(answer, Ack) else 0, admission))
+            self._journal.commit()
+        except (sqlite3.Error, OSError) as error:
+            self._journal.rollback()
+            self.counters[f"refused_{Refusal.STORE}"] += len(group)
+            return [Refused(Refusal.STORE, f"the server cannot write: {error}") for _ in group]
+        for row, admission in admitted:
+            self._fold(row, admission.batch)
+        return answers
+
+    def save_snapshot(self) -> None:
+        """Write a snapshot of the grid as it is."""
+        if self.merged > self.snapshot_row:
+            snapshot.save(self._folder, self.merged, self.grid.state(), self.site.cell_m, self.config.fold)
+            self.snapshot_row = self.merged
+
+    def close(self) -> None:
+        """Snapshot, then close the journal."""
+        self.save_snapshot()
+        self._journal.close()
+
+    def info(self) -> dict[str, Any]:
+        """State of the store in plain values."""
+        machines: dict[str, dict[str, int]] = {}
+        for (machine, _), mark in self._journal.marks().items():
+            entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0})
+            entry["spools"] += 1
+            entry["samples"] += mark.seq - mark.lost
+            entry["lost"] += mark.lost
+        site = {name: getattr(self.site, name) for name in SiteConfig.__dataclass_fields__}
+        return {
+            "site": {**site, "frame": self.site.frame, "crs": self.site.crs},
+            "journalled": self.journalled,
+            "merged": self.merged,
+            "snapshot": self.snapshot_row,
+            "samples_merged": self.grid.folded,
+            "samples_too_unsure": self.grid.skipped,
+            "cells": self.grid.known_cells(),
+            "bounds": self.grid.bounds(),
+            "stamp_ns": self.newest_ns,
+            "machines": machines,
+            "counters": dict(self.counters),
+        }
+
+    def _take_one(self, incoming: Incoming) -> tuple[Ack | Refused, Admission | None]:
+        try:
+            batch = ingest.parse(incoming.payload, incoming.machine, self.site, self._now_ns)
+            admission = ingest.admit(batch, self._journal.mark(batch.machine, batch.spool_id).seq)
+        except MessageError as error:
+            self.counters[f"refused_{error.reason}"] += 1
+            expected = error.expected if isinstance(error, GapError) else 0
+            return Refused(error.reason, str(error), expected), None
+        self.counters["samples_trimmed"] += admission.trimmed
+        self.counters["samples_lost"] += admission.lost
+        if not len(admission.batch.rows):
+            return Ack(admission.watermark, self.journalled, admission.trimmed), None
+        row = self._journal.append(admission, self._now_ns())
+        self.counters["batches"] += 1
+        return Ack(admission.watermark, row, admission.trimmed), admission
+
+    def _fold(self, row: int, batch: SampleBatch) -> None:
+        self.grid.fold(batch.rows, batch.machine)
+        self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
+        self.merged = row
+
+    def _fold_tail(self) -> None:
+        """Fold what the snapshot does not hold; find the site's now."""
+        for row in self._journal.read(after=self.merged):
+            self.grid.fold(row.rows, row.machine)
+            self.merged = row.row
+        self.newest_ns = self._journal.newest_ns()

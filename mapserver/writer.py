@@ -1,0 +1,144 @@
+"""The thread that owns the store: batches are journalled, acknowledged and folded here; readers ask it for copies."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mapserver.config import ServerConfig
+from mapserver.store import Incoming, Store
+from protocol.errors import QueryError, Refusal
+from protocol.messages import Ack, Refused
+from protocol.site import SiteConfig
+
+T = TypeVar("T")
+Reply = Callable[[Ack | Refused], None]
+log = logging.getLogger("mapserver.writer")
+
+
+@dataclass(frozen=True)
+class _Read:
+    """Work for the owner's thread on behalf of a reader."""
+
+    work: Callable[[Store], Any]
+    result: Future[Any]
+
+
+class Writer:
+    """Owns a Store on a thread of its own.
+
+    `submit` and `read` may be called from any thread; both return at once or wait for the owner, never touch the store.
+    """
+
+    def __init__(self, folder: Path, site: SiteConfig, config: ServerConfig, now_ns: Callable[[], int]) -> None:
+        self._config = config.store
+        self._store = Store(folder, site, config, now_ns)
+        self._batches: queue.Queue[tuple[Incoming, Reply] | _Read | None] = queue.Queue()
+        self._waiting = threading.Semaphore(config.store.queue_batches)
+        self._overloaded = 0
+        self._merged = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
+        self._thread.start()
+
+    def submit(self, incoming: Incoming, reply: Reply) -> None:
+        """Hand in a batch; `reply` is called on the owner's thread, at once here if too many are waiting."""
+        if not self._waiting.acquire(blocking=False):
+            self._overloaded += 1
+            reply(Refused(Refusal.OVERLOADED, "too many batches are waiting; send this one again later"))
+            return
+        self._batches.put((incoming, reply))
+
+    def read(self, work: Callable[[Store], T], timeout_s: float = 60.0) -> T:
+        """Run `work` on the owner's thread, between two groups of batches, and return its result."""
+        result: Future[T] = Future()
+        self._batches.put(_Read(work, result))
+        return result.result(timeout_s)
+
+    def wait_merged(self, row: int, wait_s: float) -> None:
+        """Wait until a journal row is merged; QueryError if that takes longer than wait_s."""
+        with self._merged:
+            if not self._merged.wait_for(lambda: self._store.merged >= row, wait_s):
+                problem = f"journal row {row} is not merged after {wait_s:g} s; merged is {self._store.merged}"
+                raise QueryError(Refusal.AFTER_TIMEOUT, problem)
+
+    def count_refusal(self, reason: str) -> None:
+        """Count a refused query."""
+        self.read(lambda store: store.counters.update({f"refused_query_{reason}": 1}))
+
+    def info(self) -> dict[str, Any]:
+        """State of the store."""
+        info = self.read(Store.info)
+        if self._overloaded:
+            info["counters"][f"refused_{Refusal.OVERLOADED}"] = self._overloaded
+        return info
+
+    def close(self) -> None:
+        """Finish what is waiting, snapshot, close."""
+        self._batches.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        next_snapshot_s = time.monotonic() + self._config.snapshot_s
+        while (first := self._next(next_snapshot_s)) is not None:
+            if isinstance(first, _Read):
+                _answer(first, self._store)
+            elif first:
+                self._take_group(first)
+            rows = self._store.merged - self._store.snapshot_row
+            if rows >= self._config.snapshot_rows or time.monotonic() >= next_snapshot_s:
+                self._save_snapshot()
+                next_snapshot_s = time.monotonic() + self._config.snapshot_s
+        self._store.close()
+
+    def _next(self, deadline_s: float) -> tuple[Incoming, Reply] | _Read | tuple[()] | None:
+        """Return the next piece of work, () when it is time for a snapshot, None to end."""
+        try:
+            return self._batches.get(timeout=max(0.0, deadline_s - time.monotonic()))
+        except queue.Empty:
+            return ()
+
+    def _take_group(self, first: tuple[Incoming, Reply]) -> None:
+        group, reads, ending = [first], [], False
+        while len(group) < self._config.group_batches and not ending:
+            try:
+                item = self._batches.get_nowait()
+            except queue.Empty:
+                break
+            if isinstance(item, _Read):
+                reads.append(item)
+            elif item is None:
+                ending = True
+            else:
+                group.append(item)
+        answers = self._store.take([incoming for incoming, _ in group])
+        with self._merged:
+            self._merged.notify_all()
+        for (incoming, reply), answer in zip(group, answers, strict=True):
+            self._waiting.release()
+            if isinstance(answer, Refused):
+                log.warning("refused machine=%s reason=%s problem=%r", incoming.machine, answer.reason, answer.problem)
+            reply(answer)
+        for item in reads:
+            _answer(item, self._store)
+        if ending:
+            self._batches.put(None)
+
+    def _save_snapshot(self) -> None:
+        try:
+            self._store.save_snapshot()
+        except OSError as error:  # the journal is the truth; a missing snapshot only makes the next start longer
+            log.error("snapshot failed error=%r", str(error))
+
+
+def _answer(item: _Read, store: Store) -> None:
+    try:
+        item.result.set_result(item.work(store))
+    except Exception as error:  # handed on to the reader that asked
+        item.result.set_exception(error)
