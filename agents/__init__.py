@@ -1,0 +1,1 @@
+"""One machine: drivers, localisation, ground estimation, sampling, spool, uplink."""

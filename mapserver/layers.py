@@ -102,11 +102,13 @@ def _robust_centre(votes: AnyArray, centres: Floats, reach: int) -> Floats:
     median = (votes.cumsum(axis=-1) >= total[..., None] / 2).argmax(axis=-1)
     near: Bools = np.abs(np.arange(len(centres)) - median[..., None]) <= reach
     kept = np.where(near, votes, 0.0)
-    return _ratio(np.asarray(kept @ centres), kept.sum(axis=-1))
+    weighted: Floats = np.matmul(kept, centres)
+    weight: Floats = kept.sum(axis=-1)
+    return _ratio(weighted, weight)
 
 
 def _class_votes(evidence: ev.Evidence) -> Floats:
-    votes: Floats = evidence.counts[..., ev.RESISTANCE].astype(np.float64) @ _CLASS_OF_BIN
+    votes: Floats = np.matmul(evidence.counts[..., ev.RESISTANCE].astype(np.float64), _CLASS_OF_BIN)
     return votes
 
 
@@ -117,11 +119,14 @@ def _class_of_bin() -> Floats:
     edges = np.concatenate([[-np.inf], np.log(BOUNDARIES), [np.inf]])
     low = np.maximum(centres[:, None] - half, edges[None, :-1])
     high = np.minimum(centres[:, None] + half, edges[None, 1:])
-    return np.maximum(high - low, 0) / (2 * half)
+    share: Floats = np.maximum(high - low, 0) / (2 * half)
+    return share
 
 
 _CLASS_OF_BIN = _class_of_bin()
 
 
 def _ratio(numerator: Floats, denominator: Floats) -> Floats:
-    return np.divide(numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0)
+    out: Floats = np.full(denominator.shape, np.nan)
+    np.divide(numerator, denominator, out=out, where=denominator > 0)
+    return out

@@ -1,0 +1,1 @@
+"""Where the machine is, with an honest covariance: dead reckoning, alignment of the start heading, UKF."""

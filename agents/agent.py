@@ -1,0 +1,116 @@
+"""One machine's process: driver -> pipeline -> spool -> uplink, with pose and health on the side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from agents.audit import AuditLog
+from agents.config import AgentConfig
+from agents.drivers import Driver
+from agents.holdout import Holdout
+from agents.pipeline import Pipeline
+from agents.presence import Presence
+from agents.spool import Spool
+from agents.uplink import Uplink, UplinkState, linger
+from protocol.machine import MachineConfig
+from protocol.site import SiteConfig
+
+HEALTH_S = 1.0
+
+
+@dataclass(frozen=True)
+class Places:
+    """Files of an agent: its spool, and where asked for an audit file."""
+
+    spool: Path
+    audit: Path | None = None
+
+
+class Agent:
+    """Runs one machine until its stream ends or it is stopped."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        site: SiteConfig,
+        machine: MachineConfig,
+        config: AgentConfig,
+        places: Places,
+        *,
+        withhold: bool = False,
+    ) -> None:
+        self._config = config
+        self._pipeline = Pipeline(site, machine, config.pipeline)
+        self._holdout = Holdout(site, machine, config.holdout) if withhold else None
+        self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
+        self._presence = Presence(session, site.name, machine.name)
+        state = UplinkState(machine.name, site.frame, self._spool, config.uplink)
+        self._uplink = Uplink(session, site.name, machine.name, state, config.uplink.timeout_s)
+        self._readings = 0
+        self._samples = 0
+        self._newest_ns = 0
+
+    def run(
+        self,
+        driver: Driver,
+        is_stopped: Callable[[], bool],
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[float], object] = time.sleep,
+    ) -> dict[str, Any]:
+        """Take readings until the stream ends or `is_stopped`; returns a report in plain values."""
+        health_s = clock()
+        while not is_stopped():
+            readings = driver.read(0.2)
+            if readings is None:
+                break
+            self._step(list(readings))
+            if clock() >= health_s:
+                health_s = clock() + HEALTH_S
+                self._presence.show_health(self._newest_ns, self.report(driver))
+        driver.close()
+        delivered = linger(self._is_delivered, wait, clock, 0.0 if is_stopped() else self._config.linger_s)
+        report = {**self.report(driver), "delivered": delivered}
+        self._presence.show_health(self._newest_ns, report)
+        return report
+
+    def report(self, driver: Driver) -> dict[str, Any]:
+        """Health in plain values."""
+        uplink = self._uplink.state
+        return {
+            "readings": self._readings,
+            "samples": self._samples,
+            "driver": dict(driver.counters()),
+            "pipeline": self._pipeline.health(),
+            "spool": self._spool.counters(),
+            "uplink": {"problem": uplink.problem, "counters": dict(uplink.counters)},
+            "holdout": self._holdout.report() if self._holdout else None,
+        }
+
+    def close(self) -> None:
+        """End the uplink, leave the network, close the spool."""
+        self._uplink.close()
+        self._presence.close()
+        self._spool.close()
+
+    def _step(self, readings: list[Any]) -> None:
+        self._readings += len(readings)
+        if readings:
+            self._newest_ns = max(self._newest_ns, readings[-1].stamp_ns)
+        rows = self._pipeline.step(self._holdout.split(readings) if self._holdout else readings)
+        if self._holdout:
+            self._holdout.compare(self._pipeline)
+        if len(rows):
+            self._spool.record(rows)
+            self._samples += len(rows)
+            self._uplink.wake()
+        if pose := self._pipeline.pose:
+            self._presence.show_pose(pose)
+
+    def _is_delivered(self) -> bool:
+        return self._spool.counters()["depth"] == 0

@@ -1,0 +1,74 @@
+"""The audit file: what an agent recorded, line by line at recording time, to compare with what the server has.
+
+`+ <spool_id> <seq> <hash>` is a recorded sample (a later line for the same sample replaces it), `- <spool_id> <seq>`
+one whose identity is void because it was numbered anew. A line is written before its sample is committed; what a crash
+left without its sample is taken out when the spool is opened again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from protocol.arrays import Table
+from protocol.samples import content_hash
+
+Identity = tuple[int, int]  # spool_id, seq
+
+
+class AuditLog:
+    """Appends to the audit file of one agent."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._path = path
+        self._file = path.open("a", encoding="ascii")
+
+    def recorded(self, spool_id: int, first_seq: int, rows: Table) -> None:
+        """Note samples."""
+        self._write(f"+ {spool_id:016x} {first_seq + i} {content_hash(row)}" for i, row in enumerate(rows))
+
+    def renumbered(self, old_id: int, old_seqs: list[int], new_id: int, rows: Table) -> None:
+        """Note that samples have a new identity: 1, 2, 3... of spool `new_id`."""
+        self._write(f"- {old_id:016x} {seq}" for seq in old_seqs)
+        self.recorded(new_id, 1, rows)
+
+    def reconcile(self, spool_id: int, newest: int) -> None:
+        """Void lines of samples that a crash kept from being committed, and end a line that it cut off."""
+        text = self._path.read_text(encoding="ascii")
+        if text and not text.endswith("\n"):
+            self._write([" # cut off"])
+            text = text[: text.rfind("\n") + 1]
+        lost = [seq for (spool, seq) in parse(text.splitlines()) if spool == spool_id and seq > newest]
+        self._write(f"- {spool_id:016x} {seq}" for seq in lost)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _write(self, lines: Iterable[str]) -> None:
+        self._file.writelines(f"{line}\n" for line in lines)
+        self._file.flush()
+
+
+def read_audit(path: Path) -> dict[Identity, str]:
+    """Hash of every sample that an agent recorded, by identity."""
+    return parse(path.read_text(encoding="ascii").splitlines())
+
+
+def parse(lines: Iterable[str]) -> dict[Identity, str]:
+    """Hash by identity, of audit lines; malformed lines (cut off by a crash) are left out."""
+    recorded: dict[Identity, str] = {}
+    for sign, spool_id, seq, content in _fields(lines):
+        if sign == "+":
+            recorded[spool_id, seq] = content
+        else:
+            recorded.pop((spool_id, seq), None)
+    return recorded
+
+
+def _fields(lines: Iterable[str]) -> Iterator[tuple[str, int, int, str]]:
+    for line in lines:
+        parts = line.split()
+        if "#" not in line and (len(parts), parts[:1]) in ((4, ["+"]), (3, ["-"])):
+            yield parts[0], int(parts[1], 16), int(parts[2]), parts[3] if len(parts) == 4 else ""

@@ -1,0 +1,41 @@
+"""An agent's options (config/agent.toml): its machine, its sensors, and one table per stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from agents.holdout import HoldoutConfig
+from agents.pipeline import PipelineConfig
+from agents.spool import SpoolConfig
+from agents.uplink import UplinkConfig
+from protocol.config import from_table, load_toml, section
+from protocol.errors import ConfigError
+from protocol.machine import MachineConfig, SensorConfig, parse_machine
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Options of one agent. linger_s: how long to wait at the end for the last samples to be acknowledged."""
+
+    pipeline: PipelineConfig = field(default_factory=PipelineConfig)
+    spool: SpoolConfig = field(default_factory=SpoolConfig)
+    uplink: UplinkConfig = field(default_factory=UplinkConfig)
+    holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
+    linger_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        if self.linger_s < 0:
+            raise ValueError("linger_s: negative")
+
+
+def load_agent(path: Path) -> tuple[MachineConfig | None, AgentConfig]:
+    """Read an agent's file: its machine with sensors (None where the file has no [machine]), and its options."""
+    table, where = load_toml(path), str(path)
+    machine = section(table, "machine", where)
+    sensors = table.pop("sensor", [])
+    if not isinstance(sensors, list):
+        raise ConfigError(where, "sensors are written as [[sensor]]")
+    config = from_table(AgentConfig, table, where)
+    parsed = tuple(from_table(SensorConfig, s, f"{where} [[sensor]] {i + 1}") for i, s in enumerate(sensors))
+    return (parse_machine(machine, parsed, where) if machine else None), config

@@ -1,0 +1,55 @@
+"""Replay of a log folder, in real time, faster, or as fast as the agent takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from protocol.logfolder import LogFolder
+from protocol.readings import Reading
+
+SPAN_NS = 50_000_000  # readings of 50 ms are handed on together, as a live bundle does
+
+
+class Replay:
+    """Driver that reads a log folder.
+
+    speed: times real time; 0 is as fast as possible. clock, wait: seconds that pass, and how to let them pass.
+    """
+
+    def __init__(
+        self, log: LogFolder, speed: float, clock: Callable[[], float], wait: Callable[[float], object]
+    ) -> None:
+        self._log = log
+        self._readings = iter(log.readings())
+        self._speed = speed
+        self._clock = clock
+        self._wait = wait
+        self._next = next(self._readings, None)
+        self._first_ns = self._next.stamp_ns if self._next else 0
+        self._began_s = clock()
+
+    def read(self, timeout_s: float) -> Sequence[Reading] | None:
+        """Readings of the next 50 ms of the log, once they are due."""
+        if self._next is None:
+            return None
+        if self._speed > 0:
+            due_s = self._began_s + (self._next.stamp_ns - self._first_ns) * 1e-9 / self._speed
+            if (early_s := due_s - self._clock()) > 0:
+                self._wait(min(early_s, timeout_s))
+                if early_s > timeout_s:
+                    return ()
+        return self._take_span(self._next.stamp_ns + SPAN_NS)
+
+    def counters(self) -> Mapping[str, int]:
+        """Rows of the log that were left out, by reason."""
+        return {f"log_{reason}": n for reason, n in self._log.refused.items()}
+
+    def close(self) -> None:
+        """Nothing is held open between two reads."""
+
+    def _take_span(self, end_ns: int) -> list[Reading]:
+        span: list[Reading] = []
+        while self._next is not None and self._next.stamp_ns < end_ns:
+            span.append(self._next)
+            self._next = next(self._readings, None)
+        return span

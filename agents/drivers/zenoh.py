@@ -1,0 +1,72 @@
+"""Sensor bundles of a simulated machine or a remote driver, over Zenoh."""
+
+from __future__ import annotations
+
+import queue
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import zenoh
+
+from protocol import keys
+from protocol.codec import decode_bundle
+from protocol.errors import MessageError
+from protocol.readings import Reading
+
+QUEUE_BUNDLES = 4000  # 200 s of bundles; beyond it bundles are dropped and counted
+
+
+class ZenohDriver:
+    """Driver that subscribes to the machine's `sensors` key; the callback only moves bytes to a queue."""
+
+    def __init__(self, session: zenoh.Session, site: str, machine: str) -> None:
+        self._machine = machine
+        self._queue: queue.Queue[bytes] = queue.Queue(QUEUE_BUNDLES)
+        self._counters: Counter[str] = Counter()
+        self._newest = 0
+        self._ended = False
+        self._subscriber = session.declare_subscriber(keys.sensors(site, machine), self._on_sample)
+
+    def read(self, timeout_s: float) -> Sequence[Reading] | None:
+        """Readings of the next bundle."""
+        if self._ended:
+            return None
+        try:
+            return self._decode(self._queue.get(timeout=timeout_s))
+        except queue.Empty:
+            return ()
+
+    def counters(self) -> Mapping[str, int]:
+        """Bundles that were lost or refused, and readings that were refused, by reason."""
+        return dict(self._counters)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        try:
+            self._queue.put_nowait(sample.payload.to_bytes())
+        except queue.Full:
+            self._counters["bundles_overflowed"] += 1
+
+    def _decode(self, payload: bytes) -> Sequence[Reading]:
+        try:
+            bundle = decode_bundle(payload)
+        except MessageError as error:
+            self._counters[f"refused_bundle_{error.reason}"] += 1
+            return ()
+        if bundle.machine != self._machine:
+            self._counters["refused_bundle_wrong_machine"] += 1
+            return ()
+        self._count_gap(bundle.counter)
+        for reason, n in bundle.refused.items():
+            self._counters[f"refused_reading_{reason}"] += n
+        self._ended = bundle.last
+        return bundle.readings
+
+    def _count_gap(self, counter: int) -> None:
+        """Count missing bundles; a counter of 1 is a stream that starts anew."""
+        if counter > self._newest + 1 and self._newest:
+            self._counters["bundles_missing"] += counter - self._newest - 1
+        self._newest = counter

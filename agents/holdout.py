@@ -1,0 +1,79 @@
+"""Fixes that are withheld from the filter, to see how far off it is where it has none: an honest error on real logs."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.pipeline import Pipeline
+from protocol.machine import MachineConfig
+from protocol.readings import Gps, Reading
+from protocol.site import Projection, SiteConfig
+
+
+@dataclass(frozen=True)
+class HoldoutConfig:
+    """Withhold GPS for off_s of every period_s, and judge from settle_s after the first reading on."""
+
+    period_s: float = 10.0
+    off_s: float = 1.0
+    settle_s: float = 40.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.off_s < self.period_s or self.settle_s < 0:
+            raise ValueError("off_s must lie between 0 and period_s; settle_s must not be negative")
+
+
+class Holdout:
+    """Splits off fixes before the pipeline sees them, and compares them with its poses afterwards."""
+
+    def __init__(self, site: SiteConfig, machine: MachineConfig, config: HoldoutConfig) -> None:
+        self._config = config
+        self._projection = Projection(site)
+        self._levers = {s.name: s.mount.xyz_m for s in machine.sensors}
+        self._first_ns = 0
+        self._waiting: deque[Gps] = deque()
+        self._errors_m: list[float] = []
+
+    def split(self, readings: Sequence[Reading]) -> list[Reading]:
+        """Return what the pipeline may see."""
+        return [r for r in readings if not self._is_withheld(r)]
+
+    def compare(self, pipeline: Pipeline) -> None:
+        """Compare withheld fixes with the poses that are known by now."""
+        pose = pipeline.pose
+        while pose and self._waiting and self._waiting[0].stamp_ns <= pose.stamp_ns:
+            fix = self._waiting.popleft()
+            if (at := pipeline.pose_at(fix.stamp_ns)) and self._seconds(fix) >= self._config.settle_s:
+                x, y, _ = self._projection.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
+                lever, c, s = self._levers[fix.sensor], math.cos(at.heading_rad), math.sin(at.heading_rad)
+                dx = at.x_m + c * lever[0] - s * lever[1] - x
+                dy = at.y_m + s * lever[0] + c * lever[1] - y
+                self._errors_m.append(math.hypot(dx, dy))
+
+    def report(self) -> dict[str, float | int | None]:
+        """How many fixes were judged, and the error against them [m]."""
+        if not self._errors_m:
+            return {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None}
+        errors = np.array(self._errors_m)
+        rms = float(np.sqrt((errors**2).mean()))
+        return {
+            "fixes": len(errors),
+            "rms_m": round(rms, 3),
+            "median_m": round(float(np.median(errors)), 3),
+            "max_m": round(float(errors.max()), 3),
+        }
+
+    def _is_withheld(self, reading: Reading) -> bool:
+        self._first_ns = self._first_ns or reading.stamp_ns
+        if not isinstance(reading, Gps) or self._seconds(reading) % self._config.period_s >= self._config.off_s:
+            return False
+        self._waiting.append(reading)
+        return True
+
+    def _seconds(self, reading: Reading) -> float:
+        return (reading.stamp_ns - self._first_ns) * 1e-9

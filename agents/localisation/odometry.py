@@ -1,0 +1,152 @@
+"""Dead reckoning from wheels and gyro: how far, how far round, how fast; and the start heading from it and GPS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.localisation.model import Step
+from protocol.arrays import Floats
+from protocol.machine import MachineConfig, SensorConfig
+from protocol.readings import Encoder, Imu, Odometry, Reading
+
+
+class WheelTracker:
+    """Speed and acceleration from quantised wheel travel: a fading-memory filter of third order.
+
+    Least squares of a parabola over the past, with weights that fade by exp(-dt / tau_s) (Morrison 1969): stable at
+    any rate, and without lasting error while the acceleration is constant.
+    """
+
+    def __init__(self, tau_s: float = 0.15) -> None:
+        self.speed_mps = 0.0
+        self.accel_mps2 = 0.0
+        self._tau_s = tau_s
+        self._travel_m = 0.0
+        self._stamp_ns = 0
+
+    def update(self, stamp_ns: int, travel_m: float) -> None:
+        """Take in the wheel travel so far."""
+        dt = (stamp_ns - self._stamp_ns) * 1e-9
+        if not self._stamp_ns or dt > 1:  # the first, or a pause: start from here
+            self._travel_m, self._stamp_ns = travel_m, stamp_ns
+            return
+        if dt <= 0:
+            return
+        fade = math.exp(-dt / self._tau_s)
+        self._travel_m += dt * (self.speed_mps + 0.5 * self.accel_mps2 * dt)
+        self.speed_mps += dt * self.accel_mps2
+        error = travel_m - self._travel_m
+        self._travel_m += (1 - fade**3) * error
+        self.speed_mps += 1.5 * (1 - fade) ** 2 * (1 + fade) * error / dt
+        self.accel_mps2 += (1 - fade) ** 3 * error / dt**2
+        self._stamp_ns = stamp_ns
+
+
+@dataclass(frozen=True)
+class Dead:
+    """Dead-reckoned pose in a frame of its own: travel [m], angle [rad], x, y [m] at a stamp."""
+
+    stamp_ns: int
+    travel_m: float
+    angle_rad: float
+    x_m: float
+    y_m: float
+
+
+class DeadReckoning:
+    """Accumulates wheel travel and turn; knows nothing of GPS."""
+
+    def __init__(self, machine: MachineConfig) -> None:
+        self.wheels = WheelTracker()
+        self.stamp_ns = 0
+        self.travel_m = 0.0
+        self.angle_rad = 0.0
+        self.way_m = 0.0  # like travel, but reverse counts up too
+        self._machine = machine
+        self._rotation: dict[str, Floats] = {}
+        self._imu: Imu | None = None
+        self._ticks: dict[str, float] = {}
+        self._odometry_ns = 0
+        self._x_m = 0.0
+        self._y_m = 0.0
+
+    def update(self, reading: Reading, sensor: SensorConfig) -> None:
+        """Take in a reading of the gyro or the wheels; others change nothing."""
+        if isinstance(reading, Imu):
+            self._turn(reading, sensor)
+        elif isinstance(reading, Encoder):
+            ticks = (reading.left_ticks + reading.right_ticks) / 2
+            per_tick_m = 2 * math.pi * self._machine.wheel_radius_m / sensor.ticks_per_rev
+            self._advance(reading.stamp_ns, (ticks - self._ticks.get(sensor.name, ticks)) * per_tick_m)
+            self._ticks[sensor.name] = ticks
+        elif isinstance(reading, Odometry):
+            dt = (reading.stamp_ns - self._odometry_ns) * 1e-9 if self._odometry_ns else 0.0
+            self._advance(reading.stamp_ns, reading.speed_x_mps * min(dt, 1.0))
+            self._odometry_ns = reading.stamp_ns
+
+    def now(self) -> Dead:
+        """The dead-reckoned pose of this moment."""
+        return Dead(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
+
+    def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
+        """Integrate the vertical rate of the first IMU in use (the others serve later issues)."""
+        if self._imu is not None and self._imu.sensor != imu.sensor:
+            return
+        if imu.sensor not in self._rotation:
+            self._rotation[imu.sensor] = sensor.mount.base_from_sensor()
+        up = self._rotation[imu.sensor][2]
+        if self._imu is not None:
+            dt = (imu.stamp_ns - self._imu.stamp_ns) * 1e-9
+            rate = up[0] * imu.gyro_x_radps + up[1] * imu.gyro_y_radps + up[2] * imu.gyro_z_radps
+            self.angle_rad += rate * min(dt, 1.0)
+        self._imu = imu
+        self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
+
+    def _advance(self, stamp_ns: int, travel_m: float) -> None:
+        self.travel_m += travel_m
+        self.way_m += abs(travel_m)
+        self._x_m += travel_m * math.cos(self.angle_rad)
+        self._y_m += travel_m * math.sin(self.angle_rad)
+        self.wheels.update(stamp_ns, self.travel_m)
+        self.stamp_ns = max(self.stamp_ns, stamp_ns)
+
+
+def step_between(before: Dead, after: Dead) -> Step:
+    """Travel, turn and time between two dead-reckoned poses."""
+    dt_s = (after.stamp_ns - before.stamp_ns) * 1e-9
+    return Step(after.travel_m - before.travel_m, after.angle_rad - before.angle_rad, dt_s)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How the dead-reckoned frame lies in `map`: rotation [rad], its standard deviation, place of its origin [m]."""
+
+    rotation_rad: float
+    std_rad: float
+    origin_m: tuple[float, float]
+
+
+def align(dead_m: Floats, fixes_m: Floats, fix_std_m: float) -> Alignment | None:
+    """Fit dead-reckoned antenna positions (n, 2) onto fixes (n, 2) by rotation and shift (Umeyama 1991, in 2-D).
+
+    fix_std_m: error of one fix. Returns None where all positions coincide. The standard deviation takes half the
+    spread for granted: slow GPS errors do not average out.
+    """
+    origin, target = dead_m.mean(axis=0), fixes_m.mean(axis=0)
+    d, f = dead_m - origin, fixes_m - target
+    spread_m = float(np.sqrt((d**2).sum(axis=1).mean()))
+    if spread_m < 1e-6:
+        return None
+    rotation = math.atan2(float((d[:, 0] * f[:, 1] - d[:, 1] * f[:, 0]).sum()), float((d * f).sum()))
+    c, s = math.cos(rotation), math.sin(rotation)
+    shift = target - np.array([c * origin[0] - s * origin[1], s * origin[0] + c * origin[1]])
+    return Alignment(rotation, fix_std_m / (2 * spread_m), (float(shift[0]), float(shift[1])))
+
+
+def mean_std(variances_m2: Sequence[float]) -> float:
+    """Root of the mean variance."""
+    return math.sqrt(sum(variances_m2) / len(variances_m2))

@@ -1,0 +1,107 @@
+"""The machine's pure heart: readings in, samples out. No clock, no files, no network."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from agents.estimation.ground import EstimationConfig, GroundEstimator
+from agents.localisation.localiser import LocalisationConfig, Localiser, PoseBelief
+from agents.localisation.model import ModelConfig
+from agents.order import Order, Verdict
+from agents.sampling import NOTHING, Sampler, SamplingConfig
+from protocol.arrays import Table
+from protocol.machine import MachineConfig
+from protocol.readings import Reading
+from protocol.site import Projection, SiteConfig
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """Options of the pure core, one table per stage.
+
+    gap_s: a pause in the readings longer than this starts localisation anew. late_s: readings that come later than
+    this behind the newest are refused.
+    """
+
+    gap_s: float = 5.0
+    late_s: float = 0.5
+    localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    estimation: EstimationConfig = field(default_factory=EstimationConfig)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+
+    def __post_init__(self) -> None:
+        if self.gap_s <= 0 or self.late_s < 0:
+            raise ValueError("gap_s must be positive and late_s not negative")
+
+
+class Pipeline:
+    """Localisation, ground estimation and sampling of one machine."""
+
+    def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
+        self._machine = machine
+        self._config = config
+        self._projection = Projection(site)
+        self._sensors = {s.name: s for s in machine.sensors if s.use}
+        self._order = Order(config.gap_s, config.late_s)
+        self._counters: Counter[str] = Counter()
+        self._start()
+
+    @property
+    def pose(self) -> PoseBelief | None:
+        """The newest pose, None until the start heading is known."""
+        return self._sampler.poses.newest
+
+    def pose_at(self, stamp_ns: int) -> PoseBelief | None:
+        """Pose at a recent stamp, None where it is not known."""
+        return self._sampler.poses.at(stamp_ns)
+
+    def step(self, readings: Sequence[Reading]) -> Table:
+        """Take in readings in the order of their stamps; returns the samples (n,) that they made possible."""
+        samples = [self._step_one(reading) for reading in readings]
+        made = [rows for rows in samples if len(rows)]
+        return np.concatenate(made) if made else NOTHING
+
+    def health(self) -> dict[str, Any]:
+        """State of the stages in plain values."""
+        pose = self.pose
+        std_m = float(np.sqrt(np.linalg.eigvalsh(pose.covariance_m2)[-1])) if pose else None
+        return {
+            "aligned": self._localiser.is_aligned,
+            "position_std_m": std_m,
+            "counters": dict(self._counters + self._order.counters + self._localiser.counters),
+            "withheld": dict(self._sampler.withheld),
+        }
+
+    def _step_one(self, reading: Reading) -> Table:
+        sensor = self._sensors.get(reading.sensor)
+        if sensor is None or sensor.kind != reading.kind:
+            self._counters["reading_unknown_sensor"] += 1
+            return NOTHING
+        verdict = self._order.judge(reading)
+        if verdict is Verdict.REFUSE:
+            return NOTHING
+        if verdict is Verdict.RESTART:
+            self._counters.update(self._localiser.counters)
+            self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
+            self._start()
+        for pose in self._localiser.update(reading, sensor):
+            self._sampler.poses.append(pose)
+        wheels = self._localiser.dead.wheels
+        self._estimator.update(reading, sensor, wheels.speed_mps, wheels.accel_mps2)
+        dead = self._localiser.dead
+        if self._sampler.is_due(dead.way_m):
+            self._sampler.mark(dead.stamp_ns, dead.way_m, self._estimator.now(wheels.speed_mps))
+        return self._sampler.take()
+
+    def _start(self) -> None:
+        """Start with nothing known, as after power-up or a jump of the clock."""
+        config, machine = self._config, self._machine
+        self._localiser = Localiser(machine, self._projection, config.localisation, config.model)
+        self._estimator = GroundEstimator(machine, config.estimation)
+        self._sampler = Sampler(machine.load_centre_m, config.sampling)
