@@ -1,0 +1,1 @@
+"""Simulation: machines on a terrain, their sensors and their truth; nothing at run time imports it."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-GRAVITY_MPS2 = 9.81
+from agents.physics import GRAVITY_MPS2
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from agents.estimation.attitude import GRAVITY_MPS2, AttitudeConfig, SlopeFilter
+from agents.estimation.attitude import AttitudeConfig, SlopeFilter
+from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import MachineConfig, SensorConfig
 from protocol.readings import Imu, Reading, Torque

@@ -78,7 +78,7 @@ class Localiser:
         self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, noise: model.ModelConfig
     ) -> None:
         self.counters: Counter[str] = Counter()
-        self.dead = DeadReckoning(machine)
+        self.dead = DeadReckoning(machine, noise.slip)
         self.last_nis = math.nan
         self._config = config
         self._noise = noise
@@ -136,7 +136,7 @@ class Localiser:
         drift_m2 = sensor.drift_share * float(variance.mean())
         white = np.maximum(variance * (1 - sensor.drift_share), self._config.min_fix_std_m**2)
         dead = self.dead.now()
-        stamped = Dead(max(dead.stamp_ns, gps.stamp_ns), dead.travel_m, dead.angle_rad, dead.x_m, dead.y_m)
+        stamped = Dead(max(dead.stamp_ns, gps.stamp_ns), dead.travel_m, dead.angle_rad, dead.x_m, dead.y_m, dead.pull)
         return _Fix(gps.stamp_ns, self._receivers[gps.sensor], np.array([x, y]), white, drift_m2, stamped)
 
     def _condition(self, ukf: VectorisedUkf, fix: _Fix) -> None:

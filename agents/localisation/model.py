@@ -23,14 +23,19 @@ BASE_STATES = 5  # followed by two per GPS receiver: its error east and north
 class ModelConfig:
     """Noise of the model.
 
-    slip_m2_per_s: position variance that slip adds per second of driving. turn_noise: heading random walk
-    [rad/sqrt(s)]. travel_share: standard deviation of wheel travel as a share of the square root of the way [sqrt(m)].
+    slip_m2_per_s: position variance that side slip and the like add per second of driving. turn_noise: heading random
+    walk [rad/sqrt(s)]. travel_share: standard deviation of wheel travel over the square root of the way [sqrt(m)].
+    slip, slip_std: wheel slip per traction (drive force over weight), what is taken off and how unsure that is;
+    slip_time_s: how long a ground's slip stays the same.
     gyro_bias_radps, wheel_scale: standard deviations at start; *_walk: their random walks per sqrt(s).
     """
 
     slip_m2_per_s: float = 2e-3
     turn_noise: float = 2e-3
     travel_share: float = 0.02
+    slip: float = 0.2
+    slip_std: float = 0.15
+    slip_time_s: float = 5.0
     gyro_bias_radps: float = 5e-3
     gyro_bias_walk: float = 5e-5
     wheel_scale: float = 0.03
@@ -44,11 +49,15 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class Step:
-    """What wheels and gyro say of one time step: travel [m], turn [rad], duration [s]."""
+    """What wheels and gyro say of one time step: travel [m], turn [rad], duration [s].
+
+    pull: integral of (traction x speed)^2 over the step [m2/s], to which slip's uncertainty is proportional.
+    """
 
     travel_m: float
     turn_rad: float
     dt_s: float
+    pull: float = 0.0
 
 
 def drift_states(receiver: int) -> slice:
@@ -76,7 +85,8 @@ def process_noise(step: Step, heading: float, decay: Floats, drift_var_m2: Float
     way = abs(step.travel_m)
     along = np.array([np.cos(heading), np.sin(heading)])
     moving = min(1.0, way / max(step.dt_s, 1e-9))  # a machine at rest does not slip
-    Q[POSITION, POSITION] = np.outer(along, along) * config.travel_share**2 * way
+    slip_m2 = config.slip_std**2 * 2 * config.slip_time_s * step.pull
+    Q[POSITION, POSITION] = np.outer(along, along) * (config.travel_share**2 * way + slip_m2)
     Q[POSITION, POSITION] += np.eye(2) * config.slip_m2_per_s * step.dt_s * moving
     Q[HEADING, HEADING] = config.turn_noise**2 * step.dt_s
     Q[GYRO_BIAS, GYRO_BIAS] = config.gyro_bias_walk**2 * step.dt_s

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.localisation.model import Step
+from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import MachineConfig, SensorConfig
-from protocol.readings import Encoder, Imu, Odometry, Reading
+from protocol.readings import Encoder, Imu, Odometry, Reading, Torque
 
 
 class WheelTracker:
@@ -48,25 +49,35 @@ class WheelTracker:
 
 @dataclass(frozen=True)
 class Dead:
-    """Dead-reckoned pose in a frame of its own: travel [m], angle [rad], x, y [m] at a stamp."""
+    """Dead-reckoned pose in a frame of its own: travel [m], angle [rad], x, y [m] at a stamp, pull as in `Step`."""
 
     stamp_ns: int
     travel_m: float
     angle_rad: float
     x_m: float
     y_m: float
+    pull: float = 0.0
 
 
 class DeadReckoning:
-    """Accumulates wheel travel and turn; knows nothing of GPS."""
+    """Accumulates wheel travel and turn; knows nothing of GPS.
 
-    def __init__(self, machine: MachineConfig) -> None:
+    slip: wheel slip per traction, taken off the travel where the machine has a torque sensor. travel_m is what remains,
+    way_m counts up in reverse too.
+    """
+
+    def __init__(self, machine: MachineConfig, slip: float) -> None:
         self.wheels = WheelTracker()
         self.stamp_ns = 0
         self.travel_m = 0.0
         self.angle_rad = 0.0
-        self.way_m = 0.0  # like travel, but reverse counts up too
+        self.way_m = 0.0
         self._machine = machine
+        self._slip = slip
+        self._traction = 0.0
+        self._rolled_m = 0.0
+        self._rolled_ns = 0
+        self._pull = 0.0
         self._rotation: dict[str, Floats] = {}
         self._imu: Imu | None = None
         self._ticks: dict[str, float] = {}
@@ -87,10 +98,13 @@ class DeadReckoning:
             dt = (reading.stamp_ns - self._odometry_ns) * 1e-9 if self._odometry_ns else 0.0
             self._advance(reading.stamp_ns, reading.speed_x_mps * min(dt, 1.0))
             self._odometry_ns = reading.stamp_ns
+        elif isinstance(reading, Torque):
+            weight_n = self._machine.mass_kg * GRAVITY_MPS2
+            self._traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
 
     def now(self) -> Dead:
         """The dead-reckoned pose of this moment."""
-        return Dead(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
+        return Dead(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m, self._pull)
 
     def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
         """Integrate the vertical rate of the first IMU in use (the others serve later issues)."""
@@ -106,19 +120,26 @@ class DeadReckoning:
         self._imu = imu
         self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
 
-    def _advance(self, stamp_ns: int, travel_m: float) -> None:
+    def _advance(self, stamp_ns: int, rolled_m: float) -> None:
+        self._rolled_m += rolled_m
+        self.wheels.update(stamp_ns, self._rolled_m)
+        dt_s = (stamp_ns - self._rolled_ns) * 1e-9
+        travel_m = rolled_m * (1 - self._slip * self._traction * math.copysign(1.0, rolled_m))
+        if 0 < dt_s < 1:
+            self._pull += (self._traction * rolled_m) ** 2 / dt_s
+        self._rolled_ns = stamp_ns
         self.travel_m += travel_m
         self.way_m += abs(travel_m)
         self._x_m += travel_m * math.cos(self.angle_rad)
         self._y_m += travel_m * math.sin(self.angle_rad)
-        self.wheels.update(stamp_ns, self.travel_m)
         self.stamp_ns = max(self.stamp_ns, stamp_ns)
 
 
 def step_between(before: Dead, after: Dead) -> Step:
     """Travel, turn and time between two dead-reckoned poses."""
     dt_s = (after.stamp_ns - before.stamp_ns) * 1e-9
-    return Step(after.travel_m - before.travel_m, after.angle_rad - before.angle_rad, dt_s)
+    travel_m, turn_rad = after.travel_m - before.travel_m, after.angle_rad - before.angle_rad
+    return Step(travel_m, turn_rad, dt_s, after.pull - before.pull)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,185 @@
+"""Publish simulated readings over Zenoh, one bundle per machine and span, at a multiple of real time."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from protocol import keys
+from protocol.codec import encode_bundle
+from protocol.errors import LinkError
+from protocol.messages import SensorBundle
+from protocol.readings import Reading
+from protocol.session import SessionConfig, open_session
+from sim.config import SimConfig
+from sim.recorder import Recording, record, write_truth
+from sim.simulator import Simulator
+
+__all__ = ["SimReport", "record", "run"]
+
+MATCH_POLL_S = 0.05
+PROGRESS_S = 0.2
+
+
+@dataclass(frozen=True)
+class SimReport:
+    """How a run went. bundles: of each machine, without the closing one. late_s: the most it fell behind its pace."""
+
+    machines: int
+    simulated_s: float
+    wall_s: float
+    bundles: int
+    readings: int
+    late_s: float
+    stopped: bool
+
+
+class Stream:
+    """The bundles of one machine, counted 1, 2, 3..."""
+
+    def __init__(self, session: zenoh.Session, site: str, machine: str) -> None:
+        self.machine = machine
+        self._counter = 0
+        # readings must not be dropped when an agent is slow: the simulation waits instead
+        block = zenoh.CongestionControl.BLOCK
+        self._publisher: Any = session.declare_publisher(keys.sensors(site, machine), congestion_control=block)
+
+    @property
+    def heard(self) -> bool:
+        """Whether somebody subscribes."""
+        return bool(self._publisher.matching_status.matching)
+
+    def put(self, readings: tuple[Reading, ...] = (), *, last: bool = False) -> None:
+        """Publish the next bundle."""
+        self._counter += 1
+        self._publisher.put(encode_bundle(SensorBundle(self.machine, self._counter, readings, last)))
+
+    def close(self) -> None:
+        """Publish the closing bundle and withdraw."""
+        self.put(last=True)
+        self._publisher.undeclare()
+
+
+class Pace:
+    """Holds simulated time back to `speed` times the clock's; speed 0 never waits."""
+
+    def __init__(self, speed: float, stop: threading.Event, clock: Callable[[], float]) -> None:
+        self._speed, self._stop, self._clock = speed, stop, clock
+        self._start = clock()
+        self.late_s = 0.0
+
+    def wait(self, simulated_s: float) -> None:
+        """Wait until this simulated time is due, or the run is stopped."""
+        if not self._speed:
+            return
+        early_s = self._start + simulated_s / self._speed - self._clock()
+        self.late_s = max(self.late_s, -early_s)
+        if early_s > 0:
+            self._stop.wait(early_s)
+
+
+def run(
+    config: SimConfig,
+    session_config: SessionConfig,
+    stop: threading.Event,
+    *,
+    clock: Callable[[], float] = time.monotonic,
+    on_progress: Callable[[float], None] | None = None,
+    truth_dir: Path | None = None,
+    record_dir: Path | None = None,
+) -> SimReport:
+    """Simulate and publish until `config.seconds` are over or `stop` is set.
+
+    Waits first until every machine has a subscriber, at most `config.wait_s`, else a LinkError. on_progress gets the
+    simulated time about five times a second. The truth and log folders are written at the end, whatever ends the run;
+    readings are kept in memory for record_dir.
+    """
+    simulator = Simulator(config)
+    recording = Recording(simulator) if record_dir else None
+    progress = _throttled(on_progress, clock) if on_progress else None
+    with _streams(config, session_config) as streams:
+        _await_subscribers(streams, config, session_config.endpoint, stop, clock)
+        try:
+            report = _drive(simulator, streams, stop, clock, recording, progress)
+        finally:
+            if truth_dir:
+                write_truth(truth_dir, simulator)
+            if recording and record_dir:
+                recording.write(record_dir)
+    return report
+
+
+def _drive(
+    simulator: Simulator,
+    streams: list[Stream],
+    stop: threading.Event,
+    clock: Callable[[], float],
+    recording: Recording | None,
+    progress: Callable[[float], None] | None,
+) -> SimReport:
+    start, bundles, readings = clock(), 0, 0
+    pace = Pace(simulator.config.speed, stop, clock)
+    planned = simulator.config.bundles
+    for _ in itertools.count() if planned is None else range(planned):
+        if stop.is_set():
+            break
+        step = simulator.advance()
+        pace.wait(simulator.simulated_s)  # a bundle is due when its span is over
+        for stream in streams:
+            stream.put(tuple(step[stream.machine]))
+        bundles += 1
+        readings += sum(map(len, step.values()))
+        if recording:
+            recording.add(step)
+        if progress:
+            progress(simulator.simulated_s)
+    wall_s = clock() - start
+    stopped = planned is None or bundles < planned
+    return SimReport(len(streams), simulator.simulated_s, wall_s, bundles, readings, pace.late_s, stopped)
+
+
+@contextlib.contextmanager
+def _streams(config: SimConfig, session_config: SessionConfig) -> Iterator[list[Stream]]:
+    session: Any = open_session(session_config)
+    try:
+        streams = [Stream(session, config.site, name) for name in config.machine_names]
+        try:
+            yield streams
+        finally:
+            for stream in streams:
+                stream.close()
+    finally:
+        session.close()
+
+
+def _await_subscribers(
+    streams: list[Stream], config: SimConfig, endpoint: str, stop: threading.Event, clock: Callable[[], float]
+) -> None:
+    deadline = clock() + config.wait_s
+    while unheard := [s.machine for s in streams if not s.heard]:
+        if stop.is_set():
+            return
+        if clock() >= deadline:
+            problem = f"nobody listens to machine {unheard[0]} of site {config.site}"
+            raise LinkError(endpoint, f"{problem}: start its agent with `sitegrid agent`, within {config.wait_s:g} s")
+        stop.wait(MATCH_POLL_S)
+
+
+def _throttled(call: Callable[[float], None], clock: Callable[[], float]) -> Callable[[float], None]:
+    last = clock() - PROGRESS_S
+
+    def throttled(simulated_s: float) -> None:
+        nonlocal last
+        if clock() - last >= PROGRESS_S:
+            last = clock()
+            call(simulated_s)
+
+    return throttled

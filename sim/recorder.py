@@ -1,0 +1,53 @@
+"""Simulate into log folders, with no network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from protocol.errors import ConfigError
+from protocol.logfolder import write_log
+from protocol.readings import Reading
+from sim.config import SimConfig
+from sim.simulator import Simulator
+from sim.truth import MAP_FILE, save_tracks
+
+TRACKS_FOLDER = "tracks"
+
+
+class Recording:
+    """Keeps readings in memory, to be written as one log folder per machine."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
+        self._readings: dict[str, list[Reading]] = {m.name: [] for m in simulator.machines}
+
+    def add(self, bundles: dict[str, list[Reading]]) -> None:
+        """Keep what `Simulator.advance` returned."""
+        for name, readings in bundles.items():
+            self._readings[name] += readings
+
+    def write(self, folder: Path) -> None:
+        """Write `<folder>/<machine>/log.toml` and its CSV files."""
+        for machine in self._simulator.machines:
+            name = f"{self._simulator.site.name}-{machine.name}"
+            write_log(folder / machine.name, name, self._simulator.site, machine, self._readings[machine.name])
+
+
+def write_truth(folder: Path, simulator: Simulator) -> None:
+    """Write the truth map and the tracks so far: `truth_map.npz` and `tracks/<machine>.csv`."""
+    simulator.truth_map.save(folder / MAP_FILE)
+    save_tracks(folder / TRACKS_FOLDER, simulator.tracks())
+
+
+def record(config: SimConfig, record_dir: Path, truth_dir: Path | None = None) -> Simulator:
+    """Simulate `config.seconds` into log folders; the truth goes to truth_dir. Returns the simulator, at its end."""
+    if config.bundles is None:
+        raise ConfigError("seconds", "a recording needs an end: set seconds above 0")
+    simulator = Simulator(config)
+    recording = Recording(simulator)
+    for _ in range(config.bundles):
+        recording.add(simulator.advance())
+    recording.write(record_dir)
+    if truth_dir:
+        write_truth(truth_dir, simulator)
+    return simulator

@@ -1,0 +1,74 @@
+"""What is true of the ground and of the machines' ways, kept apart from what sensors say; for evaluation only."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from protocol.arrays import Floats32, Table
+from protocol.errors import StoreError
+from sim.soil import C_RR
+from sim.terrain import Terrain
+
+TRACK_EVERY = 10  # steps: 10 Hz
+TRACK_VALUES = ("x", "y", "yaw", "speed", "c_rr", "grade_e", "grade_n")  # m, rad, m/s, -, m/m
+TRACK_DTYPE = np.dtype([("stamp_ns", "<i8"), *((name, "<f8") for name in TRACK_VALUES)])
+MAP_FILE = "truth_map.npz"
+
+
+@dataclass(frozen=True)
+class TruthMap:
+    """The true layers of a site: (rows, columns) float32, rows to the north, values at the cells' centres.
+
+    west_m, south_m: the south-west corner of cell (0, 0). grade_*: gradient over the cell [m/m].
+    """
+
+    west_m: float
+    south_m: float
+    c_rr: Floats32
+    grade_east: Floats32
+    grade_north: Floats32
+    cell_m: float = 1.0
+
+    def save(self, path: Path) -> None:
+        """Write as .npz, whose name must end so."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(path, **vars(self))
+
+    @classmethod
+    def load(cls, path: Path) -> TruthMap:
+        """Read what `save` wrote; a StoreError if that is not what the file holds."""
+        try:
+            with path.open("rb") as file, np.load(file) as data:
+                west_m, south_m, cell_m = (float(data[name]) for name in ("west_m", "south_m", "cell_m"))
+                return cls(west_m, south_m, data["c_rr"], data["grade_east"], data["grade_north"], cell_m)
+        except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
+            raise StoreError(path, f"is no truth map: {error}") from None
+
+
+def truth_map(terrain: Terrain, width_m: float, depth_m: float, cell_m: float = 1.0) -> TruthMap:
+    """Survey a terrain from the origin of `map` on."""
+    east = (np.arange(round(width_m / cell_m)) + 0.5) * cell_m
+    north = (np.arange(round(depth_m / cell_m)) + 0.5) * cell_m
+    x, y = np.meshgrid(east, north)
+    half = cell_m / 2  # the gradient over the cell, not of the little patch that the centre lies on
+    rise_e = (terrain.height(x + half, y) - terrain.height(x - half, y)) / cell_m
+    rise_n = (terrain.height(x, y + half) - terrain.height(x, y - half)) / cell_m
+    c_rr = C_RR[terrain.zone(x, y)]
+    layers = [layer.astype(np.float32) for layer in (c_rr, rise_e, rise_n)]
+    return TruthMap(0.0, 0.0, layers[0], layers[1], layers[2], cell_m)
+
+
+def save_tracks(folder: Path, tracks: Mapping[str, Table]) -> None:
+    """Write one CSV file per machine: <machine>.csv with the columns of TRACK_DTYPE."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, track in tracks.items():
+        with (folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as text:
+            writer = csv.writer(text)
+            writer.writerow(["stamp_ns", *TRACK_VALUES])
+            writer.writerows([row[0], *map(repr, row[1:])] for row in track.tolist())

@@ -1,0 +1,164 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapserver import plotter, sheet
+from mapserver.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from protocol.ground import ZONES
+from protocol.queries import Region
+
+NAN = np.float32(np.nan)
+
+
+def region(columns: int, rows: int, *, west: float = 0.0, south: float = 0.0, cell: float = 1.0, **layers) -> Region:
+    x, y = west + (np.arange(columns) + 0.5) * cell, south + (np.arange(rows) + 0.5) * cell
+    full = {name: np.broadcast_to(np.asarray(v, np.float32), (rows, columns)).copy() for name, v in layers.items()}
+    return Region(x, y, cell, full, merged=1, stamp_ns=1)
+
+
+def cell_colour(image: np.ndarray, column: int, row: int, rows: int, cell_px: int) -> tuple[int, ...]:
+    """Colour in the middle of a cell; row 0 is the southernmost."""
+    x = sheet.LEFT + column * cell_px + cell_px // 2
+    y = sheet.TOP + (rows - 1 - row) * cell_px + cell_px // 2
+    return tuple(int(v) for v in image[y, x])
+
+
+def test_each_zone_has_its_colour_and_unknown_is_pale():
+    values = np.full((2, 6), [*(zone.c_rr for zone in ZONES), np.nan], np.float32)
+    image = draw_resistance(region(6, 2, resistance=values))
+    shown = [cell_colour(image, column, 0, 2, plotter.MAX_CELL_PX) for column in range(6)]
+    assert shown == [*(zone.bgr for zone in ZONES), plotter.UNKNOWN_COLOUR]
+
+
+def test_north_is_up_and_east_is_right():
+    values = np.full((4, 4), 0.008)
+    values[3, 0] = 0.25  # north-west
+    image = draw_resistance(region(4, 4, resistance=values))
+    top_left = image[sheet.TOP + 10, sheet.LEFT + 10]
+    assert tuple(top_left) == ZONES[4].bgr
+
+
+def test_usual_site_has_five_pixels_per_metre():
+    image = draw_resistance(region(200, 150, resistance=0.02))
+    ground = image[sheet.TOP : sheet.TOP + 750, sheet.LEFT : sheet.LEFT + 1000]
+    assert (ground == ZONES[1].bgr).all()
+    assert tuple(image[sheet.TOP + 751, sheet.LEFT + 500]) != ZONES[1].bgr
+
+
+def test_slope_is_red_uphill_and_downhill():
+    east = np.array([[0.0, 0.27, -0.27, 0.1, NAN]])
+    image = draw_grade(region(5, 1, grade_east=east, grade_north=0.0))
+    corner = [tuple(image[sheet.TOP + 3, sheet.LEFT + 64 * column + 3]) for column in range(5)]
+    flat, slope = ZONES[0].bgr, ZONES[1].bgr
+    assert corner == [flat, slope, slope, flat, plotter.UNKNOWN_COLOUR]
+
+
+def test_arrow_tip_points_uphill():
+    hill = region(1, 1, grade_east=0.0, grade_north=0.3)
+    ground = draw_grade(hill)[sheet.TOP : sheet.TOP + 64, sheet.LEFT : sheet.LEFT + 64]
+    white = (ground > 200).all(axis=2)
+    assert white[:32].sum() > white[32:].sum() + 5  # the head is in the northern half
+
+
+def test_wrong_cells_are_loud_and_counted(monkeypatch):
+    titles = []
+    real = sheet.text
+    monkeypatch.setattr(sheet, "text", lambda s, words, *a: (titles.append(words), real(s, words, *a)))
+    values = np.array([[0.008, 0.008, 0.25, NAN]])
+    image = draw_difference(region(4, 1, resistance=values), {"resistance": np.full((1, 4), 0.008)}, "resistance")
+    shown = [cell_colour(image, column, 0, 1, plotter.MAX_CELL_PX) for column in range(4)]
+    pale = plotter._pale(ZONES[0].bgr)
+    assert shown == [pale, pale, plotter.WRONG_COLOUR, plotter.UNKNOWN_COLOUR]
+    assert any("33.33 % of 3 known cells wrong" in words for words in titles)
+
+
+def test_grade_difference_takes_a_region_as_truth():
+    here = region(2, 2, grade_east=0.3, grade_north=0.0)
+    truth = region(2, 2, grade_east=0.0, grade_north=-0.3)
+    image = draw_difference(here, truth, "grade")
+    assert cell_colour(image, 1, 1, 2, 64) == plotter._pale(ZONES[1].bgr)
+
+
+def test_truth_of_another_shape_is_refused():
+    with pytest.raises(ValueError, match="truth has shape"):
+        draw_difference(region(2, 2, resistance=0.02), {"resistance": np.zeros((3, 2))}, "resistance")
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "cell"),
+    [(1, 1, 1.0), (5, 5, 1.0), (30, 400, 1.0), (400, 30, 1.0), (2000, 2000, 1.0), (1241, 3, 1.0), (9, 5, 0.05)],
+)
+def test_every_size_fits_a_screen(columns, rows, cell):
+    track = Track("m" * 63, np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    here = region(columns, rows, west=-90_000.55, south=-90_000.55, cell=cell, resistance=0.04)
+    image = draw_resistance(here, [track] * 40, "A long title " * 20)
+    assert image.dtype == np.uint8
+    assert image.shape[1] <= 1600
+    assert (image[:, -4:] == 255).all()  # nothing is cut off at the right
+    assert (image[-2:] == 255).all()  # nor below
+
+
+def test_unknown_map_is_drawn():
+    here = region(20, 10, resistance=NAN, grade_east=NAN, grade_north=NAN)
+    for image in (draw_resistance(here), draw_grade(here), draw_difference(here, here, "resistance")):
+        assert cell_colour(image, 3, 3, 10, 62) == plotter.UNKNOWN_COLOUR
+
+
+def test_thin_track_stays_visible_on_a_large_map():
+    values = np.full((1300, 2600), np.nan)
+    values[700, :] = 0.25
+    image = draw_resistance(region(2600, 1300, resistance=values))
+    ground = image[sheet.TOP :, sheet.LEFT : sheet.LEFT + 800]
+    assert (ground == ZONES[4].bgr).all(axis=2).any(axis=0).all()
+
+
+def test_track_has_its_colour_and_a_marker_at_its_end():
+    track = Track("loader-1", np.array([10.5, 50.5, np.nan, 90.5]), np.array([10.5, 10.5, np.nan, 40.5]))
+    image = draw_resistance(region(100, 50, resistance=0.04), [track])
+    assert cell_colour(image, 90, 40, 50, 12) == plotter.TRACK_COLOURS[0]
+    assert min(cell_colour(image, 30, 10, 50, 12)) > 150  # a thin white line, smoothed
+    assert cell_colour(image, 70, 25, 50, 12) == ZONES[2].bgr  # NaN breaks the line
+
+
+@pytest.mark.parametrize("positions", [[], [np.nan, np.nan], [1e9, -1e9], [5.0]])
+def test_odd_tracks_do_no_harm(positions):
+    track = Track("loader-1", np.array(positions), np.array(positions))
+    assert draw_resistance(region(10, 10, resistance=0.04), [track]).any()
+
+
+def test_drawing_leaves_the_region_as_it_was():
+    here = region(10, 10, resistance=0.04, grade_east=0.3, grade_north=0.0)
+    draw_resistance(here), draw_grade(here)
+    assert (here["resistance"] == np.float32(0.04)).all()
+
+
+def test_side_by_side_pads_the_smaller():
+    small, large = (np.zeros((size, size, 3), np.uint8) for size in (10, 20))
+    pair = side_by_side([small, large])
+    assert pair.shape == (20, 30, 3)
+    assert (pair[10:, :10] == 255).all()
+
+
+def test_written_picture_reads_back_and_leaves_nothing_beside_it(tmp_path: Path):
+    image = draw_resistance(region(5, 5, resistance=0.02))
+    for _ in range(2):  # a second write replaces the first
+        write_image(tmp_path / "map.png", image)
+    assert (cv2.imread(str(tmp_path / "map.png")) == image).all()
+    assert [p.name for p in tmp_path.iterdir()] == ["map.png"]
+
+
+def test_failed_write_keeps_the_old_picture(tmp_path: Path, monkeypatch):
+    path = tmp_path / "map.png"
+    write_image(path, np.zeros((2, 2, 3), np.uint8))
+    old = path.read_bytes()
+
+    def full(self, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="space"):
+        write_image(path, np.ones((2, 2, 3), np.uint8))
+    assert path.read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["map.png"]
