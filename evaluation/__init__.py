@@ -1,0 +1,1 @@
+"""Accuracy experiments and proofs: maps against truth, journals against audits, real logs."""

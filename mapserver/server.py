@@ -50,6 +50,11 @@ class Server:
         """The map, for callers in this process."""
         return self._answers
 
+    @property
+    def failed(self) -> bool:
+        """Whether the writer's thread has died; the process should end."""
+        return self._writer.failed
+
     def close(self) -> None:
         """Stop listening, finish what has come in, commit, snapshot."""
         for queryable in self._queryables:

@@ -44,7 +44,8 @@ class Writer:
         self._waiting = threading.Semaphore(config.store.queue_batches)
         self._overloaded = 0
         self._merged = threading.Condition()
-        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
+        self.failed = False
+        self._thread = threading.Thread(target=self._guard, name="writer", daemon=True)
         self._thread.start()
 
     def submit(self, incoming: Incoming, reply: Reply) -> None:
@@ -83,6 +84,14 @@ class Writer:
         """Finish what is waiting, snapshot, close."""
         self._batches.put(None)
         self._thread.join()
+
+    def _guard(self) -> None:
+        """A bug must end the process visibly: a server that takes nothing more is worse than none."""
+        try:
+            self._run()
+        except Exception:
+            self.failed = True
+            log.critical("writer failed", exc_info=True)
 
     def _run(self) -> None:
         next_snapshot_s = time.monotonic() + self._config.snapshot_s

@@ -12,7 +12,7 @@ import numpy as np
 from protocol.arrays import Table
 from protocol.errors import MessageError, Refusal
 from protocol.messages import VERSION, Ack, Health, Pose, Refused, SampleBatch, SensorBundle
-from protocol.readings import KINDS, Reading, columns, parse_reading
+from protocol.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
 from protocol.samples import COLUMNS, SAMPLE_DTYPE, check_samples
 from protocol.site import NAME
 
@@ -20,6 +20,7 @@ MAX_BATCH_BYTES = 4 * 2**20
 MAX_BATCH_SAMPLES = 20_000
 MAX_BUNDLE_BYTES = 2**20
 MAX_SMALL_BYTES = 64 * 2**10
+MAX_ITEMS = 100_000  # of one list: the decoder reserves the length that a header claims
 MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
 
@@ -35,7 +36,7 @@ def unpack(data: bytes, limit: int) -> dict[str, Any]:
     if len(data) > limit:
         raise MessageError(Refusal.TOO_LARGE, f"{len(data)} bytes, at most {limit} are allowed")
     try:
-        table = msgpack.unpackb(data)
+        table = msgpack.unpackb(data, max_array_len=MAX_ITEMS)
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
         raise MessageError(Refusal.NOT_MSGPACK, f"not MessagePack, or cut off: {error}") from None
     if not isinstance(table, dict):
@@ -66,11 +67,15 @@ def _take_int(table: dict[str, Any], name: str, low: int, high: int, reason: Ref
     return value
 
 
-def _take_name(table: dict[str, Any]) -> str:
-    name: str = take(table, "machine", str)
+def _take_name(table: dict[str, Any], field: str = "machine") -> str:
+    name: str = take(table, field, str)
     if not NAME.fullmatch(name):
-        raise MessageError(Refusal.OUT_OF_RANGE, f"{name[:70]!r} is not a name", field="machine")
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{name[:70]!r} is not a name", field=field)
     return name
+
+
+def _take_stamp(table: dict[str, Any]) -> int:
+    return _take_int(table, "stamp_ns", 1, MAX_STAMP_NS)
 
 
 # --- samples ---------------------------------------------------------------------------------------------------------
@@ -181,7 +186,7 @@ def decode_bundle(data: bytes) -> SensorBundle:
 
 
 def _decode_group(group: dict[str, Any], refused: Counter[str]) -> list[Reading]:
-    sensor, kind = take(group, "sensor", str), take(group, "kind", str)
+    sensor, kind = _take_name(group, "sensor"), take(group, "kind", str)
     if kind not in KINDS:
         raise MessageError(Refusal.OUT_OF_RANGE, f"{kind[:40]!r} is none of {', '.join(KINDS)}", field="kind")
     n, cols = _take_int(group, "n", 0, MAX_BATCH_SAMPLES), take(group, "cols", dict)
@@ -212,7 +217,7 @@ def decode_pose(data: bytes) -> Pose:
     """Undo `encode_pose`."""
     table = unpack(data, MAX_SMALL_BYTES)
     numbers = (take(table, name, float) for name in list(Pose.__dataclass_fields__)[2:])
-    return Pose(_take_name(table), take(table, "stamp_ns", int), *numbers)
+    return Pose(_take_name(table), _take_stamp(table), *numbers)
 
 
 def encode_health(health: Health) -> bytes:
@@ -223,4 +228,4 @@ def encode_health(health: Health) -> bytes:
 def decode_health(data: bytes) -> Health:
     """Undo `encode_health`."""
     table = unpack(data, MAX_SMALL_BYTES)
-    return Health(_take_name(table), take(table, "stamp_ns", int), take(table, "values", dict))
+    return Health(_take_name(table), _take_stamp(table), take(table, "values", dict))

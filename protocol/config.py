@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tomllib
 import types
 import typing
@@ -21,6 +22,8 @@ def load_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ConfigError(path, "no such file") from None
+    except OSError as error:
+        raise ConfigError(path, f"cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(path, f"not valid TOML: {error}") from None
 
@@ -66,6 +69,8 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         return from_table(hint, value, where)
     if hint is float and type(value) is int:
         return float(value)
+    if hint is float and type(value) is float and not math.isfinite(value):
+        raise ConfigError(where, f"a finite number is expected, not {value}")
     if type(value) is not hint:
         raise ConfigError(where, f"{hint.__name__} is expected, not {type(value).__name__} ({value!r})")
     return value

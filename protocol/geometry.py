@@ -15,6 +15,7 @@ from protocol.arrays import Floats, Ints
 
 BLOCK_CELLS = 16
 MAX_CELLS = 16_000_000  # of one region query: 64 MB a layer
+SLACK = 1e-9  # cells; a bound on an edge, in floating point, is on the edge
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,9 @@ class GridGeometry:
 
     def window(self, bounds: Bounds) -> CellWindow:
         """Return the smallest window of whole cells that holds the bounds."""
-        column, row = (math.floor(v / self.cell_m) for v in (bounds.west_m, bounds.south_m))
-        end_column, end_row = (math.ceil(v / self.cell_m) for v in (bounds.east_m, bounds.north_m))
-        return CellWindow(column, row, end_column - column, end_row - row)
+        column, row = (math.floor(v / self.cell_m + SLACK) for v in (bounds.west_m, bounds.south_m))
+        end_column, end_row = (math.ceil(v / self.cell_m - SLACK) for v in (bounds.east_m, bounds.north_m))
+        return CellWindow(column, row, max(1, end_column - column), max(1, end_row - row))
 
     def bounds(self, window: CellWindow) -> Bounds:
         """Outer edges of a window [m]."""

@@ -62,7 +62,7 @@ def sensors(site: str, machine: str) -> str:
 
 def map_query(site: str, query: str) -> str:
     """One of the map's queryables: point, region, info, ..."""
-    return f"{ROOT}/{check_name(site, 'site')}/map/{query}"
+    return f"{ROOT}/{check_name(site, 'site')}/map/{check_name(query, 'query')}"
 
 
 def map_queries_all(site: str) -> str:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import csv
 import gzip
 import heapq
+import json
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -65,7 +67,7 @@ class LogFolder:
         try:
             with _open_text(path) as text:
                 yield from self._parse(csv.DictReader(text), source, path)
-        except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
+        except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
             raise LogFolderError(path, f"cannot be read: {error}") from None
 
     def _parse(self, rows: csv.DictReader[str], source: Source, path: Path) -> Iterator[Reading]:
@@ -138,16 +140,17 @@ def _parse_source(table: Any, where: str) -> Source:
         raise ConfigError(where, f"unknown column `{unknown[0]}`; a {sensor.kind} has {', '.join(known)}")
     if missing := [name for name in known if name not in parsed]:
         raise ConfigError(where, f"column `{missing[0]}` is not described")
+    if not parsed["stamp"].column:
+        raise ConfigError(f"{where} columns.stamp", "a column is expected, not a constant")
     for name, column in parsed.items():
         _check_unit(name, column, f"{where} columns.{name}")
     return Source(sensor, file, parsed.pop("stamp"), parsed)
 
 
 def _parse_column(value: Any, where: str) -> Column:
-    if isinstance(value, str):
-        return Column(column=value)
-    if isinstance(value, dict) and ("column" in value) != ("value" in value):
-        return from_table(Column, value, where)
+    table = {"column": value} if isinstance(value, str) else value
+    if isinstance(table, dict) and ("column" in table) != ("value" in table) and table.get("column") != "":
+        return from_table(Column, table, where)
     raise ConfigError(where, 'write "name", { column = "name", unit = "deg" } or { value = 0.01 }')
 
 
@@ -163,9 +166,10 @@ def _check_unit(name: str, column: Column, where: str) -> None:
 
 def _pick(name: str, column: Column, rows: csv.DictReader[str], path: Path) -> tuple[str, float]:
     """Return a CSV column and the factor to the field's unit; or no column and a constant."""
+    scale = factor(column.unit, name) if column.unit else 1.0
     if not column.column:
-        return "", column.value
-    return _require(column.column, rows, path), factor(column.unit, name) if column.unit else 1.0
+        return "", column.value * scale
+    return _require(column.column, rows, path), scale
 
 
 def _require(column: str, rows: csv.DictReader[str], path: Path) -> str:
@@ -176,8 +180,8 @@ def _require(column: str, rows: csv.DictReader[str], path: Path) -> str:
 
 def _open_text(path: Path) -> IO[str]:
     if path.suffix == ".gz":
-        return gzip.open(path, "rt", encoding="utf-8", newline="")
-    return path.open(encoding="utf-8", newline="")
+        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
+    return path.open(encoding="utf-8-sig", newline="")  # with or without the mark that spreadsheets write
 
 
 def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig, readings: Iterable[Reading]) -> None:
@@ -191,12 +195,21 @@ def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig,
             writer = csv.writer(text)
             names = columns(sensor.kind)
             writer.writerow(["stamp_ns", *names])
-            writer.writerows([r.stamp_ns, *(repr(getattr(r, n)) for n in names)] for r in files[sensor.name])
+            writer.writerows([r.stamp_ns, *(repr(float(getattr(r, n))) for n in names)] for r in files[sensor.name])
     (folder / MANIFEST).write_text(_manifest(name, site, machine), encoding="utf-8")
 
 
 def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
-    lines = ["[log]", f'name = "{name}"', "", "[site]", *plain_lines(site), "", "[machine]", *plain_lines(machine)]
+    lines = [
+        "[log]",
+        f"name = {json.dumps(name, ensure_ascii=False)}",
+        "",
+        "[site]",
+        *plain_lines(site),
+        "",
+        "[machine]",
+        *plain_lines(machine),
+    ]
     for sensor in machine.sensors:
         lines += ["", "[[sensor]]", *sensor_lines(sensor), f'file = "{sensor.name}.csv"', "[sensor.columns]"]
         lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(sensor.kind))]

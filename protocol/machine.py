@@ -107,8 +107,8 @@ def parse_machine(table: Mapping[str, Any], sensors: tuple[SensorConfig, ...], w
 
 def sensor_lines(sensor: SensorConfig) -> list[str]:
     """The keys of one sensor as TOML."""
-    mount = f"mount = {{ xyz_m = {list(sensor.mount.xyz_m)}, rpy_deg = {list(sensor.mount.rpy_deg)} }}"
-    return [*plain_lines(sensor), mount]
+    xyz_m, rpy_deg = ([float(v) for v in values] for values in (sensor.mount.xyz_m, sensor.mount.rpy_deg))
+    return [*plain_lines(sensor), f"mount = {{ xyz_m = {xyz_m}, rpy_deg = {rpy_deg} }}"]
 
 
 def machine_toml(machine: MachineConfig) -> str:

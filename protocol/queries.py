@@ -14,7 +14,7 @@ import numpy as np
 
 from protocol.arrays import Floats, Floats32
 from protocol.codec import pack, take, unpack
-from protocol.errors import QueryError, Refusal
+from protocol.errors import MessageError, QueryError, Refusal
 from protocol.geometry import MAX_CELLS, Bounds
 
 MAX_REPLY_BYTES = 2**30
@@ -107,15 +107,20 @@ def encode_query(query: MapQuery) -> dict[str, str]:
     """Selector parameters."""
     parameters: dict[str, str] = {}
     if isinstance(query, PointQuery):
-        parameters |= {"x": repr(query.x_m), "y": repr(query.y_m)}
+        parameters |= {"x": _text(query.x_m), "y": _text(query.y_m)}
     if isinstance(query, RegionQuery):
         b = query.bounds
-        parameters["bounds"] = ",".join(repr(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
+        parameters["bounds"] = ",".join(_text(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
     if not isinstance(query, InfoQuery) and query.layers:
         parameters["layers"] = ",".join(query.layers)
     if query.fresh.after:
-        parameters |= {"after": str(query.fresh.after), "wait": repr(query.fresh.wait_s)}
+        parameters |= {"after": str(query.fresh.after), "wait": _text(query.fresh.wait_s)}
     return parameters
+
+
+def _text(number: float) -> str:
+    """All digits; as a plain number, where numpy's own `repr` writes its type."""
+    return repr(float(number))
 
 
 def parse_query(name: str, parameters: Mapping[str, str]) -> MapQuery:
@@ -188,8 +193,11 @@ def encode_point(answer: PointAnswer) -> bytes:
 def decode_point(data: bytes) -> PointAnswer:
     """Undo `encode_point`."""
     table = unpack(data, MAX_REPLY_BYTES)
-    x, y = take(table, "x_m", float), take(table, "y_m", float)
-    return PointAnswer(x, y, take(table, "values", dict), take(table, "merged", int), take(table, "stamp_ns", int))
+    x, y, values = take(table, "x_m", float), take(table, "y_m", float), take(table, "values", dict)
+    for name, value in values.items():
+        if type(name) is not str or type(value) is not float:  # NaN is unknown, so `take` would be too strict
+            raise MessageError(Refusal.WRONG_TYPE, "a number is expected", field=f"values.{name!s:.40}")
+    return PointAnswer(x, y, values, take(table, "merged", int), take(table, "stamp_ns", int))
 
 
 def encode_region(region: Region) -> bytes:
@@ -213,10 +221,10 @@ def decode_region(data: bytes) -> Region:
     """Undo `encode_region`."""
     table = unpack(data, MAX_REPLY_BYTES)
     cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
-    layers = {
-        name: np.frombuffer(values, "<f4").reshape(rows, columns)
-        for name, values in take(table, "layers", dict).items()
-    }
+    if not (cell_m > 0 and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
+    tables = take(table, "layers", dict)
+    layers = {name: _decode_layer(tables, name, rows, columns) for name in tables}
     return Region(
         x_m=take(table, "west_m", float) + (np.arange(columns) + 0.5) * cell_m,
         y_m=take(table, "south_m", float) + (np.arange(rows) + 0.5) * cell_m,
@@ -225,6 +233,14 @@ def decode_region(data: bytes) -> Region:
         merged=take(table, "merged", int),
         stamp_ns=take(table, "stamp_ns", int),
     )
+
+
+def _decode_layer(layers: dict[str, Any], name: str, rows: int, columns: int) -> Floats32:
+    data: bytes = take(layers, name, bytes)
+    if type(name) is not str or len(data) != 4 * rows * columns:
+        problem = f"{len(data)} bytes, {columns} x {rows} cells take {4 * rows * columns}"
+        raise MessageError(Refusal.COLUMN_LENGTH, problem, field=f"layers.{name!s:.40}")
+    return np.frombuffer(data, "<f4").reshape(rows, columns)
 
 
 def encode_info(info: Mapping[str, Any]) -> bytes:

@@ -90,7 +90,13 @@ def check_samples(rows: Table, extent_m: float) -> None:
 def _check_finite(rows: Table) -> None:
     for group in (RESISTANCE, GRADE):
         missing = np.stack([np.isnan(rows[name]) for name in group]).sum(axis=0)
-        _refuse((missing > 0) & (missing < len(group)), rows, group[0], Refusal.NOT_FINITE, f"{', '.join(group)} must be NaN together or not at all")
+        _refuse(
+            (missing > 0) & (missing < len(group)),
+            rows,
+            group[0],
+            Refusal.NOT_FINITE,
+            f"{', '.join(group)} must be NaN together or not at all",
+        )
     for name in COLUMNS[1:]:
         may_be_nan = name in RESISTANCE or name in GRADE
         bad = np.isinf if may_be_nan else _is_not_finite

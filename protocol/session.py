@@ -35,9 +35,9 @@ class SessionConfig:
 def open_session(config: SessionConfig) -> zenoh.Session:
     """Open a session; LinkError if the router cannot be reached, or the address not be listened on, in time."""
     settings = zenoh.Config()
-    for key, value in _settings(config).items():
-        settings.insert_json5(key, json.dumps(value))
     try:
+        for key, value in _settings(config).items():
+            settings.insert_json5(key, json.dumps(value))
         return zenoh.open(settings)
     except zenoh.ZError as error:
         role = "listen here" if config.mode == "router" else "reach a router here: start one with `sitegrid router`"

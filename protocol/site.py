@@ -57,14 +57,14 @@ class SiteConfig:
     def crs(self) -> str:
         """The site frame as a PROJ string."""
         return (
-            f"+proj=tmerc +lat_0={self.origin_lat_deg!r} +lon_0={self.origin_lon_deg!r} "
+            f"+proj=tmerc +lat_0={float(self.origin_lat_deg)!r} +lon_0={float(self.origin_lon_deg)!r} "
             "+k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
         )
 
     @property
     def frame(self) -> str:
         """Eight hex digits that tell site frames apart; batches carry them, so that frames never mix in one map."""
-        return hashlib.sha256(f"{self.crs} {self.origin_height_m!r}".encode()).hexdigest()[:8]
+        return hashlib.sha256(f"{self.crs} {float(self.origin_height_m)!r}".encode()).hexdigest()[:8]
 
     @cached_property
     def geometry(self) -> GridGeometry:

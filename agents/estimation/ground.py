@@ -30,8 +30,8 @@ class EstimationConfig:
 
     smooth_s: float = 0.15
     noise: float = 0.004
-    walk: float = 0.004
-    jump: float = 0.008
+    walk: float = 0.003
+    jump: float = 0.016
     jump_std: float = 0.05
     force_zero_mps2: float = 0.03
     force_share: float = 0.05

@@ -1,0 +1,108 @@
+"""Lost and double: what agents recorded, against the server's journal and against its grid.
+
+Identity is (machine, spool_id, seq), content is the hash of the sample's bytes. The journal is folded again from
+nothing and compared with the grid that the server left in its last snapshot, count by count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from agents.audit import read_audit
+from mapserver import snapshot
+from mapserver.config import ServerConfig
+from mapserver.grid import Grid, GridState
+from mapserver.journal import Journal, JournalRow
+from mapserver.store import JOURNAL_FILE
+from protocol.samples import content_hash
+from protocol.site import SiteConfig
+
+Identity = tuple[str, int, int]  # machine, spool_id, seq
+
+
+@dataclass(frozen=True)
+class AuditResult:
+    """What became of the recorded samples.
+
+    recorded: in the audit files; merged: voted in the grid, or journalled but too unsure of their place to vote. lost:
+    recorded, but not in the journal with the same content, or missing in the grid; double: more than once in the
+    journal, by identity or by content, or too often in the grid. unrecorded: in the journal, but in no audit file.
+    """
+
+    recorded: int
+    merged: int
+    lost: int
+    double: int
+    unrecorded: int
+
+
+def read_audits(audits: Mapping[str, Path]) -> dict[Identity, str]:
+    """Content hash of every recorded sample; audits: machine -> file."""
+    return {
+        (machine, spool, seq): content
+        for machine, path in audits.items()
+        for (spool, seq), content in read_audit(path).items()
+    }
+
+
+def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, config: ServerConfig) -> AuditResult:
+    """Compare audit files with the store of a server that has ended."""
+    journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
+    try:
+        rows = list(journal.read())
+    finally:
+        journal.close()
+    last = rows[-1].row if rows else 0
+    _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold)
+    return compare(read_audits(audits), rows, grid, site, config)
+
+
+def compare(
+    recorded: Mapping[Identity, str], rows: Iterable[JournalRow], grid: Grid, site: SiteConfig, config: ServerConfig
+) -> AuditResult:
+    """Compare recorded samples with journal rows, and those, folded again, with a grid."""
+    refolded = Grid(site.cell_m, config.fold)
+    found: dict[Identity, list[str]] = {}
+    contents: Counter[tuple[str, str]] = Counter()
+    for row in rows:
+        refolded.fold(row.rows, row.machine)
+        for i, sample in enumerate(row.rows):
+            content = content_hash(sample)
+            found.setdefault((row.machine, row.spool_id, row.first_seq + i), []).append(content)
+            contents[row.machine, content] += 1
+    lost = sum(content not in found.get(identity, ()) for identity, content in recorded.items())
+    by_identity = sum(len(hashes) - 1 for hashes in found.values())
+    by_content = sum(n - 1 for n in contents.values())
+    short, over = grid_difference(refolded.state(), grid.state())
+    return AuditResult(
+        recorded=len(recorded),
+        merged=grid.folded + grid.skipped,
+        lost=lost + short,
+        double=max(by_identity, by_content) + over,
+        unrecorded=sum(identity not in recorded for identity in found),
+    )
+
+
+def grid_difference(expected: GridState, found: GridState) -> tuple[int, int]:
+    """About how many samples are missing in a grid, and how many are too many: 0, 0 only where all counts agree.
+
+    Counts are compared cell by cell; their difference is turned into samples by the counts of a mean sample, rounded
+    up.
+    """
+    per_sample = max(1.0, float(expected.counts.sum()) / max(1, expected.folded))
+    slots = {int(code): i for i, code in enumerate(found.codes)}
+    missing = surplus = 0
+    for i, code in enumerate(expected.codes):
+        j = slots.pop(int(code), None)
+        there = found.counts[j] if j is not None else np.zeros_like(expected.counts[i])
+        difference = expected.counts[i].astype(np.int64) - there
+        missing += int(difference[difference > 0].sum())
+        surplus -= int(difference[difference < 0].sum())
+    surplus += sum(int(found.counts[j].sum()) for j in slots.values())
+    return math.ceil(missing / per_sample), math.ceil(surplus / per_sample)

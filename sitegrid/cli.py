@@ -1,0 +1,180 @@
+"""The `sitegrid` command: noun first, quiet by default, `--json` for machines.
+
+Exit codes: 0 ok, 1 failed, 2 usage. Each sub-command imports what it needs only when it runs, so that the base install
+serves the client and `--help` is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from protocol.errors import SitegridError
+from protocol.session import DEFAULT_ENDPOINT
+
+EXTRA = {"numba": "server", "cv2": "server", "filterpy": "agent", "pyproj": "agent", "rich": "all"}
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the command; errors in one line."""
+    arguments = build_parser().parse_args(words)
+    _start_logging(verbose=arguments.verbose)
+    try:
+        module = importlib.import_module(arguments.module)
+        return int(module.run(arguments))
+    except SitegridError as error:
+        return _fail(str(error), arguments.json)
+    except ModuleNotFoundError as error:
+        extra = EXTRA.get(str(error.name))
+        if not extra:
+            raise
+        return _fail(f"{error.name} is not installed: pip install 'sitegrid[{extra}]'", arguments.json)
+    except KeyboardInterrupt:
+        return 130
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all sub-commands."""
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--json", action="store_true", help="print JSON for machines")
+    common.add_argument("--verbose", action="store_true", help="log what happens, not only what goes wrong")
+    network = argparse.ArgumentParser(add_help=False)
+    network.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="router to connect to (default %(default)s)")
+    parser = argparse.ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
+    nouns = parser.add_subparsers(metavar="COMMAND", required=True)
+    for add in (_add_demo, _add_router, _add_server, _add_sim, _add_agent, _add_query, _add_plot):
+        add(nouns, common, network)
+    return parser
+
+
+Nouns = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Parent = argparse.ArgumentParser
+
+
+def _add_demo(nouns: Nouns, common: Parent, _: Parent) -> None:
+    demo = _noun(nouns, "demo", "router, map server, simulator and agents, each its own process; pictures", [common])
+    demo.add_argument("--seconds", type=_positive, default=240.0, help="simulated time (default %(default)s)")
+    demo.add_argument("--speed", type=_positive, default=4.0, help="times real time (default %(default)s)")
+    demo.add_argument("--machines", type=int, default=3, help="how many (default %(default)s)")
+    demo.add_argument("--seed", type=int, default=1000, help="seed of the simulation (default %(default)s)")
+    demo.add_argument("--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores")
+    demo.add_argument("--headless", action="store_true", help="no live display, plain lines only")
+    demo.add_argument("--log", type=Path, help="manifest of a real log that a further agent replays")
+    demo.add_argument("--data", type=Path, help="folder with the CSV files of that log")
+    demo.add_argument("--no-log", action="store_true", help="replay no log, also where the default one exists")
+
+
+def _add_router(nouns: Nouns, common: Parent, _: Parent) -> None:
+    router = _noun(nouns, "router", "the site's Zenoh router", [common])
+    router.add_argument("--listen", default=DEFAULT_ENDPOINT, help="where to listen (default %(default)s)")
+
+
+def _add_server(nouns: Nouns, common: Parent, network: Parent) -> None:
+    server = _noun(nouns, "server", "the map server of a site", [common, network])
+    server.add_argument(
+        "--site-file", type=Path, required=True, help="the site: name, origin, cells (config/site.toml)"
+    )
+    server.add_argument("--store", type=Path, required=True, help="folder of the journal and its snapshots")
+    server.add_argument("--config", type=Path, help="options (config/server.toml)")
+
+
+def _add_sim(nouns: Nouns, common: Parent, network: Parent) -> None:
+    sim = _noun(nouns, "sim", "the simulator: machines drive, their sensors are published", [common, network])
+    sim.add_argument("--config", type=Path, help="options (config/sim.toml)")
+    for name, kind, what in (
+        ("seconds", float, "simulated time, 0 until stopped"),
+        ("speed", float, "times real time, 0 as fast as possible"),
+        ("machines", int, "how many machines"),
+        ("seed", int, "seed"),
+    ):
+        sim.add_argument(f"--{name}", type=kind, help=f"{what} (over the config)")
+    sim.add_argument("--site", help="name of the site in keys (over the config)")
+    sim.add_argument("--truth", type=Path, help="folder to write the true map and tracks to")
+    sim.add_argument("--record", type=Path, help="folder to write a log folder per machine to, instead of publishing")
+    sim.add_argument("--write-configs", type=Path, help="write site.toml and one agent file per machine, and end")
+
+
+def _add_agent(nouns: Nouns, common: Parent, network: Parent) -> None:
+    agent = _noun(nouns, "agent", "the localisation agent of one machine", [common, network])
+    agent.add_argument("--config", type=Path, help="machine, sensors and options (config/agent.toml)")
+    agent.add_argument("--site-file", type=Path, help="the site (config/site.toml); a log brings its own")
+    agent.add_argument("--name", help="name of the machine (over the config)")
+    agent.add_argument("--spool", type=Path, required=True, help="file of the spool")
+    agent.add_argument("--audit", type=Path, help="file that notes every recorded sample")
+    agent.add_argument("--driver", choices=("zenoh", "replay"), default="zenoh", help="where readings come from")
+    agent.add_argument("--log", type=Path, help="replay: manifest of the log")
+    agent.add_argument("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
+    agent.add_argument("--speed", type=_not_negative, default=1.0, help="replay: times real time, 0 at once")
+    agent.add_argument(
+        "--withhold", action="store_true", help="withhold GPS ([holdout]) and report the error against it"
+    )
+
+
+def _add_query(nouns: Nouns, common: Parent, network: Parent) -> None:
+    query = _noun(nouns, "query", "ask the map", [common, network])
+    query.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
+    query.add_argument("--after", type=int, default=0, help="wait until this journal row is merged")
+    query.add_argument("--layers", default="", help="layers, comma-separated; default all")
+    asks = query.add_subparsers(metavar="QUERY", required=True, dest="ask")
+    point = asks.add_parser("point", help="the cell at a position", description="The cell at a position in metres.")
+    point.add_argument("x_m", type=float)
+    point.add_argument("y_m", type=float)
+    region = asks.add_parser("region", help="a rectangle of cells", description="A rectangle of cells, in metres.")
+    for side in ("west_m", "south_m", "east_m", "north_m"):
+        region.add_argument(side, type=float)
+    region.add_argument("--out", type=Path, help="write coordinates and layers as .npz")
+    asks.add_parser("info", help="state of the map and its server", description="State of the map and its server.")
+
+
+def _add_plot(nouns: Nouns, common: Parent, network: Parent) -> None:
+    plot = _noun(nouns, "plot", "draw the map with OpenCV, once or live", [common, network])
+    plot.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
+    plot.add_argument("--out", type=Path, default=Path("map.png"), help="picture to write (default %(default)s)")
+    plot.add_argument("--bounds", type=float, nargs=4, metavar=("W", "S", "E", "N"), help="metres; default all")
+    plot.add_argument("--truth", type=Path, help="true map of a simulation (truth_map.npz): draw the difference")
+    plot.add_argument("--follow", action="store_true", help="redraw while machines drive, until stopped")
+    plot.add_argument("--every", type=_positive, default=1.0, help="seconds between two pictures (default %(default)s)")
+    plot.add_argument("--pictures", type=int, default=0, help="with --follow: end after so many pictures")
+
+
+def _noun(nouns: Nouns, name: str, what: str, parents: list[Parent]) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = nouns.add_parser(  # type: ignore[attr-defined]
+        name, help=what, description=what[0].upper() + what[1:] + ".", parents=parents
+    )
+    parser.set_defaults(module=f"sitegrid.commands.{name}")
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not positive")
+    return value
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def _fail(problem: str, as_json: bool) -> int:  # noqa: FBT001 - the user's own flag
+    print(json.dumps({"error": problem}) if as_json else f"sitegrid: {problem}", file=sys.stderr)
+    return 1
+
+
+def _start_logging(*, verbose: bool) -> None:
+    style = "%(asctime)s level=%(levelname)s logger=%(name)s %(message)s"
+    if not sys.stderr.isatty():
+        style = '{"t": "%(asctime)s", "level": "%(levelname)s", "logger": "%(name)s", "event": "%(message)s"}'
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format=style, stream=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,69 @@
+"""`sitegrid agent`: the localisation agent of one machine."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from argparse import Namespace
+
+import zenoh
+
+from agents.agent import Agent, Places
+from agents.config import AgentConfig, load_agent
+from agents.drivers import Driver
+from agents.drivers.replay import Replay
+from agents.drivers.zenoh import ZenohDriver
+from protocol.errors import ConfigError
+from protocol.logfolder import LogFolder, open_log
+from protocol.machine import MachineConfig
+from protocol.session import SessionConfig, open_session
+from protocol.site import SiteConfig, load_site
+from sitegrid.process import note, plain, say, stop_flag
+
+
+def run(arguments: Namespace) -> int:
+    """Run until the stream ends or the process is stopped; the router may come and go."""
+    stop = stop_flag()
+    log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
+    site, machine, config = _configure(arguments, log)
+    session = open_session(SessionConfig(arguments.endpoint, wait_s=-1))
+    agent = Agent(session, site, machine, config, Places(arguments.spool, arguments.audit), withhold=arguments.withhold)
+    say({"ready": "agent", "machine": machine.name, "site": site.name})
+    try:
+        report = agent.run(_driver(arguments, log, session, site, machine), stop.is_set, wait=stop.wait)
+    finally:
+        agent.close()
+        session.close()  # type: ignore[no-untyped-call]
+    say({"ended": plain(report)}) if arguments.json else note(_summary(machine, report))
+    return 0 if report["delivered"] or stop.is_set() else 1
+
+
+def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig, MachineConfig, AgentConfig]:
+    machine, config = load_agent(arguments.config) if arguments.config else (None, AgentConfig())
+    if arguments.driver == "replay" and log is None:
+        raise ConfigError("sitegrid agent", "--driver replay needs --log MANIFEST")
+    machine = machine or (log.machine if log else None)
+    if machine is None:
+        raise ConfigError(arguments.config or "sitegrid agent", "no [machine] is described; see config/agent.toml")
+    if arguments.name:
+        machine = dataclasses.replace(machine, name=arguments.name)
+    if arguments.site_file:
+        return load_site(arguments.site_file), machine, config
+    if log is None:
+        raise ConfigError("sitegrid agent", "--site-file is missing; see config/site.toml")
+    return log.site, machine, config
+
+
+def _driver(
+    arguments: Namespace, log: LogFolder | None, session: zenoh.Session, site: SiteConfig, machine: MachineConfig
+) -> Driver:
+    if log:
+        return Replay(log, arguments.speed, time.monotonic, time.sleep)
+    return ZenohDriver(session, site.name, machine.name)
+
+
+def _summary(machine: MachineConfig, report: dict[str, object]) -> str:
+    line = (
+        f"{machine.name}: {report['readings']} readings, {report['samples']} samples, delivered {report['delivered']}"
+    )
+    return f"{line}, withheld fixes {report['holdout']}" if report["holdout"] else line

@@ -1,0 +1,79 @@
+"""`sitegrid plot`: the paper's plotter; once, or redrawn live while machines drive."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+
+from mapserver.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from protocol.errors import ConfigError, LinkError, QueryError
+from protocol.geometry import Bounds
+from protocol.queries import Region
+from sitegrid.client import Client, connect
+from sitegrid.process import note, say, stop_flag
+from sitegrid.tracks import TrackRecorder
+from sitegrid.truth import load_truth, truth_layers
+
+LAYERS = ("resistance", "grade_east", "grade_north")
+
+
+def run(arguments: Namespace) -> int:
+    """Draw the map; with --follow again and again until stopped."""
+    stop = stop_flag()
+    with connect(arguments.endpoint, arguments.site) as client:
+        tracks = TrackRecorder(client.session, arguments.site)
+        drawn = 0
+        while not stop.is_set():
+            drawn += _draw_if_possible(client, arguments, tracks.tracks())
+            if not arguments.follow or drawn == arguments.pictures:
+                break
+            stop.wait(arguments.every)
+        tracks.close()
+    say({"picture": str(arguments.out), "drawn": drawn}) if arguments.json else note(f"{arguments.out}")
+    return 0
+
+
+def _draw_if_possible(client: Client, arguments: Namespace, tracks: list[Track]) -> int:
+    """Draw one picture; while following, a server that is away is waited for."""
+    try:
+        draw(client, arguments.out, arguments.bounds, tracks, arguments.truth)
+    except (LinkError, QueryError) as error:
+        if not arguments.follow:
+            raise
+        note(f"sitegrid plot: {error}; trying again")
+        return 0
+    return 1
+
+
+def draw(
+    client: Client, out: Path, bounds: list[float] | None, tracks: list[Track], truth: Path | None = None
+) -> Region:
+    """Ask for the map and write its picture; with a true map the difference beside it."""
+    region = client.region(_bounds(client, bounds), LAYERS)
+    row = [draw_resistance(region, tracks), draw_grade(region, tracks)]
+    images = [side_by_side(row)]
+    if truth:
+        layers = truth_layers(load_truth(truth), region)
+        images = [
+            side_by_side(row),
+            side_by_side([draw_difference(region, layers, k) for k in ("resistance", "grade")]),
+        ]
+    write_image(out, images[0])
+    for image in images[1:]:
+        write_image(out.with_stem(f"{out.stem}-difference"), image)
+    return region
+
+
+def _bounds(client: Client, given: list[float] | None) -> Bounds:
+    """The rectangle to draw: as given, or everything that is known."""
+    if given:
+        try:
+            return Bounds(*given)
+        except ValueError as error:
+            raise ConfigError("--bounds", str(error)) from None
+    info = client.info()
+    cells, cell_m = info["bounds"], info["site"]["cell_m"]
+    if cells is None:
+        return Bounds(0, 0, 16 * cell_m, 16 * cell_m)
+    west, south, east, north = (cell * cell_m for cell in cells)
+    return Bounds(west, south, east, north)

@@ -1,0 +1,149 @@
+"""Children of this process: started, listened to, and ended, whatever happens."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from protocol.errors import SitegridError
+
+END_S = 8.0  # after SIGTERM; then it is killed
+
+
+class ProcessError(SitegridError):
+    """A child process did not do what it should."""
+
+    def __init__(self, name: str, problem: str) -> None:
+        super().__init__(f"{name}: {problem}")
+
+
+class Child:
+    """One `sitegrid` process and the JSON lines that it prints."""
+
+    def __init__(self, name: str, words: list[str], errors: Path | None = None) -> None:
+        self.name = name
+        self._errors = errors.open("ab") if errors else None
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "sitegrid.cli", *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            start_new_session=True,  # Ctrl-C reaches the parent alone, which ends its children in order
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        )
+        self._lines: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
+    def code(self) -> int | None:
+        """Exit code, None while it runs."""
+        return self._process.poll()
+
+    def lines(self) -> list[dict[str, Any]]:
+        """JSON lines that have come in since the last call."""
+        found = []
+        while True:
+            try:
+                found.append(self._lines.get_nowait())
+            except queue.Empty:
+                return found
+
+    def expect(self, key: str, timeout_s: float) -> dict[str, Any]:
+        """Wait for a line that has `key`; ProcessError if the process ends or the time is up first."""
+        end_s = time.monotonic() + timeout_s
+        while (left_s := end_s - time.monotonic()) > 0:
+            try:
+                line = self._lines.get(timeout=min(left_s, 0.1))
+            except queue.Empty:
+                if self.code is not None and self._lines.empty() and not self._reader.is_alive():
+                    raise ProcessError(self.name, f"ended with {self.code} instead of printing `{key}`") from None
+                continue
+            if key in line:
+                return line
+        raise ProcessError(self.name, f"did not print `{key}` within {timeout_s:g} s")
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal, if it still runs."""
+        if self.code is None:
+            self._process.send_signal(number)
+
+    def wait(self, timeout_s: float) -> int:
+        """Wait for the end; returns the exit code."""
+        try:
+            return self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise ProcessError(self.name, f"has not ended within {timeout_s:g} s") from None
+
+    def stop(self) -> int:
+        """End it: SIGTERM, then SIGKILL; returns the exit code."""
+        self.send(signal.SIGTERM)
+        try:
+            code = self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            code = self._process.wait()
+        self._reader.join()
+        if self._process.stdout:
+            self._process.stdout.close()
+        if self._errors:
+            self._errors.close()
+        return code
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            try:
+                table = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(table, dict):
+                self._lines.put(table)
+
+
+class Children:
+    """All children of a run; leaving the block ends them, the youngest first."""
+
+    def __init__(self, log_folder: Path | None = None) -> None:
+        self._log_folder = log_folder
+        self._children: list[Child] = []
+
+    def start(self, name: str, *words: str | Path | float) -> Child:
+        """Start `sitegrid <words>`."""
+        errors = self._log_folder / f"{name}.log" if self._log_folder else None
+        child = Child(name, [str(word) for word in words], errors)
+        self._children.append(child)
+        return child
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for child in reversed(self._children):
+            child.stop()
+
+
+def wait_until(is_so: Callable[[], bool], timeout_s: float, what: str) -> None:
+    """Poll a condition until it holds; ProcessError with `what` if it does not in time."""
+    end_s = time.monotonic() + timeout_s
+    while not is_so():
+        if time.monotonic() >= end_s:
+            raise ProcessError(what, f"has not come true within {timeout_s:g} s")
+        time.sleep(0.02)

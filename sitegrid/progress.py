@@ -1,0 +1,48 @@
+"""What a demo shows while it runs: a bar on a terminal, a plain line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+from typing import Any
+
+from sitegrid.process import note
+
+EVERY_S = 5.0  # between two plain lines
+
+
+class Display:
+    """Progress of a run; use it as a context."""
+
+    def __init__(self, *, headless: bool) -> None:
+        self._bar: Any = None
+        self._task: Any = None
+        self._next_s = 0.0
+        if not headless and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[what]}"))
+            self._bar = Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True))
+            self._task = self._bar.add_task("machines drive", total=None, what="")
+
+    def show(self, simulated_s: float, total_s: float, info: dict[str, Any]) -> None:
+        """Show how far the simulation is and what the map holds."""
+        what = f"{info.get('samples_merged', 0)} samples, {info.get('cells', 0)} cells"
+        if self._bar:
+            self._bar.update(self._task, completed=simulated_s, total=total_s, what=what)
+        elif time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + EVERY_S
+            note(f"{simulated_s:5.0f} of {total_s:g} s driven, {what}")
+
+    def __enter__(self) -> Display:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar:
+            self._bar.stop()

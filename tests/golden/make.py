@@ -1,0 +1,124 @@
+"""Write the golden messages beside this file: `PYTHONPATH=. python tests/golden/make.py`.
+
+Only after a deliberate change of the wire, with docs/protocol.md. The tests compare files and records both ways.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from protocol import codec, queries
+from protocol.errors import QueryError, Refusal
+from protocol.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
+from protocol.readings import Articulation, Attitude, Encoder, Gps, Imu, Odometry, Torque
+from protocol.samples import SAMPLE_DTYPE
+
+FOLDER = Path(__file__).parent
+EXTENT_M = 20_000.0
+T0 = 1_750_000_000_000_000_000
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class Golden:
+    """One message: the record, and the two functions that must agree on its bytes."""
+
+    record: Any
+    encode: Callable[[Any], bytes]
+    decode: Callable[[bytes], Any]
+
+
+def rows() -> np.ndarray:
+    """Return three samples: complete, without a gradient, without a resistance."""
+    return np.array(
+        [
+            (T0, 12.25, -40.5, 1.5, 0.25, 2.0, 0.5, 2.75, 0.55, 0.02, 1e-5, 0.125, -0.25, 1e-4),
+            (T0 + 200_000_000, 12.75, -40.25, 1.5, -0.25, 2.0, 0.5, -2.75, 0.5, 0.25, 1e-5, NAN, NAN, NAN),
+            (T0 + 400_000_000, 13.25, -40.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, NAN, NAN, 0.0, 0.0, 1e-4),
+        ],
+        SAMPLE_DTYPE,
+    )
+
+
+def readings() -> tuple[Any, ...]:
+    """One reading of each kind, and a second of one of them."""
+    return (
+        Gps("gps-1", T0, 49.5, 8.25, 112.5, 1.5, 1.5, 4.0),
+        Imu("imu-1", T0 + 1, 0.001, -0.002, 0.25, 0.1, -0.2, 9.80665),
+        Attitude("ahrs", T0 + 2, 0.0, 0.0, 0.6, 0.8, 1e-4, 1e-4, 1e-2),
+        Odometry("controller", T0 + 3, 1.5, 0.0, -0.25),
+        Encoder("axle", T0 + 4, 1024.0, 1025.0),
+        Torque("drive", T0 + 5, 12_500.0),
+        Articulation("joint", T0 + 6, -0.125),
+        Imu("imu-1", T0 + 10_000_000, 0.002, -0.001, 0.5, 0.2, -0.1, 9.75),
+    )
+
+
+def region() -> queries.Region:
+    """3 x 2 cells of half a metre, south-west corner (-1, 2)."""
+    resistance = np.array([[0.02, NAN, 0.25], [NAN, 0.008, 0.04]], np.float32)
+    return queries.Region(
+        x_m=np.array([-0.75, -0.25, 0.25]),
+        y_m=np.array([2.25, 2.75]),
+        cell_m=0.5,
+        layers={"resistance": resistance, "visits": np.arange(6, dtype=np.float32).reshape(2, 3)},
+        merged=17,
+        stamp_ns=T0,
+    )
+
+
+def decode_batch(data: bytes) -> SampleBatch:
+    """Decode with the extent of the golden site."""
+    return codec.decode_batch(data, EXTENT_M)
+
+
+BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
+LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60)
+ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
+POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
+HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
+POINT = queries.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
+
+GOLDEN: dict[str, Golden] = {
+    "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
+    "batch_lost.bin": Golden(LOST, codec.encode_batch, decode_batch),
+    "batch_empty.bin": Golden(ASK, codec.encode_batch, decode_batch),
+    "ack.bin": Golden(Ack(43, 17, 2), codec.encode_reply, codec.decode_reply),
+    "refused.bin": Golden(Refused("gap", "first_seq: 41: 12 is expected", 12), codec.encode_reply, codec.decode_reply),
+    "bundle.bin": Golden(
+        SensorBundle("loader-1", 5, readings(), last=True), codec.encode_bundle, codec.decode_bundle
+    ),
+    "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
+    "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
+    "point.bin": Golden(POINT, queries.encode_point, queries.decode_point),
+    "region.bin": Golden(region(), queries.encode_region, queries.decode_region),
+    "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, queries.encode_info, queries.decode_info),
+    "error.bin": Golden(
+        QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known"), queries.encode_error, queries.decode_error
+    ),
+}
+NEWER = "batch_newer.bin"  # of a later version of the software: an unknown field and an unknown column
+
+
+def newer_batch() -> bytes:
+    """Return BATCH as a newer agent might send it."""
+    table = msgpack.unpackb(codec.encode_batch(BATCH))
+    table["cols"]["slip"] = np.zeros(3, "<f4").tobytes()
+    return bytes(msgpack.packb({**table, "firmware": "2.0"}))
+
+
+def main() -> None:
+    """Write all files."""
+    for name, golden in GOLDEN.items():
+        (FOLDER / name).write_bytes(golden.encode(golden.record))
+    (FOLDER / NEWER).write_bytes(newer_batch())
+
+
+if __name__ == "__main__":
+    main()
