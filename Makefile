@@ -1,5 +1,5 @@
 # make demo: everything from nothing to pictures. make check test: what CI runs.
-PYTHON ?= python3.11
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 

@@ -41,10 +41,11 @@ class FoldConfig:
     kernel: str = "auto"
 
     def __post_init__(self) -> None:
-        if not 1 <= self.bucket_s <= 86_400:
-            raise ValueError(f"bucket_s: {self.bucket_s} is not between 1 and 86400")
-        if not 0 < self.std_floor_m < self.std_cap_m <= 30:
-            raise ValueError("std_floor_m must be positive and below std_cap_m, std_cap_m at most 30")
+        if not 60 <= self.bucket_s <= 86_400:
+            raise ValueError(f"bucket_s: {self.bucket_s} is not between 60 and 86400")
+        # the floor also keeps the covariance invertible: samples are checked in single precision
+        if not 0.01 <= self.std_floor_m < self.std_cap_m <= 30:
+            raise ValueError("std_floor_m must be at least 0.01 and below std_cap_m, std_cap_m at most 30")
         if self.kernel not in ("auto", "numba", "numpy"):
             raise ValueError(f'kernel: {self.kernel!r} is none of "auto", "numba", "numpy"')
 

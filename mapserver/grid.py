@@ -14,7 +14,10 @@ from protocol.arrays import Ints, Table
 from protocol.geometry import BLOCK_CELLS, CellWindow
 
 CELLS = BLOCK_CELLS * BLOCK_CELLS
-_HALF = 1 << 19  # block columns and rows are packed as 20 bits each below the bucket
+# Block columns and rows are packed as 18 bits each below the bucket, which has 27 bits: enough for 100 km of 5 cm cells,
+# and for minutes until the year 2100.
+_BITS = 18
+_HALF = 1 << (_BITS - 1)
 READ_BLOCKS = 256  # summed at once: 60 MB
 
 
@@ -125,7 +128,7 @@ class Grid:
         steps = np.arange(k)
         x = np.minimum(corner[:, 0, None, None] + steps[None, None, :], last[:, 0, None, None])
         y = np.minimum(corner[:, 1, None, None] + steps[None, :, None], last[:, 1, None, None])
-        codes = (votes.bucket[:, None, None] << 40) | ((x + _HALF) << 20) | (y + _HALF)
+        codes = (votes.bucket[:, None, None] << 2 * _BITS) | ((x + _HALF) << _BITS) | (y + _HALF)
         unique, inverse = np.unique(codes, return_inverse=True)
         slots = np.fromiter((self._slot(code) for code in unique.tolist()), np.int64, len(unique))
         return slots[inverse].reshape(codes.shape)
@@ -154,4 +157,5 @@ def chunks(blocks: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
 
 def _unpack(code: int) -> tuple[int, int, int]:
     """Bucket, block column, block row."""
-    return code >> 40, ((code >> 20) & 0xFFFFF) - _HALF, (code & 0xFFFFF) - _HALF
+    mask = (1 << _BITS) - 1
+    return code >> 2 * _BITS, (code >> _BITS & mask) - _HALF, (code & mask) - _HALF

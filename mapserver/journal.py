@@ -145,8 +145,9 @@ class Journal:
     def _create_or_check(self, site: str, frame: str) -> None:
         expected = {"schema": str(SCHEMA), "site": site, "frame": frame}
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
-            self._db.executescript("BEGIN;" + _TABLES + "COMMIT;")
+            self._db.executescript("BEGIN IMMEDIATE;" + _TABLES)
             self._db.executemany("INSERT INTO meta VALUES (?, ?)", expected.items())
+            self._db.execute("COMMIT")
         found = dict(self._db.execute("SELECT key, value FROM meta"))
         for key, value in expected.items():
             if found.get(key) != value:

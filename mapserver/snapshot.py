@@ -7,9 +7,9 @@ and the journal is folded again.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
-import zipfile
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,19 +21,23 @@ from mapserver.grid import Grid, GridState
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2
+log = logging.getLogger("mapserver.snapshot")
 
 
 def save(folder: Path, row: int, state: GridState, cell_m: float, config: FoldConfig) -> Path:
     """Write a snapshot that is true for journal row `row`, and remove all but the newest two."""
     path = folder / f"snapshot-{row}.npz"
-    temporary = path.with_suffix(".tmp")
+    temporary = folder / "snapshot.tmp"
     header = {**_parameters(cell_m, config), "row": row, "folded": state.folded, "skipped": state.skipped}
-    with temporary.open("wb") as file:
-        arrays = {"codes": state.codes, "counts": state.counts, "bitmaps": state.bitmaps, "newest": state.newest}
-        np.savez(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    arrays = {"codes": state.codes, "counts": state.counts, "bitmaps": state.bitmaps, "newest": state.newest}
+    try:
+        with temporary.open("wb") as file:
+            np.savez(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)  # after a full disk
     for old in rows_on_disk(folder)[KEEP:]:
         (folder / f"snapshot-{old}.npz").unlink(missing_ok=True)
     return path
@@ -45,10 +49,20 @@ def rows_on_disk(folder: Path) -> list[int]:
     return sorted((int(m.group(1)) for m in matches if m), reverse=True)
 
 
+def remove_beyond(folder: Path, last_row: int) -> None:
+    """Remove snapshots that the journal does not reach: once it grew past them they would pass for true.
+
+    They are left where the journal was restored from a backup.
+    """
+    for row in rows_on_disk(folder):
+        if row > last_row:
+            (folder / f"snapshot-{row}.npz").unlink(missing_ok=True)
+
+
 def load(path: Path, cell_m: float, config: FoldConfig) -> tuple[int, Grid] | None:
     """Return the row and the grid of a snapshot, or None if it is damaged or was made with other parameters."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
             expected = _parameters(cell_m, config)
             if {key: header.get(key) for key in expected} != expected:
@@ -56,7 +70,8 @@ def load(path: Path, cell_m: float, config: FoldConfig) -> tuple[int, Grid] | No
             arrays = (file["codes"], file["counts"], file["bitmaps"], file["newest"])
             state = GridState(*arrays, header["folded"], header["skipped"])
             return header["row"], Grid.from_state(cell_m, config, state)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except Exception as error:  # zipfile and numpy answer damage with a dozen kinds of error
+        log.warning("snapshot passed over path=%s error=%r", path, str(error))
         return None
 
 

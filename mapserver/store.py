@@ -39,6 +39,7 @@ class Store:
         self._folder = folder
         self._now_ns = now_ns
         self._journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
+        snapshot.remove_beyond(folder, self._journal.last_row)
         self.merged, self.grid = snapshot.load_newest(folder, self._journal.last_row, site.cell_m, config.fold)
         self.snapshot_row = self.merged
         self._fold_tail()
@@ -53,23 +54,19 @@ class Store:
 
         Nothing is acknowledged before its commit; where the commit fails, every batch of the group is refused.
         """
-        answers: list[Ack | Refused] = []
-        admitted: list[tuple[int, Admission]] = []
         try:
             self._journal.begin()
-            for incoming in group:
-                answer, admission = self._take_one(incoming)
-                answers.append(answer)
-                if admission:
-                    admitted.append((answer.row if isinstance(answer, Ack) else 0, admission))
+            taken = [self._take_one(incoming) for incoming in group]
             self._journal.commit()
         except (sqlite3.Error, OSError) as error:
             self._journal.rollback()
             self.counters[f"refused_{Refusal.STORE}"] += len(group)
             return [Refused(Refusal.STORE, f"the server cannot write: {error}") for _ in group]
-        for row, admission in admitted:
-            self._fold(row, admission.batch)
-        return answers
+        for answer, admission in taken:
+            self._count(answer, admission)
+            if isinstance(answer, Ack) and admission and len(admission.batch.rows):
+                self._fold(answer.row, admission.batch)
+        return [answer for answer, _ in taken]
 
     def save_snapshot(self) -> None:
         """Write a snapshot of the grid as it is."""
@@ -110,16 +107,20 @@ class Store:
             batch = ingest.parse(incoming.payload, incoming.machine, self.site, self._now_ns)
             admission = ingest.admit(batch, self._journal.mark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
-            self.counters[f"refused_{error.reason}"] += 1
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
-        self.counters["samples_trimmed"] += admission.trimmed
-        self.counters["samples_lost"] += admission.lost
-        if not len(admission.batch.rows):
-            return Ack(admission.watermark, self.journalled, admission.trimmed), None
-        row = self._journal.append(admission, self._now_ns())
-        self.counters["batches"] += 1
+        new = len(admission.batch.rows) > 0
+        row = self._journal.append(admission, self._now_ns()) if new else self.journalled
         return Ack(admission.watermark, row, admission.trimmed), admission
+
+    def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
+        """Count what became of a batch, once it is certain."""
+        if isinstance(answer, Refused):
+            self.counters[f"refused_{answer.reason}"] += 1
+        elif admission:
+            self.counters["batches"] += len(admission.batch.rows) > 0
+            self.counters["samples_trimmed"] += admission.trimmed
+            self.counters["samples_lost"] += admission.lost
 
     def _fold(self, row: int, batch: SampleBatch) -> None:
         self.grid.fold(batch.rows, batch.machine)

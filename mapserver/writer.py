@@ -92,17 +92,29 @@ class Writer:
         except Exception:
             self.failed = True
             log.critical("writer failed", exc_info=True)
+            self._refuse_all()
+
+    def _refuse_all(self) -> None:
+        """Leave nobody waiting until the process ends."""
+        problem = "the server's writer has failed; restart the server"
+        while (item := self._batches.get()) is not None:
+            if isinstance(item, _Read):
+                item.result.set_exception(QueryError(Refusal.STORE, problem))
+            else:
+                self._waiting.release()
+                item[1](Refused(Refusal.STORE, problem))
 
     def _run(self) -> None:
+        tried_row = self._store.snapshot_row
         next_snapshot_s = time.monotonic() + self._config.snapshot_s
         while (first := self._next(next_snapshot_s)) is not None:
             if isinstance(first, _Read):
                 _answer(first, self._store)
             elif first:
                 self._take_group(first)
-            rows = self._store.merged - self._store.snapshot_row
-            if rows >= self._config.snapshot_rows or time.monotonic() >= next_snapshot_s:
+            if self._store.merged - tried_row >= self._config.snapshot_rows or time.monotonic() >= next_snapshot_s:
                 self._save_snapshot()
+                tried_row = self._store.merged
                 next_snapshot_s = time.monotonic() + self._config.snapshot_s
         self._store.close()
 

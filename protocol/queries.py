@@ -19,6 +19,7 @@ from protocol.geometry import MAX_CELLS, Bounds
 
 MAX_REPLY_BYTES = 2**30
 MAX_WAIT_S = 60.0
+MAX_CELL_M = 1e4
 
 
 @dataclass(frozen=True)
@@ -221,7 +222,7 @@ def decode_region(data: bytes) -> Region:
     """Undo `encode_region`."""
     table = unpack(data, MAX_REPLY_BYTES)
     cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
-    if not (cell_m > 0 and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
+    if not (0 < cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
     tables = take(table, "layers", dict)
     layers = {name: _decode_layer(tables, name, rows, columns) for name in tables}

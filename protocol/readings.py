@@ -145,7 +145,7 @@ def columns(kind: str) -> tuple[str, ...]:
 def parse_reading(kind: str, sensor: str, stamp_ns: int, values: tuple[float, ...]) -> Reading:
     """Build a reading; a MessageError names the first value that is not finite or out of range."""
     cls = KINDS[kind]
-    if not 0 < stamp_ns < MAX_STAMP_NS:
+    if not 0 < stamp_ns <= MAX_STAMP_NS:
         raise MessageError(Refusal.OUT_OF_RANGE, f"{stamp_ns} is not a UTC stamp in ns", field=f"{sensor}.stamp_ns")
     for (name, (low, high)), value in zip(cls.limits.items(), values, strict=True):
         if not low <= value <= high:  # also false for NaN

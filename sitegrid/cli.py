@@ -13,11 +13,12 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 from protocol.errors import SitegridError
 from protocol.session import DEFAULT_ENDPOINT
 
-EXTRA = {"numba": "server", "cv2": "server", "filterpy": "agent", "pyproj": "agent", "rich": "all"}
+EXTRA = {"numba": "server", "cv2": "server", "filterpy": "agent", "pyproj": "agent", "rich": "sim"}
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -52,8 +53,8 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-Nouns = "argparse._SubParsersAction[argparse.ArgumentParser]"
-Parent = argparse.ArgumentParser
+Nouns: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - it has no public name
+Parent: TypeAlias = argparse.ArgumentParser
 
 
 def _add_demo(nouns: Nouns, common: Parent, _: Parent) -> None:
@@ -143,7 +144,7 @@ def _add_plot(nouns: Nouns, common: Parent, network: Parent) -> None:
 
 
 def _noun(nouns: Nouns, name: str, what: str, parents: list[Parent]) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = nouns.add_parser(  # type: ignore[attr-defined]
+    parser: argparse.ArgumentParser = nouns.add_parser(
         name, help=what, description=what[0].upper() + what[1:] + ".", parents=parents
     )
     parser.set_defaults(module=f"sitegrid.commands.{name}")

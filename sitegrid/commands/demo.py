@@ -272,7 +272,7 @@ def _result(
 
 def _print(result: dict[str, Any]) -> None:
     print(
-        f"{result['machines']} machines drove {result['seconds']:g} s and recorded {result['samples_recorded']} samples;"
+        f"{result['machines']} machines drove {result['seconds']:g} s, recorded {result['samples_recorded']} samples;"
     )
     print(f"  merged {result['samples_merged']}, lost {result['lost']}, double {result['double']}")
     wrong = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from argparse import Namespace
+from typing import Any
 
 import numpy as np
 
@@ -39,16 +40,16 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> No
     except ValueError as error:
         raise ConfigError("sitegrid query region", str(error)) from None
     if arguments.out:
-        np.savez_compressed(arguments.out, x_m=region.x_m, y_m=region.y_m, **region.layers)
+        arrays: dict[str, Any] = {"x_m": region.x_m, "y_m": region.y_m, **region.layers}
+        np.savez_compressed(arguments.out, **arrays)
     summary = {name: _statistics(values) for name, values in region.layers.items()}
     if arguments.json:
         say(plain({"columns": len(region.x_m), "rows": len(region.y_m), "merged": region.merged, "layers": summary}))
         return
     print(f"{_size(region)}, journal row {region.merged}")
     for name, row in summary.items():
-        print(
-            f"  {name:18} {row['known']:7d} known   min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
-        )
+        span = f"min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
+        print(f"  {name:18} {row['known']:7d} known   {span}")
 
 
 def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:

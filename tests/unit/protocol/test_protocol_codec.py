@@ -1,0 +1,397 @@
+import struct
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from protocol import codec, queries
+from protocol.codec import decode_batch, encode_batch
+from protocol.errors import MessageError, Refusal
+from protocol.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
+from protocol.readings import KINDS, Encoder, Imu, columns
+from protocol.samples import COLUMNS, SAMPLE_DTYPE
+
+EXTENT_M = 20_000.0
+T0 = 1_750_000_000_000_000_000
+
+
+def rows(n: int = 5) -> np.ndarray:
+    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4)
+    return np.array([one] * n, SAMPLE_DTYPE)
+
+
+def batch(table: np.ndarray, **fields) -> SampleBatch:
+    return SampleBatch(**{"machine": "m-1", "spool_id": 9, "first_seq": 1, "rows": table, "frame": "0123abcd", **fields})
+
+
+def changed(**fields) -> bytes:
+    """A valid batch with fields replaced; ... takes a field away."""
+    table = {**msgpack.unpackb(encode_batch(batch(rows()))), **fields}
+    return msgpack.packb({name: value for name, value in table.items() if value is not ...})
+
+
+def with_value(column: str, row: int, value: float) -> bytes:
+    table = rows()
+    table[column][row] = value
+    return encode_batch(batch(table))
+
+
+def refusal(data: bytes, decode=lambda data: decode_batch(data, EXTENT_M)) -> MessageError:
+    with pytest.raises(MessageError) as caught:
+        decode(data)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+    return caught.value
+
+
+# --- one clear error for each kind of bad batch ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keep", [0, 1, 10, 100, 200])
+def test_truncated_batch_is_refused(keep):
+    assert refusal(changed()[:keep]).reason is Refusal.NOT_MSGPACK
+
+
+def test_trailing_bytes_are_refused():
+    assert refusal(changed() + b"\x00").reason is Refusal.NOT_MSGPACK
+
+
+@pytest.mark.parametrize("data", [b"\xc0", b"\x93\x01\x02\x03", b"\xa3abc", msgpack.packb(1.5)])
+def test_what_is_no_map_is_refused(data):
+    assert refusal(data).reason is Refusal.NOT_MSGPACK
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason", "field"),
+    [
+        ({"v": 2}, Refusal.VERSION, "v"),
+        ({"v": True}, Refusal.WRONG_TYPE, "v"),
+        ({"v": ...}, Refusal.MISSING_FIELD, "v"),
+        ({"n": -1}, Refusal.TOO_LARGE, "n"),
+        ({"n": codec.MAX_BATCH_SAMPLES + 1}, Refusal.TOO_LARGE, "n"),
+        ({"n": 5.0}, Refusal.WRONG_TYPE, "n"),
+        ({"n": 4}, Refusal.COLUMN_LENGTH, "cols.stamp_ns"),
+        ({"first_seq": 0}, Refusal.FIRST_SEQ, "first_seq"),
+        ({"first_seq": -3}, Refusal.FIRST_SEQ, "first_seq"),
+        ({"first_seq": 2**63}, Refusal.FIRST_SEQ, "first_seq"),
+        ({"first_seq": "1"}, Refusal.WRONG_TYPE, "first_seq"),
+        ({"lost_before": 1}, Refusal.OUT_OF_RANGE, "lost_before"),
+        ({"lost_before": -1}, Refusal.OUT_OF_RANGE, "lost_before"),
+        ({"spool_id": 0}, Refusal.OUT_OF_RANGE, "spool_id"),
+        ({"spool_id": True}, Refusal.WRONG_TYPE, "spool_id"),
+        ({"machine": "*"}, Refusal.OUT_OF_RANGE, "machine"),
+        ({"machine": "a/b"}, Refusal.OUT_OF_RANGE, "machine"),
+        ({"machine": "m" * 100_000}, Refusal.OUT_OF_RANGE, "machine"),
+        ({"machine": "m-1\n"}, Refusal.OUT_OF_RANGE, "machine"),
+        ({"machine": b"m-1"}, Refusal.WRONG_TYPE, "machine"),
+        ({"frame": ...}, Refusal.MISSING_FIELD, "frame"),
+        ({"frame": 7}, Refusal.WRONG_TYPE, "frame"),
+        ({"cols": ...}, Refusal.MISSING_FIELD, "cols"),
+        ({"cols": []}, Refusal.WRONG_TYPE, "cols"),
+        ({"cols": {}}, Refusal.MISSING_FIELD, "stamp_ns"),
+        ({"cols": {"stamp_ns": "text"}}, Refusal.WRONG_TYPE, "stamp_ns"),
+    ],
+)
+def test_wrong_field_is_named(fields, reason, field):
+    error = refusal(changed(**fields))
+    assert (error.reason, error.field) == (reason, field)
+    assert field in str(error)
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+@pytest.mark.parametrize("change", [-8, -1, 1, 8])
+def test_column_of_another_length_is_named(column, change):
+    cols = msgpack.unpackb(changed())["cols"]
+    cols[column] = cols[column][:change] if change < 0 else cols[column] + bytes(change)
+    error = refusal(changed(cols=cols))
+    assert (error.reason, error.field) == (Refusal.COLUMN_LENGTH, f"cols.{column}")
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "reason"),
+    [
+        ("stamp_ns", 0, Refusal.OUT_OF_RANGE),
+        ("stamp_ns", -5, Refusal.OUT_OF_RANGE),
+        ("x_m", np.nan, Refusal.NOT_FINITE),
+        ("y_m", np.inf, Refusal.NOT_FINITE),
+        ("x_m", 1e6, Refusal.OUTSIDE_SITE),
+        ("y_m", -1e6, Refusal.OUTSIDE_SITE),
+        ("cov_xx_m2", -1.0, Refusal.COVARIANCE),
+        ("cov_yy_m2", -1e-6, Refusal.COVARIANCE),
+        ("cov_xx_m2", np.nan, Refusal.NOT_FINITE),
+        ("cov_xy_m2", 2.0, Refusal.COVARIANCE),
+        ("cov_xy_m2", -2.0, Refusal.COVARIANCE),
+        ("cov_xx_m2", 0.0, Refusal.COVARIANCE),
+        ("heading_rad", 8.0, Refusal.OUT_OF_RANGE),
+        ("heading_rad", np.nan, Refusal.NOT_FINITE),
+        ("speed_mps", -np.inf, Refusal.NOT_FINITE),
+        ("distance_m", -0.1, Refusal.OUT_OF_RANGE),
+        ("c_rr", np.nan, Refusal.NOT_FINITE),
+        ("c_rr", np.inf, Refusal.NOT_FINITE),
+        ("c_rr", 6.0, Refusal.OUT_OF_RANGE),
+        ("c_rr_var", np.nan, Refusal.NOT_FINITE),
+        ("c_rr_var", -1.0, Refusal.OUT_OF_RANGE),
+        ("grade_e", np.nan, Refusal.NOT_FINITE),
+        ("grade_n", -6.0, Refusal.OUT_OF_RANGE),
+        ("grade_var", np.inf, Refusal.NOT_FINITE),
+    ],
+)
+def test_bad_value_is_named_with_its_row(column, value, reason):
+    error = refusal(with_value(column, 3, value))
+    assert (error.reason, error.row) == (reason, 3)
+    partner = {"cov_xx_m2": "cov_xy_m2", "c_rr_var": "c_rr"}  # named for the pair
+    assert error.field in (column, partner.get(column))
+    assert f"{error.field}[3]" in str(error)
+
+
+def test_ten_megabytes_are_refused_unread():
+    error = refusal(bytes(10 * 2**20))
+    assert error.reason is Refusal.TOO_LARGE
+
+
+def test_position_a_thousand_kilometres_away_is_refused_in_one_line():
+    error = refusal(with_value("x_m", 0, 1_000_000.0))
+    assert str(error) == "x_m[0]: 1000000.0: beyond 20000 m of the origin"
+
+
+def test_row_count_of_a_message_reserves_no_memory():
+    claimed = b"\x82\xa1v\x01\xa1a" + b"".join(b"\xdd" + struct.pack(">I", 4_000_000) for _ in range(1000))
+    assert refusal(claimed + bytes(4 * 2**20 - len(claimed))).reason is Refusal.NOT_MSGPACK
+
+
+def test_largest_batch_fits():
+    assert len(encode_batch(batch(rows(codec.MAX_BATCH_SAMPLES)))) < codec.MAX_BATCH_BYTES
+
+
+def test_unknown_resistance_or_gradient_is_allowed():
+    table = rows()
+    for name in ("c_rr", "c_rr_var"):
+        table[name][1] = np.nan
+    for name in ("grade_e", "grade_n", "grade_var"):
+        table[name][2] = np.nan
+    assert decode_batch(encode_batch(batch(table)), EXTENT_M).rows.tobytes() == table.tobytes()
+
+
+# --- round trips -----------------------------------------------------------------------------------------------------
+
+names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,62}", fullmatch=True)
+stamps = st.integers(1, 4_102_444_800_000_000_000)
+numbers = st.floats(-1e6, 1e6)
+
+
+@st.composite
+def tables(draw):
+    values = {
+        "stamp_ns": stamps,
+        **dict.fromkeys(("x_m", "y_m"), st.floats(-EXTENT_M, EXTENT_M)),
+        **dict.fromkeys(("cov_xx_m2", "cov_yy_m2"), st.floats(0.0625, 1e5, width=32)),
+        "cov_xy_m2": st.floats(-0.0625, 0.0625, width=32),
+        **dict.fromkeys(("heading_rad", "grade_e", "grade_n"), st.floats(-4, 4, width=32)),
+        **dict.fromkeys(("speed_mps", "distance_m", "c_rr_var", "grade_var"), st.floats(0, 50, width=32)),
+        "c_rr": st.floats(-1, 5, width=32),
+    }
+    table = np.zeros(draw(st.integers(0, 4)), SAMPLE_DTYPE)
+    for row in table:
+        for name in COLUMNS:
+            row[name] = draw(values[name])
+    return table
+
+
+@given(tables(), names, st.integers(1, 2**64 - 1), st.integers(1, 2**62), st.data())
+def test_batch_round_trip(table, machine, spool_id, first_seq, data):
+    lost = data.draw(st.integers(0, first_seq - 1))
+    sent = batch(table, machine=machine, spool_id=spool_id, first_seq=first_seq, lost_before=lost)
+    got = decode_batch(encode_batch(sent), EXTENT_M)
+    assert got.rows.tobytes() == table.tobytes()
+    assert (got.machine, got.spool_id, got.first_seq, got.lost_before, got.frame, got.last_seq) == (
+        (machine, spool_id, first_seq, lost, "0123abcd", first_seq + len(table) - 1)
+    )
+
+
+counts = st.integers(0, codec.MAX_SEQ)
+
+
+@given(st.builds(Ack, counts, counts, counts) | st.builds(Refused, st.text(max_size=20), st.text(max_size=200), counts))
+def test_reply_round_trip(reply):
+    assert codec.decode_reply(codec.encode_reply(reply)) == reply
+
+
+@given(st.builds(Pose, names, stamps, *[numbers] * 7))
+def test_pose_round_trip(pose):
+    assert codec.decode_pose(codec.encode_pose(pose)) == pose
+
+
+@given(names, stamps, st.dictionaries(st.text(max_size=9), st.integers(0, 9) | st.text(max_size=9), max_size=5))
+def test_health_round_trip(machine, stamp, values):
+    health = Health(machine, stamp, values)
+    assert codec.decode_health(codec.encode_health(health)) == health
+
+
+@st.composite
+def reading_lists(draw):
+    readings = []
+    for kind, cls in KINDS.items():
+        limits = [st.floats(low, high) for low, high in cls.limits.values()]
+        readings += draw(st.lists(st.builds(cls, st.just(f"{kind}-1"), stamps, *limits), max_size=3))
+    return readings
+
+
+@given(names, st.integers(1, codec.MAX_SEQ), reading_lists(), st.booleans())
+def test_bundle_round_trip_in_the_order_of_stamps(machine, counter, readings, last):
+    got = codec.decode_bundle(codec.encode_bundle(SensorBundle(machine, counter, tuple(readings), last)))
+    assert (got.machine, got.counter, got.last, got.refused) == (machine, counter, last, {})
+    assert [r.stamp_ns for r in got.readings] == sorted(r.stamp_ns for r in readings)
+    assert sorted(map(repr, got.readings)) == sorted(map(repr, readings))
+
+
+# --- bundles ---------------------------------------------------------------------------------------------------------
+
+
+def bundle_with(**fields) -> bytes:
+    cols = {name: np.ones(2, "<f8").tobytes() for name in columns("encoder")}
+    group = {"sensor": "axle", "kind": "encoder", "n": 2, "cols": {"stamp_ns": np.array([5, 6], "<i8").tobytes(), **cols}}
+    return codec.pack({"machine": "m-1", "counter": 1, "sensors": [{**group, **fields}]})
+
+
+def test_implausible_reading_is_left_out_and_counted():
+    readings = (Encoder("axle", T0, 1.0, 2.0), Encoder("axle", T0 + 1, float("nan"), 2.0), Imu("imu", 0, *[0.0] * 6))
+    got = codec.decode_bundle(codec.encode_bundle(SensorBundle("m-1", 1, readings)))
+    assert got.readings == readings[:1]
+    assert got.refused == {Refusal.NOT_FINITE: 1, Refusal.OUT_OF_RANGE: 1}
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason", "field"),
+    [
+        ({"kind": "sonar"}, Refusal.OUT_OF_RANGE, "kind"),
+        ({"kind": 3}, Refusal.WRONG_TYPE, "kind"),
+        ({"sensor": "a/b"}, Refusal.OUT_OF_RANGE, "sensor"),
+        ({"sensor": "s" * 100_000}, Refusal.OUT_OF_RANGE, "sensor"),
+        ({"n": 3}, Refusal.COLUMN_LENGTH, "axle.stamp_ns"),
+        ({"n": 2**40}, Refusal.OUT_OF_RANGE, "n"),
+        ({"cols": {}}, Refusal.MISSING_FIELD, "stamp_ns"),
+    ],
+)
+def test_malformed_bundle_is_refused_whole(fields, reason, field):
+    error = refusal(bundle_with(**fields), codec.decode_bundle)
+    assert (error.reason, error.field) == (reason, field)
+
+
+def test_bundle_counter_starts_at_one():
+    data = codec.encode_bundle(SensorBundle("m-1", 0, ()))
+    assert refusal(data, codec.decode_bundle).field == "counter"
+
+
+@pytest.mark.parametrize("group", [1, [], "x", None])
+def test_group_that_is_no_map_is_refused(group):
+    data = codec.pack({"machine": "m-1", "counter": 1, "sensors": [group]})
+    assert refusal(data, codec.decode_bundle).field == "sensors"
+
+
+@pytest.mark.parametrize("stamp", [0, -1, 2**63])
+def test_live_messages_carry_a_plausible_stamp(stamp):
+    pose = Pose("m-1", stamp, *[0.0] * 7)
+    assert refusal(codec.encode_pose(pose), codec.decode_pose).field == "stamp_ns"
+    assert refusal(codec.encode_health(Health("m-1", stamp, {})), codec.decode_health).field == "stamp_ns"
+
+
+def test_pose_that_is_nowhere_is_refused():
+    error = refusal(codec.encode_pose(Pose("m-1", T0, float("nan"), *[0.0] * 6)), codec.decode_pose)
+    assert (error.reason, error.field) == (Refusal.NOT_FINITE, "x_m")
+
+
+# --- whatever arrives, only a MessageError leaves --------------------------------------------------------------------
+
+DECODERS = {
+    "batch": lambda data: decode_batch(data, EXTENT_M),
+    "reply": codec.decode_reply,
+    "bundle": codec.decode_bundle,
+    "pose": codec.decode_pose,
+    "health": codec.decode_health,
+    "point": queries.decode_point,
+    "region": queries.decode_region,
+    "info": queries.decode_info,
+    "error": queries.decode_error,
+}
+FIELDS = """v machine spool_id first_seq n frame cols lost_before ack watermark row trimmed reason problem expected sensors
+sensor kind counter last stamp_ns x_m y_m cov_xx_m2 values info layers cell_m columns rows west_m south_m merged""".split()
+plain = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5)
+plain |= st.binary(max_size=16) | st.sampled_from(["m-1", "encoder", 1, 0])
+wild = st.recursive(
+    plain,
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from([*FIELDS, *COLUMNS]) | st.binary(max_size=3), inner, max_size=6)
+    ),
+    max_leaves=12,
+)
+messages = st.fixed_dictionaries({"v": st.just(1)}, optional=dict.fromkeys(FIELDS[1:], wild))
+
+
+def attempt(decode, data: bytes) -> None:
+    try:
+        decode(data)
+    except MessageError as error:
+        assert isinstance(error.reason, Refusal)  # noqa: PT017 - any outcome but another error is right
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=200))
+def test_any_bytes(data):
+    for decode in DECODERS.values():
+        attempt(decode, data)
+
+
+@settings(max_examples=200)
+@given(messages)
+def test_any_message(message):
+    data = msgpack.packb(message)
+    for decode in DECODERS.values():
+        attempt(decode, data)
+
+
+@pytest.mark.parametrize("name", DECODERS)
+@pytest.mark.parametrize(
+    "inside",
+    [
+        b"\x91" * 5000 + b"\xc0",  # lists in lists
+        b"\x81\xa1a" * 5000 + b"\xc0",  # maps in maps
+        b"\xc7\x0c\xff" + b"\xff" * 12,  # a time stamp that is none
+        b"\xd4\x05\x00",  # an extension type
+        b"\xd6\xff" + bytes(4),  # a time stamp
+        b"\xa2\xff\xfe",  # no UTF-8
+        b"\x81\x91\x01\x01",  # a list as a key
+        b"\xc1",  # never used
+    ],
+)
+def test_wild_content(name, inside):
+    for field in FIELDS[1:]:
+        attempt(DECODERS[name], b"\x82\xa1v\x01" + msgpack.packb(field) + inside)
+
+
+@pytest.mark.parametrize("name", DECODERS)
+def test_flipped_bits_of_valid_messages(golden, name):
+    files = {"reply": ["ack.bin", "refused.bin"], "batch": ["batch_empty.bin"]}.get(name, [f"{name}.bin"])
+    for file in files:
+        data = golden.GOLDEN[file].encode(golden.GOLDEN[file].record)
+        for bit in range(8 * len(data)):
+            flipped = bytearray(data)
+            flipped[bit // 8] ^= 1 << bit % 8
+            attempt(DECODERS[name], bytes(flipped))
+
+
+@given(st.integers(0, 8 * 426 - 1), st.integers(0, 8 * 426 - 1))
+def test_flipped_bits_of_a_batch_with_samples(golden, one, other):
+    data = bytearray(golden.GOLDEN["batch.bin"].encode(golden.BATCH))
+    for bit in (one, other):
+        data[bit // 8] ^= 1 << bit % 8
+    attempt(DECODERS["batch"], bytes(data))
+
+
+def test_every_prefix_of_a_message_is_refused(golden):
+    for entry in golden.GOLDEN.values():
+        data = entry.encode(entry.record)
+        for end in range(0, len(data), 7):
+            refusal(data[:end], entry.decode)

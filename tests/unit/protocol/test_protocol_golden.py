@@ -1,0 +1,45 @@
+"""The wire does not change by accident: stored bytes, records, and the code agree both ways."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "golden"
+NAMES = sorted(path.name for path in FOLDER.glob("*.bin"))
+
+
+def same(a, b) -> bool:
+    """Equality of records, NaN and arrays by their bytes."""
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, Exception):
+        return type(a) is type(b) and str(a) == str(b) and a.reason == b.reason
+    return a == b
+
+
+def test_every_message_has_a_golden_file(golden):
+    assert sorted([*golden.GOLDEN, golden.NEWER]) == NAMES
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "batch_newer.bin"])
+def test_golden_file_decodes_to_the_record_and_back(golden, name):
+    entry, data = golden.GOLDEN[name], (FOLDER / name).read_bytes()
+    assert same(entry.decode(data), entry.record)
+    assert entry.encode(entry.decode(data)) == data
+
+
+def test_unknown_field_and_column_of_a_newer_agent_are_ignored(golden):
+    assert same(golden.decode_batch((FOLDER / golden.NEWER).read_bytes()), golden.BATCH)
+
+
+def test_columns_and_types_are_the_specified_ones():
+    from protocol.samples import SAMPLE_DTYPE
+
+    assert SAMPLE_DTYPE.names[:3] == ("stamp_ns", "x_m", "y_m")
+    assert [SAMPLE_DTYPE[name].str for name in SAMPLE_DTYPE.names] == ["<i8", "<f8", "<f8", *["<f4"] * 11]
