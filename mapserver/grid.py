@@ -14,7 +14,7 @@ from protocol.arrays import Ints, Table
 from protocol.geometry import BLOCK_CELLS, CellWindow
 
 CELLS = BLOCK_CELLS * BLOCK_CELLS
-# Block columns and rows are packed as 18 bits each below the bucket, which has 27 bits: enough for 100 km of 5 cm cells,
+# Block columns and rows are packed as 18 bits each below the bucket, which has 27: enough for 5 cm cells 100 km away,
 # and for minutes until the year 2100.
 _BITS = 18
 _HALF = 1 << (_BITS - 1)

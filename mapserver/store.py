@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import sqlite3
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +15,12 @@ from mapserver import ingest, snapshot
 from mapserver.config import ServerConfig
 from mapserver.ingest import Admission, GapError
 from mapserver.journal import Journal
-from protocol.errors import MessageError, Refusal
+from protocol.errors import MessageError, Refusal, StoreError
 from protocol.messages import Ack, Refused, SampleBatch
 from protocol.site import SiteConfig
 
 JOURNAL_FILE = "journal.db"
+LOCK_FILE = "lock"
 
 
 @dataclass(frozen=True)
@@ -38,11 +41,15 @@ class Store:
         self.newest_ns = 0
         self._folder = folder
         self._now_ns = now_ns
-        self._journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
-        snapshot.remove_beyond(folder, self._journal.last_row)
-        self.merged, self.grid = snapshot.load_newest(folder, self._journal.last_row, site.cell_m, config.fold)
-        self.snapshot_row = self.merged
-        self._fold_tail()
+        with ExitStack() as opened:
+            opened.enter_context(_hold(folder))
+            self._journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
+            opened.callback(self._journal.close)
+            snapshot.remove_beyond(folder, self._journal.last_row)
+            self.merged, self.grid = snapshot.load_newest(folder, self._journal.last_row, site.cell_m, config.fold)
+            self.snapshot_row = self.merged
+            self._fold_tail()
+            self._opened = opened.pop_all()
 
     @property
     def journalled(self) -> int:
@@ -75,9 +82,8 @@ class Store:
             self.snapshot_row = self.merged
 
     def close(self) -> None:
-        """Snapshot, then close the journal."""
-        self.save_snapshot()
-        self._journal.close()
+        """Close the journal and let go of the folder."""
+        self._opened.close()
 
     def info(self) -> dict[str, Any]:
         """State of the store in plain values."""
@@ -133,3 +139,16 @@ class Store:
             self.grid.fold(row.rows, row.machine)
             self.merged = row.row
         self.newest_ns = self._journal.newest_ns()
+
+
+@contextmanager
+def _hold(folder: Path) -> Iterator[None]:
+    """Keep a second server off the folder: each would take the samples that the other has. A crash releases it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK_FILE).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            problem = "another server is using this store; stop it, or choose another --store"
+            raise StoreError(folder, problem) from None
+        yield

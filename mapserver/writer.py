@@ -93,6 +93,10 @@ class Writer:
             self.failed = True
             log.critical("writer failed", exc_info=True)
             self._refuse_all()
+        else:
+            self._save_snapshot()
+        finally:
+            self._store.close()
 
     def _refuse_all(self) -> None:
         """Leave nobody waiting until the process ends."""
@@ -116,7 +120,6 @@ class Writer:
                 self._save_snapshot()
                 tried_row = self._store.merged
                 next_snapshot_s = time.monotonic() + self._config.snapshot_s
-        self._store.close()
 
     def _next(self, deadline_s: float) -> tuple[Incoming, Reply] | _Read | tuple[()] | None:
         """Return the next piece of work, () when it is time for a snapshot, None to end."""
@@ -138,6 +141,8 @@ class Writer:
                 ending = True
             else:
                 group.append(item)
+        if ending:
+            self._batches.put(None)
         answers = self._store.take([incoming for incoming, _ in group])
         with self._merged:
             self._merged.notify_all()
@@ -148,8 +153,6 @@ class Writer:
             reply(answer)
         for item in reads:
             _answer(item, self._store)
-        if ending:
-            self._batches.put(None)
 
     def _save_snapshot(self) -> None:
         try:

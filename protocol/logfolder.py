@@ -58,7 +58,8 @@ class LogFolder:
     refused: Counter[str] = field(default_factory=Counter)
 
     def readings(self) -> Iterator[Reading]:
-        """All readings of the sensors in use, in the order of their stamps."""
+        """All readings of the sensors in use, in the order of their stamps; counts `refused` anew."""
+        self.refused.clear()
         streams = [self._read(source) for source in self.sources if source.sensor.use]
         return heapq.merge(*streams, key=lambda r: r.stamp_ns)
 
@@ -189,6 +190,8 @@ def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig,
     folder.mkdir(parents=True, exist_ok=True)
     files: dict[str, list[Reading]] = {s.name: [] for s in machine.sensors}
     for reading in readings:
+        if reading.sensor not in files:
+            raise LogFolderError(folder, f"machine {machine.name} has no sensor `{reading.sensor}`")
         files[reading.sensor].append(reading)
     for sensor in machine.sensors:
         with (folder / f"{sensor.name}.csv").open("w", encoding="utf-8", newline="") as text:

@@ -18,7 +18,7 @@ class SessionConfig:
     """How a process joins the network.
 
     mode: "client" connects to a router; "router" is the site's router and listens. wait_s: how long to wait for the
-    router; negative waits for ever, in the background.
+    router; negative opens at once and goes on looking for it in the background, as an agent does.
     """
 
     endpoint: str = DEFAULT_ENDPOINT
@@ -53,11 +53,14 @@ def _settings(config: SessionConfig) -> dict[str, object]:
     }
     if config.mode == "router":
         return settings | {"listen/endpoints": [config.endpoint]}
-    wait_ms = -1 if config.wait_s < 0 else int(config.wait_s * 1000)
+    # A client's open blocks until the router is there; a peer that listens nowhere connects in the background.
+    in_background = config.wait_s < 0
+    wait_ms = -1 if in_background else int(config.wait_s * 1000)
     return settings | {
+        "mode": "peer" if in_background else "client",
         "connect/endpoints": [config.endpoint],
         "connect/timeout_ms": wait_ms,
-        "connect/exit_on_failure": config.wait_s >= 0,
+        "connect/exit_on_failure": not in_background,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
         "listen/endpoints": [],
     }

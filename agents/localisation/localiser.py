@@ -17,6 +17,7 @@ from protocol.readings import Gps, Reading
 from protocol.site import Projection
 
 TWO_PI = 2 * math.pi
+MIN_DRIFT_M2 = 1e-6  # a receiver that was never heard, or has no slow error, must not make the covariance singular
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ class Localiser:
         self._receivers = {s.name: i for i, s in enumerate(receivers)}
         self._levers = [(s.mount.xyz_m[0], s.mount.xyz_m[1]) for s in receivers]
         self._drift_time_s = np.array([s.drift_time_s for s in receivers])
-        self._drift_m2 = np.zeros(len(receivers))
+        self._drift_m2 = np.full(len(receivers), MIN_DRIFT_M2)
+        self._heard: set[int] = set()
         self._filter: VectorisedUkf | None = None
         self._at = Dead(0, 0.0, 0.0, 0.0, 0.0)  # dead-reckoned pose of the filter's last step
         self._track: list[Dead] = []
@@ -133,7 +135,7 @@ class Localiser:
     def _fix(self, gps: Gps, sensor: SensorConfig) -> _Fix:
         x, y, _ = self._projection.to_map(gps.lat_deg, gps.lon_deg, gps.height_m)
         variance = np.array([gps.var_e_m2, gps.var_n_m2])
-        drift_m2 = sensor.drift_share * float(variance.mean())
+        drift_m2 = max(sensor.drift_share * float(variance.mean()), MIN_DRIFT_M2)
         white = np.maximum(variance * (1 - sensor.drift_share), self._config.min_fix_std_m**2)
         dead = self.dead.now()
         stamped = Dead(max(dead.stamp_ns, gps.stamp_ns), dead.travel_m, dead.angle_rad, dead.x_m, dead.y_m, dead.pull)
@@ -141,7 +143,8 @@ class Localiser:
 
     def _condition(self, ukf: VectorisedUkf, fix: _Fix) -> None:
         lever, receiver = self._levers[fix.receiver], fix.receiver
-        if not self._drift_m2[receiver]:  # a receiver that comes late brings its own unknown error
+        if receiver not in self._heard:  # a receiver that comes late brings its own unknown error
+            self._heard.add(receiver)
             states = model.drift_states(receiver)
             ukf.P[states, states] = np.eye(2) * fix.drift_m2
         self._drift_m2[receiver] = fix.drift_m2
@@ -216,6 +219,7 @@ class Localiser:
         x[model.HEADING] = found.rotation_rad + first.angle_rad
         for fix in self._fixes:
             self._drift_m2[fix.receiver] = fix.drift_m2
+            self._heard.add(fix.receiver)
         self._filter = VectorisedUkf(x, self._start_covariance(len(x), found, fix_std_m))
         self._at = first
         events: list[Dead | _Fix] = [*self._track[1:], *self._fixes]

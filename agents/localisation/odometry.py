@@ -14,6 +14,8 @@ from protocol.arrays import Floats
 from protocol.machine import MachineConfig, SensorConfig
 from protocol.readings import Encoder, Imu, Odometry, Reading, Torque
 
+MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
+
 
 class WheelTracker:
     """Speed and acceleration from quantised wheel travel: a fading-memory filter of third order.
@@ -80,8 +82,7 @@ class DeadReckoning:
         self._pull = 0.0
         self._rotation: dict[str, Floats] = {}
         self._imu: Imu | None = None
-        self._ticks: dict[str, float] = {}
-        self._odometry_ns = 0
+        self._wheel_reading: Encoder | Odometry | None = None
         self._x_m = 0.0
         self._y_m = 0.0
 
@@ -89,15 +90,8 @@ class DeadReckoning:
         """Take in a reading of the gyro or the wheels; others change nothing."""
         if isinstance(reading, Imu):
             self._turn(reading, sensor)
-        elif isinstance(reading, Encoder):
-            ticks = (reading.left_ticks + reading.right_ticks) / 2
-            per_tick_m = 2 * math.pi * self._machine.wheel_radius_m / sensor.ticks_per_rev
-            self._advance(reading.stamp_ns, (ticks - self._ticks.get(sensor.name, ticks)) * per_tick_m)
-            self._ticks[sensor.name] = ticks
-        elif isinstance(reading, Odometry):
-            dt = (reading.stamp_ns - self._odometry_ns) * 1e-9 if self._odometry_ns else 0.0
-            self._advance(reading.stamp_ns, reading.speed_x_mps * min(dt, 1.0))
-            self._odometry_ns = reading.stamp_ns
+        elif isinstance(reading, Encoder | Odometry):
+            self._roll(reading, sensor)
         elif isinstance(reading, Torque):
             weight_n = self._machine.mass_kg * GRAVITY_MPS2
             self._traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
@@ -119,6 +113,22 @@ class DeadReckoning:
             self.angle_rad += rate * min(dt, 1.0)
         self._imu = imu
         self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
+
+    def _roll(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
+        """Advance by what the first wheel sensor in use says (the others serve later issues)."""
+        last = self._wheel_reading or reading
+        if last.sensor == reading.sensor:
+            self._wheel_reading = reading
+            self._advance(reading.stamp_ns, self._rolled_between(last, reading, sensor))
+
+    def _rolled_between(self, last: Encoder | Odometry, now: Encoder | Odometry, sensor: SensorConfig) -> float:
+        dt_s = (now.stamp_ns - last.stamp_ns) * 1e-9
+        if isinstance(now, Odometry):
+            return now.speed_x_mps * min(dt_s, 1.0)
+        assert isinstance(last, Encoder)
+        ticks = (now.left_ticks - last.left_ticks + now.right_ticks - last.right_ticks) / 2
+        rolled_m = ticks * 2 * math.pi * self._machine.wheel_radius_m / sensor.ticks_per_rev
+        return rolled_m if abs(rolled_m) <= MAX_WHEEL_MPS * dt_s else 0.0
 
     def _advance(self, stamp_ns: int, rolled_m: float) -> None:
         self._rolled_m += rolled_m

@@ -91,14 +91,14 @@ GOLDEN: dict[str, Golden] = {
     "batch_empty.bin": Golden(ASK, codec.encode_batch, decode_batch),
     "ack.bin": Golden(Ack(43, 17, 2), codec.encode_reply, codec.decode_reply),
     "refused.bin": Golden(Refused("gap", "first_seq: 41: 12 is expected", 12), codec.encode_reply, codec.decode_reply),
-    "bundle.bin": Golden(
-        SensorBundle("loader-1", 5, readings(), last=True), codec.encode_bundle, codec.decode_bundle
-    ),
+    "bundle.bin": Golden(SensorBundle("loader-1", 5, readings(), last=True), codec.encode_bundle, codec.decode_bundle),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, queries.encode_point, queries.decode_point),
     "region.bin": Golden(region(), queries.encode_region, queries.decode_region),
-    "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, queries.encode_info, queries.decode_info),
+    "info.bin": Golden(
+        {"site": "paper", "merged": 17, "refused": {"gap": 1}}, queries.encode_info, queries.decode_info
+    ),
     "error.bin": Golden(
         QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known"), queries.encode_error, queries.decode_error
     ),

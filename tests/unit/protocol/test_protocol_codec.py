@@ -23,7 +23,9 @@ def rows(n: int = 5) -> np.ndarray:
 
 
 def batch(table: np.ndarray, **fields) -> SampleBatch:
-    return SampleBatch(**{"machine": "m-1", "spool_id": 9, "first_seq": 1, "rows": table, "frame": "0123abcd", **fields})
+    return SampleBatch(
+        **{"machine": "m-1", "spool_id": 9, "first_seq": 1, "rows": table, "frame": "0123abcd", **fields}
+    )
 
 
 def changed(**fields) -> bytes:
@@ -251,7 +253,12 @@ def test_bundle_round_trip_in_the_order_of_stamps(machine, counter, readings, la
 
 def bundle_with(**fields) -> bytes:
     cols = {name: np.ones(2, "<f8").tobytes() for name in columns("encoder")}
-    group = {"sensor": "axle", "kind": "encoder", "n": 2, "cols": {"stamp_ns": np.array([5, 6], "<i8").tobytes(), **cols}}
+    group = {
+        "sensor": "axle",
+        "kind": "encoder",
+        "n": 2,
+        "cols": {"stamp_ns": np.array([5, 6], "<i8").tobytes(), **cols},
+    }
     return codec.pack({"machine": "m-1", "counter": 1, "sensors": [{**group, **fields}]})
 
 
@@ -315,8 +322,41 @@ DECODERS = {
     "info": queries.decode_info,
     "error": queries.decode_error,
 }
-FIELDS = """v machine spool_id first_seq n frame cols lost_before ack watermark row trimmed reason problem expected sensors
-sensor kind counter last stamp_ns x_m y_m cov_xx_m2 values info layers cell_m columns rows west_m south_m merged""".split()
+FIELDS = [
+    "v",
+    "machine",
+    "spool_id",
+    "first_seq",
+    "n",
+    "frame",
+    "cols",
+    "lost_before",
+    "ack",
+    "watermark",
+    "row",
+    "trimmed",
+    "reason",
+    "problem",
+    "expected",
+    "sensors",
+    "sensor",
+    "kind",
+    "counter",
+    "last",
+    "stamp_ns",
+    "x_m",
+    "y_m",
+    "cov_xx_m2",
+    "values",
+    "info",
+    "layers",
+    "cell_m",
+    "columns",
+    "rows",
+    "west_m",
+    "south_m",
+    "merged",
+]
 plain = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5)
 plain |= st.binary(max_size=16) | st.sampled_from(["m-1", "encoder", 1, 0])
 wild = st.recursive(

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -7,7 +8,7 @@ from protocol.ground import BOUNDARIES, FLAT, SLOPE, UNKNOWN, ZONES, resistance_
 
 
 def test_boundaries_are_midway_between_zones():
-    midway = [(a.c_rr + b.c_rr) / 2 for a, b in zip(ZONES, ZONES[1:], strict=False)]
+    midway = [(a.c_rr + b.c_rr) / 2 for a, b in itertools.pairwise(ZONES)]
     assert list(BOUNDARIES) == pytest.approx(midway)
 
 

@@ -56,8 +56,16 @@ def test_name_that_is_none_is_refused(name):
 
 @pytest.mark.parametrize(
     "key",
-    ["", "sitegrid", "sitegrid/paper/ingest", "sitegrid/paper/ingest/*", "sitegrid/paper/ingest/**"]
-    + ["other/paper/ingest/loader-1", "sitegrid/paper/map/info", "sitegrid/paper/machine//pose"],
+    [
+        "",
+        "sitegrid",
+        "sitegrid/paper/ingest",
+        "sitegrid/paper/ingest/*",
+        "sitegrid/paper/ingest/**",
+        "other/paper/ingest/loader-1",
+        "sitegrid/paper/map/info",
+        "sitegrid/paper/machine//pose",
+    ],
 )
 def test_key_without_a_machine_is_refused(key):
     with pytest.raises(ConfigError):

@@ -1,0 +1,168 @@
+"""Readings of made-up drives with known physics, and recorded ones of the simulator, for the tests of the agents."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from agents.physics import GRAVITY_MPS2
+from protocol.arrays import Floats, Table
+from protocol.machine import MachineConfig, Mount, SensorConfig
+from protocol.readings import Encoder, Gps, Imu, Reading, Torque
+from protocol.samples import SAMPLE_DTYPE
+from protocol.site import Projection, SiteConfig
+from sim.config import SimConfig
+from sim.simulator import Simulator
+
+SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
+PROJECTION = Projection(SITE)
+START_NS = 1_767_225_600_000_000_000
+STEP_S = 0.01
+LEVER_M = (0.8, 0.3, 3.0)
+
+
+def machine(mount: Mount | None = None, receivers: int = 1, **options: Any) -> MachineConfig:
+    sensors = [
+        SensorConfig("imu", "imu", mount or Mount()),
+        SensorConfig("torque", "torque"),
+        SensorConfig("wheels", "encoder"),
+        *(SensorConfig(f"gps-{i + 1}", "gps", Mount(LEVER_M)) for i in range(receivers)),
+    ]
+    return MachineConfig("loader-1", sensors=tuple(sensors), **options)
+
+
+def changed_sensor(of: MachineConfig, name: str, **options: Any) -> MachineConfig:
+    return replace(of, sensors=tuple(replace(s, **options) if s.name == name else s for s in of.sensors))
+
+
+@dataclass(frozen=True)
+class Leg:
+    """So many seconds of constant acceleration and turn rate."""
+
+    seconds: float
+    accel_mps2: float = 0.0
+    turn_radps: float = 0.0
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Rolling resistance, and the slope angles ahead and to the left of the machine, positive uphill."""
+
+    c_rr: float = 0.04
+    ahead_rad: float = 0.0
+    left_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What was true, at 100 Hz, and what the sensors said without any noise."""
+
+    stamps_ns: list[int]
+    x_m: Floats
+    y_m: Floats
+    heading_rad: Floats
+    speed_mps: Floats
+    readings: list[Reading]
+
+    def at(self, stamp_ns: int) -> tuple[float, float, float]:
+        i = round((stamp_ns - START_NS) * 1e-9 / STEP_S) - 1
+        return float(self.x_m[i]), float(self.y_m[i]), float(self.heading_rad[i])
+
+
+def drive(
+    legs: Iterable[Leg],
+    of: MachineConfig,
+    *,
+    ground: Ground | None = None,
+    heading_rad: float = 0.7,
+    without: Sequence[str] = (),
+) -> Drive:
+    """Drive from (10, 20) at rest; gyro, force and torque at 100 Hz, wheels at 20 Hz, fixes at 5 Hz."""
+    ground = ground or Ground()
+    v, heading, x, y, way = 0.0, heading_rad, 10.0, 20.0, 0.0
+    rows: list[tuple[float, ...]] = []
+    readings: list[Reading] = []
+    stamps: list[int] = []
+    for leg in legs:
+        for _ in range(round(leg.seconds / STEP_S)):
+            step_m = v * STEP_S + 0.5 * leg.accel_mps2 * STEP_S**2
+            middle = heading + 0.5 * leg.turn_radps * STEP_S
+            x, y, way = x + step_m * math.cos(middle), y + step_m * math.sin(middle), way + step_m
+            v, heading = v + leg.accel_mps2 * STEP_S, heading + leg.turn_radps * STEP_S
+            rows.append((x, y, heading, v))
+            stamps.append(START_NS + len(rows) * 10_000_000)
+            readings += _readings(of, ground, leg, rows[-1], way, stamps[-1], len(rows))
+    columns = np.array(rows).T
+    seen = [r for r in readings if r.sensor not in without]
+    return Drive(stamps, columns[0], columns[1], columns[2], columns[3], seen)
+
+
+def _readings(
+    of: MachineConfig, ground: Ground, leg: Leg, row: tuple[float, ...], way_m: float, stamp_ns: int, step: int
+) -> list[Reading]:
+    x, y, heading, v = row
+    found: list[Reading] = []
+    for sensor in of.sensors:
+        if sensor.kind == "imu":
+            found.append(_imu(sensor, ground, leg, v, stamp_ns))
+        elif sensor.kind == "torque":
+            found.append(Torque(sensor.name, stamp_ns, drive_n(of, ground, leg, v) * of.wheel_radius_m))
+        elif sensor.kind == "encoder" and step % 5 == 0:
+            ticks = way_m / (2 * math.pi * of.wheel_radius_m) * sensor.ticks_per_rev
+            found.append(Encoder(sensor.name, stamp_ns, ticks, ticks))
+        elif sensor.kind == "gps" and step % 20 == 0:
+            found.append(fix(sensor, stamp_ns, x, y, heading))
+    return found
+
+
+def drive_n(of: MachineConfig, ground: Ground, leg: Leg, v: float) -> float:
+    """Drive force that balances inertia, the wheels' inertia, the slope and the rolling resistance."""
+    rolling = ground.c_rr * GRAVITY_MPS2 * math.cos(ground.ahead_rad) * float(np.sign(v))
+    uphill = GRAVITY_MPS2 * math.sin(ground.ahead_rad)
+    return of.mass_kg * (of.rotating_mass_factor * leg.accel_mps2 + uphill + rolling)
+
+
+def _imu(sensor: SensorConfig, ground: Ground, leg: Leg, v: float, stamp_ns: int) -> Imu:
+    up = GRAVITY_MPS2 * math.sqrt(1 - math.sin(ground.ahead_rad) ** 2 - math.sin(ground.left_rad) ** 2)
+    ahead = leg.accel_mps2 + GRAVITY_MPS2 * math.sin(ground.ahead_rad)
+    left = v * leg.turn_radps + GRAVITY_MPS2 * math.sin(ground.left_rad)
+    sensor_from_base = sensor.mount.base_from_sensor().T
+    gyro = sensor_from_base @ (0.0, 0.0, leg.turn_radps)
+    force = sensor_from_base @ (ahead, left, up)
+    return Imu(sensor.name, stamp_ns, *gyro.tolist(), *force.tolist())
+
+
+def fix(sensor: SensorConfig, stamp_ns: int, x: float, y: float, heading: float, variance_m2: float = 2.0) -> Gps:
+    lever, c, s = sensor.mount.xyz_m, math.cos(heading), math.sin(heading)
+    place = PROJECTION.to_geodetic(x + c * lever[0] - s * lever[1], y + s * lever[0] + c * lever[1], lever[2])
+    return Gps(sensor.name, stamp_ns, *place, variance_m2, variance_m2, variance_m2)
+
+
+S_BEND = (Leg(4, 0.5), Leg(5), Leg(4, 0, 0.25), Leg(5), Leg(4, 0, -0.3), Leg(8))
+
+
+@cache
+def simulated(seed: int, seconds: float, **options: Any) -> tuple[SiteConfig, MachineConfig, list[Reading], Table]:
+    """Site, machine, readings and true track of one simulated loader."""
+    simulator = Simulator(SimConfig(machines=1, seed=seed, seconds=seconds, speed=0.0, **options))
+    readings: list[Reading] = []
+    for _ in range(simulator.config.bundles or 0):
+        readings += simulator.advance()["loader-1"]
+    return simulator.site, simulator.machines[0], readings, simulator.tracks()["loader-1"]
+
+
+def made_up_samples(n: int, seed: int = 0) -> Table:
+    """Plausible samples, every one different."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros(n, SAMPLE_DTYPE)
+    rows["stamp_ns"] = START_NS + np.arange(n) * 100_000_000
+    for name, low, high in (("x_m", 0, 200), ("y_m", 0, 150), ("c_rr", 0.01, 0.3), ("c_rr_var", 1e-5, 1e-3)):
+        rows[name] = rng.uniform(low, high, n)
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0
+    rows["distance_m"] = 0.5
+    return rows

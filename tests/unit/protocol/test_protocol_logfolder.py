@@ -1,0 +1,225 @@
+import gzip
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.errors import ConfigError, LogFolderError, Refusal
+from protocol.logfolder import open_log, write_log
+from protocol.machine import MachineConfig, Mount, SensorConfig
+from protocol.readings import KINDS, Articulation, Encoder, Gps, Imu, Torque
+from protocol.site import SiteConfig
+
+T0 = 1_750_000_000_000_000_000
+MANIFEST = f"""
+[log]
+name = "test"
+start_ns = {T0}
+[site]
+name = "paper"
+origin_lat_deg = 49.0
+origin_lon_deg = 8.4
+[machine]
+name = "loader-1"
+[[sensor]]
+name = "joint"
+kind = "articulation"
+file = "joint.csv"
+[sensor.columns]
+stamp = {{ column = "t", unit = "ms" }}
+angle_rad = {{ column = "angle", unit = "deg" }}
+"""
+
+
+def folder(tmp_path, manifest=MANIFEST, **files):
+    (tmp_path / "log.toml").write_text(manifest)
+    for name, text in {"joint": "t,angle\n0,0\n1000,90\n", **files}.items():
+        if text is not None:
+            (tmp_path / f"{name}.csv").write_text(text)
+    return tmp_path
+
+
+def test_units_are_converted_and_stamps_count_from_the_start(tmp_path):
+    log = open_log(folder(tmp_path))
+    assert list(log.readings()) == [
+        Articulation("joint", T0, 0.0),
+        Articulation("joint", T0 + 10**9, pytest.approx(math.pi / 2)),
+    ]
+    assert not log.refused
+
+
+@pytest.mark.parametrize(
+    ("column", "expected"),
+    [('"angle"', 90.0), ("{ value = 0.5 }", 0.5), ('{ value = 90.0, unit = "deg" }', math.pi / 2)],
+)
+def test_column_may_be_plain_or_constant(tmp_path, column, expected):
+    manifest = MANIFEST.replace('{ column = "angle", unit = "deg" }', column)
+    log = open_log(folder(tmp_path, manifest, joint="t,angle\n0,90\n"))
+    if expected > math.pi:
+        assert list(log.readings()) == []  # 90 rad is no angle of a joint: counted
+        assert log.refused == {Refusal.OUT_OF_RANGE: 1}
+    else:
+        assert [r.angle_rad for r in log.readings()] == pytest.approx([expected])
+
+
+def test_bad_rows_are_left_out_and_counted_by_reason(tmp_path):
+    text = "t,angle\n0,1\n1,x\n2\n,3\n3,nan\n4,inf\n5,400\n6,2\n5,2\ninf,1\n7,2\n"
+    log = open_log(folder(tmp_path, joint=text))
+    expected = {"wrong_type": 4, "not_finite": 2, "out_of_range": 1, "stamp_goes_back": 1}
+    for _ in range(2):  # counted anew each time
+        assert [r.stamp_ns - T0 for r in log.readings()] == [0, 6_000_000, 7_000_000]
+        assert log.refused == expected
+
+
+def test_equal_stamps_are_kept(tmp_path):
+    log = open_log(folder(tmp_path, joint="t,angle\n5,1\n5,2\n"))
+    assert len(list(log.readings())) == 2
+
+
+def test_nanoseconds_are_exact(tmp_path):
+    manifest = MANIFEST.replace(f"start_ns = {T0}", "").replace('unit = "ms"', 'unit = "ns"')
+    log = open_log(folder(tmp_path, manifest, joint=f"t,angle\n{T0 + 1},1\n"))
+    assert next(iter(log.readings())).stamp_ns == T0 + 1
+
+
+def test_seconds_are_the_default(tmp_path):
+    manifest = MANIFEST.replace('{ column = "t", unit = "ms" }', '"t"')
+    log = open_log(folder(tmp_path, manifest, joint="t,angle\n0.029,1\n"))
+    assert next(iter(log.readings())).stamp_ns == T0 + 29_000_000
+
+
+def test_gzip_and_the_mark_of_spreadsheets(tmp_path):
+    manifest = MANIFEST.replace("joint.csv", "joint.csv.gz")
+    folder(tmp_path, manifest, joint=None)
+    (tmp_path / "joint.csv.gz").write_bytes(gzip.compress("\ufefft,angle\r\n0,1\r\n".encode()))
+    assert len(list(open_log(tmp_path).readings())) == 1
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "plain"])
+def test_damaged_gzip_is_named(tmp_path, damage):
+    manifest = MANIFEST.replace("joint.csv", "joint.csv.gz")
+    folder(tmp_path, manifest, joint=None)
+    data = bytearray(gzip.compress(("t,angle\n" + "".join(f"{i},{i % 3}\n" for i in range(5000))).encode()))
+    if damage == "flip":
+        data[40:60] = bytes(20)
+    (tmp_path / "joint.csv.gz").write_bytes({"cut": data[:-20], "flip": data, "plain": b"t,angle\n"}[damage])
+    with pytest.raises(LogFolderError, match=r"joint\.csv\.gz"):
+        list(open_log(tmp_path).readings())
+
+
+def test_manifest_may_lie_apart_from_the_data(tmp_path):
+    (tmp_path / "data").mkdir()
+    folder(tmp_path, joint=None)
+    (tmp_path / "data" / "joint.csv").write_text("t,angle\n0,1\n")
+    log = open_log(tmp_path / "log.toml", tmp_path / "data")
+    assert len(list(log.readings())) == 1
+
+
+def test_missing_file_and_column_are_named(tmp_path):
+    with pytest.raises(LogFolderError, match=r"joint\.csv"):
+        list(open_log(folder(tmp_path, joint=None)).readings())
+    with pytest.raises(LogFolderError, match="has no column `angle`; it has t, alpha"):
+        list(open_log(folder(tmp_path, joint="t,alpha\n0,1\n")).readings())
+    with pytest.raises(LogFolderError, match="has no column"):
+        list(open_log(folder(tmp_path, joint="")).readings())
+
+
+def test_bytes_that_are_no_text_are_a_log_error(tmp_path):
+    folder(tmp_path)
+    (tmp_path / "joint.csv").write_bytes(b"t,angle\n0,\xff\xfe\n")
+    with pytest.raises(LogFolderError, match=r"joint\.csv"):
+        list(open_log(tmp_path).readings())
+
+
+def test_unused_sensor_is_not_even_opened(tmp_path):
+    log = open_log(folder(tmp_path, MANIFEST.replace("file =", "use = false\nfile ="), joint=None))
+    assert list(log.readings()) == []
+    assert log.machine.sensor("joint").use is False
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "test"', "", "`name` is missing"),
+        ("[log]", "[extra]\n[log]", "unknown key `extra`"),
+        ('name = "paper"', 'name = "paper"\ncells = 1', "unknown key `cells`"),
+        ('name = "loader-1"', 'name = "loader-1"\nmas_kg = 1', "unknown key `mas_kg`"),
+        ('kind = "articulation"', 'kind = "sonar"', "'sonar' is none of"),
+        ('file = "joint.csv"', "", "`file` is missing"),
+        ('angle_rad = { column = "angle", unit = "deg" }', "", "`angle_rad` is not described"),
+        ("angle_rad =", 'angle_rads = "a"\nangle_rad =', "unknown column `angle_rads`"),
+        ('unit = "deg"', 'unit = "furlong"', "unit `furlong` is not known"),
+        ('unit = "deg"', 'unit = "km/h"', "does not fit `angle_rad`"),
+        ('unit = "ms"', 'unit = "deg"', "no unit of time"),
+        ('{ column = "t", unit = "ms" }', "{ value = 0.0 }", "a column is expected"),
+        ('{ column = "angle", unit = "deg" }', '""', "columns.angle_rad: write"),
+        ('{ column = "angle", unit = "deg" }', "{}", "columns.angle_rad: write"),
+        ('{ column = "angle", unit = "deg" }', '{ column = "a", value = 1.0 }', "columns.angle_rad: write"),
+        ('{ column = "angle", unit = "deg" }', "{ value = nan }", "finite"),
+        ("[[sensor]]", "[sensor]", "no .*sensor.* is described"),
+    ],
+)
+def test_wrong_manifest_is_refused_by_name(tmp_path, old, new, words):
+    assert old in MANIFEST
+    with pytest.raises(ConfigError, match=words) as caught:
+        open_log(folder(tmp_path, MANIFEST.replace(old, new, 1)))
+    assert "log.toml" in str(caught.value)
+
+
+def test_two_sensors_of_one_name_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="two are named 'joint'"):
+        open_log(folder(tmp_path, MANIFEST + MANIFEST[MANIFEST.index("[[sensor]]") :]))
+
+
+# --- what is written reads back --------------------------------------------------------------------------------------
+
+SITE = SiteConfig("paper", 49.1, 8.4, 110.5)
+MOUNT = Mount((0.1, -0.2, 3.0), (0.0, 90.0, -90.0))
+SENSORS = tuple(SensorConfig(f"{kind}-1", kind, MOUNT, drift_time_s=60.0) for kind in KINDS)
+MACHINE = MachineConfig("loader-1", mass_kg=17_000.5, sensors=SENSORS)
+
+
+@st.composite
+def recordings(draw):
+    readings = []
+    for kind, cls in KINDS.items():
+        limits = [st.floats(low, high) for low, high in cls.limits.values()]
+        stamps = st.integers(1, 4_102_444_800_000_000_000)
+        readings += draw(st.lists(st.builds(cls, st.just(f"{kind}-1"), stamps, *limits), max_size=3))
+    return sorted(readings, key=lambda r: r.stamp_ns)
+
+
+@given(recordings())
+def test_written_log_reads_back_exactly(tmp_path_factory, readings):
+    where = tmp_path_factory.mktemp("log")
+    write_log(where, 'a "quoted" \\ näme', SITE, MACHINE, readings)
+    log = open_log(where)
+    assert (log.name, log.site, log.machine, log.start_ns) == ('a "quoted" \\ näme', SITE, MACHINE, 0)
+    got = list(log.readings())
+    assert [r.stamp_ns for r in got] == [r.stamp_ns for r in readings]
+    assert sorted(map(repr, got)) == sorted(map(repr, readings))
+    assert not log.refused
+
+
+def test_numbers_of_numpy_read_back(tmp_path):
+    machine = MachineConfig("m-1", sensors=(SensorConfig("drive", "torque", Mount(tuple(np.zeros(3)))),))
+    write_log(tmp_path, "numpy", SITE, machine, [Torque("drive", np.int64(T0), np.float64(0.1))])
+    log = open_log(tmp_path)
+    assert list(log.readings()) == [Torque("drive", T0, 0.1)]
+    assert log.machine.sensors[0].mount == Mount()
+
+
+def test_reading_of_an_unknown_sensor_is_not_written(tmp_path):
+    with pytest.raises(LogFolderError, match="no sensor `axle`"):
+        write_log(tmp_path, "x", SITE, MACHINE, [Encoder("axle", T0, 0.0, 0.0)])
+
+
+def test_sensors_are_merged_in_the_order_of_time(tmp_path):
+    gps = [Gps("gps-1", T0 + i * 200, 49.0, 8.0, 1.0, 1.0, 1.0, 1.0) for i in range(5)]
+    imu = [Imu("imu-1", T0 + i * 30, *[0.0] * 6) for i in range(30)]
+    write_log(tmp_path, "two", SITE, MACHINE, [*gps, *imu])
+    stamps = [r.stamp_ns for r in open_log(tmp_path).readings()]
+    assert stamps == sorted(stamps)
+    assert len(stamps) == 35
