@@ -174,15 +174,18 @@ class Localiser:
             self._at = to
 
     def _watch_standstill(self, ukf: VectorisedUkf, now: Dead) -> None:
-        """At rest the gyro shows its bias: condition on it once per standstill_s."""
+        """At rest the gyro shows its bias: condition on it once per standstill_s, unless the frame turns (steering)."""
         if self._still and now.travel_m != self._still[0].travel_m:
             self._still.clear()
         self._still.append(now)
         step = step_between(self._still[0], now)
         if step.dt_s >= self._config.standstill_s:
             rate, R = np.array([step.turn_rad / step.dt_s]), np.array([[1e-6]])
-            ukf.condition(*ukf.innovation(rate, lambda s: s[:, model.GYRO_BIAS, None], R))
-            self.counters["standstill_updates"] += 1
+            y, S, cross = ukf.innovation(rate, lambda s: s[:, model.GYRO_BIAS, None], R)
+            is_bias = y[0] ** 2 <= self._config.gate_sigma**2 * S[0, 0]
+            self.counters["standstill_updates" if is_bias else "standstill_gated"] += 1
+            if is_bias:
+                ukf.condition(y, S, cross)
             self._still.clear()
 
     def _belief(self, ukf: VectorisedUkf) -> PoseBelief:

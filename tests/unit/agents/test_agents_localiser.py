@@ -148,7 +148,7 @@ def test_late_receiver_brings_its_own_unknown_error() -> None:
     ]
     errors = position_errors(run(localiser(of), of, readings), made)
     first = next(i for i, b in enumerate(run(localiser(of), of, readings)) if b.stamp_ns > START_NS + 20_200_000_000)
-    assert errors[first] - errors[first - 3] < 1.0
+    assert errors[first] - errors[first - 3] < 1.5
     assert max(errors) < 2.0
 
 
@@ -179,6 +179,7 @@ def test_turning_on_the_spot_is_no_gyro_bias() -> None:
     found = localiser(of)
     run(found, of, drive([*S_BEND, Leg(4, -0.5), Leg(3, 0.0, 0.1), Leg(1)], of, without=("torque",)).readings)
     assert found._filter is not None
+    assert found.counters["standstill_gated"] >= 2
     assert abs(found._filter.x[GYRO_BIAS]) < 1e-3
 
 

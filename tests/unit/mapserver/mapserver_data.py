@@ -1,0 +1,158 @@
+"""Samples, batches and stores for the tests of the map server."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from mapserver.config import ServerConfig
+from mapserver.evidence import COUNTS
+from mapserver.fold import FoldConfig
+from mapserver.grid import Grid
+from mapserver.store import Incoming, Store
+from mapserver.writer import Writer
+from protocol.arrays import Table
+from protocol.codec import encode_batch
+from protocol.messages import Ack, Refused, SampleBatch
+from protocol.samples import empty
+from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.site import SiteConfig
+
+SITE = SiteConfig("pit", 48.0, 11.0)
+CONFIG = ServerConfig()
+NOW_NS = 1_767_225_600_000_000_000
+WAIT_S = 20.0
+
+
+def now_ns() -> int:
+    return NOW_NS
+
+
+def samples(n: int = 1, **columns: Any) -> Table:
+    """Plain samples: one metre each on dry dirt, at the centre of cell (8, 8), unless told otherwise."""
+    rows = empty(n)
+    usual = {"x_m": 8.5, "y_m": 8.5, "distance_m": 1.0, "c_rr": 0.04, "grade_e": 0.1, "grade_n": -0.05}
+    usual |= {"stamp_ns": NOW_NS + np.arange(n) * 10**9, "cov_xx_m2": 0.01, "cov_yy_m2": 0.01}
+    for name, values in (usual | columns).items():
+        rows[name] = values
+    return rows
+
+
+def random_samples(n: int, seed: int, half_m: float = 60.0, std_m: float = 1.5) -> Table:
+    """Samples all over a site around the origin, with full covariances; some without c_rr, some without grade."""
+    draw = np.random.default_rng(seed)
+    deviations, correlation = draw.uniform(0.0, std_m, (2, n)), draw.uniform(-0.95, 0.95, n)
+    rows = samples(
+        n,
+        stamp_ns=NOW_NS + draw.integers(0, 1800, n) * 10**9,
+        x_m=draw.uniform(-half_m, half_m, n),
+        y_m=draw.uniform(-half_m, half_m, n),
+        cov_xx_m2=deviations[0] ** 2,
+        cov_yy_m2=deviations[1] ** 2,
+        cov_xy_m2=correlation * deviations[0] * deviations[1],
+        heading_rad=draw.uniform(-np.pi, np.pi, n),
+        distance_m=draw.uniform(0.0, 2.0, n),
+        c_rr=draw.uniform(0.0, 0.5, n),
+        grade_e=draw.uniform(-0.6, 0.6, n),
+        grade_n=draw.uniform(-0.6, 0.6, n),
+    )
+    for names, hit in ((("c_rr", "c_rr_var"), 7), (("grade_e", "grade_n", "grade_var"), 5)):
+        for name in names:
+            rows[name][::hit] = np.nan
+    return rows
+
+
+def batch(rows: Table, first_seq: int = 1, machine: str = "a", spool_id: int = 7, **more: Any) -> SampleBatch:
+    return SampleBatch(machine, spool_id, first_seq, rows, more.pop("frame", SITE.frame), **more)
+
+
+def incoming(rows: Table, first_seq: int = 1, machine: str = "a", spool_id: int = 7, **more: Any) -> Incoming:
+    return Incoming(machine, encode_batch(batch(rows, first_seq, machine, spool_id, **more)))
+
+
+def folded(rows: Table, machine: str = "a", cell_m: float = 1.0, **options: Any) -> Grid:
+    grid = Grid(cell_m, FoldConfig(**options))
+    grid.fold(rows, machine)
+    return grid
+
+
+def total(grid: Grid) -> np.ndarray:
+    """Counts of all cells together, (COUNTS,)."""
+    return grid.state().counts.reshape(-1, COUNTS).sum(axis=0, dtype=np.int64)
+
+
+def same(one: Grid, other: Grid) -> bool:
+    """Equal to the bit."""
+    a, b = one.state(), other.state()
+    arrays = all(np.array_equal(getattr(a, f), getattr(b, f)) for f in ("codes", "counts", "bitmaps", "newest"))
+    return arrays and (a.folded, a.skipped) == (b.folded, b.skipped)
+
+
+def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Store:
+    return Store(folder, site, config, now_ns)
+
+
+class Replies:
+    """Collects the answers to batches, in the order in which they come."""
+
+    def __init__(self) -> None:
+        self.all: list[tuple[int, Ack | Refused]] = []
+        self._more = Event()
+
+    def __getitem__(self, key: int) -> Callable[[Ack | Refused], None]:
+        def reply(answer: Ack | Refused) -> None:
+            self.all.append((key, answer))
+            self._more.set()
+
+        return reply
+
+    def wait(self, n: int) -> list[Ack | Refused]:
+        while len(self.all) < n:
+            assert self._more.wait(WAIT_S), f"{len(self.all)} of {n} answers after {WAIT_S} s"
+            self._more.clear()
+        return [answer for _, answer in self.all]
+
+
+@contextmanager
+def held(writer: Writer) -> Iterator[None]:
+    """Keep the owner's thread busy, so that what is submitted meanwhile waits."""
+    entered, release = Event(), Event()
+
+    def hold(_: Store) -> None:
+        entered.set()
+        release.wait(WAIT_S)
+
+    from threading import Thread
+
+    reader = Thread(target=writer.read, args=(hold,))
+    reader.start()
+    assert entered.wait(WAIT_S)
+    try:
+        yield
+    finally:
+        release.set()
+        reader.join()
+
+
+def send(writer: Writer, batches: Sequence[Incoming]) -> list[Ack | Refused]:
+    replies = Replies()
+    for i, one in enumerate(batches):
+        writer.submit(one, replies[i])
+    return replies.wait(len(batches))
+
+
+@contextmanager
+def routed() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    """Two sessions on one router in this process: the router's own, and a client's."""
+    endpoint = free_endpoint()
+    router = open_session(SessionConfig(endpoint, mode="router"))
+    client = open_session(SessionConfig(endpoint))
+    try:
+        yield router, client
+    finally:
+        client.close()
+        router.close()

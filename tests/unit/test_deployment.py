@@ -1,0 +1,105 @@
+"""compose.yaml and Dockerfile, checked without Docker: schema, lint, and every command by the real parser."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from protocol.site import load_site
+
+ROOT = Path(__file__).parents[2]
+COMPOSE, DOCKERFILE = ROOT / "compose.yaml", ROOT / "Dockerfile"
+MACHINES = ["loader-1", "loader-2", "loader-3"]
+
+
+def tool(name: str) -> str:
+    """The tool beside this Python, or on the path."""
+    found = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
+    if not found:
+        pytest.skip(f"{name} is not installed")
+    return found
+
+
+def services() -> dict:
+    yaml = pytest.importorskip("ruamel.yaml", reason="comes with check-jsonschema")
+    return yaml.YAML(typ="safe").load(COMPOSE.read_text())["services"]
+
+
+def commands() -> list[list[str]]:
+    """The words after `sitegrid` of every command and health check."""
+    found = [list(service["command"]) for service in services().values()]
+    checks = [service["healthcheck"]["test"] for service in services().values() if "healthcheck" in service]
+    return found + [list(test[2:]) for test in checks if test[1] == "sitegrid"]
+
+
+def test_compose_file_follows_the_specification():
+    command = [tool("check-jsonschema"), "--builtin-schema", "vendor.compose-spec", str(COMPOSE)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_dockerfile_is_clean():
+    done = subprocess.run([tool("hadolint"), str(DOCKERFILE)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_command_is_one_that_the_parser_takes():
+    import sitegrid.cli
+
+    parser = sitegrid.cli.build_parser()
+    words = commands()
+    assert len(words) == len(services()) + 1
+    for line in words:
+        parser.parse_args(line)  # a usage error exits, and fails the test
+
+
+def test_everybody_meets_at_the_router():
+    listen = commands()[0]
+    assert listen[listen.index("--listen") + 1] == "tcp/0.0.0.0:7447"
+    for line in commands()[1:]:
+        assert line[line.index("--endpoint") + 1] == "tcp/router:7447"
+
+
+def test_files_that_commands_name_exist():
+    for line in commands():
+        for word in line:
+            assert not word.startswith("config/") or (ROOT / word).is_file(), f"{word} is missing"
+
+
+def test_each_agent_has_a_name_and_a_spool_of_its_own():
+    agents = {name: service["command"] for name, service in services().items() if service["command"][0] == "agent"}
+    assert list(agents) == MACHINES
+    for name, line in agents.items():
+        assert line[line.index("--name") + 1] == name
+        assert line[line.index("--spool") + 1] == f"/data/{name}.db"
+
+
+def test_agents_and_simulator_mean_the_same_machines_and_site():
+    from sim.config import load_sim
+    from sim.simulator import Simulator
+
+    config = load_sim(ROOT / "config" / "sim.toml")
+    assert list(config.machine_names) == MACHINES
+    simulator, site = Simulator(config), load_site(ROOT / "config" / "site.toml")
+    assert (site.name, site.frame) == (config.site, simulator.site.frame)
+
+
+def test_services_restart_and_need_no_privileges():
+    for name, service in services().items():
+        assert service["restart"] == "unless-stopped", name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["read_only"] is True, name
+    assert re.search(r"^USER (?!root)", DOCKERFILE.read_text(), re.MULTILINE)
+
+
+def test_image_holds_every_package():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packages = {name.removesuffix("*") for name in project["tool"]["setuptools"]["packages"]["find"]["include"]}
+    copied = set(re.findall(r"^COPY (\w+) \1$", DOCKERFILE.read_text(), re.MULTILINE))
+    assert packages <= copied
+    kept = set(re.findall(r"^!(.+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE))
+    assert packages | {"pyproject.toml", "constraints.txt", project["project"]["readme"], "config"} <= kept
