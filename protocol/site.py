@@ -93,5 +93,8 @@ class Projection:
 
 
 def load_site(path: Path) -> SiteConfig:
-    """Read a `site.toml`."""
-    return from_table(SiteConfig, load_toml(path), str(path))
+    """Read a `site.toml`, or the [site] of a log's manifest."""
+    table = load_toml(path)
+    if isinstance(table.get("site"), dict):
+        return from_table(SiteConfig, table["site"], f"{path} [site]")
+    return from_table(SiteConfig, table, str(path))

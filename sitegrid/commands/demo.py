@@ -18,10 +18,9 @@ from mapserver.config import ServerConfig
 from mapserver.plotter import draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.logfolder import LogFolder, open_log
-from protocol.machine import plain_lines
 from protocol.queries import Region
 from protocol.session import free_endpoint
-from protocol.site import SiteConfig, load_site
+from protocol.site import load_site
 from sim.config import SimConfig
 from sitegrid.client import Client, connect
 from sitegrid.commands.plot import draw
@@ -211,9 +210,7 @@ class _LogRun:
         assert plan.manifest is not None
         self._site = log.site
         self._machine = log.machine.name
-        site_file = plan.work / "log-site.toml"
-        site_file.write_text(_site_toml(log.site), encoding="utf-8")
-        self._server = _start_server(plan, children, "log-server", site_file)
+        self._server = _start_server(plan, children, "log-server", plan.manifest)
         self._client = connect(plan.endpoint, log.site.name)
         self._tracks = TrackRecorder(self._client.session, log.site.name)
         files = ("--spool", plan.work / "log.db", "--audit", plan.work / "log.audit")
@@ -234,10 +231,6 @@ class _LogRun:
         audit = audit_store(audits, plan.work / "store-log-server", self._site, ServerConfig())
         withheld = {f"withheld_{key}": value for key, value in report["holdout"].items()}
         return {"name": self._machine, **dataclasses.asdict(audit), **withheld, "picture": str(picture)}
-
-
-def _site_toml(site: SiteConfig) -> str:
-    return "\n".join(plain_lines(site)) + "\n"
 
 
 # --- what came out ---------------------------------------------------------------------------------------------------

@@ -1,0 +1,173 @@
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapserver_data import CONFIG, folded, incoming, open_store, random_samples, same, samples
+
+from mapserver import evidence as ev
+from mapserver import snapshot
+from mapserver.fold import FoldConfig
+from mapserver.grid import Grid
+from protocol.messages import Ack
+
+FOLD = FoldConfig()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def save(folder: Path, row: int, grid: Grid | None = None) -> Path:
+    return snapshot.save(folder, row, (grid or folded(samples(3))).state(), 1.0, FOLD)
+
+
+@pytest.mark.parametrize("after", [0, 3, 10])
+def test_snapshot_and_tail_are_the_fold_of_everything(tmp_path, after):
+    running, copy = open_store(tmp_path / "store"), tmp_path / "copy"
+    parts = np.split(random_samples(200, 5), 10)
+    for i, part in enumerate(parts):
+        if i == after:
+            running.save_snapshot()
+        assert isinstance(running.take([incoming(part, 1 + 20 * i)])[0], Ack)
+    if after == 10:
+        running.save_snapshot()
+    shutil.copytree(tmp_path / "store", copy)  # as after a power cut: the log is not folded into the journal
+    restarted = open_store(copy)
+    assert restarted.snapshot_row == after
+    assert same(restarted.grid, running.grid)
+    assert same(restarted.grid, folded(np.concatenate(parts)))
+    assert (restarted.merged, restarted.journalled, restarted.newest_ns) == (10, 10, running.newest_ns)
+    restarted.close(), running.close()
+
+
+def test_an_empty_folder_gives_an_empty_grid(tmp_path):
+    row, grid = snapshot.load_newest(tmp_path, 100, 1.0, FOLD)
+    assert (row, grid.known_cells()) == (0, 0)
+
+
+def test_a_snapshot_reads_back_to_the_bit(tmp_path):
+    grid = folded(random_samples(100, 6, std_m=4.0))
+    assert grid.skipped
+    row, again = snapshot.load(save(tmp_path, 17, grid), 1.0, FOLD) or (0, None)
+    assert row == 17
+    assert same(again, grid)
+
+
+def test_damage_anywhere_is_passed_over_or_harmless(tmp_path):
+    grid = folded(samples(3))
+    data = save(tmp_path, 1, grid).read_bytes()
+    path, seed = tmp_path / "snapshot-2.npz", 7
+    draw = np.random.default_rng(seed)
+    ends = [*range(0, 300, 3), *range(len(data) - 500, len(data), 4), *draw.integers(0, len(data), 60)]
+    passed_over = 0
+    for place in ends:
+        damaged = bytearray(data)
+        damaged[place] ^= int(draw.choice([1, 8, 128, 255]))
+        path.write_bytes(damaged)
+        found = snapshot.load(path, 1.0, FOLD)
+        passed_over += found is None
+        assert found is None or (found[0] == 1 and same(found[1], grid)), f"byte {place}, seed {seed}"
+    assert passed_over > 100
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
+def test_a_truncated_snapshot_is_passed_over_for_the_one_before(tmp_path, share):
+    save(tmp_path, 1)
+    path = save(tmp_path, 2)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    row, grid = snapshot.load_newest(tmp_path, 5, 1.0, FOLD)
+    assert row == 1
+    assert same(grid, folded(samples(3)))
+
+
+def test_a_snapshot_of_another_schema_is_passed_over(tmp_path, monkeypatch):
+    path = save(tmp_path, 1)
+    monkeypatch.setattr(ev, "SCHEMA", ev.SCHEMA + 1)
+    assert snapshot.load(path, 1.0, FOLD) is None
+
+
+@pytest.mark.parametrize("change", [{"bucket_s": 60.0}, {"std_floor_m": 0.4}, {"std_cap_m": 2.0}])
+def test_a_snapshot_of_other_parameters_is_passed_over(tmp_path, change):
+    path = save(tmp_path, 1)
+    assert snapshot.load(path, 1.0, replace(FOLD, **change)) is None
+    assert snapshot.load(path, 0.5, FOLD) is None
+
+
+def test_the_kernel_does_not_matter_to_a_snapshot(tmp_path):
+    assert snapshot.load(save(tmp_path, 1), 1.0, replace(FOLD, kernel="numpy")) is not None
+
+
+def test_a_snapshot_beyond_the_journal_is_passed_over(tmp_path):
+    save(tmp_path, 3), save(tmp_path, 8)
+    assert snapshot.load_newest(tmp_path, 7, 1.0, FOLD)[0] == 3
+    assert snapshot.load_newest(tmp_path, 2, 1.0, FOLD)[0] == 0
+
+
+def test_only_the_newest_two_are_kept_and_nothing_else_is_left(tmp_path):
+    for row in (1, 5, 9, 10, 100):
+        save(tmp_path, row)
+    assert snapshot.rows_on_disk(tmp_path) == [100, 10]
+    assert names(tmp_path) == ["snapshot-10.npz", "snapshot-100.npz"]
+
+
+def test_a_full_disk_leaves_the_old_snapshot_and_nothing_beside_it(tmp_path, monkeypatch):
+    save(tmp_path, 1)
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="space"):
+        save(tmp_path, 2)
+    assert names(tmp_path) == ["snapshot-1.npz"]
+
+
+def test_what_a_kill_left_half_written_is_replaced(tmp_path):
+    (tmp_path / "snapshot.tmp").write_bytes(b"half")
+    save(tmp_path, 2)
+    assert names(tmp_path) == ["snapshot-2.npz"]
+
+
+def test_other_files_are_no_snapshots(tmp_path):
+    for name in ("snapshot-x.npz", "snapshot-1.npz.old", "my-snapshot-3.npz"):
+        (tmp_path / name).touch()
+    assert snapshot.rows_on_disk(tmp_path) == []
+
+
+def test_snapshots_that_a_restored_journal_does_not_reach_never_come_back(tmp_path):
+    """A backup of the journal is put back; later it grows past the snapshots of the history that is gone."""
+    store, backup = open_store(tmp_path / "store"), tmp_path / "backup.db"
+    parts = np.split(random_samples(120, 8), 6)
+    store.take([incoming(parts[0], 1)])
+    store.close()
+    shutil.copy(tmp_path / "store" / "journal.db", backup)
+    store = open_store(tmp_path / "store")
+    for i in (1, 2):
+        store.take([incoming(parts[i], 1 + 20 * i)])
+    store.save_snapshot()  # of row 3
+    store.close()
+    shutil.copy(backup, tmp_path / "store" / "journal.db")
+    store = open_store(tmp_path / "store")
+    for i in (3, 4, 5):
+        store.take([incoming(parts[i], 21 + 20 * (i - 3))])
+    assert store.journalled == 4
+    store.close()  # without a snapshot, as a kill would
+    store = open_store(tmp_path / "store")
+    assert same(store.grid, folded(np.concatenate([parts[i] for i in (0, 3, 4, 5)])))
+    store.close()
+
+
+def test_parameters_of_a_store_reach_its_snapshot(tmp_path):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(5))])
+    store.save_snapshot()
+    store.close()
+    changed = replace(CONFIG, fold=replace(CONFIG.fold, std_cap_m=0.35))
+    store = open_store(tmp_path, changed)
+    assert store.snapshot_row == 0  # folded again
+    assert store.grid.config.std_cap_m == 0.35
+    assert store.merged == 1
+    store.close()

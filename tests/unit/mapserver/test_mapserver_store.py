@@ -1,0 +1,167 @@
+import sqlite3
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mapserver_data import NOW_NS, SITE, Incoming, folded, incoming, open_store, random_samples, same, samples
+
+from protocol.errors import Refusal, StoreError
+from protocol.messages import Ack, Refused
+
+
+def test_a_group_is_answered_in_order(tmp_path):
+    store = open_store(tmp_path)
+    group = [
+        incoming(samples(3), 1),
+        incoming(samples(2), 9),
+        incoming(samples(4), 1, machine="b"),
+        Incoming("a", b"rubbish"),
+        incoming(samples(5), 2),
+        incoming(samples(0), 1),
+    ]
+    answers = store.take(group)
+    assert answers[0] == Ack(3, 1)
+    assert answers[1] == Refused(Refusal.GAP, answers[1].problem, expected=4)
+    assert answers[2] == Ack(4, 2)
+    assert answers[3].reason == Refusal.NOT_MSGPACK
+    assert answers[4] == Ack(6, 3, trimmed=2)
+    assert answers[5] == Ack(6, 3)
+    assert (store.merged, store.journalled, store.grid.folded) == (3, 3, 10)
+    store.close()
+
+
+def test_a_refused_batch_leaves_no_trace(tmp_path):
+    store = open_store(tmp_path)
+    bad = samples(3, speed_mps=[1.0, 1e6, 1.0])
+    answer = store.take([incoming(bad)])[0]
+    assert answer == Refused(Refusal.OUT_OF_RANGE, "speed_mps[1]: 1000000.0: not between -100 and 100", 0)
+    assert store.journalled == store.grid.folded == 0
+    assert store.take([incoming(samples(3))])[0] == Ack(3, 1)
+    store.close()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sent_at_least_once_is_merged_exactly_once(tmp_path, seed):
+    rows, draw = random_samples(120, seed), np.random.default_rng(seed)
+    store = open_store(tmp_path)
+    watermark = 0
+    while watermark < len(rows):
+        first = max(1, watermark + 1 - int(draw.integers(0, 15)))
+        group = [incoming(rows[first - 1 : first - 1 + n], first) for n in draw.integers(1, 30, 3).tolist()]
+        answers = store.take(group)
+        watermark = max([watermark, *(a.watermark for a in answers if isinstance(a, Ack))])
+    assert same(store.grid, folded(rows))
+    assert store.counters["samples_trimmed"] > 0
+    store.close()
+
+
+def test_a_failed_commit_refuses_all_and_folds_nothing(tmp_path, monkeypatch):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(2))])
+
+    def full():
+        raise sqlite3.OperationalError("database or disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store._journal, "commit", full)
+        answers = store.take([incoming(samples(3), 3), incoming(samples(4), machine="b"), Incoming("a", b"?")])
+    assert [(a.reason, a.problem) for a in answers] == [
+        (Refusal.STORE, "the server cannot write: database or disk is full")
+    ] * 3
+    assert (store.grid.folded, store.merged, store.journalled) == (2, 1, 1)
+    assert store.counters == {"batches": 1, "samples_trimmed": 0, "samples_lost": 0, "refused_store": 3}
+    again = store.take([incoming(samples(3), 3), incoming(samples(4), machine="b")])
+    assert [(a.watermark, a.trimmed) for a in again] == [(5, 0), (4, 0)]
+    assert store.grid.folded == 9
+    assert store.info()["machines"]["b"] == {"spools": 1, "samples": 4, "lost": 0}
+    store.close()
+
+
+@pytest.mark.parametrize("method", ["begin", "append"])
+def test_a_journal_that_cannot_be_written_refuses(tmp_path, monkeypatch, method):
+    store = open_store(tmp_path)
+
+    def locked(*_):
+        raise sqlite3.OperationalError("database is locked")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store._journal, method, locked)
+        assert store.take([incoming(samples(3))])[0].reason == Refusal.STORE
+    assert store.take([incoming(samples(3))])[0] == Ack(3, 1)
+    store.close()
+
+
+def test_losses_and_repeats_are_counted(tmp_path):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(3)), incoming(samples(2), 2), incoming(samples(1), 10, lost_before=6)])
+    assert store.counters == {"batches": 2, "samples_trimmed": 2, "samples_lost": 6}
+    assert store.info()["machines"] == {"a": {"spools": 1, "samples": 4, "lost": 6}}
+    store.close()
+
+
+def test_info_tells_the_state_in_plain_values(tmp_path):
+    store = open_store(tmp_path)
+    store.take([
+        incoming(samples(3)),
+        incoming(samples(2), spool_id=8),
+        incoming(samples(2, cov_xx_m2=10.0, x_m=900.0, stamp_ns=NOW_NS + 10**12), machine="b"),
+    ])  # fmt: skip
+    info = store.info()
+    assert info["site"]["name"] == SITE.name
+    assert info["site"]["frame"] == SITE.frame
+    assert info["site"]["crs"] == SITE.crs
+    assert info["site"]["cell_m"] == 1.0
+    assert (info["journalled"], info["merged"], info["snapshot"]) == (3, 3, 0)
+    assert (info["samples_merged"], info["samples_too_unsure"], info["cells"]) == (5, 2, 1)
+    assert info["bounds"] == (0, 0, 16, 16)
+    assert info["stamp_ns"] == NOW_NS + 10**12 + 0
+    assert info["machines"]["a"] == {"spools": 2, "samples": 5, "lost": 0}
+    store.close()
+
+
+def test_now_is_the_newest_accepted_stamp_also_after_a_restart(tmp_path):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(2, stamp_ns=[500, 300])), incoming(samples(1, stamp_ns=400), machine="b")])
+    assert store.newest_ns == 500
+    store.close()
+    store = open_store(tmp_path)
+    assert store.newest_ns == 500
+    store.close()
+
+
+def test_a_restart_goes_on_where_it_ended(tmp_path):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(3)), incoming(samples(1), machine="b")])
+    store.close()
+    store = open_store(tmp_path)
+    assert store.take([incoming(samples(5))])[0] == Ack(5, 3, trimmed=3)
+    assert store.grid.folded == 6
+    store.close()
+
+
+def test_a_second_server_on_a_store_is_refused_until_the_first_ends(tmp_path):
+    store = open_store(tmp_path)
+    with pytest.raises(StoreError, match="another server is using this store"):
+        open_store(tmp_path)
+    store.close()
+    open_store(tmp_path).close()
+
+
+def test_a_store_that_cannot_be_opened_is_let_go(tmp_path):
+    open_store(tmp_path).close()
+    for _ in range(2):
+        with pytest.raises(StoreError, match="site 'pit'"):
+            open_store(tmp_path, site=replace(SITE, name="quarry"))
+    open_store(tmp_path).close()
+
+
+def test_a_damaged_journal_is_named_at_the_start(tmp_path):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(3))])
+    store.close()
+    db = sqlite3.connect(tmp_path / "journal.db")
+    db.execute("UPDATE journal SET crc32 = crc32 + 1")
+    db.commit()
+    db.close()
+    with pytest.raises(StoreError, match="row 1 is damaged; restore"):
+        open_store(tmp_path)

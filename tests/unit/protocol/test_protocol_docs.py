@@ -1,0 +1,51 @@
+"""The pages say what the code does: names, limits, and an example that works."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from protocol import codec
+from protocol.errors import Refusal
+from protocol.geometry import MAX_CELLS
+from protocol.logfolder import open_log
+from protocol.messages import Pose
+from protocol.readings import KINDS, MAX_STAMP_NS, columns
+from protocol.samples import COLUMNS
+from protocol.units import _NS, _UNITS
+
+DOCS = Path(__file__).parents[3] / "docs"
+WIRE, LOGS = ((DOCS / name).read_text() for name in ("protocol.md", "log-folders.md"))
+
+
+@pytest.mark.parametrize("name", [*COLUMNS, *KINDS, *Pose.__dataclass_fields__, *Refusal])
+def test_every_name_of_the_wire_is_documented(name):
+    assert f"`{name}`" in WIRE
+
+
+def test_every_column_of_a_reading_is_documented():
+    wide = WIRE.replace("`gyro_{x,y,z}_radps`", "`gyro_x_radps` `gyro_y_radps` `gyro_z_radps`")
+    wide = wide.replace("`force_{x,y,z}_mps2`", "`force_x_mps2` `force_y_mps2` `force_z_mps2`")
+    assert [name for kind in KINDS for name in columns(kind) if f"`{name}`" not in wide] == []
+
+
+def test_limits_are_the_documented_ones():
+    assert (codec.MAX_BATCH_BYTES, codec.MAX_BUNDLE_BYTES, codec.MAX_SMALL_BYTES) == (4 * 2**20, 2**20, 64 * 2**10)
+    assert "at most 4 MiB" in WIRE
+    assert "At most 1 MiB" in WIRE
+    for number in (codec.MAX_BATCH_SAMPLES, MAX_STAMP_NS, f"{MAX_CELLS:,}", "2^62", "2^64 - 1"):
+        assert str(number) in WIRE
+    assert codec.MAX_SEQ == 2**62
+
+
+@pytest.mark.parametrize("unit", [*_UNITS, *_NS])
+def test_every_unit_is_documented(unit):
+    assert f"`{unit}`" in LOGS
+
+
+def test_example_of_a_manifest_is_read(tmp_path):
+    (tmp_path / "log.toml").write_text(re.search(r"```toml\n(.*?)```", LOGS, re.DOTALL)[1])
+    (tmp_path / "gps.csv").write_text("")
+    log = open_log(tmp_path)
+    assert [source.file for source in log.sources] == ["gps.csv.gz", "wheels.csv"]
+    assert [s.use for s in log.machine.sensors] == [True, False]

@@ -1,0 +1,89 @@
+"""The command line: lazy, one-line errors, every sub-command described."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from protocol.errors import ConfigError
+from sitegrid import cli
+from sitegrid.process import plain
+
+COMMANDS = ("demo", "router", "server", "sim", "agent", "query", "plot")
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--help"])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    assert all(command in text for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_has_help_and_a_module(command: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as end:
+        cli.main([command, "--help"])
+    assert end.value.code == 0
+    assert "--json" in capsys.readouterr().out
+    assert (Path(cli.__file__).parent / "commands" / f"{command}.py").exists()
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys; import sitegrid.cli as c; c.build_parser(); print(sorted(sys.modules))"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not [name for name in ("'cv2'", "'numba'", "'filterpy'", "'scipy'", "'pyproj'", "'rich'") if name in modules]
+
+
+def test_errors_are_one_line_or_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def fail(_: object) -> int:
+        raise ConfigError("site.toml", "broken")
+
+    monkeypatch.setattr("sitegrid.commands.router.run", fail)
+    assert cli.main(["router"]) == 1
+    assert capsys.readouterr().err == "sitegrid: site.toml: broken\n"
+    assert cli.main(["router", "--json"]) == 1
+    assert json.loads(capsys.readouterr().err) == {"error": "site.toml: broken"}
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def fail(_: object) -> int:
+        raise ModuleNotFoundError("No module named 'numba'", name="numba")
+
+    monkeypatch.setattr("sitegrid.commands.router.run", fail)
+    assert cli.main(["router"]) == 1
+    assert "pip install 'sitegrid[server]'" in capsys.readouterr().err
+
+
+def test_a_bug_is_not_hidden(monkeypatch: pytest.MonkeyPatch):
+    def fail(_: object) -> int:
+        raise ModuleNotFoundError("No module named 'ours'", name="ours")
+
+    monkeypatch.setattr("sitegrid.commands.router.run", fail)
+    with pytest.raises(ModuleNotFoundError):
+        cli.main(["router"])
+
+
+def test_verbose_raises_the_log_level(monkeypatch: pytest.MonkeyPatch):
+    levels = []
+    monkeypatch.setattr(logging, "basicConfig", lambda **options: levels.append(options["level"]))
+    monkeypatch.setattr("sitegrid.commands.router.run", lambda _: 0)
+    cli.main(["router"])
+    cli.main(["router", "--verbose"])
+    assert levels == [logging.WARNING, logging.INFO]
+
+
+@pytest.mark.parametrize("words", [["plot", "--every", "-1"], ["demo", "--speed", "nan"], ["agent", "--speed", "-1"]])
+def test_numbers_out_of_range_are_usage_errors(words: list[str]):
+    with pytest.raises(SystemExit) as end:
+        cli.main(words)
+    assert end.value.code == 2
+
+
+def test_json_knows_no_nan():
+    assert plain({"a": [float("nan"), 1.0], "b": {"c": float("nan")}}) == {"a": [None, 1.0], "b": {"c": None}}

@@ -1,0 +1,50 @@
+"""The true map, cut to the cells of a region."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol.errors import ConfigError
+from protocol.queries import Region
+from sim.truth import TruthMap
+from sitegrid.truth import load_truth, truth_layers
+
+
+def region(west: float, south: float, columns: int, rows: int, cell_m: float = 1.0) -> Region:
+    x, y = west + (np.arange(columns) + 0.5) * cell_m, south + (np.arange(rows) + 0.5) * cell_m
+    return Region(x, y, cell_m, {"resistance": np.zeros((rows, columns), np.float32)}, 0, 0)
+
+
+@pytest.fixture
+def truth() -> TruthMap:
+    values = np.arange(12, dtype=np.float32).reshape(3, 4)
+    return TruthMap(10.0, 20.0, values, values + 100, values + 200)
+
+
+def test_cells_fall_on_their_places(truth: TruthMap):
+    layers = truth_layers(truth, region(11, 21, 2, 2))
+    assert layers["resistance"].tolist() == [[5, 6], [9, 10]]
+    assert layers["grade_north"].tolist() == [[205, 206], [209, 210]]
+
+
+def test_beyond_the_simulated_site_nothing_is_known(truth: TruthMap):
+    found = truth_layers(truth, region(8, 19, 3, 2))["resistance"]
+    assert np.isnan(found[0]).all()
+    assert np.isnan(found[1, :2]).all()
+    assert found[1, 2] == 0
+    assert np.isnan(truth_layers(truth, region(-50, -50, 2, 2))["resistance"]).all()
+
+
+def test_cells_of_another_size_are_refused(truth: TruthMap):
+    with pytest.raises(ConfigError, match="cells of 1 m, the map of 2 m"):
+        truth_layers(truth, region(10, 20, 2, 2, cell_m=2.0))
+
+
+def test_a_file_that_is_no_truth_says_so(tmp_path: Path):
+    path = tmp_path / "truth.npz"
+    path.write_bytes(b"no")
+    with pytest.raises(ConfigError, match="is no true map"):
+        load_truth(path)

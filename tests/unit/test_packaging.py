@@ -1,0 +1,31 @@
+"""The generic names of the packages resolve to this project, and the project says what it is."""
+
+from __future__ import annotations
+
+import importlib
+import tomllib
+from pathlib import Path
+
+import pytest
+
+PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid", "evaluation", "benchmarks")
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_each_name_resolves_to_this_project(name: str, root: Path):
+    module = importlib.import_module(name)
+    assert Path(module.__file__).parent == root / name
+    assert module.__doc__
+
+
+def test_it_is_never_uploaded_and_has_its_extras(root: Path):
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    assert "Private :: Do Not Upload" in project["classifiers"]
+    assert set(project["optional-dependencies"]) == {"agent", "server", "sim", "export", "ros", "all", "dev"}
+    base = {requirement.split(">")[0] for requirement in project["dependencies"]}
+    assert base == {"eclipse-zenoh", "msgpack", "numpy"}
+
+
+def test_pins_are_exact_and_name_no_host(root: Path):
+    lines = [line for line in (root / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    assert all("==" in line and "/" not in line and "@" not in line for line in lines)
