@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.queries import Region
 from sim.truth import TruthMap
-
-
-def load_truth(path: Path) -> TruthMap:
-    """Read `truth_map.npz`."""
-    try:
-        return TruthMap.load(path)
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(path, f"is no true map of a simulation: {error}") from None
 
 
 def truth_layers(truth: TruthMap, region: Region) -> dict[str, Floats32]:

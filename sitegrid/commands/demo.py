@@ -22,6 +22,7 @@ from protocol.queries import Region
 from protocol.session import free_endpoint
 from protocol.site import load_site
 from sim.config import SimConfig
+from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.commands.plot import draw
 from sitegrid.commands.sim import write_configs
@@ -29,7 +30,7 @@ from sitegrid.process import note, plain, say, stop_flag
 from sitegrid.processes import Child, Children, wait_until
 from sitegrid.progress import Display
 from sitegrid.tracks import TrackRecorder
-from sitegrid.truth import load_truth, truth_layers
+from sitegrid.truth import truth_layers
 
 DEFAULT_MANIFEST = Path("evaluation/logs/rl_test1_husky/log.toml")
 DEFAULT_DATA = Path("../shared/data/rl_test1_husky")
@@ -120,7 +121,7 @@ def _drive(plan: Plan, children: Children, stop: threading.Event, display: Displ
     server.stop()
     audits = {name: plan.work / f"{name}.audit" for name in agents}
     audit = audit_store(audits, plan.work / "store", load_site(plan.site_file()), ServerConfig())
-    found = score(region, truth_layers(load_truth(_truth_file(plan)), region))
+    found = score(region, truth_layers(TruthMap.load(_truth_file(plan)), region))
     return _result(plan, (audit, found, rmse), reports, pictures, log_report)
 
 
@@ -180,7 +181,7 @@ def _whole(plan: Plan) -> list[float]:
     truth = _truth_file(plan)
     if not truth.exists():
         return [0.0, 0.0, 200.0, 150.0]
-    true = load_truth(truth)
+    true = TruthMap.load(truth)
     rows, columns = true.c_rr.shape
     return [true.west_m, true.south_m, true.west_m + columns * true.cell_m, true.south_m + rows * true.cell_m]
 
@@ -192,7 +193,7 @@ def _truth_file(plan: Plan) -> Path:
 def _draw(plan: Plan, client: Client, tracks: TrackRecorder) -> tuple[Region, list[str]]:
     """Write the final pictures; returns the map and their files."""
     region = client.region(tuple(_whole(plan)))  # type: ignore[arg-type]
-    truth = truth_layers(load_truth(_truth_file(plan)), region)
+    truth = truth_layers(TruthMap.load(_truth_file(plan)), region)
     lines = tracks.tracks()
     pictures = {
         "map.png": [draw_resistance(region, lines), draw_grade(region, lines)],

@@ -9,10 +9,11 @@ from mapserver.plotter import Track, draw_difference, draw_grade, draw_resistanc
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.geometry import Bounds
 from protocol.queries import Region
+from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.process import note, say, stop_flag
 from sitegrid.tracks import TrackRecorder
-from sitegrid.truth import load_truth, truth_layers
+from sitegrid.truth import truth_layers
 
 LAYERS = ("resistance", "grade_east", "grade_north")
 
@@ -53,7 +54,7 @@ def draw(
     row = [draw_resistance(region, tracks), draw_grade(region, tracks)]
     images = [side_by_side(row)]
     if truth:
-        layers = truth_layers(load_truth(truth), region)
+        layers = truth_layers(TruthMap.load(truth), region)
         images = [
             side_by_side(row),
             side_by_side([draw_difference(region, layers, k) for k in ("resistance", "grade")]),

@@ -109,8 +109,9 @@ def test_demo_prints_one_object_with_its_proof(tmp_path: Path, husky_data: Path)
 
 
 def test_ctrl_c_ends_everything_that_the_demo_started(tmp_path: Path):
-    command = [sys.executable, "-m", "sitegrid.cli", "demo", "--headless", "--no-log", "--machines", "1", "--json"]
-    demo = subprocess.Popen([*command, "--out", str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    words = ["demo", "--headless", "--no-log", "--machines", "1", "--json", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "sitegrid.cli", *words]
+    demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         picture = tmp_path / "map.png"
         wait_until(picture.exists, 60.0, "machines drive")

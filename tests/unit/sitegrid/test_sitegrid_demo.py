@@ -54,7 +54,7 @@ def test_a_log_of_ones_own_needs_no_default(tmp_path: Path):
     manifest = Path(__file__).parents[3] / demo.DEFAULT_MANIFEST
     found = plan(tmp_path, "--log", str(manifest), "--data", str(tmp_path))
     assert found.log.data == tmp_path
-    with pytest.raises(ConfigError, match="nowhere.toml: no such file"):
+    with pytest.raises(ConfigError, match=r"nowhere.toml: no such file"):
         plan(tmp_path, "--log", "nowhere.toml")
 
 

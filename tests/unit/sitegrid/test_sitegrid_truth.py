@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from protocol.errors import ConfigError
 from protocol.queries import Region
 from sim.truth import TruthMap
-from sitegrid.truth import load_truth, truth_layers
+from sitegrid.truth import truth_layers
 
 
 def region(west: float, south: float, columns: int, rows: int, cell_m: float = 1.0) -> Region:
@@ -41,10 +39,3 @@ def test_beyond_the_simulated_site_nothing_is_known(truth: TruthMap):
 def test_cells_of_another_size_are_refused(truth: TruthMap):
     with pytest.raises(ConfigError, match="cells of 1 m, the map of 2 m"):
         truth_layers(truth, region(10, 20, 2, 2, cell_m=2.0))
-
-
-def test_a_file_that_is_no_truth_says_so(tmp_path: Path):
-    path = tmp_path / "truth.npz"
-    path.write_bytes(b"no")
-    with pytest.raises(ConfigError, match="is no true map"):
-        load_truth(path)
