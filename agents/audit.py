@@ -38,8 +38,7 @@ class AuditLog:
         text = self._path.read_text(encoding="ascii")
         if text and not text.endswith("\n"):
             self._write([" # cut off"])
-            text = text[: text.rfind("\n") + 1]
-        lost = [seq for (spool, seq) in parse(text.splitlines()) if spool == spool_id and seq > newest]
+        lost = [seq for (spool, seq) in parse(_whole_lines(text)) if spool == spool_id and seq > newest]
         self._write(f"- {spool_id:016x} {seq}" for seq in lost)
 
     def close(self) -> None:
@@ -53,11 +52,11 @@ class AuditLog:
 
 def read_audit(path: Path) -> dict[Identity, str]:
     """Hash of every sample that an agent recorded, by identity."""
-    return parse(path.read_text(encoding="ascii").splitlines())
+    return parse(_whole_lines(path.read_text(encoding="ascii")))
 
 
 def parse(lines: Iterable[str]) -> dict[Identity, str]:
-    """Hash by identity, of audit lines; malformed lines (cut off by a crash) are left out."""
+    """Hash by identity, of audit lines; malformed lines are left out."""
     recorded: dict[Identity, str] = {}
     for sign, spool_id, seq, content in _fields(lines):
         if sign == "+":
@@ -65,6 +64,11 @@ def parse(lines: Iterable[str]) -> dict[Identity, str]:
         else:
             recorded.pop((spool_id, seq), None)
     return recorded
+
+
+def _whole_lines(text: str) -> list[str]:
+    """Lines without a last one that a crash cut off."""
+    return text[: text.rfind("\n") + 1].splitlines()
 
 
 def _fields(lines: Iterable[str]) -> Iterator[tuple[str, int, int, str]]:

@@ -63,8 +63,7 @@ class Pipeline:
 
     def step(self, readings: Sequence[Reading]) -> Table:
         """Take in readings in the order of their stamps; returns the samples (n,) that they made possible."""
-        samples = [self._step_one(reading) for reading in readings]
-        made = [rows for rows in samples if len(rows)]
+        made = [rows for reading in readings for rows in self._step_one(reading) if len(rows)]
         return np.concatenate(made) if made else NOTHING
 
     def health(self) -> dict[str, Any]:
@@ -78,26 +77,28 @@ class Pipeline:
             "withheld": dict(self._sampler.withheld),
         }
 
-    def _step_one(self, reading: Reading) -> Table:
+    def _step_one(self, reading: Reading) -> list[Table]:
         sensor = self._sensors.get(reading.sensor)
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
-            return NOTHING
+            return []
         verdict = self._order.judge(reading)
         if verdict is Verdict.REFUSE:
-            return NOTHING
+            return []
         if verdict is Verdict.RESTART:
             self._counters.update(self._localiser.counters)
             self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
             self._start()
-        for pose in self._localiser.update(reading, sensor):
+        made: list[Table] = []
+        for pose in self._localiser.update(reading, sensor):  # after a late alignment more than the history holds
             self._sampler.poses.append(pose)
+            made.append(self._sampler.take())
         wheels = self._localiser.dead.wheels
         self._estimator.update(reading, sensor, wheels.speed_mps, wheels.accel_mps2)
         dead = self._localiser.dead
         if self._sampler.is_due(dead.way_m):
             self._sampler.mark(dead.stamp_ns, dead.way_m, self._estimator.now(wheels.speed_mps))
-        return self._sampler.take()
+        return [*made, self._sampler.take()]
 
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""

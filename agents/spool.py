@@ -21,11 +21,12 @@ from protocol.errors import StoreError
 from protocol.samples import SAMPLE_DTYPE
 
 SCHEMA = 1
-_TABLES = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE sample (seq INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL);
-CREATE TABLE aside (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL);
-"""
+_TABLES = (
+    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
+    "CREATE TABLE sample (seq INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL)",
+    "CREATE TABLE aside (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL)",
+    f"PRAGMA user_version={SCHEMA}",
+)
 
 
 @dataclass(frozen=True)
@@ -206,8 +207,10 @@ class Spool:
 
     def _open(self) -> _Meta:
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
-            self._db.executescript("BEGIN;" + _TABLES + f"PRAGMA user_version={SCHEMA}; COMMIT;")
-            self._save(_Meta(self._draw_id()))
+            with _transaction(self._db):  # tables and identity together: a kill leaves all or nothing
+                for statement in _TABLES:
+                    self._db.execute(statement)
+                self._save(_Meta(self._draw_id()))
         if (schema := self._db.execute("PRAGMA user_version").fetchone()[0]) != SCHEMA:
             raise ValueError(f"schema {schema}, this agent knows {SCHEMA}")
         # After a crash pending samples are sent as they are: a coarse place is better than none.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sqlite3
 import zlib
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,16 +73,19 @@ class Journal:
     def __init__(self, path: Path, site: str, frame: str) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=FULL")
-            self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
-            self._create_or_check(site, frame)
-            self._marks = self._load_marks()
-            self.last_row = int(self._db.execute("SELECT COALESCE(MAX(row), 0) FROM journal").fetchone()[0])
-        except sqlite3.Error as error:
-            raise StoreError(path, f"is no usable journal: {error}") from None
+        with ExitStack() as opened:
+            try:
+                self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+                opened.callback(self._db.close)
+                self._db.execute("PRAGMA journal_mode=WAL")
+                self._db.execute("PRAGMA synchronous=FULL")
+                self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
+                self._create_or_check(site, frame)
+                self._marks = self._load_marks()
+                self.last_row = int(self._db.execute("SELECT COALESCE(MAX(row), 0) FROM journal").fetchone()[0])
+            except sqlite3.Error as error:
+                raise StoreError(path, f"is no usable journal: {error}") from None
+            opened.pop_all()
 
     def mark(self, machine: str, spool_id: int) -> Mark:
         """Progress of a spool."""

@@ -198,8 +198,8 @@ def _draw_tracks(ground: Image, tracks: Sequence[Track], view: _View) -> None:
         finite = np.isfinite(pixels).all(axis=1)
         pieces = np.split(pixels, np.flatnonzero(~finite))
         lines = [_fixed(piece[np.isfinite(piece).all(axis=1)]) for piece in pieces]
-        cv2.polylines(ground, [line for line in lines if len(line)], False, EDGE, 3, cv2.LINE_AA, shift=4)
-        cv2.polylines(ground, [line for line in lines if len(line)], False, colour, 1, cv2.LINE_AA, shift=4)
+        for shade, thickness in ((EDGE, 2), (colour, 1)):  # thin: the ground below is what the picture is about
+            cv2.polylines(ground, [line for line in lines if len(line)], False, shade, thickness, cv2.LINE_AA, shift=4)
         if finite.any() and ((end := pixels[finite][-1]) >= 0).all() and end[0] < width and end[1] < height:
             ends.append((track, colour, end))
     taken: list[Box] = [(int(x) - 6, int(y) - 6, int(x) + 6, int(y) + 6) for _, _, (x, y) in ends]

@@ -15,7 +15,7 @@ from evaluation.audit import AuditResult, audit_store
 from evaluation.localisation import position_rmse
 from evaluation.mapscore import MapScore, score
 from mapserver.config import ServerConfig
-from mapserver.plotter import draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from mapserver.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.logfolder import LogFolder, open_log
 from protocol.queries import Region
@@ -24,7 +24,7 @@ from protocol.site import load_site
 from sim.config import SimConfig
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.commands.plot import draw
+from sitegrid.commands.plot import draw, draw_both
 from sitegrid.commands.sim import write_configs
 from sitegrid.process import note, plain, say, stop_flag
 from sitegrid.processes import Child, Children, wait_until
@@ -196,7 +196,7 @@ def _draw(plan: Plan, client: Client, tracks: TrackRecorder) -> tuple[Region, li
     truth = truth_layers(TruthMap.load(_truth_file(plan)), region)
     lines = tracks.tracks()
     pictures = {
-        "map.png": [draw_resistance(region, lines), draw_grade(region, lines)],
+        "map.png": draw_both(region, lines),
         "difference.png": [draw_difference(region, truth, "resistance"), draw_difference(region, truth, "grade")],
     }
     for name, images in pictures.items():

@@ -5,7 +5,10 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
+import numpy as np
+
 from mapserver.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from mapserver.sheet import Image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.geometry import Bounds
 from protocol.queries import Region
@@ -51,7 +54,7 @@ def draw(
 ) -> Region:
     """Ask for the map and write its picture; with a true map the difference beside it."""
     region = client.region(_bounds(client, bounds), LAYERS)
-    row = [draw_resistance(region, tracks), draw_grade(region, tracks)]
+    row = draw_both(region, tracks)
     images = [side_by_side(row)]
     if truth:
         layers = truth_layers(TruthMap.load(truth), region)
@@ -63,6 +66,13 @@ def draw(
     for image in images[1:]:
         write_image(out.with_stem(f"{out.stem}-difference"), image)
     return region
+
+
+def draw_both(region: Region, tracks: list[Track]) -> list[Image]:
+    """Resistance and grade; a map without any resistance says why."""
+    has_torque = np.isfinite(region["resistance"]).any() or not np.isfinite(region["grade_east"]).any()
+    title = "Rolling resistance" if has_torque else "Rolling resistance: unknown, no machine measures drive torque"
+    return [draw_resistance(region, tracks, title), draw_grade(region, tracks)]
 
 
 def _bounds(client: Client, given: list[float] | None) -> Bounds:

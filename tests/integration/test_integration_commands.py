@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import SiteRun
+from site_run import SiteRun  # beside this file
 
 from sitegrid.processes import wait_until
 

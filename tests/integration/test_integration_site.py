@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 import pytest
-from conftest import SiteRun, kill  # the one beside this file
+from site_run import SiteRun, kill  # beside this file
 
 from protocol.errors import LinkError, QueryError
 from protocol.session import free_endpoint

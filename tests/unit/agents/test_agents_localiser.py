@@ -122,7 +122,9 @@ def test_gates_count_per_receiver() -> None:
     """One receiver of two that is far off for good does not stop the other from being used."""
     of = machine(receivers=2)
     made = drive(S_BEND, of)
-    readings = [moved(r, 40) if r.sensor == "gps-2" and 20 < (r.stamp_ns - START_NS) * 1e-9 < 23 else r for r in made.readings]
+    readings = [
+        moved(r, 40) if r.sensor == "gps-2" and 20 < (r.stamp_ns - START_NS) * 1e-9 < 23 else r for r in made.readings
+    ]
     found = localiser(of)
     beliefs = run(found, of, readings)
     assert found.counters["gps_gated"] >= 14

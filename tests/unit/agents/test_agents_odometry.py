@@ -111,8 +111,9 @@ def test_braking_makes_the_wheels_slower_than_the_machine() -> None:
     made = drive([Leg(4, 0.5), Leg(3, -0.6)], of)
     with_slip, without = reckon(of, made, slip=0.2), reckon(of, made)
     at_full_speed = [r for r in made.readings if r.stamp_ns <= START_NS + 4 * 10**9]
-    driving_slip, driving = reckon(of, replace(made, readings=at_full_speed), 0.2), reckon(
-        of, replace(made, readings=at_full_speed)
+    driving_slip, driving = (
+        reckon(of, replace(made, readings=at_full_speed), 0.2),
+        reckon(of, replace(made, readings=at_full_speed)),
     )
     assert driving_slip.travel_m < driving.travel_m
     assert with_slip.travel_m - driving_slip.travel_m > without.travel_m - driving.travel_m

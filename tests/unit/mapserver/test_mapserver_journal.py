@@ -133,7 +133,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path):
 
 
 def test_tables_and_their_names_are_made_in_one_transaction(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.journal._TABLES", "CREATE TABLE meta (key, nonsense); ")
+    monkeypatch.setattr("mapserver.journal._TABLES", "CREATE TABLE meta (key, value, more); ")
     with pytest.raises(StoreError):
         open_journal(tmp_path)
     monkeypatch.undo()

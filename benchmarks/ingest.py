@@ -1,0 +1,69 @@
+"""Samples per second from a machine's bytes to the grid: decode, judge, commit to disk (FULL), fold."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from benchmarks.measure import START_NS, Result, machine, medians, timed, track
+from mapserver.config import ServerConfig
+from mapserver.store import Incoming, Store
+from protocol.arrays import Table
+from protocol.codec import encode_batch
+from protocol.messages import Ack, SampleBatch
+from protocol.site import SiteConfig
+
+SITE = SiteConfig("bench", 48.0, 11.0)
+BATCHES = (100, 1000)
+GROUPS = (1, 16)  # batches in one commit: a single machine waiting for its answer, and many at once
+
+
+def run(samples: int, runs: int) -> Result:
+    """Measure every size of batch and group, each run on a new store."""
+    rows = track(samples)
+    with tempfile.TemporaryDirectory() as folder:
+        Store(Path(folder) / "warm", SITE, ServerConfig(), _now_ns).grid.fold(rows[:1], "loader-1")  # compiled
+        cases = {f"{size} {group}": (size, group) for size in BATCHES for group in GROUPS}
+        variants = {name: _variant(Path(folder), name, rows, *case) for name, case in cases.items()}
+        seconds = medians(variants, runs)
+    found = [
+        {
+            "batch": size,
+            "batches_per_commit": group,
+            "samples_per_s": round(samples / seconds[name]),
+            "ms_per_commit": seconds[name] / max(1, samples / size / group) * 1e3,
+        }
+        for name, (size, group) in cases.items()
+    ]
+    return {"benchmark": "ingest", "samples": samples, "runs": runs, **machine(), "rows": found}
+
+
+def _variant(folder: Path, name: str, rows: Table, size: int, group: int) -> Callable[[], float]:
+    """Send all samples through a new store; the clock runs from the first byte to the last acknowledgement."""
+    batches = [_encode(rows[first : first + size], first + 1) for first in range(0, len(rows), size)]
+    groups = [batches[first : first + group] for first in range(0, len(batches), group)]
+
+    def work() -> float:
+        with tempfile.TemporaryDirectory(dir=folder, prefix=name.replace(" ", "-")) as path:
+            store = Store(Path(path), SITE, ServerConfig(), _now_ns)
+            seconds = timed(lambda: [_take(store, some) for some in groups])
+            store.close()
+        return seconds
+
+    return work
+
+
+def _take(store: Store, group: list[Incoming]) -> None:
+    if not all(isinstance(answer, Ack) for answer in store.take(group)):
+        raise RuntimeError("the store refused a batch")
+
+
+def _encode(rows: Table, first_seq: int) -> Incoming:
+    batch = SampleBatch("loader-1", 1, first_seq, rows, SITE.frame)
+    return Incoming(batch.machine, encode_batch(replace(batch, rows=rows)))
+
+
+def _now_ns() -> int:
+    return START_NS

@@ -1,0 +1,81 @@
+"""A construction site of real processes on loopback, with free ports; every process is ended with the test."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+from evaluation.audit import AuditResult, audit_store
+from mapserver.config import ServerConfig
+from protocol.site import load_site
+from sim.config import SimConfig
+from sitegrid import Client, connect
+from sitegrid.commands.sim import write_configs
+from sitegrid.processes import Child, Children, wait_until
+
+READY_S = 40.0
+
+
+class SiteRun:
+    """Router, map server, agents and simulator of one site."""
+
+    def __init__(self, folder: Path, children: Children, endpoint: str, sim: SimConfig) -> None:
+        self.folder = folder
+        self.children = children
+        self.endpoint = endpoint
+        self.sim = sim
+        self.configs = write_configs(sim, folder)
+        self.agents: dict[str, Child] = {}
+
+    @property
+    def site_file(self) -> Path:
+        return self.folder / "site.toml"
+
+    def start_router(self) -> Child:
+        router = self.children.start("router", "router", "--listen", self.endpoint)
+        router.expect("ready", READY_S)
+        return router
+
+    def start_server(self, *options: str) -> Child:
+        words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--store", self.folder / "store")
+        server = self.children.start("server", "server", *words, *options)
+        server.expect("ready", READY_S)
+        return server
+
+    def start_agent(self, config: Path) -> Child:
+        name = config.stem
+        files = ("--spool", self.folder / f"{name}.db", "--audit", self.folder / f"{name}.audit")
+        where = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--config", config)
+        self.agents[name] = self.children.start(name, "agent", *where, *files, "--json")
+        self.agents[name].expect("ready", READY_S)
+        return self.agents[name]
+
+    def start_agents(self) -> None:
+        for config in self.configs:
+            self.start_agent(config)
+
+    def start_sim(self) -> Child:
+        options = {"seconds": self.sim.seconds, "speed": self.sim.speed, "machines": self.sim.machines}
+        words = [w for name, value in options.items() for w in (f"--{name}", str(value))]
+        truth = ("--truth", self.folder / "truth")
+        place = ("--endpoint", self.endpoint, "--site", self.sim.site, "--seed", self.sim.seed)
+        return self.children.start("sim", "sim", *place, *words, *truth, "--json")
+
+    def connect(self) -> Client:
+        return connect(self.endpoint, self.sim.site)
+
+    def wait_merged(self, client: Client, samples: int) -> None:
+        wait_until(lambda: client.info()["samples_merged"] >= samples, READY_S, f"{samples} samples merged")
+
+    def end_of_agents(self) -> dict[str, dict]:
+        return {name: agent.expect("ended", 90.0)["ended"] for name, agent in self.agents.items()}
+
+    def audit(self) -> AuditResult:
+        audits = {path.stem: self.folder / f"{path.stem}.audit" for path in self.configs}
+        return audit_store(audits, self.folder / "store", load_site(self.site_file), ServerConfig())
+
+
+def kill(child: Child) -> None:
+    """End a process without a chance to tidy up."""
+    child.send(signal.SIGKILL)
+    child.wait(10.0)

@@ -1,0 +1,330 @@
+import itertools
+import random
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from agents_drives import SITE, made_up_samples
+
+from agents.spool import Spool, SpoolConfig
+from agents.uplink import BLOCKING, PASSING, UplinkConfig, UplinkState, linger
+from mapserver.ingest import GapError, admit, parse
+from protocol.codec import decode_batch, decode_reply, encode_reply
+from protocol.errors import MessageError, Refusal
+from protocol.messages import Ack, Refused, SampleBatch
+from protocol.samples import content_hash
+
+ROWS = made_up_samples(500)
+MEMORY = Path(":memory:")  # the spool's files have tests of their own
+
+
+class Server:
+    """Admits batches as the map server does, and keeps every sample that it took."""
+
+    def __init__(self) -> None:
+        self.watermarks: Counter[int] = Counter()
+        self.taken: Counter[tuple[int, int, str]] = Counter()
+        self.lost = 0
+
+    def answer(self, payload: bytes) -> Ack | Refused:
+        try:
+            batch = parse(payload, "loader-1", SITE, lambda: 0)
+            admission = admit(batch, self.watermarks[batch.spool_id])
+        except GapError as error:
+            return Refused(error.reason, str(error), error.expected)
+        except MessageError as error:
+            return Refused(error.reason, str(error))
+        new = admission.batch
+        for i, row in enumerate(new.rows):
+            self.taken[new.spool_id, new.first_seq + i, content_hash(row)] += 1
+        self.lost += admission.lost
+        self.watermarks[batch.spool_id] = max(self.watermarks[batch.spool_id], admission.watermark)
+        return Ack(self.watermarks[batch.spool_id], 1, admission.trimmed)
+
+
+def uplink(n: int = 0, max_samples: int = 10_000, **options: Any) -> tuple[UplinkState, Spool]:
+    spool = Spool(MEMORY, SpoolConfig(max_samples))
+    if n:
+        spool.record(ROWS[:n])
+    return UplinkState("loader-1", SITE.frame, spool, UplinkConfig(**options)), spool
+
+
+def met(n: int = 0, **options: Any) -> tuple[UplinkState, Spool]:
+    """An uplink that has learnt the watermark."""
+    state, spool = uplink(n, **options)
+    assert state.next_payload()
+    assert state.on_reply(Ack(0, 0)) == 0
+    return state, spool
+
+
+def next_batch(state: UplinkState) -> SampleBatch:
+    payload = state.next_payload()
+    assert payload
+    return decode_batch(payload, 1e9)
+
+
+def test_first_payload_asks_for_the_watermark() -> None:
+    state, spool = uplink(5)
+    batch = next_batch(state)
+    assert (batch.machine, batch.spool_id, batch.frame) == ("loader-1", spool.spool_id, SITE.frame)
+    assert (batch.first_seq, len(batch.rows), batch.lost_before) == (1, 0, 0)
+    state.on_reply(Ack(2, 0))
+    assert next_batch(state).first_seq == 3
+    assert spool.acknowledged == 2
+
+
+def test_watermark_is_asked_for_until_somebody_answers() -> None:
+    state, _ = uplink(5)
+    for _ in range(3):
+        assert len(next_batch(state).rows) == 0
+        state.on_reply(None)
+    assert state.problem == "no answer from the map server"
+    state.on_reply(Ack(0, 0))
+    assert len(next_batch(state).rows) > 0
+    assert state.problem == ""
+
+
+def test_empty_spool_has_nothing_to_send() -> None:
+    state, spool = met()
+    assert state.next_payload() is None
+    spool.record(ROWS[:1])
+    assert len(next_batch(state).rows) == 1
+
+
+def test_nothing_is_deleted_before_the_acknowledgement() -> None:
+    state, spool = met(5)
+    for reply in (None, Refused(Refusal.OVERLOADED, ""), Refused(Refusal.STORE, "")):
+        next_batch(state)
+        state.on_reply(reply)
+        assert spool.counters()["depth"] == 5
+    next_batch(state)
+    state.on_reply(Ack(5, 1))
+    assert spool.counters()["depth"] == 0
+    assert state.counters["batches"] == 1
+
+
+def test_batch_is_halved_on_a_time_out_and_doubled_on_success() -> None:
+    state, _ = met(500, batch_samples=64, max_batch_samples=100)
+    sizes = []
+    for reply in ("lost", "lost", "ok", "ok", "ok", "ok"):
+        batch = next_batch(state)
+        sizes.append(len(batch.rows))
+        state.on_reply(None if reply == "lost" else Ack(batch.last_seq, 1))
+    assert sizes == [64, 32, 16, 32, 64, 100]
+    assert state.counters["timeouts"] == 2
+
+
+def test_batch_is_never_less_than_one_sample() -> None:
+    state, _ = met(500, batch_samples=4)
+    for _ in range(20):
+        state.next_payload()
+        state.on_reply(None)
+    assert len(next_batch(state).rows) == 1
+
+
+@pytest.mark.parametrize("reply", [None, Refused(Refusal.OVERLOADED, "")])
+def test_pause_doubles_up_to_its_bound_and_starts_anew_after_success(reply: Refused | None) -> None:
+    state, _ = met(5, backoff_s=0.2, max_backoff_s=1.5)
+    pauses = []
+    for _ in range(2000):
+        state.next_payload()
+        pauses.append(state.on_reply(reply))
+    assert pauses[:5] == pytest.approx([0.2, 0.4, 0.8, 1.5, 1.5])
+    assert max(pauses) == 1.5
+    next_batch(state)
+    state.on_reply(Ack(0, 1))
+    state.next_payload()
+    assert state.on_reply(None) == pytest.approx(0.2)
+
+
+def test_server_that_lost_samples_is_told_so() -> None:
+    """It was restored from a backup after this agent had met it."""
+    state, spool = met(20, batch_samples=5)
+    state.on_reply(Ack(next_batch(state).last_seq, 1))
+    assert next_batch(state).first_seq == 6
+    assert state.on_reply(Refused(Refusal.GAP, "expected 3", 3)) == 0
+    batch = next_batch(state)
+    assert (batch.first_seq, batch.lost_before) == (6, 3)
+    assert state.counters["refused_gap"] == 1
+    assert spool.counters()["put_aside"] == 0
+
+
+def test_gap_that_names_no_expected_sample_puts_nothing_aside() -> None:
+    state, spool = met(1)
+    for expected in (0, 99):
+        next_batch(state)
+        assert state.on_reply(Refused(Refusal.GAP, "?", expected)) > 0
+    batch = next_batch(state)
+    assert (batch.first_seq, batch.lost_before) == (1, 0)
+    assert spool.counters()["put_aside"] == 0
+
+
+@pytest.mark.parametrize("bad", [0, 7, 19])
+def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
+    rows = ROWS[:20].copy()
+    rows["c_rr"][bad] = 99.0
+    state, spool = met(batch_samples=20)
+    spool.record(rows)
+    server = Server()
+    for _ in range(60):
+        payload = state.next_payload()
+        if payload is None:
+            break
+        assert state.on_reply(server.answer(payload)) == 0
+    good = [content_hash(row) for i, row in enumerate(rows) if i != bad]
+    assert sorted(h for _, _, h in server.taken) == sorted(good)
+    assert set(server.taken.values()) == {1}
+    assert server.lost == (bad < 19)
+    assert spool.counters() == {"depth": 0, "dropped": 0, "put_aside": 1, "recorded": 20}
+    assert spool._db.execute("SELECT seq, row FROM aside").fetchall() == [(bad + 1, rows[bad].tobytes())]
+    assert state.counters["refused_out_of_range"] >= 1
+
+
+@pytest.mark.parametrize("reason", sorted(BLOCKING | PASSING))
+def test_what_is_no_sample_s_fault_puts_nothing_aside(reason: Refusal) -> None:
+    state, spool = met(1)
+    for _ in range(5):
+        next_batch(state)
+        assert state.on_reply(Refused(reason, "as it is")) > 0
+    assert state.problem == "as it is"
+    assert state.counters[f"refused_{reason}"] == 5
+    assert spool.counters()["put_aside"] == 0
+    assert next_batch(state).first_seq == 1
+
+
+def test_question_that_is_refused_is_asked_again() -> None:
+    state, _ = uplink(5)
+    state.next_payload()
+    assert state.on_reply(Refused(Refusal.FIRST_SEQ, "?")) > 0
+    assert len(next_batch(state).rows) == 0
+
+
+def test_new_spool_id_is_counted_and_used() -> None:
+    state, spool = uplink(5)
+    old = spool.spool_id
+    spool._newest_at_open = 3  # as if the first three had been in a restored file
+    state.next_payload()
+    state.on_reply(Ack(9, 0))
+    batch = next_batch(state)
+    assert state.counters["new_spool_ids"] == 1
+    assert (batch.spool_id, batch.first_seq) == (spool.spool_id, 1)
+    assert spool.spool_id != old
+    assert [content_hash(r) for r in batch.rows] == [content_hash(r) for r in ROWS[3:5]]
+
+
+def test_full_spool_declares_what_it_dropped() -> None:
+    state, spool = uplink(5, max_samples=10)
+    server = Server()
+    assert state.on_reply(server.answer(state.next_payload() or b"")) == 0
+    spool.record(ROWS[5:20])
+    while payload := state.next_payload():
+        state.on_reply(server.answer(payload))
+    assert server.lost == 10
+    assert sorted(seq for _, seq, _ in server.taken) == list(range(11, 21))
+
+
+def exchange(state: UplinkState, server: Server, rng: random.Random, quality: float) -> None:
+    """One round over a link that loses requests and replies, and repeats requests, also much later ones."""
+    payload = state.next_payload()
+    if payload is None:
+        return
+    answers = []
+    for _ in range(rng.choice((1, 1, 1, 2))):
+        if rng.random() < quality:
+            answers.append(decode_reply(encode_reply(server.answer(payload))))
+    heard = answers and rng.random() < quality
+    state.on_reply(rng.choice(answers) if heard else None)
+
+
+@pytest.mark.parametrize("first_seed", range(0, 200, 50))
+def test_lossy_link_delivers_every_sample_exactly_once(first_seed: int) -> None:
+    for seed in range(first_seed, first_seed + 50):
+        rng = random.Random(seed)
+        server = Server()
+        state, spool = uplink(batch_samples=rng.choice((1, 4, 16)), max_batch_samples=32)
+        waiting = list(ROWS[:120])
+        for _ in itertools.count():
+            while waiting and rng.random() < 0.5:
+                n = rng.randint(1, 9)
+                spool.record(ROWS[120 - len(waiting) :][: min(n, len(waiting))])
+                waiting = waiting[n:]
+            exchange(state, server, rng, quality=0.6)
+            if not waiting and not spool.counters()["depth"]:
+                break
+        assert set(server.taken.values()) == {1}, f"seed={seed}"
+        expected = [(spool.spool_id, i + 1, content_hash(row)) for i, row in enumerate(ROWS[:120])]
+        assert sorted(server.taken) == sorted(expected), f"seed={seed}"
+        assert server.lost == 0, f"seed={seed}"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_agent_that_is_killed_again_and_again_delivers_every_sample_exactly_once(tmp_path: Path, seed: int) -> None:
+    rng = random.Random(seed)
+    server = Server()
+    recorded = 0
+    spool = None
+    for _ in range(12):
+        spool = Spool(tmp_path / "spool.db", SpoolConfig())
+        state = UplinkState("loader-1", SITE.frame, spool, UplinkConfig(batch_samples=8))
+        for _ in range(rng.randint(0, 6)):
+            if recorded < 120:
+                recorded += len(ROWS[recorded : recorded + 5])
+                spool.record(ROWS[recorded - 5 : recorded])
+            exchange(state, server, rng, quality=0.7)
+        spool._db.close()  # without a checkpoint, as a kill leaves it
+    spool = Spool(tmp_path / "spool.db", SpoolConfig())
+    state = UplinkState("loader-1", SITE.frame, spool, UplinkConfig())
+    while spool.counters()["depth"]:
+        exchange(state, server, rng, quality=0.9)
+    assert sorted(h for _, _, h in server.taken) == sorted(content_hash(r) for r in ROWS[:recorded]), f"seed={seed}"
+    assert set(server.taken.values()) <= {1}, f"seed={seed}"
+    spool.close()
+
+
+def test_linger_waits_until_the_spool_is_empty_or_time_is_over() -> None:
+    clock = itertools.count(0.0, 0.05)
+    left = iter([False, False, True])
+    waits: list[float] = []
+    assert linger(lambda: next(left), waits.append, lambda: next(clock), 10.0)
+    assert len(waits) == 2
+    waits.clear()
+    assert not linger(lambda: False, waits.append, lambda: next(clock), 1.0)
+    assert len(waits) == pytest.approx(20, abs=2)
+    assert not linger(lambda: False, waits.append, lambda: 0.0, 0.0)
+    assert linger(lambda: True, waits.append, lambda: 0.0, 0.0)
+
+
+OPTIONS: dict[str, Any] = {"batch_samples": 3, "max_batch_samples": 200, "backoff_s": 0.5, "max_backoff_s": 0.3}
+
+
+def trace(**options: Any) -> list[Any]:
+    """Sizes and pauses of a fixed course of events."""
+    state, _ = met(500, **options)
+    found: list[Any] = []
+    for reply in ("ok", "lost", "ok", "lost", "lost", "lost"):
+        batch = next_batch(state)
+        found.append((len(batch.rows), state.on_reply(Ack(batch.last_seq, 1) if reply == "ok" else None)))
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(OPTIONS))
+def test_option_changes_what_is_sent_or_when(name: str) -> None:
+    assert set(OPTIONS) | {"timeout_s"} == set(UplinkConfig.__dataclass_fields__)
+    assert trace(**{name: OPTIONS[name]}) != trace()
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"batch_samples": 0}, "batch_samples"),
+        ({"max_batch_samples": 100}, "max_batch_samples"),
+        ({"max_batch_samples": 20_001}, "max_batch_samples"),
+        ({"timeout_s": 0.0}, "timeout_s"),
+        ({"backoff_s": 0.0}, "backoff_s"),
+        ({"max_backoff_s": 0.1}, "max_backoff_s"),
+    ],
+)
+def test_bad_uplink_option_is_refused_by_name(options: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        UplinkConfig(**options)

@@ -1,0 +1,136 @@
+import numpy as np
+import pytest
+from mapserver_data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
+
+from mapserver import layers
+from mapserver.answers import Answers
+from mapserver.layers import LAYERS, ReadConfig
+from mapserver.writer import Writer
+from protocol.errors import QueryError, Refusal
+from protocol.geometry import Bounds
+from protocol.queries import PointQuery, RegionQuery, decode_info, decode_point, decode_region
+
+# One sample in each cell of two diagonals, the value tells the cell.
+STEPS = np.arange(-40, 40)
+
+
+def diagonal() -> np.ndarray:
+    return samples(len(STEPS), x_m=STEPS + 0.5, y_m=-STEPS - 0.5, grade_e=STEPS / 100, distance_m=8.0)
+
+
+@pytest.fixture
+def answers(tmp_path):
+    writer = Writer(tmp_path, SITE, CONFIG, now_ns)
+    send(writer, [incoming(diagonal())])
+    yield Answers(writer, SITE, CONFIG.read)
+    writer.close()
+
+
+def region(answers: Answers, *bounds: float, names: tuple[str, ...] = ("grade_east",)):
+    return answers.region(RegionQuery(Bounds(*bounds), names))
+
+
+@pytest.mark.parametrize("step", [-40, -17, -16, -1, 0, 15, 16, 39])
+def test_a_point_is_the_cell_that_it_lies_in(answers, step):
+    for within in (0.0, 0.5, 0.999):
+        point = answers.point(PointQuery(step + within, -step - within - 0.001, ("grade_east",)))
+        assert (point.x_m, point.y_m) == (step + 0.5, -step - 0.5)
+        assert point.values["grade_east"] == pytest.approx(step / 100, abs=1e-3)
+        assert (point.merged, point.stamp_ns) == (1, NOW_NS + 79 * 10**9)
+
+
+def test_a_point_where_nobody_was_is_nan_in_every_layer(answers):
+    for x, y in ((10.0, 10.0), (1e6, -1e6), (-1e9, 1e9)):
+        values = answers.point(PointQuery(x, y)).values
+        assert tuple(values) == tuple(LAYERS)
+        assert np.isnan(list(values.values())).all()
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [(-45, -45, 45, 45), (-20, -3, 3, 20), (3, -16, 13, -3), (-16, 0, 0, 16), (0, -1, 1, 0), (-0.5, -0.5, 0.5, 0.5)],
+)
+def test_a_region_is_cut_from_its_blocks(answers, bounds):
+    here = region(answers, *bounds)
+    west, south = int(np.floor(bounds[0])), int(np.floor(bounds[1]))
+    expected = np.full((len(here.y_m), len(here.x_m)), np.nan)
+    for step in STEPS:
+        column, row = step - west, -step - 1 - south
+        if 0 <= column < expected.shape[1] and 0 <= row < expected.shape[0]:
+            expected[row, column] = step / 100
+    assert (here.x_m[0], here.y_m[0]) == (west + 0.5, south + 0.5)
+    np.testing.assert_allclose(here["grade_east"], expected, atol=1e-3)
+    assert np.isfinite(expected).any()
+
+
+def test_every_small_region_is_the_same_cut_of_a_large_one(answers):
+    whole = region(answers, -48, -48, 48, 48)["grade_east"]
+    draw = np.random.default_rng(11)
+    for _ in range(30):
+        west, south = draw.integers(-48, 47, 2)
+        east, north = draw.integers(west + 1, 49), draw.integers(south + 1, 49)
+        part = region(answers, west, south, east, north)["grade_east"]
+        expected = whole[south + 48 : north + 48, west + 48 : east + 48]
+        assert np.array_equal(part, expected, equal_nan=True), (west, south, east, north)
+
+
+def test_a_region_far_away_is_unknown(answers):
+    far = region(answers, 10_000, 10_000, 10_020, 10_010)
+    assert far["grade_east"].shape == (10, 20)
+    assert np.isnan(far["grade_east"]).all()
+    assert far.merged == 1
+
+
+def test_no_names_give_all_layers(answers):
+    here = region(answers, 0, -5, 5, 0, names=())
+    assert tuple(here.layers) == tuple(LAYERS)
+    assert all(layer.dtype == np.float32 for layer in here.layers.values())
+
+
+def test_many_blocks_are_read_in_pieces_and_put_together(tmp_path, monkeypatch):
+    monkeypatch.setattr("mapserver.grid.READ_BLOCKS", 3)
+    rows = random_samples(300, 3)
+    writer = Writer(tmp_path, SITE, CONFIG, now_ns)
+    send(writer, [incoming(rows)])
+    here = region(Answers(writer, SITE, ReadConfig()), -64, -64, 64, 64, names=("resistance",))
+    writer.close()
+    grid = folded(rows)
+    for x in range(-4, 4):
+        for y in range(-4, 4):
+            block = layers.read(grid.evidence([(x, y)]), ["resistance"], ReadConfig())["resistance"].reshape(16, 16)
+            row, column = 16 * (y + 4), 16 * (x + 4)
+            cut = here["resistance"][row : row + 16, column : column + 16]
+            assert np.array_equal(cut, block, equal_nan=True)
+
+
+def test_a_region_that_no_reply_carries_is_refused(answers):
+    region(answers, 0, 0, 4000, 1)
+    with pytest.raises(QueryError, match="4001 x 4000 cells") as caught:
+        region(answers, 0, 0, 4001, 4000)
+    assert caught.value.reason == Refusal.TOO_LARGE
+
+
+def test_least_weight_of_the_read_options_is_obeyed(tmp_path):
+    writer = Writer(tmp_path, SITE, CONFIG, now_ns)
+    send(writer, [incoming(samples(distance_m=2.0))])
+    query = PointQuery(8.5, 8.5, ("resistance",))
+    values = [Answers(writer, SITE, ReadConfig(least)).point(query).values["resistance"] for least in (1.9, 2.1)]
+    writer.close()
+    assert np.isfinite(values[0])
+    assert np.isnan(values[1])
+
+
+def test_answers_travel_as_bytes(answers):
+    point = decode_point(answers.answer("point", {"x": "0.5", "y": "-0.5", "layers": "grade_east,visits"}))
+    assert set(point.values) == {"grade_east", "visits"}
+    here = decode_region(answers.answer("region", {"bounds": "0,-2,2,0", "layers": "grade_east"}))
+    np.testing.assert_allclose(here["grade_east"], [[np.nan, 0.01], [0.0, np.nan]], atol=1e-3)
+    info = decode_info(answers.answer("info", {"after": "1"}))
+    assert info["layers"] == list(LAYERS)
+    assert info["samples_merged"] == 80
+
+
+def test_an_answer_waits_for_the_row_asked_for(answers):
+    with pytest.raises(QueryError, match="row 2 is not merged") as caught:
+        answers.answer("point", {"x": "0", "y": "0", "after": "2", "wait": "0.01"})
+    assert caught.value.reason == Refusal.AFTER_TIMEOUT

@@ -1,0 +1,61 @@
+import dataclasses
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from mapserver.config import ServerConfig, StoreConfig
+from protocol.config import from_table, load_toml
+from protocol.errors import ConfigError
+
+FILE = Path(__file__).parents[3] / "config" / "server.toml"
+
+
+def names(cls: type) -> dict[str, object]:
+    """Options of a dataclass by name; tables as dictionaries."""
+    default = cls()
+    fields = ((f.name, getattr(default, f.name)) for f in dataclasses.fields(cls))
+    return {name: names(type(value)) if dataclasses.is_dataclass(value) else None for name, value in fields}
+
+
+def keys(table: dict[str, object]) -> dict[str, object]:
+    return {name: keys(value) if isinstance(value, dict) else None for name, value in table.items()}
+
+
+def test_the_file_equals_the_defaults():
+    assert from_table(ServerConfig, load_toml(FILE), "server.toml") == ServerConfig()
+
+
+def test_the_file_names_every_option():
+    assert keys(load_toml(FILE)) == names(ServerConfig)
+
+
+def test_every_option_of_the_file_has_a_comment():
+    options = [line for line in FILE.read_text().splitlines() if "=" in line.partition("#")[0]]
+    assert all("#" in line for line in options)
+    assert len(options) == 10  # one per option
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("query_threads = 0", "query_threads: 0"),
+        ("query_threads = 65", "query_threads: 65"),
+        ("threads = 2", "unknown key `threads`"),
+        ("[fold]\nbucket_s = 1", "bucket_s: 1"),
+        ("[fold]\nkernel = 3", "kernel: str is expected"),
+        ("[read]\nmin_weight_m = -1", "min_weight_m"),
+        ("[store]\nqueue_batches = 0", "queue_batches"),
+        ("[store]\nsnapshots = 0", "unknown key `snapshots`"),
+    ],
+)
+def test_a_bad_option_is_refused_with_its_place(text, named):
+    with pytest.raises(ConfigError, match=f"server.toml.*{named}"):
+        from_table(ServerConfig, tomllib.loads(text), "server.toml")
+
+
+@pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(StoreConfig)])
+@pytest.mark.parametrize("value", [0, -1])
+def test_sizes_of_the_store_are_positive(name, value):
+    with pytest.raises(ValueError, match=name):
+        StoreConfig(**{name: value})
