@@ -1,0 +1,122 @@
+"""Options of the commands reach what they are for."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+
+from agents.config import AgentConfig
+from protocol.errors import ConfigError, LinkError
+from protocol.logfolder import open_log
+from protocol.machine import machine_toml
+from protocol.session import free_endpoint
+from protocol.site import load_site
+from sim.machines import loader
+from sim.truth import TruthMap
+from sitegrid.cli import build_parser, main
+from sitegrid.commands import agent, sim
+
+MANIFEST = Path(__file__).parents[3] / "evaluation/logs/rl_test1_husky/log.toml"
+
+
+def parse(*words: object) -> Namespace:
+    return build_parser().parse_args([str(word) for word in words])
+
+
+def test_sim_options_go_over_the_config(tmp_path: Path):
+    file = tmp_path / "sim.toml"
+    file.write_text('seconds = 5.0\nseed = 3\nmachines = 2\nnames = ["a", "b"]\n')
+    plain = sim._config(parse("sim", "--config", file))
+    assert (plain.seconds, plain.seed, plain.machine_names) == (5, 3, ("a", "b"))
+    words = ("--seconds", 7, "--speed", 2, "--machines", 1, "--seed", 4, "--site", "pit")
+    over = sim._config(parse("sim", "--config", file, *words))
+    assert (over.seconds, over.speed, over.seed, over.site) == (7, 2, 4, "pit")
+    assert over.machine_names == ("loader-1",)
+
+
+def test_sim_records_log_folders_and_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    logs, truth = tmp_path / "logs", tmp_path / "truth"
+    words = ["--record", str(logs), "--truth", str(truth), "--seconds", "2", "--machines", "2"]
+    assert main(["sim", *words]) == 0
+    assert json.loads(capsys.readouterr().out)["machines"] == 2
+    assert len(list(open_log(logs / "loader-2").readings())) > 300
+    assert TruthMap.load(truth / "truth_map.npz").c_rr.shape == (150, 200)
+    assert not list(logs.rglob("*truth*"))
+
+
+def test_sim_writes_what_agents_need(tmp_path: Path):
+    assert main(["sim", "--write-configs", str(tmp_path), "--machines", "2", "--site", "pit"]) == 0
+    assert load_site(tmp_path / "site.toml").name == "pit"
+    _, machine, _ = agent._configure(
+        parse("agent", "--spool", "x", "--config", tmp_path / "loader-2.toml", "--site-file", tmp_path / "site.toml"),
+        None,
+    )
+    assert machine == loader("loader-2", 2, 1)
+
+
+def test_sim_publishes_nothing_without_a_router(capsys: pytest.CaptureFixture[str]):
+    assert main(["sim", "--endpoint", free_endpoint(), "--seconds", "1"]) == 1
+    assert "start one with `sitegrid router`" in capsys.readouterr().err
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    (tmp_path / "agent.toml").write_text("linger_s = 3.5\n" + machine_toml(loader("digger", 1, 1)))
+    (tmp_path / "site.toml").write_text('name = "pit"\norigin_lat_deg = 49.0\norigin_lon_deg = 8.0\n')
+    return tmp_path
+
+
+def test_agent_takes_machine_site_and_options_from_its_files(files: Path):
+    words = ("agent", "--spool", "x", "--config", files / "agent.toml", "--site-file", files / "site.toml")
+    site, machine, config = agent._configure(parse(*words), None)
+    assert (site.name, machine.name, config.linger_s) == ("pit", "digger", 3.5)
+    _, renamed, _ = agent._configure(parse(*words, "--name", "loader-7"), None)
+    assert renamed.name == "loader-7"
+
+
+def test_a_log_brings_machine_and_site(tmp_path: Path):
+    log = open_log(MANIFEST, tmp_path)
+    words = ("agent", "--spool", "x", "--driver", "replay", "--log", MANIFEST)
+    site, machine, config = agent._configure(parse(*words), log)
+    assert (site.name, machine.name, config) == ("husky-lot", "husky", AgentConfig())
+
+
+def test_a_site_file_goes_over_the_log(files: Path):
+    words = ("agent", "--spool", "x", "--driver", "replay", "--log", MANIFEST, "--site-file", files / "site.toml")
+    assert agent._configure(parse(*words), open_log(MANIFEST, files))[0].name == "pit"
+
+
+def test_what_an_agent_lacks_is_named(files: Path):
+    with pytest.raises(ConfigError, match="--site-file is missing"):
+        agent._configure(parse("agent", "--spool", "x", "--config", files / "agent.toml"), None)
+    with pytest.raises(ConfigError, match=r"no \[machine\] is described"):
+        agent._configure(parse("agent", "--spool", "x", "--site-file", files / "site.toml"), None)
+
+
+def test_a_site_file_may_be_a_manifest():
+    assert load_site(MANIFEST).name == "husky-lot"
+
+
+def test_server_refuses_an_unknown_option(files: Path, capsys: pytest.CaptureFixture[str]):
+    options = files / "server.toml"
+    options.write_text("[fold]\nbuckets = 3\n")
+    words = ["--site-file", str(files / "site.toml"), "--store", str(files / "store"), "--config", str(options)]
+    assert main(["server", *words]) == 1
+    assert "unknown key `buckets`; known: bucket_s" in capsys.readouterr().err
+    assert not (files / "store").exists()
+
+
+def test_router_says_where_it_cannot_listen(capsys: pytest.CaptureFixture[str]):
+    assert main(["router", "--listen", "tcp/192.0.2.1:7447"]) == 1
+    assert "tcp/192.0.2.1:7447: cannot listen here" in capsys.readouterr().err
+
+
+def test_connect_names_the_endpoint_that_does_not_answer():
+    from sitegrid import connect
+
+    endpoint = free_endpoint()
+    with pytest.raises(LinkError, match=endpoint.replace(".", r"\.")):
+        connect(endpoint)
