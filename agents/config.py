@@ -37,5 +37,7 @@ def load_agent(path: Path) -> tuple[MachineConfig | None, AgentConfig]:
     if not isinstance(sensors, list):
         raise ConfigError(where, "sensors are written as [[sensor]]")
     config = from_table(AgentConfig, table, where)
+    if sensors and not machine:
+        raise ConfigError(where, "[[sensor]] without a [machine] that carries it")
     parsed = tuple(from_table(SensorConfig, s, f"{where} [[sensor]] {i + 1}") for i, s in enumerate(sensors))
     return (parse_machine(machine, parsed, where) if machine else None), config

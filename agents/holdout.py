@@ -70,7 +70,9 @@ class Holdout:
 
     def _is_withheld(self, reading: Reading) -> bool:
         self._first_ns = self._first_ns or reading.stamp_ns
-        if not isinstance(reading, Gps) or self._seconds(reading) % self._config.period_s >= self._config.off_s:
+        if not isinstance(reading, Gps) or reading.sensor not in self._levers:
+            return False
+        if self._seconds(reading) % self._config.period_s >= self._config.off_s:
             return False
         self._waiting.append(reading)
         return True

@@ -87,7 +87,6 @@ class UplinkState:
             return self._on_refused(reply)
         self._on_ack(reply)
         self.problem, self._failures = "", 0
-        self._limit = min(self._limit * 2, self._config.max_batch_samples)
         return 0.0
 
     def _encode(self, spool_id: int, first_seq: int, rows: Table, lost_before: int) -> bytes:
@@ -97,6 +96,7 @@ class UplinkState:
         if self._has_met:
             self.counters["batches"] += 1
             self._spool.acknowledge(ack.watermark)
+            self._limit = min(self._limit * 2, self._config.max_batch_samples)
         else:
             self._has_met = True
             self.counters["new_spool_ids"] += self._spool.meet(ack.watermark)
@@ -106,12 +106,14 @@ class UplinkState:
         self.problem = refused.problem
         if refused.reason in PASSING or refused.reason in BLOCKING:
             return self._back_off()
-        if refused.reason == Refusal.GAP and self._head and refused.expected <= self._head.first_seq:
+        if self._head is None:
+            return self._back_off()
+        if refused.reason == Refusal.GAP:
+            if not 1 <= refused.expected <= self._head.first_seq:
+                return self._back_off()
             # The server knows less than it once acknowledged (restored from a backup): what it lost is declared lost.
             self._spool.acknowledge(refused.expected - 1)
             return 0.0
-        if self._head is None:
-            return self._back_off()
         if len(self._head.rows) > 1:  # find the sample that is to blame
             self._limit = len(self._head.rows) // 2
             return 0.0

@@ -19,7 +19,7 @@ from agents_drives import (
 
 from agents.localisation.localiser import LocalisationConfig, Localiser, PoseBelief
 from agents.localisation.model import GYRO_BIAS, ModelConfig
-from protocol.machine import MachineConfig
+from protocol.machine import MachineConfig, Mount
 from protocol.readings import Gps, Imu, Reading
 from protocol.site import Projection
 
@@ -66,6 +66,14 @@ def test_noiseless_readings_give_a_small_error(receivers: int) -> None:
     assert all(-math.pi <= b.heading_rad <= math.pi for b in beliefs)
 
 
+def test_antenna_far_from_the_rear_axle_is_no_trouble() -> None:
+    of = changed_sensor(machine(), "gps-1", mount=Mount((4.0, 6.0, 3.0)))
+    made = drive([Leg(4, 0.5, 0.2), Leg(4, 0.0, 0.25), Leg(8)], of)
+    errors = position_errors(run(localiser(of), of, made.readings), made)
+    assert errors[0] < 0.2  # the alignment alone, found in a bend
+    assert max(errors) < 0.6
+
+
 def test_nothing_that_was_driven_before_the_alignment_is_lost() -> None:
     of = machine()
     made = drive([Leg(3), *S_BEND], of)
@@ -97,11 +105,11 @@ def test_reverse_driving_from_the_start_is_aligned_too() -> None:
 def test_outlier_is_gated_and_counted() -> None:
     of = machine()
     made = drive(S_BEND, of)
-    outliers = [r.stamp_ns for r in made.readings if isinstance(r, Gps) and after(r, 20)][::10]
+    outliers = [r.stamp_ns for r in made.readings if isinstance(r, Gps) and after(r, 16)][::10]
     readings = [moved(r, 60) if isinstance(r, Gps) and r.stamp_ns in outliers else r for r in made.readings]
-    found = localiser(of)
+    found = localiser(of, relock_fixes=3)  # outliers far apart are not "in a row"
     beliefs = run(found, of, readings)
-    assert found.counters["gps_gated"] == len(outliers) >= 2
+    assert found.counters["gps_gated"] == len(outliers) >= 3
     assert found.counters["gps_relocked"] == 0
     assert max(position_errors(beliefs, made)) < 0.3
 

@@ -41,6 +41,20 @@ def test_tracker_is_stable_on_quantised_travel(rate_hz: int) -> None:
     assert worst < 0.35
 
 
+def test_tracker_equals_least_squares_of_a_parabola_with_fading_weights() -> None:
+    seed, dt, tau_s = 2, 0.05, 0.15
+    rng = np.random.default_rng(seed)
+    t = np.arange(1, 400) * dt
+    travel = 3 * t + np.sin(t) + 0.02 * rng.standard_normal(len(t))
+    tracker = WheelTracker(tau_s)
+    for seconds, metres in zip(t, travel, strict=True):
+        tracker.update(START_NS + round(seconds * 1e9), metres)
+    weights = np.exp(-0.5 * (t[-1] - t) / tau_s)  # polyfit squares them
+    half_accel, speed, _ = np.polyfit(t - t[-1], travel, 2, w=weights)
+    assert tracker.speed_mps == pytest.approx(speed, abs=1e-6), f"seed={seed}"
+    assert tracker.accel_mps2 == pytest.approx(2 * half_accel, abs=1e-5), f"seed={seed}"
+
+
 def test_tracker_starts_anew_after_a_pause_and_ignores_time_that_stands_still() -> None:
     tracker = WheelTracker()
     for i in range(1, 100):
@@ -89,7 +103,7 @@ def test_odometry_is_integrated_over_time_and_a_pause_counts_one_second_at_most(
 
 @pytest.mark.parametrize("direction", [1, -1])
 def test_slip_is_taken_off_where_torque_drives(direction: int) -> None:
-    """At a drive force of a tenth of the weight, and slip 0.2 per traction, two per cent of the wheels' way are lost."""
+    """At a drive force of a tenth of the weight and slip 0.2 per traction, two per cent of the way are lost."""
     of = machine()
     wheels, torque = of.sensor("wheels"), of.sensor("torque")
     assert wheels
@@ -110,13 +124,10 @@ def test_braking_makes_the_wheels_slower_than_the_machine() -> None:
     of = machine()
     made = drive([Leg(4, 0.5), Leg(3, -0.6)], of)
     with_slip, without = reckon(of, made, slip=0.2), reckon(of, made)
-    at_full_speed = [r for r in made.readings if r.stamp_ns <= START_NS + 4 * 10**9]
-    driving_slip, driving = (
-        reckon(of, replace(made, readings=at_full_speed), 0.2),
-        reckon(of, replace(made, readings=at_full_speed)),
-    )
-    assert driving_slip.travel_m < driving.travel_m
-    assert with_slip.travel_m - driving_slip.travel_m > without.travel_m - driving.travel_m
+    driven = replace(made, readings=[r for r in made.readings if r.stamp_ns <= START_NS + 4 * 10**9])
+    driven_with_slip, driven_without = reckon(of, driven, slip=0.2), reckon(of, driven)
+    assert driven_with_slip.travel_m < driven_without.travel_m
+    assert with_slip.travel_m - driven_with_slip.travel_m > without.travel_m - driven_without.travel_m
 
 
 def test_second_imu_and_second_wheel_sensor_do_not_count_twice() -> None:

@@ -299,7 +299,9 @@ def test_new_spool_meets_a_server_that_knows_nothing(tmp_path: Path) -> None:
 # --- errors ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("damage", [b"no database at all, but long enough to be taken for one", b"SQLite format 3\0" * 9])
+@pytest.mark.parametrize(
+    "damage", [b"no database at all, but long enough to be taken for one", b"SQLite format 3\0" * 9]
+)
 def test_damaged_file_is_a_store_error(tmp_path: Path, damage: bytes) -> None:
     (tmp_path / "spool.db").write_bytes(damage)
     with pytest.raises(StoreError, match=r"spool\.db"):

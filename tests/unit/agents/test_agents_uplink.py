@@ -69,9 +69,8 @@ def test_first_payload_asks_for_the_watermark() -> None:
     batch = next_batch(state)
     assert (batch.machine, batch.spool_id, batch.frame) == ("loader-1", spool.spool_id, SITE.frame)
     assert (batch.first_seq, len(batch.rows), batch.lost_before) == (1, 0, 0)
-    state.on_reply(Ack(2, 0))
-    assert next_batch(state).first_seq == 3
-    assert spool.acknowledged == 2
+    state.on_reply(Ack(0, 0))
+    assert len(next_batch(state).rows) == 5
 
 
 def test_watermark_is_asked_for_until_somebody_answers() -> None:
@@ -181,6 +180,15 @@ def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
     assert state.counters["refused_out_of_range"] >= 1
 
 
+def test_bisection_halves() -> None:
+    state, _ = met(16, batch_samples=16)
+    sizes = []
+    for _ in range(4):
+        sizes.append(len(next_batch(state).rows))
+        state.on_reply(Refused(Refusal.NOT_FINITE, "c_rr[0]"))
+    assert sizes == [16, 8, 4, 2]
+
+
 @pytest.mark.parametrize("reason", sorted(BLOCKING | PASSING))
 def test_what_is_no_sample_s_fault_puts_nothing_aside(reason: Refusal) -> None:
     state, spool = met(1)
@@ -225,14 +233,12 @@ def test_full_spool_declares_what_it_dropped() -> None:
 
 
 def exchange(state: UplinkState, server: Server, rng: random.Random, quality: float) -> None:
-    """One round over a link that loses requests and replies, and repeats requests, also much later ones."""
+    """One round over a link that loses requests and replies, and repeats requests."""
     payload = state.next_payload()
     if payload is None:
         return
-    answers = []
-    for _ in range(rng.choice((1, 1, 1, 2))):
-        if rng.random() < quality:
-            answers.append(decode_reply(encode_reply(server.answer(payload))))
+    arrivals = [payload for _ in range(rng.choice((1, 1, 1, 2))) if rng.random() < quality]
+    answers = [decode_reply(encode_reply(server.answer(arrival))) for arrival in arrivals]
     heard = answers and rng.random() < quality
     state.on_reply(rng.choice(answers) if heard else None)
 
@@ -295,14 +301,15 @@ def test_linger_waits_until_the_spool_is_empty_or_time_is_over() -> None:
     assert linger(lambda: True, waits.append, lambda: 0.0, 0.0)
 
 
-OPTIONS: dict[str, Any] = {"batch_samples": 3, "max_batch_samples": 200, "backoff_s": 0.5, "max_backoff_s": 0.3}
+OPTIONS: dict[str, Any] = {"batch_samples": 3, "max_batch_samples": 30, "backoff_s": 0.5, "max_backoff_s": 0.3}
+BASE: dict[str, Any] = {"batch_samples": 20, "max_batch_samples": 80}
 
 
 def trace(**options: Any) -> list[Any]:
     """Sizes and pauses of a fixed course of events."""
-    state, _ = met(500, **options)
+    state, _ = met(500, **BASE | options)
     found: list[Any] = []
-    for reply in ("ok", "lost", "ok", "lost", "lost", "lost"):
+    for reply in ("ok", "ok", "lost", "ok", "lost", "lost", "lost"):
         batch = next_batch(state)
         found.append((len(batch.rows), state.on_reply(Ack(batch.last_seq, 1) if reply == "ok" else None)))
     return found

@@ -1,0 +1,108 @@
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agents.config import AgentConfig, load_agent
+from protocol.errors import ConfigError
+from protocol.machine import MachineConfig, Mount, SensorConfig
+from protocol.site import SiteConfig, load_site
+from sim import paper_site
+from sim.machines import loader
+
+CONFIG = Path(__file__).resolve().parents[3] / "config"
+
+
+def table(name: str) -> dict[str, Any]:
+    return tomllib.loads((CONFIG / name).read_text(encoding="utf-8"))
+
+
+def unnamed(config: Any, named: dict[str, Any], place: str = "") -> list[str]:
+    """Options of a nested dataclass that a TOML table does not name."""
+    missing = []
+    for f in fields(config):
+        value = getattr(config, f.name)
+        if f.name not in named:
+            missing.append(place + f.name)
+        elif hasattr(value, "__dataclass_fields__"):
+            missing += unnamed(value, named[f.name], f"{place}{f.name}.")
+    return missing
+
+
+def test_agent_file_gives_the_defaults_and_the_simulated_loader() -> None:
+    assert load_agent(CONFIG / "agent.toml") == (loader("loader-1", 2, 1), AgentConfig())
+
+
+def test_agent_file_names_every_option() -> None:
+    assert unnamed(AgentConfig(), table("agent.toml")) == []
+
+
+def test_agent_file_names_every_option_of_machine_and_sensor() -> None:
+    named = table("agent.toml")
+    assert {f.name for f in fields(MachineConfig)} - {"sensors"} == set(named["machine"])
+    assert {f.name for f in fields(SensorConfig)} == {key for sensor in named["sensor"] for key in sensor}
+    assert {f.name for f in fields(Mount)} == set(named["sensor"][0]["mount"])
+
+
+def test_site_file_gives_the_paper_s_site_and_names_every_option() -> None:
+    assert load_site(CONFIG / "site.toml") == paper_site.site("paper")
+    assert {f.name for f in fields(SiteConfig)} == set(table("site.toml"))
+
+
+@pytest.mark.parametrize("name", ["agent.toml", "site.toml"])
+def test_every_option_has_a_comment_and_lines_are_short(name: str) -> None:
+    lines = (CONFIG / name).read_text(encoding="utf-8").splitlines()
+    assert max(map(len, lines)) <= 120
+    plain = ("wheel_radius_m", "wheelbase_m", "use")  # their names and the words above them say it all
+    said = {line.split(" = ")[0] for line in lines if " = " in line and "#" in line} | set(plain) | {"mount"}
+    assert {line.split(" = ")[0] for line in lines if " = " in line and not line.startswith("#")} <= said
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "agent.toml"
+    path.write_text(text)
+    return path
+
+
+def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
+    machine, config = load_agent(written(tmp_path, "linger_s = 1\n[pipeline.sampling]\nevery_m = 2\n"))
+    assert machine is None
+    assert (config.linger_s, config.pipeline.sampling.every_m) == (1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("lingers = 1", "unknown key `lingers`"),
+        ("[pipeline.sampling]\nevery = 2", "unknown key `every`"),
+        ("[pipeline.sampling]\nevery_m = 0", "every_m"),
+        ("[pipeline.sampling]\nevery_m = nan", "every_m"),
+        ("[pipeline.estimation.attitude]\nrate_walk = 0", "rate_walk"),
+        ("[pipeline.localisation]\nrelock_fixes = 1.5", "relock_fixes"),
+        ("[pipeline]\ngap_s = -1", "gap_s"),
+        ("[uplink]\nbatch_samples = 0", "batch_samples"),
+        ("[spool]\nmax_samples = 0", "max_samples"),
+        ("[holdout]\noff_s = 11", "off_s"),
+        ("linger_s = -1", "linger_s"),
+        ("[machine]\nname = 'No'", "name"),
+        ("[machine]\nname = 'a'\nmass_kg = 0", "mass_kg"),
+        ("[machine]\nname = 'a'\n[[sensor]]\nname = 'g'\nkind = 'gps'\ndrift_share = 2", "drift_share"),
+        (
+            "[machine]\nname = 'a'\n[[sensor]]\nname = 'g'\nkind = 'gps'\n[[sensor]]\nname = 'g'\nkind = 'imu'",
+            "sensors",
+        ),
+        ("[[sensor]]\nname = 'g'\nkind = 'gps'", "without a"),
+        ("sensor = 3", "sensor"),
+    ],
+)
+def test_bad_option_is_refused_by_name_and_file(tmp_path: Path, text: str, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem) as refused:
+        load_agent(written(tmp_path, text))
+    assert "agent.toml" in str(refused.value)
+
+
+def test_missing_file_is_a_config_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such file"):
+        load_agent(tmp_path / "none.toml")
