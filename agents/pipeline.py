@@ -88,6 +88,7 @@ class Pipeline:
         if verdict is Verdict.RESTART:
             self._counters.update(self._localiser.counters)
             self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
+            self._counters["withheld_restart"] += self._sampler.waiting
             self._start()
         made: list[Table] = []
         for pose in self._localiser.update(reading, sensor):  # after a late alignment more than the history holds

@@ -90,6 +90,11 @@ class Sampler:
         self._way_m = 0.0
         self._marks: deque[Mark] = deque()
 
+    @property
+    def waiting(self) -> int:
+        """How many marks have no place yet."""
+        return len(self._marks)
+
     def is_due(self, way_m: float) -> bool:
         """Whether the machine has driven far enough since the last mark; way_m counts up in reverse too."""
         return way_m - self._way_m >= self._config.every_m

@@ -220,6 +220,9 @@ class Spool:
 
     def _drop_oldest(self) -> int:
         """Keep to the limit; returns how many were dropped."""
+        first, last = self._db.execute("SELECT MIN(seq), MAX(seq) FROM sample").fetchone()
+        if first is None or last - first < self._config.max_samples:  # counting takes time that grows with the spool
+            return 0
         depth: int = self._db.execute("SELECT COUNT(*) FROM sample").fetchone()[0]
         excess = max(0, depth - self._config.max_samples)
         if excess:

@@ -7,6 +7,7 @@ delete. An empty reply means "no server" or "denied", never "done".
 from __future__ import annotations
 
 import logging
+import sqlite3
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -25,7 +26,16 @@ from protocol.samples import empty
 log = logging.getLogger("agents.uplink")
 
 # The fault lies with the set-up, not with a sample: nothing is put aside, a person has to mend it.
-BLOCKING = {Refusal.WRONG_FRAME, Refusal.WRONG_MACHINE, Refusal.VERSION, Refusal.OUTSIDE_SITE, Refusal.WALL_CLOCK}
+BLOCKING = {
+    Refusal.WRONG_FRAME,
+    Refusal.WRONG_MACHINE,
+    Refusal.VERSION,
+    Refusal.WALL_CLOCK,
+    Refusal.NOT_MSGPACK,
+    Refusal.MISSING_FIELD,
+    Refusal.WRONG_TYPE,
+    Refusal.COLUMN_LENGTH,
+}
 PASSING = {Refusal.OVERLOADED, Refusal.STORE}  # the server will take the same batch later
 
 
@@ -88,6 +98,12 @@ class UplinkState:
         self._on_ack(reply)
         self.problem, self._failures = "", 0
         return 0.0
+
+    def on_disk_error(self, error: Exception) -> float:
+        """Take in that the spool could not be read or written; returns the pause before the next try [s]."""
+        self.counters["disk_errors"] += 1
+        self.problem = f"the spool cannot be used: {error}; look at the machine's disk"
+        return self._back_off()
 
     def _encode(self, spool_id: int, first_seq: int, rows: Table, lost_before: int) -> bytes:
         return encode_batch(SampleBatch(self._machine, spool_id, first_seq, rows, self._frame, lost_before))
@@ -153,11 +169,14 @@ class Uplink:
     def _run(self) -> None:
         while not self._stop.is_set():
             self._wake.clear()
-            payload = self.state.next_payload()
-            if payload is None:
+            try:
+                payload = self.state.next_payload()
+                pause_s = self.state.on_reply(self._ask(payload)) if payload else None
+            except sqlite3.Error as error:  # a full or failing disk: the samples wait, the agent goes on
+                pause_s = self.state.on_disk_error(error)
+            if pause_s is None:
                 self._wake.wait(0.5)
-                continue
-            if pause_s := self.state.on_reply(self._ask(payload)):
+            elif pause_s > 0:
                 self._stop.wait(pause_s)
 
     def _ask(self, payload: bytes) -> Ack | Refused | None:

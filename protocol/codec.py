@@ -228,4 +228,5 @@ def encode_health(health: Health) -> bytes:
 def decode_health(data: bytes) -> Health:
     """Undo `encode_health`."""
     table = unpack(data, MAX_SMALL_BYTES)
-    return Health(_take_name(table), _take_stamp(table), take(table, "values", dict))
+    stamp_ns = _take_int(table, "stamp_ns", 0, MAX_STAMP_NS)  # 0: nothing was read yet
+    return Health(_take_name(table), stamp_ns, take(table, "values", dict))

@@ -75,8 +75,6 @@ class MachineConfig:
     name: str
     mass_kg: float = 17_500.0
     wheel_radius_m: float = 0.75
-    wheelbase_m: float = 3.3
-    track_m: float = 2.2
     load_centre_m: float = 1.5
     rotating_mass_factor: float = 1.07
     sensors: tuple[SensorConfig, ...] = ()
@@ -84,8 +82,8 @@ class MachineConfig:
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
-        if min(self.mass_kg, self.wheel_radius_m, self.wheelbase_m, self.track_m) <= 0:
-            raise ValueError("mass_kg, wheel_radius_m, wheelbase_m and track_m must be positive")
+        if min(self.mass_kg, self.wheel_radius_m) <= 0:
+            raise ValueError("mass_kg and wheel_radius_m must be positive")
         if self.rotating_mass_factor < 1:
             raise ValueError("rotating_mass_factor: below 1")
         names = [s.name for s in self.sensors]

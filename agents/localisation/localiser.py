@@ -17,6 +17,7 @@ from protocol.readings import Gps, Reading
 from protocol.site import Projection
 
 TWO_PI = 2 * math.pi
+COLLECTED = 12_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
 MIN_DRIFT_M2 = 1e-6  # a receiver that was never heard, or has no slow error, must not make the covariance singular
 
 
@@ -92,8 +93,8 @@ class Localiser:
         self._heard: set[int] = set()
         self._filter: VectorisedUkf | None = None
         self._at = Dead(0, 0.0, 0.0, 0.0, 0.0)  # dead-reckoned pose of the filter's last step
-        self._track: list[Dead] = []
-        self._fixes: list[_Fix] = []
+        self._track: deque[Dead] = deque(maxlen=COLLECTED)
+        self._fixes: deque[_Fix] = deque(maxlen=COLLECTED)
         self._gated: Counter[int] = Counter()
         self._still: deque[Dead] = deque()
 
@@ -225,7 +226,7 @@ class Localiser:
             self._heard.add(fix.receiver)
         self._filter = VectorisedUkf(x, self._start_covariance(len(x), found, fix_std_m))
         self._at = first
-        events: list[Dead | _Fix] = [*self._track[1:], *self._fixes]
+        events: list[Dead | _Fix] = [*list(self._track)[1:], *self._fixes]
         beliefs = [self._belief(self._filter)]
         for event in sorted(events, key=lambda e: e.stamp_ns):
             dead = event.dead if isinstance(event, _Fix) else event
@@ -233,7 +234,8 @@ class Localiser:
             if isinstance(event, _Fix):
                 self._condition(self._filter, event)
             beliefs.append(self._belief(self._filter))
-        self._track, self._fixes = [], []
+        self._track.clear()
+        self._fixes.clear()
         return beliefs
 
     def _start_covariance(self, n: int, found: Alignment, fix_std_m: float) -> Floats:

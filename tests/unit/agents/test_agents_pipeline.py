@@ -320,7 +320,6 @@ BODY = {
     "load_centre_m": 0.5,
     "rotating_mass_factor": 1.2,
 }
-NOT_USED_YET = {"wheelbase_m", "track_m"}  # by no stage of an agent so far
 SENSOR = [
     ("gps-1", {"mount": Mount((5.0, 0.0, 3.35))}),
     ("gps-1", {"use": False}),
@@ -335,7 +334,7 @@ SENSOR = [
 
 
 def test_every_field_of_machine_and_sensor_is_covered() -> None:
-    assert {f.name for f in fields(MachineConfig)} == {"name", "sensors", *BODY, *NOT_USED_YET}
+    assert {f.name for f in fields(MachineConfig)} == {"name", "sensors", *BODY}
     covered = {name for _, options in SENSOR for name in options}
     assert {f.name for f in fields(SensorConfig)} == {"name", "kind", *covered}
     assert {f.name for f in fields(Mount)} == {"xyz_m", "rpy_deg"}
@@ -380,7 +379,7 @@ def test_bad_sensor_option_is_refused_by_name(options: dict[str, Any], named: st
     ("options", "named"),
     [
         ({"name": ""}, "name"),
-        *(({name: 0.0}, name) for name in ("mass_kg", "wheel_radius_m", "wheelbase_m", "track_m")),
+        *(({name: 0.0}, name) for name in ("mass_kg", "wheel_radius_m")),
         ({"rotating_mass_factor": 0.9}, "rotating_mass_factor"),
         ({"sensors": (SensorConfig("a", "imu"), SensorConfig("a", "gps"))}, "sensors"),
     ],

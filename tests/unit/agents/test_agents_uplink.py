@@ -288,6 +288,15 @@ def test_agent_that_is_killed_again_and_again_delivers_every_sample_exactly_once
     spool.close()
 
 
+def test_failing_disk_pauses_the_uplink_and_loses_nothing() -> None:
+    state, spool = met(5)
+    assert state.on_disk_error(OSError("disk is full")) == UplinkConfig().backoff_s
+    assert "disk is full; look at the machine's disk" in state.problem
+    assert state.counters["disk_errors"] == 1
+    assert len(next_batch(state).rows) == 5
+    assert spool.counters()["depth"] == 5
+
+
 def test_linger_waits_until_the_spool_is_empty_or_time_is_over() -> None:
     clock = itertools.count(0.0, 0.05)
     left = iter([False, False, True])

@@ -301,7 +301,13 @@ def test_group_that_is_no_map_is_refused(group):
 def test_live_messages_carry_a_plausible_stamp(stamp):
     pose = Pose("m-1", stamp, *[0.0] * 7)
     assert refusal(codec.encode_pose(pose), codec.decode_pose).field == "stamp_ns"
-    assert refusal(codec.encode_health(Health("m-1", stamp, {})), codec.decode_health).field == "stamp_ns"
+    if stamp:  # the health of an agent that has read nothing yet carries 0
+        assert refusal(codec.encode_health(Health("m-1", stamp, {})), codec.decode_health).field == "stamp_ns"
+
+
+def test_agent_that_has_read_nothing_shows_its_health():
+    waiting = Health("m-1", 0, {"readings": 0})
+    assert codec.decode_health(codec.encode_health(waiting)) == waiting
 
 
 def test_pose_that_is_nowhere_is_refused():
