@@ -32,13 +32,9 @@ def main(words: Sequence[str] | None = None) -> int:
 def _table(result: Result) -> str:
     """Rows under their names, numbers to the right."""
     names = list(result["rows"][0])
-    lines = [names, *([_text(row[name]) for name in names] for row in result["rows"])]
+    lines = [names, *([str(row[name]) for name in names] for row in result["rows"])]
     widths = [max(len(line[i]) for line in lines) for i in range(len(names))]
     return "\n".join("  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True)) for line in lines)
-
-
-def _text(value: object) -> str:
-    return f"{value:,.3g}" if isinstance(value, float) and value < 1000 else str(value)
 
 
 if __name__ == "__main__":

@@ -32,8 +32,8 @@ def run(samples: int, runs: int) -> Result:
                 {
                     "variant": name,
                     "pattern": pattern,
-                    "msamples_per_s": n / whole[name] / 1e6,
-                    "us_per_batch_of_100": batches[name] / (n / BATCH) * 1e6,
+                    "msamples_per_s": float(f"{n / whole[name] / 1e6:.3g}"),
+                    "us_per_batch_of_100": round(batches[name] / (n / BATCH) * 1e6, 1),
                 }
             )
     return {"benchmark": "merge", "samples": samples, "runs": runs, **machine(), "rows": rows}

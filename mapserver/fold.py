@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver import evidence as ev
-from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
+from protocol.arrays import Bools, Floats, Ints, Table
 
 VISIT_NS = 60_000_000_000  # one machine's passes within a minute are one visit
 
@@ -187,9 +187,9 @@ def _raw_weight(votes: Votes, dy: int, dx: int) -> Ints:
 
 def _add(counts: NDArray[np.uint32], block: Ints, cell: Ints, index: Ints, weight: Ints, which: Bools) -> None:
     """Add with saturation: the exact sum of this batch and what is there, limited to COUNT_MAX."""
-    where: AnyArray = np.stack([block[which], cell[which], index[which]])
-    unique, inverse = np.unique(where, axis=1, return_inverse=True)
-    total = np.zeros(unique.shape[1], np.int64)
-    np.add.at(total, inverse.ravel(), weight[which])
-    place = tuple(unique)
+    where = np.ravel_multi_index((block[which], cell[which], index[which]), counts.shape)
+    unique, inverse = np.unique(where, return_inverse=True)
+    total = np.zeros(len(unique), np.int64)
+    np.add.at(total, inverse, weight[which])
+    place = np.unravel_index(unique, counts.shape)
     counts[place] = np.minimum(counts[place].astype(np.int64) + total, ev.COUNT_MAX).astype(np.uint32)

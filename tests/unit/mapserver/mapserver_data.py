@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -125,8 +125,6 @@ def held(writer: Writer) -> Iterator[None]:
     def hold(_: Store) -> None:
         entered.set()
         release.wait(WAIT_S)
-
-    from threading import Thread
 
     reader = Thread(target=writer.read, args=(hold,))
     reader.start()

@@ -33,7 +33,7 @@ def test_the_file_names_every_option():
 def test_every_option_of_the_file_has_a_comment():
     options = [line for line in FILE.read_text().splitlines() if "=" in line.partition("#")[0]]
     assert all("#" in line for line in options)
-    assert len(options) == 10  # one per option
+    assert len(options) == 10
 
 
 @pytest.mark.parametrize(

@@ -130,4 +130,4 @@ def test_chunks_hold_every_block_once():
     blocks = [(i, -i) for i in range(2 * READ_BLOCKS + 3)]
     pieces = list(chunks(blocks))
     assert [len(piece) for piece in pieces] == [READ_BLOCKS, READ_BLOCKS, 3]
-    assert sum(pieces, []) == blocks
+    assert [block for piece in pieces for block in piece] == blocks

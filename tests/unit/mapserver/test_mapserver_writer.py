@@ -28,6 +28,7 @@ from mapserver_data import (
 from mapserver import snapshot
 from mapserver.answers import Answers
 from mapserver.config import ServerConfig, StoreConfig
+from mapserver.journal import Journal
 from mapserver.store import Store
 from mapserver.writer import Writer
 from protocol.codec import MAX_BATCH_BYTES, encode_batch
@@ -60,10 +61,8 @@ def wait_for(fact: Callable[[], bool]) -> None:
 
 
 def spied(monkeypatch, method: str) -> list[str]:
-    """Record calls of a Journal's method, and what else a test adds."""
+    """Record the calls of a method of Journal; a test may add what else happens."""
     events: list[str] = []
-    from mapserver.journal import Journal
-
     real = getattr(Journal, method)
 
     def spy(self, *args):
@@ -203,7 +202,7 @@ def test_waiting_for_a_merged_row_returns_once_it_is(start):
 def test_waiting_for_a_row_that_does_not_come_times_out(start):
     writer = start()
     send(writer, [incoming(samples(1))])
-    with pytest.raises(QueryError, match="row 2 is not merged after 0.01 s; merged is 1") as caught:
+    with pytest.raises(QueryError, match=r"row 2 is not merged after 0\.01 s; merged is 1") as caught:
         writer.wait_merged(2, 0.01)
     assert caught.value.reason == Refusal.AFTER_TIMEOUT
 
