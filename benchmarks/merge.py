@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.measure import SIDE_M, Result, machine, medians, scattered, timed, track
-from mapserver.fold import FoldConfig
 from mapserver.grid import Grid
+from mapserver.votes import FoldConfig
 from protocol.arrays import Table
 
 PATTERNS = {"track": track, "random": scattered}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from mapserver.fold import FoldConfig
 from mapserver.layers import ReadConfig
+from mapserver.votes import FoldConfig
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver import evidence as ev
-from mapserver.fold import TABLE, TABLE_MAX_D2, TABLE_PER_UNIT, Votes
+from mapserver.votes import TABLE, TABLE_MAX_D2, TABLE_PER_UNIT, Votes
 from protocol.arrays import Ints
 
 _FIRST = np.array([ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start])

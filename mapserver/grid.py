@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver import evidence as ev
-from mapserver.fold import FoldConfig, Votes, is_foldable, kernel, prepare
+from mapserver.fold import kernel
+from mapserver.votes import FoldConfig, Votes, is_foldable, prepare
 from protocol.arrays import Ints, Table
 from protocol.geometry import BLOCK_CELLS, CellWindow
 

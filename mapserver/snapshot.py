@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from mapserver import evidence as ev
-from mapserver.fold import FoldConfig
 from mapserver.grid import Grid, GridState
+from mapserver.votes import FoldConfig
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2

@@ -11,9 +11,9 @@ import zenoh
 
 from mapserver.config import ServerConfig
 from mapserver.evidence import COUNTS
-from mapserver.fold import FoldConfig
 from mapserver.grid import Grid
 from mapserver.store import Incoming, Store
+from mapserver.votes import FoldConfig
 from mapserver.writer import Writer
 from protocol.arrays import Table
 from protocol.codec import encode_batch

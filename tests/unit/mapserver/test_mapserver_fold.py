@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from mapserver_data import NOW_NS, folded, random_samples, same, samples, total
 
 from mapserver import evidence as ev
-from mapserver.fold import TABLE, FoldConfig, fold_numpy, kernel, prepare
+from mapserver.fold import fold_numpy, kernel
 from mapserver.grid import Grid
+from mapserver.votes import TABLE, FoldConfig, prepare
 from protocol.ground import ZONES
 
 UNITS = ev.WEIGHT_UNITS_PER_M

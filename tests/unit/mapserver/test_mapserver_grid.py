@@ -3,8 +3,8 @@ import pytest
 from mapserver_data import NOW_NS, folded, random_samples, same, samples
 
 from mapserver import evidence as ev
-from mapserver.fold import FoldConfig
 from mapserver.grid import READ_BLOCKS, Grid, chunks
+from mapserver.votes import FoldConfig
 from protocol.geometry import CellWindow
 
 EVERYTHING = CellWindow(-(2**20), -(2**20), 2**21, 2**21)

@@ -3,9 +3,9 @@ import pytest
 from mapserver_data import NOW_NS, folded, samples
 
 from mapserver import evidence as ev
-from mapserver.fold import FoldConfig
 from mapserver.grid import Grid
 from mapserver.layers import LAYERS, ReadConfig, read, select
+from mapserver.votes import FoldConfig
 from protocol.errors import QueryError, Refusal
 from protocol.ground import BOUNDARIES, ZONES
 

@@ -8,8 +8,8 @@ from mapserver_data import CONFIG, folded, incoming, open_store, random_samples,
 
 from mapserver import evidence as ev
 from mapserver import snapshot
-from mapserver.fold import FoldConfig
 from mapserver.grid import Grid
+from mapserver.votes import FoldConfig
 from protocol.messages import Ack
 
 FOLD = FoldConfig()

@@ -1,0 +1,178 @@
+"""The PyBullet world: frames of articulated machines as rigid bodies, tyres and soil as forces from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from protocol.arrays import Floats
+from sim.machine_model import BASE, FRONT, WHEELS, MachineModel
+from sim.multibody import MultiBodies
+from sim.observe import Drive, FrontState, observe
+from sim.rigid import POINT_FRAME, Ground, articulation, look
+from sim.terrain import Terrain
+from sim.tyre import Motion, TyreForces, Tyres, at_rest, radial_load, roll
+from sim.vehicle import GRAVITY, Bodies
+from sim.world import STEP_S, FleetState
+
+SETTLE_STEPS = 200  # with the brakes on, before the world starts
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What machines do at the moment, all (n,): rate of articulation, drive force, and most force of the brakes."""
+
+    steering_radps: Floats
+    drive_n: Floats
+    brake_n: Floats
+
+
+class BulletWorld:
+    """n machines on one terrain, moved by PyBullet at 100 Hz.
+
+    bodies: true mass, empty [kg], and true wheel radius [m]. starts: x, y [m] and yaw [rad] of each `base_link`,
+    (n, 3). The machines stand straight, empty and settled on their tyres.
+    """
+
+    def __init__(self, terrain: Terrain, models: Sequence[MachineModel], bodies: Bodies, starts: Floats) -> None:
+        self._terrain, self._bodies = terrain, bodies
+        mass_factor = bodies.mass_kg / np.array([m.mass_kg for m in models])
+        self._multi = MultiBodies(models, mass_factor, _standing(terrain, models, starts), STEP_S)
+        self.close = self._multi.close
+        self._payload_kg = np.zeros(len(models))
+        for machine in range(len(models)):
+            self._multi.set_payload(machine, 0.0)
+
+        self._tyres, self._free_radius_m = _tyres(models, bodies), _free_radius_m(models, bodies)
+        self._arms_m = _points(models) - self._multi.centres_m[:, POINT_FRAME]
+        self._steer = np.array([[m.steer_gain_per_s, m.steer_radps, STEP_S / m.steer_lag_s] for m in models]).T
+        self._engine_share = STEP_S / np.array([m.engine_lag_s for m in models])
+
+        zero, hold = np.zeros(len(models)), np.array([m.max_brake_n for m in models])
+        self._inputs = Inputs(zero, zero, zero)
+        self._rolling = at_rest((len(models), 4))
+        self._wheel_rad = np.zeros((len(models), 2))
+        self._scene = look(terrain, self._multi.read(), self._arms_m)
+        for _ in range(SETTLE_STEPS):
+            state = self.advance(zero, zero, hold)
+        self._wheel_rad = np.zeros((len(models), 2))
+        self._state: FleetState = replace(state, wheel_rad=self._wheel_rad)
+
+    @property
+    def state(self) -> FleetState:
+        """The state after the last step."""
+        return self._state
+
+    @property
+    def front(self) -> FrontState:
+        """Motion of the front frames after the last step."""
+        return self._front
+
+    @property
+    def mass_kg(self) -> Floats:
+        """Mass of each machine with what it carries (n,)."""
+        return self._bodies.mass_kg + self._payload_kg
+
+    @property
+    def wheel_loads_n(self) -> Floats:
+        """Load of each wheel (n, 4): front left, front right, rear left, rear right."""
+        return self._loads(self._scene.ground)
+
+    def set_payload(self, machine: int, payload_kg: float) -> None:
+        """Change what one machine carries."""
+        self._multi.set_payload(machine, payload_kg)
+        self._payload_kg[machine] = payload_kg
+
+    def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
+        """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
+        self._inputs = self._obey(steer_rad, drive_n, brake_n)
+
+        # What the ground does to the wheels where they are now.
+        ground = self._scene.ground
+        load = self._loads(ground)
+        forces = self._roll(ground, load)
+        along_wheel = np.stack([forces.traction_n + forces.resistance_n, forces.left_n, load], axis=-1)
+        in_map = (along_wheel[..., None, :] @ ground.wheel_from_map)[..., 0, :]
+
+        # Where that takes the machines.
+        before = self._scene
+        self._multi.step(in_map, ground.point_m, self._inputs.steering_radps)
+        self._scene = look(self._terrain, self._multi.read(), self._arms_m, ground.point_m)
+        rear = self._rolling.spin_radps[:, 2:]
+        self._wheel_rad = self._wheel_rad + STEP_S * rear
+        drive = Drive(self._inputs.drive_n, forces.torque_nm.sum(axis=-1), rear, self._wheel_rad)
+        self._state, self._front = observe(before, self._scene, self._loads(self._scene.ground), drive)
+        return self._state
+
+    def _obey(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> Inputs:
+        """Hydraulics and engine follow with their lags."""
+        old, (gain, fastest, share) = self._inputs, self._steer
+        wanted = gain * (steer_rad - articulation(self._scene.frames.rotation))
+        wanted = np.minimum(np.maximum(wanted, -fastest), fastest)
+        steering = old.steering_radps + share * (wanted - old.steering_radps)
+        return Inputs(steering, old.drive_n + self._engine_share * (drive_n - old.drive_n), brake_n)
+
+    def _loads(self, ground: Ground) -> Floats:
+        return radial_load(self._tyres, self._free_radius_m - ground.gap_m, -ground.velocity_mps[..., 2])
+
+    def _roll(self, ground: Ground, load: Floats) -> TyreForces:
+        """Turn the wheels; drive and brakes are split in proportion to the wheels' loads."""
+        motion = Motion(load, ground.velocity_mps[..., 0], ground.velocity_mps[..., 1], ground.zone)
+        lever = load * (self._tyres.radius_m / np.maximum(load.sum(axis=-1, keepdims=True), 1.0))
+        drive, brake = lever * self._inputs.drive_n[:, None], lever * self._inputs.brake_n[:, None]
+        self._rolling, forces = roll(self._tyres, self._rolling, motion, drive, brake, STEP_S)
+        return forces
+
+
+def _standing(terrain: Terrain, models: Sequence[MachineModel], starts: Floats) -> Floats:
+    """Place (3) and quaternion (4) of each `base_link` standing straight on the ground under its axles, (n, 7)."""
+    x, y, yaw = starts.T
+    wheelbase, half_track = np.array([[m.wheelbase_m, 0.5 * m.track_m] for m in models]).T
+    ahead_x, ahead_y = wheelbase * np.cos(yaw), wheelbase * np.sin(yaw)
+    left_x, left_y = -half_track * np.sin(yaw), half_track * np.cos(yaw)
+    left, right = terrain.height(x + left_x, y + left_y), terrain.height(x - left_x, y - left_y)
+    rear = 0.5 * (left + right)
+    pitch = -np.arctan((terrain.height(x + ahead_x, y + ahead_y) - rear) / wheelbase)
+    roll = np.arcsin(np.clip((left - right) / (2 * half_track) * np.cos(pitch), -1, 1))
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll / 2, pitch / 2, yaw / 2]), np.sin([roll / 2, pitch / 2, yaw / 2])
+    quaternion = (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+    return np.stack([x, y, rear, *quaternion], axis=-1)
+
+
+def _points(models: Sequence[MachineModel]) -> Floats:
+    """The points of `rigid.POINT_FRAME` in the links of their frames, (n, 6, 3)."""
+    rows = []
+    for model in models:
+        robot = model.robot
+        carriers = [robot.joints[wheel].parent for wheel in WHEELS]
+        hubs = [robot.place(wheel, carrier).xyz_m for wheel, carrier in zip(WHEELS, carriers, strict=True)]
+        rows.append([*hubs, robot.place(BASE, BASE).xyz_m, robot.place(FRONT, FRONT).xyz_m])
+    return np.array(rows)
+
+
+def _tyres(models: Sequence[MachineModel], bodies: Bodies) -> Tyres:
+    def of_wheels(values: Sequence[float]) -> Floats:
+        return np.repeat(np.array(values)[:, None], 4, axis=1)
+
+    return Tyres(
+        radius_m=of_wheels(bodies.wheel_radius_m.tolist()),
+        stiffness_npm=of_wheels([m.tyre_stiffness_npm for m in models]),
+        damping_nspm=of_wheels([m.tyre_damping_nspm for m in models]),
+        relaxation_m=of_wheels([m.relaxation_m for m in models]),
+        inertia_kgm2=of_wheels([m.wheel_inertia_kgm2 for m in models]),
+    )
+
+
+def _free_radius_m(models: Sequence[MachineModel], bodies: Bodies) -> Floats:
+    """Radius of unloaded tyres (n, 4), so that the nominal machine stands level when empty, hubs at their radius."""
+    share = np.array([[m.front_share()] * 2 + [1 - m.front_share()] * 2 for m in models])
+    sunk_m = np.array([0.5 * m.mass_kg * GRAVITY / m.tyre_stiffness_npm for m in models])
+    free: Floats = bodies.wheel_radius_m[:, None] + share * sunk_m[:, None]
+    return free

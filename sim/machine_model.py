@@ -1,0 +1,120 @@
+"""Kinds of machines: a URDF file for bodies, joints and sensor places, and a TOML file for everything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from protocol.config import from_table, load_toml
+from protocol.errors import ConfigError
+from protocol.machine import Mount
+from sim.urdf import Mass, Pose, Robot, joined, read_urdf, rpy_rad
+
+FOLDER = Path(__file__).parent / "models"
+BASE, FRONT, PAYLOAD = "base_link", "front_link", "payload_link"
+WHEELS = tuple(f"{place}_wheel_link" for place in ("front_left", "front_right", "rear_left", "rear_right"))
+
+
+@dataclass(frozen=True)
+class MachineModel:
+    """One kind of articulated machine on four wheels, as it leaves the works; `sim/models/*.toml` explain the values.
+
+    urdf: file beside the TOML file. mass_kg: empty. payload_kg: the most it carries. load_centre_m: how far ahead of
+    the rear axle the wheel loads' centre lies, empty.
+    """
+
+    name: str
+    urdf: str
+    rear_to_joint_m: float
+    front_to_joint_m: float
+    track_m: float
+    mass_kg: float
+    payload_kg: float
+    load_centre_m: float
+    rotating_mass_factor: float
+    max_articulation_rad: float
+    steer_radps: float
+    steer_gain_per_s: float
+    steer_lag_s: float
+    steer_nm: float
+    max_drive_n: float
+    max_brake_n: float
+    max_power_w: float
+    engine_lag_s: float
+    wheel_radius_m: float
+    wheel_inertia_kgm2: float
+    tyre_stiffness_npm: float
+    tyre_damping_nspm: float
+    relaxation_m: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.max_articulation_rad < 1.2:
+            raise ValueError("max_articulation_rad: not between 0 and 1.2")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, float) and value <= 0:
+                raise ValueError(f"{field.name}: {value:g} is not positive")
+
+    @property
+    def wheelbase_m(self) -> float:
+        """From axle to axle, standing straight."""
+        return self.rear_to_joint_m + self.front_to_joint_m
+
+    @property
+    def robot(self) -> Robot:
+        """The URDF's content."""
+        return read_urdf(FOLDER / self.urdf)
+
+    @property
+    def rolls_with_front(self) -> bool:
+        """Whether the rear frame rolls as the front wheels lie (a swinging rear axle) or as its own do (a hitch)."""
+        return self.robot.joints[WHEELS[2]].parent != BASE
+
+    def weight(self, payload_kg: float = 0.0) -> Mass:
+        """Mass, centre and inertia of the machine standing straight, in `base_link`."""
+        parts = [(self.robot.place(name, BASE), link.mass) for name, link in self.robot.links.items()]
+        load = self.robot.links[PAYLOAD].mass
+        share = payload_kg / load.mass_kg
+        scaled = Mass(payload_kg, load.centre_m, share * load.inertia_kgm2)
+        empty = [(pose, mass) for pose, mass in parts if mass is not load]
+        return joined([*empty, (self.robot.place(PAYLOAD, BASE), scaled)])
+
+    def front_share(self, payload_kg: float = 0.0) -> float:
+        """Front axle's share of the weight on level ground."""
+        return float(self.weight(payload_kg).centre_m[0]) / self.wheelbase_m
+
+    def centre_height_m(self, payload_kg: float = 0.0) -> float:
+        """Height of the centre of mass above the ground."""
+        return float(self.weight(payload_kg).centre_m[2])
+
+    def gps_mounts(self) -> tuple[Mount, ...]:
+        """Antennas, in `base_link`."""
+        return tuple(_mount(pose) for frame, pose in self._places("gps") if frame == BASE)
+
+    def imu_mounts(self) -> tuple[tuple[str, Mount], ...]:
+        """IMUs: the frame that carries each, and its mount there. The origin of `front_link` is the joint."""
+        return tuple((frame, _mount(pose)) for frame, pose in self._places("imu"))
+
+    def _places(self, kind: str) -> list[tuple[str, Pose]]:
+        names = sorted(name for name in self.robot.links if name.startswith(f"{kind}_link_"))
+        frames = [self.robot.carrier(name, (BASE, FRONT)) for name in names]
+        return [(frame, self.robot.place(name, frame)) for name, frame in zip(names, frames, strict=True)]
+
+
+@cache
+def load_model(name: str) -> MachineModel:
+    """Read the kind of machine of that name."""
+    path = FOLDER / f"{name}.toml"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.toml")))
+        raise ConfigError("machine model", f"there is no {name!r}; known: {known}")
+    return from_table(MachineModel, {"name": name, **load_toml(path)}, str(path))
+
+
+def _mount(pose: Pose) -> Mount:
+    x, y, z = (np.round(pose.xyz_m, 6) + 0.0).tolist()  # no -0.0
+    roll, pitch, yaw = (np.round(np.degrees(rpy_rad(pose.rotation)), 4) + 0.0).tolist()
+    return Mount((x, y, z), (roll, pitch, yaw))

@@ -1,0 +1,115 @@
+"""Kinematics of rigid frames for arrays of machines: points on frames, wheels on the ground, what sensors feel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocol.arrays import Floats, Ints
+from sim.multibody import Frames
+from sim.terrain import Terrain
+
+# Points that are followed, and the frame that each is fixed to: hubs, `base_link`, and the origin of `front_link`.
+HUBS, ORIGINS = slice(0, 4), slice(4, 6)
+POINT_FRAME = [1, 1, 2, 2, 0, 1]
+_LEVI_CIVITA = np.zeros((3, 9))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _LEVI_CIVITA[_j, 3 * _i + _k] = 1.0
+    _LEVI_CIVITA[_j, 3 * _k + _i] = -1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Points on machines, (n, 6, 3) in `map`: where they are and how they move."""
+
+    xyz_m: Floats
+    velocity_mps: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """Where wheels meet the ground; arrays (n, 4, ...).
+
+    point_m: the place on the ground nearest to the hub. wheel_from_map: rows ahead, left and up of the ground there.
+    gap_m: from hub to ground. velocity: of the hub along those rows.
+    """
+
+    point_m: Floats
+    wheel_from_map: Floats
+    gap_m: Floats
+    velocity_mps: Floats
+    zone: Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Everything seen at one instant."""
+
+    frames: Frames
+    points: Points
+    ground: Ground
+
+
+def look(terrain: Terrain, frames: Frames, arms_m: Floats, guess_m: Floats | None = None) -> Scene:
+    """Follow the points of frames and find the ground under their wheels; guess_m: the ground's points before."""
+    points = follow(frames, arms_m)
+    return Scene(frames, points, touch(terrain, frames, points, points.xyz_m[:, HUBS] if guess_m is None else guess_m))
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Cross product along the last axis (numpy's costs ten times as much on a handful of machines)."""
+    matrix = (a @ _LEVI_CIVITA).reshape(*a.shape[:-1], 3, 3)
+    product: Floats = (matrix @ b[..., None])[..., 0]
+    return product
+
+
+def follow(frames: Frames, arms_m: Floats) -> Points:
+    """Follow points that lie at arms_m (n, 6, 3) from their frame's centre of mass, along its axes."""
+    arms = (frames.rotation[:, POINT_FRAME] @ arms_m[..., None])[..., 0]
+    turning = cross(frames.rate_radps[:, POINT_FRAME], arms)
+    return Points(frames.centre_m[:, POINT_FRAME] + arms, frames.velocity_mps[:, POINT_FRAME] + turning)
+
+
+def touch(terrain: Terrain, frames: Frames, points: Points, guess_m: Floats) -> Ground:
+    """Find the ground under wheels. guess_m: the previous points on it; the hub's foot moves little in a step."""
+    x, y = guess_m[..., 0], guess_m[..., 1]
+    height = terrain.height(x, y)
+    east, north = terrain.gradient(x, y)
+    hub = points.xyz_m[:, HUBS]
+
+    up = np.empty_like(hub)
+    up[..., 0], up[..., 1], up[..., 2] = -east, -north, 1.0
+    up /= np.sqrt(np.vecdot(up, up))[..., None]
+    above = hub - guess_m
+    above[..., 2] = hub[..., 2] - height
+    gap = np.vecdot(above, up)
+
+    axle = frames.rotation[:, POINT_FRAME[HUBS]][..., 1]
+    ahead = cross(axle, up)
+    ahead /= np.sqrt(np.vecdot(ahead, ahead))[..., None]
+    axes = np.stack([ahead, cross(up, ahead), up], axis=-2)
+    velocity = (axes @ points.velocity_mps[:, HUBS, :, None])[..., 0]
+    return Ground(hub - gap[..., None] * up, axes, gap, velocity, terrain.zone(x, y))
+
+
+def attitude(rotation: Floats) -> tuple[Floats, Floats, Floats]:
+    """Yaw, pitch (nose down) and roll of rotations (n, 3, 3)."""
+    yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+    roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
+    return yaw, -np.arcsin(rotation[:, 2, 0]), roll
+
+
+def plane_gradient(points_m: Floats) -> tuple[Floats, Floats]:
+    """Gradient, east and north, of the plane through four wheels' points (n, 4, 3)."""
+    ahead = points_m[:, 0] + points_m[:, 1] - points_m[:, 2] - points_m[:, 3]
+    left = points_m[:, 0] - points_m[:, 1] + points_m[:, 2] - points_m[:, 3]
+    normal = cross(ahead, left)
+    return -normal[:, 0] / normal[:, 2], -normal[:, 1] / normal[:, 2]
+
+
+def articulation(rotation: Floats) -> Floats:
+    """Angle (n,) from the rear to the front frame about the rear frame's upright axis; rotation (n, frames, 3, 3)."""
+    front, rear = rotation[:, 1, :, 0], rotation[:, 0]
+    angle: Floats = np.arctan2(np.vecdot(front, rear[:, :, 1]), np.vecdot(front, rear[:, :, 0]))
+    return angle

@@ -1,0 +1,230 @@
+"""URDF files: links, joints and places, and the few rigid bodies that a physics engine has to move.
+
+Only what our machines need: inertia, boxes to collide, fixed, revolute and continuous joints.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from protocol.arrays import Floats
+from protocol.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A frame in another one: origin (3,) [m] and rotation (3, 3); `a @ b` is b, given in a, in the parent of a."""
+
+    xyz_m: Floats
+    rotation: Floats
+
+    def __matmul__(self, inner: Pose) -> Pose:
+        return Pose(self.xyz_m + self.rotation @ inner.xyz_m, self.rotation @ inner.rotation)
+
+
+@dataclass(frozen=True)
+class Mass:
+    """A rigid mass: centre (3,) [m] in some frame, inertia (3, 3) [kg m2] about the centre along that frame's axes."""
+
+    mass_kg: float
+    centre_m: Floats
+    inertia_kgm2: Floats
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box that collides: its middle in the link, and its size (3,) [m]."""
+
+    pose: Pose
+    size_m: Floats
+
+
+@dataclass(frozen=True)
+class Link:
+    """One link; a mass of 0 is a mere place."""
+
+    name: str
+    mass: Mass
+    boxes: tuple[Box, ...]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint: where the child's frame is at angle 0, and for the turning ones the axis and limits [rad]."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    pose: Pose
+    axis: Floats
+    lower_rad: float
+    upper_rad: float
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Links by name, and the joint above each of them."""
+
+    name: str
+    links: dict[str, Link]
+    joints: dict[str, Joint]  # by child
+
+    def place(self, link: str, frame: str) -> Pose:
+        """Pose of a link in a frame above it, all joints at angle 0."""
+        pose = Pose(np.zeros(3), np.eye(3))
+        while link != frame:
+            joint = self.joints[link]
+            pose, link = joint.pose @ pose, joint.parent
+        return pose
+
+    def carrier(self, link: str, bodies: Iterable[str]) -> str:
+        """Find the first of `bodies` at or above a link."""
+        while link not in bodies:
+            link = self.joints[link].parent
+        return link
+
+
+@cache
+def read_urdf(path: Path) -> Robot:
+    """Read a URDF file."""
+    try:
+        root = ET.parse(path).getroot()  # noqa: S314 (the package's own files)
+        links = {name: _link(name, e) for e in root.findall("link") if (name := e.attrib["name"])}
+        joints = {joint.child: joint for joint in map(_joint, root.findall("joint"))}
+    except (OSError, ET.ParseError, KeyError, ValueError) as error:
+        raise ConfigError(path, f"is no URDF file that we can read: {error!r}") from None
+    return Robot(root.get("name", path.stem), links, joints)
+
+
+def joined(masses: Iterable[tuple[Pose, Mass]]) -> Mass:
+    """Join masses, each given in the frame of its pose, into one (parallel axes)."""
+    moved = [(mass.mass_kg, pose @ Pose(mass.centre_m, np.eye(3)), mass.inertia_kgm2) for pose, mass in masses]
+    total = sum(kg for kg, _, _ in moved)
+    centre = sum((kg * at.xyz_m for kg, at, _ in moved), np.zeros(3)) / max(total, 1e-9)
+    inertia = np.zeros((3, 3))
+    for kg, at, own in moved:
+        arm = at.xyz_m - centre
+        inertia += at.rotation @ own @ at.rotation.T + kg * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return Mass(total, centre, inertia)
+
+
+def rigid_urdf(robot: Robot, bodies: tuple[str, ...], mass_factor: float) -> str:
+    """Rewrite a robot with these links alone, all others joined to the one that carries them (wheels do not turn).
+
+    PyBullet's own URDF_MERGE_FIXED_LINKS puts the centres of mass in wrong places. mass_factor: scales all masses.
+    """
+    root = ET.Element("robot", name=robot.name)
+    for body in bodies:
+        parts = [link for name, link in robot.links.items() if robot.carrier(name, bodies) == body]
+        poses = [robot.place(part.name, body) for part in parts]
+        mass = joined((pose, part.mass) for pose, part in zip(poses, parts, strict=True))
+        link = ET.SubElement(root, "link", name=body)
+        _write_inertial(link, mass, mass_factor)
+        for pose, part in zip(poses, parts, strict=True):
+            for box in part.boxes:
+                collision = ET.SubElement(link, "collision")
+                _write_origin(collision, pose @ box.pose)
+                ET.SubElement(ET.SubElement(collision, "geometry"), "box", size=_text(box.size_m))
+        if body in robot.joints:
+            _write_joint(root, robot, robot.joints[body], bodies)
+    return ET.tostring(root, encoding="unicode")
+
+
+def rpy_rad(rotation: Floats) -> Floats:
+    """Roll, pitch and yaw (3,) of a rotation matrix (yaw @ pitch @ roll)."""
+    r = rotation
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
+
+
+def _rotation(rpy: Floats) -> Floats:
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _numbers(text: str) -> Floats:
+    return np.array([float(word) for word in text.split()])
+
+
+def _text(numbers: Floats) -> str:
+    return " ".join(repr(float(n)) for n in numbers)
+
+
+def _pose(element: ET.Element) -> Pose:
+    origin = element.find("origin")
+    attributes = {} if origin is None else origin.attrib
+    turn = _rotation(_numbers(attributes.get("rpy", "0 0 0")))
+    return Pose(_numbers(attributes.get("xyz", "0 0 0")), turn)
+
+
+def _link(name: str, element: ET.Element) -> Link:
+    boxes = tuple(
+        Box(_pose(collision), _numbers(box.attrib["size"]))
+        for collision in element.findall("collision")
+        for box in collision.findall("geometry/box")
+    )
+    return Link(name, _mass(element.find("inertial")), boxes)
+
+
+def _mass(inertial: ET.Element | None) -> Mass:
+    if inertial is None:
+        return Mass(0.0, np.zeros(3), np.zeros((3, 3)))
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or inertia is None:
+        raise ValueError("an <inertial> without <mass> or <inertia>")
+    xx, yy, zz, xy, xz, yz = (float(inertia.attrib[f"i{axes}"]) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+    pose, own = _pose(inertial), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return Mass(float(mass.attrib["value"]), pose.xyz_m, pose.rotation @ own @ pose.rotation.T)
+
+
+def _joint(element: ET.Element) -> Joint:
+    ends = {end: e.attrib["link"] for end in ("parent", "child") if (e := element.find(end)) is not None}
+    axis, limit = element.find("axis"), element.find("limit")
+    limits = {} if limit is None else limit.attrib
+    return Joint(
+        name=element.attrib["name"],
+        kind=element.attrib["type"],
+        parent=ends["parent"],
+        child=ends["child"],
+        pose=_pose(element),
+        axis=_numbers("1 0 0" if axis is None else axis.attrib["xyz"]),
+        lower_rad=float(limits.get("lower", 0)),
+        upper_rad=float(limits.get("upper", 0)),
+    )
+
+
+def _write_origin(parent: ET.Element, pose: Pose) -> None:
+    ET.SubElement(parent, "origin", xyz=_text(pose.xyz_m), rpy=_text(rpy_rad(pose.rotation)))
+
+
+def _write_inertial(link: ET.Element, mass: Mass, factor: float) -> None:
+    inertial = ET.SubElement(link, "inertial")
+    _write_origin(inertial, Pose(mass.centre_m, np.eye(3)))
+    ET.SubElement(inertial, "mass", value=repr(float(mass.mass_kg * factor)))
+    i = mass.inertia_kgm2 * factor
+    values = {"ixx": i[0, 0], "iyy": i[1, 1], "izz": i[2, 2], "ixy": i[0, 1], "ixz": i[0, 2], "iyz": i[1, 2]}
+    ET.SubElement(inertial, "inertia", {key: repr(float(value)) for key, value in values.items()})
+
+
+def _write_joint(root: ET.Element, robot: Robot, joint: Joint, bodies: tuple[str, ...]) -> None:
+    parent = robot.carrier(joint.parent, bodies)
+    element = ET.SubElement(root, "joint", name=joint.name, type=joint.kind)
+    ET.SubElement(element, "parent", link=parent)
+    ET.SubElement(element, "child", link=joint.child)
+    _write_origin(element, robot.place(joint.parent, parent) @ joint.pose)
+    ET.SubElement(element, "axis", xyz=_text(joint.axis))
+    limits = {"lower": repr(joint.lower_rad), "upper": repr(joint.upper_rad), "effort": "1e9", "velocity": "100"}
+    ET.SubElement(element, "limit", limits)
