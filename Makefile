@@ -25,4 +25,5 @@ check: venv
 	$(BIN)/lint-imports
 
 bench: venv
-	$(BIN)/python -m benchmarks merge --json
+	$(BIN)/python -m benchmarks merge
+	$(BIN)/python -m benchmarks ingest
