@@ -169,7 +169,7 @@ def _spool_bytes(spool_id: int) -> bytes:
 
 
 def _pack(rows: Table) -> bytes:
-    """Columns of a journal row; named, so that a column that is added later reads as absent in old rows."""
+    """Columns of a journal row; named, so that a column that is added later reads as NaN in older rows."""
     packed: bytes = msgpack.packb({name: rows[name].tobytes() for name in SAMPLE_DTYPE.names or ()})
     return packed
 
@@ -178,5 +178,5 @@ def _unpack(payload: bytes) -> Table:
     cols = msgpack.unpackb(payload)
     rows = np.zeros(len(cols["stamp_ns"]) // 8, SAMPLE_DTYPE)
     for name in SAMPLE_DTYPE.names or ():
-        rows[name] = np.frombuffer(cols[name], SAMPLE_DTYPE[name])
+        rows[name] = np.frombuffer(cols[name], SAMPLE_DTYPE[name]) if name in cols else np.nan
     return rows

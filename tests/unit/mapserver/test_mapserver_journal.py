@@ -1,13 +1,16 @@
 import sqlite3
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 
+from mapserver import journal as journal_module
 from mapserver.ingest import Admission
 from mapserver.journal import Journal, Mark
 from protocol.errors import StoreError
+from protocol.samples import SAMPLE_DTYPE
 
 
 def open_journal(folder: Path, site: str = SITE.name, frame: str = SITE.frame) -> Journal:
@@ -186,3 +189,12 @@ def test_closing_folds_the_log_into_the_file(tmp_path):
     assert not (tmp_path / "journal.db-wal").exists()
     copy = np.frombuffer((tmp_path / "journal.db").read_bytes(), np.uint8)
     assert len(copy) > 1000 * 64
+
+
+def test_column_that_an_older_row_lacks_reads_as_nan():
+    rows = np.ones(3, SAMPLE_DTYPE)
+    older = msgpack.unpackb(journal_module._pack(rows))
+    del older["grade_var"]
+    found = journal_module._unpack(msgpack.packb(older))
+    assert np.isnan(found["grade_var"]).all()
+    assert (found["c_rr"] == 1).all()
