@@ -116,23 +116,29 @@ class Spool:
         return {"depth": depth, "dropped": self._meta.dropped, "put_aside": aside, "recorded": self._meta.recorded}
 
     def record(self, rows: Table, *, final: bool = True) -> int:
-        """Write samples durably; returns the sequence number of the first.
+        """Write samples durably; returns the sequence number of the first. StoreError if the disk does not take them.
 
         Pending ones (not final) are not sent before they are made final.
         """
         with self._lock:
-            meta = self._meta
-            first = meta.newest + 1
+            first = self._meta.newest + 1
             if self._audit:
-                self._audit.recorded(meta.spool_id, first, rows)
-            values = [(first + i, row.tobytes(), int(final)) for i, row in enumerate(rows)]
-            with _transaction(self._db):
-                self._db.executemany("INSERT INTO sample VALUES (?, ?, ?)", values)
-                dropped = meta.dropped + self._drop_oldest()
-                new = replace(meta, newest=meta.newest + len(rows), recorded=meta.recorded + len(rows), dropped=dropped)
-                self._save(new)
-            self._meta = new
+                self._audit.recorded(self._meta.spool_id, first, rows)
+            try:
+                self._meta = self._insert(first, rows, final=final)
+            except sqlite3.Error as error:
+                raise StoreError(self._path, f"cannot be written: {error}; look at the machine's disk") from None
             return first
+
+    def _insert(self, first: int, rows: Table, *, final: bool) -> _Meta:
+        values = [(first + i, row.tobytes(), int(final)) for i, row in enumerate(rows)]
+        old, n = self._meta, len(rows)
+        with _transaction(self._db):
+            self._db.executemany("INSERT INTO sample VALUES (?, ?, ?)", values)
+            dropped = old.dropped + self._drop_oldest()
+            new = replace(old, newest=old.newest + n, recorded=old.recorded + n, dropped=dropped)
+            self._save(new)
+        return new
 
     def finalise(self, first_seq: int, rows: Table) -> None:
         """Replace pending samples by their final values."""

@@ -330,7 +330,7 @@ def test_failed_record_changes_nothing(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:2])
     spool._db.execute("INSERT INTO sample VALUES (4, x'00', 1)")  # in the way
-    with pytest.raises(sqlite3.IntegrityError):
+    with pytest.raises(StoreError, match="UNIQUE"):
         spool.record(ROWS[2:5])
     spool._db.execute("DELETE FROM sample WHERE seq = 4")
     assert spool.newest == 2
@@ -342,3 +342,14 @@ def test_failed_record_changes_nothing(tmp_path: Path) -> None:
 def test_bad_spool_option_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match="max_samples"):
         SpoolConfig(max_samples=0)
+
+
+def test_disk_that_takes_nothing_is_named(tmp_path: Path) -> None:
+    spool = Spool(tmp_path / "spool.db", SpoolConfig())
+    spool._db.execute("PRAGMA query_only = ON")
+    with pytest.raises(StoreError, match=r"spool\.db: cannot be written: .*; look at the machine's disk"):
+        spool.record(made_up_samples(2))
+    assert spool.newest == 0
+    spool._db.execute("PRAGMA query_only = OFF")
+    assert spool.record(made_up_samples(2)) == 1
+    spool.close()
