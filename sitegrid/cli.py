@@ -62,7 +62,7 @@ def _add_demo(nouns: Nouns, common: Parent, _: Parent) -> None:
     demo.add_argument("--seconds", type=_positive, default=240.0, help="simulated time (default %(default)s)")
     demo.add_argument("--speed", type=_positive, default=4.0, help="times real time (default %(default)s)")
     demo.add_argument("--machines", type=int, default=3, help="how many (default %(default)s)")
-    demo.add_argument("--seed", type=int, default=1000, help="seed of the simulation (default %(default)s)")
+    demo.add_argument("--seed", type=int, default=0, help="seed of the simulation (default %(default)s)")
     demo.add_argument("--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores")
     demo.add_argument("--headless", action="store_true", help="no live display, plain lines only")
     demo.add_argument("--log", type=Path, help="manifest of a real log that a further agent replays")
