@@ -15,7 +15,7 @@ from agents.localisation.model import ModelConfig
 from agents.order import Order, Verdict
 from agents.sampling import NOTHING, Sampler, SamplingConfig
 from protocol.arrays import Table
-from protocol.machine import MachineConfig
+from protocol.machine import BASE, MachineConfig
 from protocol.readings import Reading
 from protocol.site import Projection, SiteConfig
 
@@ -81,6 +81,9 @@ class Pipeline:
         sensor = self._sensors.get(reading.sensor)
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
+            return []
+        if sensor.frame != BASE:  # the front frame moves by itself; the filter knows the rear one alone
+            self._counters["reading_front_frame"] += 1
             return []
         verdict = self._order.judge(reading)
         if verdict is Verdict.REFUSE:

@@ -4,29 +4,57 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
 
-from benchmarks import ingest, merge
+from benchmarks import ingest, merge, sim
 from benchmarks.measure import Result
 
-SAMPLES = {"merge": 20_000, "ingest": 20_000}
+SAMPLES, SECONDS, RUNS = 20_000, 20.0, 5
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run one benchmark and print what it found."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure the speed of the map server.")
-    parser.add_argument("name", choices=sorted(SAMPLES), help="what to measure")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--samples", type=int, default=0, help="samples in a run")
-    parser.add_argument("--runs", type=int, default=5, help="runs of each variant; the median counts")
-    arguments = parser.parse_args(words)
-    if arguments.samples < 0 or arguments.runs < 1:
-        parser.error("--samples and --runs must be positive")
-    run = {"merge": merge.run, "ingest": ingest.run}[arguments.name]
-    result = run(arguments.samples or SAMPLES[arguments.name], arguments.runs)
+    arguments = _parser().parse_args(words)
+    result: Result = arguments.run(arguments.size, arguments.runs)
     print(json.dumps(result) if arguments.json else _table(result))
     return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """A sub-command for each benchmark, so that an option that does nothing for it is refused."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure how fast the parts are.")
+    names = parser.add_subparsers(required=True, metavar="NAME", help="what to measure:")
+    merges = names.add_parser("merge", help="samples that the map server folds into its grid")
+    ingests = names.add_parser("ingest", help="samples that the map server takes, from their bytes to the grid")
+    sims = names.add_parser("sim", help="simulated time of small and large fleets, sensors on")
+    for benchmark, run in ((merges, merge.run), (ingests, ingest.run), (sims, sim.run)):
+        benchmark.set_defaults(run=run)
+        benchmark.add_argument("--json", action="store_true", help="print one JSON object")
+        benchmark.add_argument(
+            "--runs", metavar="N", type=_count, default=RUNS, help="of each variant; the median counts (%(default)s)"
+        )
+    for benchmark in (merges, ingests):
+        benchmark.add_argument(
+            "--samples", metavar="N", dest="size", type=_count, default=SAMPLES, help="in a run (%(default)s)"
+        )
+    sims.add_argument(
+        "--seconds", metavar="S", dest="size", type=_seconds, default=SECONDS, help="simulated, in a run (%(default)s)"
+    )
+    return parser
+
+
+def _count(word: str) -> int:
+    if (count := int(word)) < 1:
+        raise argparse.ArgumentTypeError("must be positive")
+    return count
+
+
+def _seconds(word: str) -> float:
+    if not 0 < (seconds := float(word)) < math.inf:
+        raise argparse.ArgumentTypeError("must be positive")
+    return seconds
 
 
 def _table(result: Result) -> str:

@@ -16,10 +16,12 @@ from protocol.errors import ConfigError
 from protocol.readings import KINDS
 from protocol.site import NAME
 
+BASE, FRONT = "base_link", "front_link"
+
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a sensor sits: its origin in `base_link` [m] and roll, pitch, yaw [deg] of `base_from_sensor`."""
+    """Where a sensor sits: its origin in its frame [m] and roll, pitch, yaw [deg] of `frame_from_sensor`."""
 
     xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -40,8 +42,9 @@ class Mount:
 class SensorConfig:
     """One sensor of a machine.
 
-    name: as readings carry it. use: false leaves the sensor's readings aside. drift_share, drift_time_s: of a GPS
-    receiver, the share of its stated variance that is a slow error, and that error's correlation time.
+    name: as readings carry it. use: false leaves the sensor's readings aside. frame: which frame of an articulated
+    machine carries it; `front_link` starts at the joint, at the height of the wheels' hubs. drift_share, drift_time_s:
+    of a GPS receiver, the share of its stated variance that is a slow error, and that error's correlation time.
     ticks_per_rev: of an encoder.
     """
 
@@ -49,6 +52,7 @@ class SensorConfig:
     kind: str
     mount: Mount = field(default_factory=Mount)
     use: bool = True
+    frame: str = BASE
     drift_share: float = 0.75
     drift_time_s: float = 45.0
     ticks_per_rev: int = 100
@@ -58,6 +62,8 @@ class SensorConfig:
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
         if self.kind not in KINDS:
             raise ValueError(f"kind: {self.kind!r} is none of {', '.join(KINDS)}")
+        if self.frame not in (BASE, FRONT):
+            raise ValueError(f"frame: {self.frame!r} is neither {BASE} nor {FRONT}")
         if not 0 <= self.drift_share <= 1:
             raise ValueError(f"drift_share: {self.drift_share} is not between 0 and 1")
         if self.drift_time_s <= 0 or self.ticks_per_rev <= 0:

@@ -13,6 +13,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from protocol.arrays import Floats
 from protocol.config import from_table, load_toml
 from protocol.geometry import GridGeometry
 
@@ -90,6 +93,11 @@ class Projection:
         """Latitude and longitude [deg] and height [m]."""
         lon, lat = self._proj(x_m, y_m, inverse=True)
         return float(lat), float(lon), z_m + self._height_m
+
+    def to_geodetic_many(self, x_m: Floats, y_m: Floats, z_m: Floats) -> Floats:
+        """Latitude, longitude [deg] and height [m] of places in `map`, all of one shape (...): (3, ...)."""
+        lon, lat = self._proj(x_m.ravel(), y_m.ravel(), inverse=True)
+        return np.stack([lat.reshape(x_m.shape), lon.reshape(x_m.shape), z_m + self._height_m])
 
 
 def load_site(path: Path) -> SiteConfig:

@@ -8,16 +8,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocol.arrays import Floats
-from sim.machine_model import BASE, FRONT, WHEELS, MachineModel
+from sim.machine_model import WHEELS, MachineModel
 from sim.multibody import MultiBodies
-from sim.observe import Drive, FrontState, observe
-from sim.rigid import POINT_FRAME, Ground, articulation, look
+from sim.observe import Drive, observe
+from sim.rigid import POINT_FRAME, Ground, look
+from sim.soil import TRACTION
 from sim.terrain import Terrain
 from sim.tyre import Motion, TyreForces, Tyres, at_rest, radial_load, roll
-from sim.vehicle import GRAVITY, Bodies
+from sim.vehicle import (
+    GRAVITY,
+    SETTLE_STEPS,
+    TRACTION_USE,
+    Bodies,
+    chassis_of,
+    drive_force_n,
+    steering_radps,
+)
 from sim.world import STEP_S, FleetState
-
-SETTLE_STEPS = 200  # with the brakes on, before the world starts
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,28 +44,28 @@ class BulletWorld:
     """
 
     def __init__(self, terrain: Terrain, models: Sequence[MachineModel], bodies: Bodies, starts: Floats) -> None:
-        self._terrain, self._bodies = terrain, bodies
+        self._terrain, self._bodies, self._chassis = terrain, bodies, chassis_of(models)
         mass_factor = bodies.mass_kg / np.array([m.mass_kg for m in models])
         self._multi = MultiBodies(models, mass_factor, _standing(terrain, models, starts), STEP_S)
-        self.close = self._multi.close
         self._payload_kg = np.zeros(len(models))
         for machine in range(len(models)):
-            self._multi.set_payload(machine, 0.0)
+            self.set_payload(machine, 0.0)
 
         self._tyres, self._free_radius_m = _tyres(models, bodies), _free_radius_m(models, bodies)
         self._arms_m = _points(models) - self._multi.centres_m[:, POINT_FRAME]
-        self._steer = np.array([[m.steer_gain_per_s, m.steer_radps, STEP_S / m.steer_lag_s] for m in models]).T
-        self._engine_share = STEP_S / np.array([m.engine_lag_s for m in models])
+        self._rolling = at_rest((len(models), 4))
+        self._scene = look(terrain, self._multi.read(), self._arms_m)
+        self._wheel_load_n = self._loads(self._scene.ground)
 
         zero, hold = np.zeros(len(models)), np.array([m.max_brake_n for m in models])
+        wheels = np.zeros((len(models), 2))
         self._inputs = Inputs(zero, zero, zero)
-        self._rolling = at_rest((len(models), 4))
-        self._wheel_rad = np.zeros((len(models), 2))
-        self._scene = look(terrain, self._multi.read(), self._arms_m)
+        self._state = observe(
+            self._scene, self._scene, self._wheel_load_n, self._mass_kg, Drive(zero, zero, wheels, wheels)
+        )
         for _ in range(SETTLE_STEPS):
-            state = self.advance(zero, zero, hold)
-        self._wheel_rad = np.zeros((len(models), 2))
-        self._state: FleetState = replace(state, wheel_rad=self._wheel_rad)
+            self.advance(zero, zero, hold)
+        self._state = replace(self._state, wheel_rad=wheels)
 
     @property
     def state(self) -> FleetState:
@@ -66,32 +73,30 @@ class BulletWorld:
         return self._state
 
     @property
-    def front(self) -> FrontState:
-        """Motion of the front frames after the last step."""
-        return self._front
-
-    @property
-    def mass_kg(self) -> Floats:
-        """Mass of each machine with what it carries (n,)."""
-        return self._bodies.mass_kg + self._payload_kg
-
-    @property
     def wheel_loads_n(self) -> Floats:
         """Load of each wheel (n, 4): front left, front right, rear left, rear right."""
-        return self._loads(self._scene.ground)
+        return self._wheel_load_n
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
         """Change what one machine carries."""
         self._multi.set_payload(machine, payload_kg)
         self._payload_kg[machine] = payload_kg
+        self._mass_kg = self._bodies.mass_kg + self._payload_kg
+
+    def set_terrain(self, terrain: Terrain) -> None:
+        """Change the ground under the machines."""
+        self._terrain = terrain
+
+    def close(self) -> None:
+        """Free PyBullet's client."""
+        self._multi.close()
 
     def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
         """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
         self._inputs = self._obey(steer_rad, drive_n, brake_n)
 
         # What the ground does to the wheels where they are now.
-        ground = self._scene.ground
-        load = self._loads(ground)
+        ground, load = self._scene.ground, self._wheel_load_n
         forces = self._roll(ground, load)
         along_wheel = np.stack([forces.traction_n + forces.resistance_n, forces.left_n, load], axis=-1)
         in_map = (along_wheel[..., None, :] @ ground.wheel_from_map)[..., 0, :]
@@ -100,19 +105,20 @@ class BulletWorld:
         before = self._scene
         self._multi.step(in_map, ground.point_m, self._inputs.steering_radps)
         self._scene = look(self._terrain, self._multi.read(), self._arms_m, ground.point_m)
+        self._wheel_load_n = self._loads(self._scene.ground)
         rear = self._rolling.spin_radps[:, 2:]
-        self._wheel_rad = self._wheel_rad + STEP_S * rear
-        drive = Drive(self._inputs.drive_n, forces.torque_nm.sum(axis=-1), rear, self._wheel_rad)
-        self._state, self._front = observe(before, self._scene, self._loads(self._scene.ground), drive)
+        turned = self._state.wheel_rad + STEP_S * rear
+        drive = Drive(self._inputs.drive_n, forces.torque_nm.sum(axis=-1), rear, turned)
+        self._state = observe(before, self._scene, self._wheel_load_n, self._mass_kg, drive)
         return self._state
 
     def _obey(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> Inputs:
         """Hydraulics and engine follow with their lags."""
-        old, (gain, fastest, share) = self._inputs, self._steer
-        wanted = gain * (steer_rad - articulation(self._scene.frames.rotation))
-        wanted = np.minimum(np.maximum(wanted, -fastest), fastest)
-        steering = old.steering_radps + share * (wanted - old.steering_radps)
-        return Inputs(steering, old.drive_n + self._engine_share * (drive_n - old.drive_n), brake_n)
+        old = self._inputs
+        steering = steering_radps(self._chassis, steer_rad, self._state.articulation_rad, old.steering_radps)
+        least = TRACTION[self._scene.ground.zone].min(axis=-1)
+        grip = TRACTION_USE * least * self._state.load_n
+        return Inputs(steering, drive_force_n(self._chassis, drive_n, old.drive_n, grip), brake_n)
 
     def _loads(self, ground: Ground) -> Floats:
         return radial_load(self._tyres, self._free_radius_m - ground.gap_m, -ground.velocity_mps[..., 2])
@@ -147,13 +153,13 @@ def _standing(terrain: Terrain, models: Sequence[MachineModel], starts: Floats) 
 
 
 def _points(models: Sequence[MachineModel]) -> Floats:
-    """The points of `rigid.POINT_FRAME` in the links of their frames, (n, 6, 3)."""
+    """The points of `rigid.POINT_FRAME` in the links of their frames, (n, 5, 3)."""
     rows = []
     for model in models:
         robot = model.robot
         carriers = [robot.joints[wheel].parent for wheel in WHEELS]
         hubs = [robot.place(wheel, carrier).xyz_m for wheel, carrier in zip(WHEELS, carriers, strict=True)]
-        rows.append([*hubs, robot.place(BASE, BASE).xyz_m, robot.place(FRONT, FRONT).xyz_m])
+        rows.append([*hubs, np.zeros(3)])
     return np.array(rows)
 
 

@@ -1,62 +1,52 @@
-"""Options of a simulation run, as `config/sim.toml` describes them."""
+"""Options of a simulation run, as `config/sim.toml` describes them: a scenario, what differs from it, and the pace."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 from protocol.config import from_table, load_toml
+from protocol.errors import ConfigError
 from protocol.readings import MAX_STAMP_NS
 from protocol.site import NAME
+from sim.scenario import FleetConfig, Scenario
+from sim.scenario_file import check, load_scenario
 
+T = TypeVar("T", FleetConfig, Scenario)
 STEP_MS = 10  # the world runs at 100 Hz
 
 
 @dataclass(frozen=True)
 class SimConfig:
-    """What is simulated, and how fast.
+    """What is simulated, and how fast. Options that are None are as the scenario says.
 
-    seconds: simulated time, 0 runs until stopped. speed: times real time, 0 as fast as possible. names: default
-    `loader-1`, `loader-2`, ... gps, imus: receivers and IMUs of each machine. outage_s of every outage_period_s each
-    receiver is silent. gps_*_std_m: per horizontal axis; the vertical is worse (`sensors.GPS_VERTICAL`). wait_s: how
-    long to wait for a subscriber of every machine before driving.
+    scenario: a name of `sim/scenarios/`, or the path of a TOML file. machines: of the scenario's first fleet. names: of
+    all machines. seconds: simulated time, 0 runs until stopped. preset, drive_mps, gps, imu, attitude: of every fleet.
+    speed: times real time, 0 as fast as possible. wait_s: how long to wait for a subscriber of every machine before
+    driving.
     """
 
-    site: str = "paper"
-    machines: int = 3
-    names: tuple[str, ...] = ()
-    seed: int = 0
-    seconds: float = 120.0
+    scenario: str = "paper_site"
+    site: str | None = None
+    world: str | None = None
+    machines: int | None = None
+    names: tuple[str, ...] | None = None
+    seed: int | None = None
+    seconds: float | None = None
+    preset: str | None = None
+    drive_mps: float | None = None
+    gps: tuple[int, ...] | None = None
+    imu: tuple[int, ...] | None = None
+    attitude: tuple[int, ...] | None = None
     speed: float = 1.0
-    drive_mps: float = 4.0
-    gps: int = 2
-    imus: int = 1
-    outage_s: float = 1.0
-    outage_period_s: float = 10.0
-    gps_drift_std_m: float = 1.2
-    gps_drift_time_s: float = 60.0
-    gps_white_std_m: float = 0.7
-    roughness_m: float = 0.01
     bundle_ms: int = 50
     start_ns: int = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
     wait_s: float = 30.0
 
     def __post_init__(self) -> None:
-        self._check_names()
         limits = {
-            "machines": (1, 1000),
-            "seed": (0, 2**63),
-            "seconds": (0, 1e7),
             "speed": (0, 1e3),
-            "drive_mps": (0.5, 8),
-            "gps": (0, 3),
-            "imus": (1, 3),
-            "outage_s": (0, 1e6),
-            "outage_period_s": (0.1, 1e6),
-            "gps_drift_std_m": (0, 100),
-            "gps_drift_time_s": (0.1, 1e6),
-            "gps_white_std_m": (0, 100),
-            "roughness_m": (0, 0.1),
             "bundle_ms": (STEP_MS, 1000),
             "start_ns": (1, MAX_STAMP_NS - 10**16),
             "wait_s": (0, 1e6),
@@ -66,31 +56,42 @@ class SimConfig:
                 raise ValueError(f"{name}: {getattr(self, name)!r} is not between {low:g} and {high:g}")
         if self.bundle_ms % STEP_MS:
             raise ValueError(f"bundle_ms: {self.bundle_ms} is not a multiple of {STEP_MS}")
-        if self.outage_s > self.outage_period_s:
-            raise ValueError(f"outage_s: {self.outage_s} is longer than outage_period_s")
-
-    def _check_names(self) -> None:
-        if not NAME.fullmatch(self.site):
-            raise ValueError(f"site: {self.site!r} is not a name (lower-case letters, digits, - and _)")
-        if self.names and len(self.names) != self.machines:
-            raise ValueError(f"names: {len(self.names)} names for {self.machines} machines")
-        for name in self.names:
+        for name in (*([self.site] if self.site is not None else []), *(self.names or ())):
             if not NAME.fullmatch(name):
-                raise ValueError(f"names: {name!r} is not a name (lower-case letters, digits, - and _)")
-        if len(set(self.names)) < len(self.names):
-            raise ValueError("names: two machines have the same name")
-
-    @property
-    def machine_names(self) -> tuple[str, ...]:
-        """Name of every machine."""
-        return self.names or tuple(f"loader-{i + 1}" for i in range(self.machines))
-
-    @property
-    def bundles(self) -> int | None:
-        """How many bundles the run has; None if it ends only when it is stopped."""
-        return -int(-self.seconds * 1000 // self.bundle_ms) if self.seconds else None
+                raise ValueError(f"site, names: {name!r} is not a name (lower-case letters, digits, - and _)")
 
 
 def load_sim(path: Path) -> SimConfig:
     """Read a `sim.toml`."""
     return from_table(SimConfig, load_toml(path), str(path))
+
+
+def resolve(config: SimConfig) -> Scenario:
+    """The scenario with the options of this run; a ConfigError says what does not fit."""
+    scenario = load_scenario(config.scenario)
+    where = f"scenario {config.scenario}"
+    over = {name: getattr(config, name) for name in ("world", "seed", "seconds", "names")}
+    fleets = tuple(_fleet(fleet, config) for fleet in scenario.fleet)
+    if config.machines is not None:
+        fleets = (_replace(fleets[0], where, count=config.machines), *fleets[1:])
+    count = sum(fleet.size for fleet in fleets)
+    if config.names is not None and len(config.names) != count:
+        raise ConfigError(where, f"names: {len(config.names)} names for {count} machines")
+    site = scenario.site if config.site is None else replace(scenario.site, name=config.site)
+    kept = {name: value for name, value in over.items() if value is not None}
+    scenario = _replace(scenario, where, fleet=fleets, site=site, **kept)
+    check(scenario, where)
+    return scenario
+
+
+def _fleet(fleet: FleetConfig, config: SimConfig) -> FleetConfig:
+    over = {name: getattr(config, name) for name in ("preset", "drive_mps", "gps", "imu", "attitude")}
+    kept = {name: value for name, value in over.items() if value is not None}
+    return _replace(fleet, f"scenario {config.scenario}", **kept)
+
+
+def _replace(old: T, where: str, **values: Any) -> T:
+    try:
+        return replace(old, **values)
+    except ValueError as error:
+        raise ConfigError(where, str(error)) from None

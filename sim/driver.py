@@ -1,105 +1,187 @@
-"""Drivers: pure pursuit along closed routes and a speed controller with limited force and power."""
+"""Drivers: pure pursuit along routes, forwards and in reverse, a speed controller, stops, and regard for others."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from protocol.arrays import Floats, Ints
-from sim.routes import Route, speed_limits
-from sim.vehicle import AXLE_TO_JOINT_M
+from protocol.arrays import Bools, Floats, Ints
+from sim.course import Course, Start
+from sim.machine_model import MachineModel
+from sim.traffic import Bodywork, clear_way
 from sim.world import FleetState
 
-MAX_ARTICULATION_RAD = 0.6
+DRIVER_STEPS = 5  # of the world: drivers act at 20 Hz
 LOOK_AHEAD_M, LOOK_AHEAD_S = 2.5, 0.6
-MAX_DRIVE_N, MAX_BRAKE_N, MAX_POWER_W = 130e3, 80e3, 140e3
-GAIN_N, INTEGRAL_N = 50e3, 20e3  # drive force per m/s of speed error, and per m
-START_MPS2 = 0.8
+REVERSE_SHARE = 0.5  # of the speed forwards
+GAIN_PER_S, INTEGRAL_PER_S2 = 2.9, 1.15  # acceleration asked for per m/s of speed error, and per m
+START_MPS2, STOP_MPS2 = 0.8, 0.5
+STOP_M, STANDING_MPS = 0.3, 0.03  # a leg's end is reached this close to it, and left once the machine stands
 
 
 @dataclass(frozen=True)
-class Course:
-    """Routes of n machines side by side. points: all of them, (k, 2), each lap followed by its first point again."""
+class Crew:
+    """What the drivers of n machines know of them; all (n,)."""
 
-    points: Floats
-    limits_mps: Floats
-    first: Ints
-    count: Ints
-    spacing_m: Floats
-
-    def at(self, way_m: Floats) -> tuple[Floats, Floats]:
-        """Point (n, 2) after way_m (n,) along each machine's route, and the direction of the route there (n, 2)."""
-        index, share = self._locate(way_m)
-        here = self.points[index]
-        step = self.points[index + 1] - here
-        return here + share[:, None] * step, step / self.spacing_m[:, None]
-
-    def limit(self, way_m: Floats) -> Floats:
-        """Speed to aim at [m/s]."""
-        limit: Floats = self.limits_mps[self._locate(way_m)[0]]
-        return limit
-
-    def _locate(self, way_m: Floats) -> tuple[Ints, Floats]:
-        steps = way_m / self.spacing_m
-        whole = np.floor(steps)
-        return self.first + whole.astype(np.int64) % self.count, steps - whole
+    rear_m: Floats
+    front_m: Floats
+    max_articulation_rad: Floats
+    mass_kg: Floats
+    max_drive_n: Floats
+    max_brake_n: Floats
+    max_power_w: Floats
+    body: Bodywork
 
 
 @dataclass(frozen=True)
 class Drivers:
-    """What n drivers keep in mind: way along the route [m], integral of the speed controller [N], time [s]."""
+    """What n drivers keep in mind: leg and way along it [m], speed aimed at [m/s], integral of the controller [N].
 
+    waited_s: how long they have stood at the end of their leg. payload_kg: what they carry. clear_m: way that is free
+    of other machines.
+    """
+
+    leg: Ints
     way_m: Floats
+    aim_mps: Floats
     integral_n: Floats
-    time_s: float = 0.0
+    waited_s: Floats
+    payload_kg: Floats
+    clear_m: Floats
 
 
-def lay_course(routes: list[Route], drive_mps: float) -> Course:
-    """Prepare one route per machine."""
-    laps = [np.vstack([r.points, r.points[:1]]) for r in routes]
-    limits = [np.append(v, v[0]) for v in (speed_limits(r, drive_mps) for r in routes)]
-    lengths = np.array([len(lap) for lap in laps])
-    return Course(
-        points=np.vstack(laps),
-        limits_mps=np.concatenate(limits),
-        first=np.cumsum(lengths) - lengths,
-        count=lengths - 1,
-        spacing_m=np.array([r.spacing_m for r in routes]),
+@dataclass(frozen=True)
+class Commands:
+    """What n drivers ask for: articulation, drive force, most force of the brakes; and the payload they carry."""
+
+    steer_rad: Floats
+    drive_n: Floats
+    brake_n: Floats
+    payload_kg: Floats
+
+
+def hire(models: Sequence[MachineModel]) -> Crew:
+    """One driver per machine."""
+
+    def of(name: str) -> Floats:
+        return np.array([getattr(model, name) for model in models])
+
+    return Crew(
+        rear_m=of("rear_to_joint_m"),
+        front_m=of("front_to_joint_m"),
+        max_articulation_rad=of("max_articulation_rad"),
+        mass_kg=of("mass_kg"),
+        max_drive_n=of("max_drive_n"),
+        max_brake_n=of("max_brake_n"),
+        max_power_w=of("max_power_w"),
+        body=Bodywork(of("front_to_joint_m"), of("rear_to_joint_m")),
     )
 
 
-def drive(course: Course, drivers: Drivers, state: FleetState, dt: float) -> tuple[Drivers, Floats, Floats]:
-    """Return the drivers' next memory, the articulation [rad] and the drive force [N] that they ask for."""
-    position = joint(state)
-    nearest, direction = course.at(drivers.way_m)
-    way = drivers.way_m + ((position - nearest) * direction).sum(axis=-1)
-    target = course.at(way + LOOK_AHEAD_M + LOOK_AHEAD_S * state.speed_mps)[0] - position
-    steer = pursue(target, state.yaw_rad + 0.5 * state.articulation_rad)
-
-    aim = np.minimum(course.limit(way + LOOK_AHEAD_S * state.speed_mps), START_MPS2 * drivers.time_s)
-    force, integral = hold_speed(aim, state.speed_mps, drivers.integral_n, dt)
-    return Drivers(way, integral, drivers.time_s + dt), steer, force
-
-
-def joint(state: FleetState) -> Floats:
-    """Position (n, 2) of the articulation joint; it goes where the frames' mean heading points, however they steer."""
-    x = state.x_m + AXLE_TO_JOINT_M * np.cos(state.yaw_rad)
-    return np.stack([x, state.y_m + AXLE_TO_JOINT_M * np.sin(state.yaw_rad)], axis=-1)
+def board(starts: Sequence[Start]) -> Drivers:
+    """Drivers before the first step."""
+    zero = np.zeros(len(starts))
+    return Drivers(
+        leg=np.array([start.leg for start in starts]),
+        way_m=np.array([start.way_m for start in starts]),
+        aim_mps=zero,
+        integral_n=zero,
+        waited_s=zero,
+        payload_kg=np.array([start.payload_kg for start in starts]),
+        clear_m=np.full(len(starts), np.inf),
+    )
 
 
-def pursue(target_m: Floats, heading_rad: Floats) -> Floats:
-    """Articulation (n,) whose circle leads the joint through the target (n, 2), given relative to it in `map`."""
+def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float) -> tuple[Drivers, Commands]:
+    """Return the drivers' next memory and what they ask for."""
+    # Where on the leg the machine is; at its end it stops, waits, loads, and takes up the next leg.
+    position = joint(crew, state)
+    arrived = ~course.closed[old.leg] & (course.length_m[old.leg] - old.way_m < STOP_M)
+    standing = np.abs(state.speed_mps) < STANDING_MPS
+    waited = np.where(arrived & standing, old.waited_s + dt, 0.0)
+    payload = _load(course, old, waited, dt)
+    done = waited > course.wait_s[old.leg]
+    leg = np.where(done, course.following[old.leg], old.leg)
+    way = _follow(course, leg, np.where(done, 0.0, old.way_m), position)
+    arrived &= ~done
+    travel = course.travel[leg]
+
+    # Steer for a point ahead.
+    speed = travel * state.speed_mps
+    target = course.at(leg, way + LOOK_AHEAD_M + LOOK_AHEAD_S * np.abs(speed))[0] - position
+    heading = state.yaw_rad + state.articulation_rad * crew.rear_m / (crew.rear_m + crew.front_m)
+    steer = travel * pursue(crew, target, np.where(travel < 0, heading + np.pi, heading))
+
+    # Keep the speed that the way allows; gently up, and at once down.
+    limit = np.where(travel < 0, REVERSE_SHARE, 1.0) * course.limit(leg, way + LOOK_AHEAD_S * speed)
+    to_go = np.where(course.closed[leg], np.inf, course.length_m[leg] - way)
+    limit = np.minimum(limit, np.sqrt(2 * STOP_MPS2 * np.maximum(to_go - 0.5 * STOP_M, 0.05)))
+    limit = np.where(arrived, 0.0, np.minimum(limit, np.sqrt(2 * START_MPS2 * old.clear_m)))
+    aim = np.minimum(limit, np.maximum(old.aim_mps, 0.0) + START_MPS2 * dt)
+    halt = (aim < STANDING_MPS) & (np.abs(speed) < 5 * STANDING_MPS)
+    force, integral = hold_speed(crew, aim, speed, np.where(halt | done, 0.0, old.integral_n), dt)
+    commands = Commands(
+        steer_rad=steer,
+        drive_n=np.where(halt, 0.0, travel * force),
+        brake_n=np.where(halt, crew.max_brake_n, 0.0),
+        payload_kg=payload,
+    )
+    return Drivers(leg, way, aim, integral, np.where(done, 0.0, waited), payload, old.clear_m), commands
+
+
+def look_out(course: Course, crew: Crew, old: Drivers, state: FleetState) -> Drivers:
+    """Drivers look how far their way is clear of other machines."""
+    clear = clear_way(course, crew.body, old.leg, old.way_m, joint(crew, state), state)
+    return Drivers(old.leg, old.way_m, old.aim_mps, old.integral_n, old.waited_s, old.payload_kg, clear)
+
+
+def joint(crew: Crew, state: FleetState) -> Floats:
+    """Position (n, 2) of the articulation joint, which follows the route."""
+    x = state.x_m + crew.rear_m * np.cos(state.yaw_rad)
+    return np.stack([x, state.y_m + crew.rear_m * np.sin(state.yaw_rad)], axis=-1)
+
+
+def pursue(crew: Crew, target_m: Floats, heading_rad: Floats) -> Floats:
+    """Articulation (n,) whose circle leads the joint through the target (n, 2), given relative to it in `map`.
+
+    On a circle of curvature k each frame is turned from the joint's way by asin(k l), l from its axle to the joint.
+    """
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     left = target_m[:, 1] * c - target_m[:, 0] * s
     curvature = 2 * left / np.maximum((target_m**2).sum(axis=-1), 1.0)
-    articulation: Floats = 2 * np.arctan(AXLE_TO_JOINT_M * curvature)
-    return np.minimum(np.maximum(articulation, -MAX_ARTICULATION_RAD), MAX_ARTICULATION_RAD)
+    articulation = bend(crew.rear_m, crew.front_m, curvature)
+    return np.minimum(np.maximum(articulation, -crew.max_articulation_rad), crew.max_articulation_rad)
 
 
-def hold_speed(aim_mps: Floats, speed_mps: Floats, integral_n: Floats, dt: float) -> tuple[Floats, Floats]:
+def bend(rear_m: Floats, front_m: Floats, curvature_pm: Floats) -> Floats:
+    """Articulation [rad] with which the joint drives a circle of this curvature [1/m]."""
+    bent: Floats = np.arcsin(np.clip(rear_m * curvature_pm, -1, 1)) + np.arcsin(np.clip(front_m * curvature_pm, -1, 1))
+    return bent
+
+
+def hold_speed(crew: Crew, aim_mps: Floats, speed_mps: Floats, integral_n: Floats, dt: float) -> tuple[Floats, Floats]:
     """PI controller within the limits of force and power; its integral never leaves them (no wind-up)."""
     error = aim_mps - speed_mps
-    strongest = np.minimum(MAX_DRIVE_N, MAX_POWER_W / np.maximum(speed_mps, 0.6))
-    integral = np.minimum(np.maximum(integral_n + INTEGRAL_N * dt * error, -MAX_BRAKE_N), strongest)
-    return np.minimum(np.maximum(GAIN_N * error + integral, -MAX_BRAKE_N), strongest), integral
+    strongest = np.minimum(crew.max_drive_n, crew.max_power_w / np.maximum(np.abs(speed_mps), 0.6))
+    grown = integral_n + INTEGRAL_PER_S2 * crew.mass_kg * dt * error
+    integral = np.minimum(np.maximum(grown, -crew.max_brake_n), strongest)
+    wanted = GAIN_PER_S * crew.mass_kg * error + integral
+    return np.minimum(np.maximum(wanted, -crew.max_brake_n), strongest), integral
+
+
+def _follow(course: Course, leg: Ints, way_m: Floats, position_m: Floats) -> Floats:
+    """Way along the leg of the point nearest to the machine; a lap's end is its start."""
+    nearest, direction = course.at(leg, way_m)
+    way = way_m + ((position_m - nearest) * direction).sum(axis=-1)
+    lap: Floats = way - np.where(course.closed[leg] & (way >= course.length_m[leg]), course.length_m[leg], 0.0)
+    return lap
+
+
+def _load(course: Course, old: Drivers, waited_s: Floats, dt: float) -> Floats:
+    """Payloads change evenly while the machines wait."""
+    wanted, wait_s = course.payload_kg[old.leg], course.wait_s[old.leg]
+    changes: Bools = (waited_s > 0) & ~np.isnan(wanted)
+    share = dt / np.maximum(wait_s - waited_s + dt, dt)
+    return np.where(changes, old.payload_kg + np.minimum(share, 1.0) * (wanted - old.payload_kg), old.payload_kg)

@@ -1,4 +1,8 @@
-"""Rotations between `map` and `base_link` for arrays of machines (REP-103: pitch is positive nose down)."""
+"""Rotations for arrays of machines (REP-103: pitch is positive nose down).
+
+Vectors and quaternions (x, y, z, w) hold their axes first: (3, ...) and (4, ...). Plain sums of products rather than
+`@` and `einsum`, which round differently with the number of machines: seeds would not repeat.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +12,13 @@ from protocol.arrays import Floats
 
 
 def map_from_base(vector: Floats, yaw_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> Floats:
-    """Rotate one vector (3,) of `base_link` into `map` for all attitudes (k,): returns (k, 3)."""
+    """Rotate vectors (3, ...) of `base_link` into `map`, for attitudes (...)."""
     cy, sy, cp, sp = np.cos(yaw_rad), np.sin(yaw_rad), np.cos(pitch_rad), np.sin(pitch_rad)
     cr, sr = np.cos(roll_rad), np.sin(roll_rad)
     x, y, z = vector
     ahead = cp * x + sp * sr * y + sp * cr * z
     left = cr * y - sr * z
-    return np.stack([cy * ahead - sy * left, sy * ahead + cy * left, -sp * x + cp * sr * y + cp * cr * z], axis=-1)
+    return np.stack([cy * ahead - sy * left, sy * ahead + cy * left, -sp * x + cp * sr * y + cp * cr * z])
 
 
 def body_rates(yaw_rate: Floats, pitch_rate: Floats, roll_rate: Floats, pitch_rad: Floats, roll_rad: Floats) -> Floats:
@@ -29,3 +33,53 @@ def up_in_base(pitch_rad: Floats, roll_rad: Floats) -> Floats:
     """The vertical (n, 3) as `base_link` sees it."""
     cp = np.cos(pitch_rad)
     return np.stack([-np.sin(pitch_rad), cp * np.sin(roll_rad), cp * np.cos(roll_rad)], axis=-1)
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Cross product of vectors (3, ...)."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def turned(matrix: Floats, vector: Floats) -> Floats:
+    """Rotate vectors (3, r, units) by one matrix for each unit (3, 3, units)."""
+    x, y, z = matrix[:, :, None].swapaxes(0, 1)
+    product: Floats = x * vector[0] + y * vector[1] + z * vector[2]
+    return product
+
+
+def seen_turned(angle_rad: Floats, vector: Floats) -> Floats:
+    """Vectors (3, ...) as a frame sees them that is turned by an angle (...) about z."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    x, y, z = vector
+    return np.stack([c * x + s * y, c * y - s * x, z])
+
+
+def rotation(vector_rad: Floats) -> Floats:
+    """Matrix (3, 3) of the rotation about a vector (3,), by its length (Rodrigues)."""
+    x, y, z = vector_rad
+    angle = float(np.hypot(np.hypot(x, y), z))
+    along = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    half = np.sinc(angle / (2 * np.pi))  # numpy's sinc(x) is sin(pi x) / (pi x)
+    turn: Floats = np.eye(3) + np.sinc(angle / np.pi) * along + 0.5 * half**2 * (along @ along)
+    return turn
+
+
+def quaternion(yaw_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> Floats:
+    """Unit quaternion (4, ...) of yaw @ pitch @ roll."""
+    cy, sy = np.cos(0.5 * yaw_rad), np.sin(0.5 * yaw_rad)
+    cp, sp = np.cos(0.5 * pitch_rad), np.sin(0.5 * pitch_rad)
+    cr, sr = np.cos(0.5 * roll_rad), np.sin(0.5 * roll_rad)
+    x = cy * cp * sr - sy * sp * cr
+    y = cy * sp * cr + sy * cp * sr
+    z = sy * cp * cr - cy * sp * sr
+    return np.stack([x, y, z, cy * cp * cr + sy * sp * sr])
+
+
+def compose(first: Floats, second: Floats) -> Floats:
+    """Hamilton product of quaternions (4, ...): `map_from_a` and `a_from_b` give `map_from_b`."""
+    (ax, ay, az, aw), (bx, by, bz, bw) = first, second
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    return np.stack([x, y, z, aw * bw - ax * bx - ay * by - az * bz])

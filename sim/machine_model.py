@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from protocol.arrays import Floats
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
-from protocol.machine import Mount
+from protocol.machine import BASE, FRONT, Mount
 from sim.urdf import Mass, Pose, Robot, joined, read_urdf, rpy_rad
 
 FOLDER = Path(__file__).parent / "models"
-BASE, FRONT, PAYLOAD = "base_link", "front_link", "payload_link"
+PAYLOAD = "payload_link"
 WHEELS = tuple(f"{place}_wheel_link" for place in ("front_left", "front_right", "rear_left", "rear_right"))
 
 
@@ -81,6 +82,13 @@ class MachineModel:
         scaled = Mass(payload_kg, load.centre_m, share * load.inertia_kgm2)
         empty = [(pose, mass) for pose, mass in parts if mass is not load]
         return joined([*empty, (self.robot.place(PAYLOAD, BASE), scaled)])
+
+    @property
+    def payload_centre_m(self) -> Floats:
+        """Where the centre of what it carries lies (3,), in `base_link`, standing straight."""
+        pose = self.robot.place(PAYLOAD, BASE)
+        centre: Floats = pose.xyz_m + pose.rotation @ self.robot.links[PAYLOAD].mass.centre_m
+        return centre
 
     def front_share(self, payload_kg: float = 0.0) -> float:
         """Front axle's share of the weight on level ground."""

@@ -1,24 +1,109 @@
-"""The simulated wheel loader as its agent knows it: nominal body, sensors and where they are mounted."""
+"""Machines as the simulator knows them: what their agents may know, how bad their sensors are, and what is broken."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
 from protocol.machine import MachineConfig, Mount, SensorConfig
-
-# Antennas on the cab's roof; two IMUs under the rear frame's deck and one at the joint (paper: "under the frames").
-GPS_MOUNTS = tuple(Mount(xyz) for xyz in ((0.8, 0.0, 3.35), (0.3, 0.6, 3.35), (0.3, -0.6, 3.35)))
-IMU_MOUNTS = (
-    Mount((0.4, 0.0, 0.9)),
-    Mount((0.4, 0.5, 0.9), (0.0, 0.0, 90.0)),
-    Mount((1.4, 0.0, 0.8), (180.0, 0.0, 0.0)),
-)
+from sim.datasheets import GpsNoise
+from sim.machine_model import MachineModel
+from sim.noise import generator
+from sim.presets import Preset
+from sim.vehicle import Bodies
 
 
-def loader(name: str, gps: int, imus: int) -> MachineConfig:
-    """Build the nominal loader with this many GPS receivers and IMUs (at most three of each).
+@dataclass(frozen=True)
+class Faults:
+    """What is wrong with a machine, from from_s (simulated) on, beyond what its preset says.
 
-    Fast sensors stand first: readings of one stamp then have the same order live, in bundles and in log folders.
+    torque_scale: factor on what the drive train reports. antenna_off_m: how far the antennas really sit from where the
+    config says, in `base_link`. clock_off_s: what the stamps of all its sensors are ahead.
     """
-    inertial = [SensorConfig(f"imu-{i + 1}", "imu", mount) for i, mount in enumerate(IMU_MOUNTS[:imus])]
-    others = [SensorConfig(*o) for o in (("torque", "torque"), ("wheels", "encoder"), ("articulation", "articulation"))]
-    receivers = [SensorConfig(f"gps-{i + 1}", "gps", mount) for i, mount in enumerate(GPS_MOUNTS[:gps])]
-    return MachineConfig(name, sensors=(*inertial, *others, *receivers))
+
+    from_s: float = 0.0
+    torque_scale: float = 1.0
+    antenna_off_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    clock_off_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        values = {"from_s": self.from_s, "torque_scale": self.torque_scale, "clock_off_s": self.clock_off_s}
+        limits = {"from_s": (0, 1e7), "torque_scale": (0, 10), "clock_off_s": (-1e6, 1e6)}
+        for name, (low, high) in limits.items():
+            if not low <= values[name] <= high:  # also false for NaN
+                raise ValueError(f"{name}: {values[name]!r} is not between {low:g} and {high:g}")
+        if not all(abs(off) <= 100 for off in self.antenna_off_m):
+            raise ValueError(f"antenna_off_m: {self.antenna_off_m!r} is more than 100 m away")
+
+
+@dataclass(frozen=True)
+class Rig:
+    """One machine's sensors. machine: what its agent may know; the rest is for the simulator alone."""
+
+    machine: MachineConfig
+    model: MachineModel
+    preset: Preset
+    faults: Faults = Faults()
+
+
+def machine_config(
+    name: str,
+    model: MachineModel,
+    preset: Preset,
+    gps: tuple[int, ...],
+    imu: tuple[int, ...],
+    attitude: tuple[int, ...],
+) -> MachineConfig:
+    """Describe a machine of a kind as its agent knows it; sensors by the numbers that the model's URDF gives them.
+
+    attitude: IMUs that also say their orientation. Fast sensors stand first: readings of one stamp then have the same
+    order live, in bundles and in log folders.
+    """
+    ticks = preset.encoder.ticks_per_rev
+    sensors = [_inertial("imu", number, model) for number in imu]
+    sensors += [_inertial("attitude", number, model) for number in attitude]
+    sensors += [SensorConfig("torque", "torque"), SensorConfig("wheels", "encoder", ticks_per_rev=ticks)]
+    sensors += [SensorConfig("articulation", "articulation")]
+    sensors += [_receiver(number, model, preset.gps) for number in gps]
+    return MachineConfig(
+        name,
+        mass_kg=model.mass_kg,
+        wheel_radius_m=model.wheel_radius_m,
+        load_centre_m=model.load_centre_m,
+        rotating_mass_factor=model.rotating_mass_factor,
+        sensors=tuple(sorted(sensors, key=lambda sensor: -preset.rate_hz(sensor.kind))),
+    )
+
+
+def draw_bodies(rigs: Sequence[Rig], seed: int) -> Bodies:
+    """Draw the true bodies of machines around their nominal ones."""
+    mass_kg, radius_m = np.empty(len(rigs)), np.empty(len(rigs))
+    for i, rig in enumerate(rigs):
+        rng, spread = generator(seed, i, "body"), rig.preset.body
+        mass_kg[i] = rig.machine.mass_kg * (1 + spread.mass * rng.uniform(-1, 1))
+        radius_m[i] = rig.machine.wheel_radius_m * (1 + spread.wheel_radius * rng.standard_normal())
+    return Bodies(mass_kg, radius_m)
+
+
+def _inertial(kind: str, number: int, model: MachineModel) -> SensorConfig:
+    mounts = model.imu_mounts()
+    _check_number(kind, number, len(mounts), model)
+    frame, mount = mounts[number - 1]
+    return SensorConfig(f"{kind}-{number}", kind, mount, frame=frame)
+
+
+def _receiver(number: int, model: MachineModel, noise: GpsNoise) -> SensorConfig:
+    mounts: tuple[Mount, ...] = model.gps_mounts()
+    _check_number("gps", number, len(mounts), model)
+    total = math.hypot(noise.drift_std_m, noise.white_std_m)
+    share = round((noise.drift_std_m / total) ** 2, 2) if total else 0.0  # no finer than a data sheet
+    name, mount = f"gps-{number}", mounts[number - 1]
+    return SensorConfig(name, "gps", mount, drift_share=share, drift_time_s=noise.drift_time_s)
+
+
+def _check_number(kind: str, number: int, count: int, model: MachineModel) -> None:
+    if not 1 <= number <= count:
+        raise ValueError(f"{kind}: a {model.name} has no number {number}; it has 1 to {count}")

@@ -13,7 +13,8 @@ import numpy as np
 import pybullet
 
 from protocol.arrays import Floats
-from sim.machine_model import BASE, FRONT, PAYLOAD, WHEELS, MachineModel
+from protocol.machine import BASE, FRONT
+from sim.machine_model import PAYLOAD, WHEELS, MachineModel
 from sim.urdf import rigid_urdf
 from sim.vehicle import GRAVITY
 

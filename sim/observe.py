@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats
-from sim.rigid import ORIGINS, Scene, articulation, attitude, plane_gradient
+from sim.rigid import BASE_POINT, Scene, articulation, attitude, plane_gradient
 from sim.soil import C_RR
 from sim.vehicle import GRAVITY
 from sim.world import STEP_S, FleetState
@@ -25,30 +25,20 @@ class Drive:
     wheel_rad: Floats
 
 
-@dataclass(frozen=True, slots=True)
-class FrontState:
-    """Front frames, arrays (n, 3) in `front_link`: angular rate, its derivative, specific force at the joint."""
-
-    rates_radps: Floats
-    rates_dot_radps2: Floats
-    force_mps2: Floats
-
-
-def observe(before: Scene, now: Scene, load_n: Floats, drive: Drive) -> tuple[FleetState, FrontState]:
+def observe(before: Scene, now: Scene, load_n: Floats, mass_kg: Floats, drive: Drive) -> FleetState:
     """Read off the state of machines. load_n: of each wheel, (n, 4).
 
     Accelerations are differences over the step, as an accelerometer that averages over its interval has them.
     """
     rates, rates_dot, force = _inertial(before, now)
-    base = now.frames.rotation[:, 0]
-    yaw, pitch, roll = attitude(base)
+    yaw, pitch, roll = attitude(now.frames.rotation[:, 0])
     cosine, sine, tangent = np.cos(roll), np.sin(roll), np.tan(pitch)
-    speed, old_speed = _speed(now), _speed(before)
+    speed, bending = _speed(now), _bending(now)
     load = load_n.sum(axis=-1)
     grade_e, grade_n = plane_gradient(now.ground.point_m)
-    about_x, about_y, about_z = rates[:, 0].T
-    x, y, z = now.points.xyz_m[:, ORIGINS.start].T
-    state = FleetState(
+    about_x, about_y, about_z = rates.T
+    x, y, z = now.points.xyz_m[:, BASE_POINT].T
+    return FleetState(
         x_m=x,
         y_m=y,
         z_m=z,
@@ -56,39 +46,49 @@ def observe(before: Scene, now: Scene, load_n: Floats, drive: Drive) -> tuple[Fl
         pitch_rad=pitch,
         roll_rad=roll,
         speed_mps=speed,
-        accel_mps2=(speed - old_speed) / STEP_S,
+        accel_mps2=(speed - _speed(before)) / STEP_S,
         pitch_radps=about_y * cosine - about_z * sine,
         roll_radps=about_x + (about_y * sine + about_z * cosine) * tangent,
-        rates_radps=rates[:, 0],
-        rates_dot_radps2=rates_dot[:, 0],
-        force_mps2=force[:, 0],
+        rates_radps=rates,
+        rates_dot_radps2=rates_dot,
+        force_mps2=force,
         articulation_rad=articulation(now.frames.rotation),
+        articulation_radps=bending,
+        articulation_radps2=(bending - _bending(before)) / STEP_S,
         drive_n=drive.drive_n,
         torque_nm=drive.torque_nm,
         load_n=load,
+        mass_kg=mass_kg,
         wheel_radps=drive.wheel_radps,
         wheel_rad=drive.wheel_rad,
         c_rr=(C_RR[now.ground.zone] * load_n).sum(axis=-1) / np.maximum(load, 1.0),
         grade_e=grade_e,
         grade_n=grade_n,
     )
-    return state, FrontState(rates[:, 1], rates_dot[:, 1], force[:, 1])
 
 
 def _inertial(before: Scene, now: Scene) -> tuple[Floats, Floats, Floats]:
-    """Rate, its derivative, and specific force at the origins of rear and front frame, each (n, 2, 3) in its axes."""
-    old_rates, rates = _own_rates(before), _own_rates(now)
-    change = now.points.velocity_mps[:, ORIGINS] - before.points.velocity_mps[:, ORIGINS]
+    """Rate, its derivative, and specific force at `base_link`, each (n, 3) in its axes."""
+    old_rates, rates = _in_base(before.frames.rate_radps[:, 0], before), _in_base(now.frames.rate_radps[:, 0], now)
+    change = now.points.velocity_mps[:, BASE_POINT] - before.points.velocity_mps[:, BASE_POINT]
     feels = change / STEP_S + _GRAVITY_UP
-    force = (feels[..., None, :] @ now.frames.rotation[:, :2])[..., 0, :]
+    force = _in_base(feels, now)
     return rates, (rates - old_rates) / STEP_S, force
 
 
-def _own_rates(scene: Scene) -> Floats:
-    rates: Floats = (scene.frames.rate_radps[:, :2, None, :] @ scene.frames.rotation[:, :2])[..., 0, :]
-    return rates
+def _in_base(vector: Floats, scene: Scene) -> Floats:
+    """Vectors (n, 3) of `map` along the axes of `base_link`."""
+    turned: Floats = (vector[:, None, :] @ scene.frames.rotation[:, 0])[:, 0]
+    return turned
 
 
 def _speed(scene: Scene) -> Floats:
-    speed: Floats = np.vecdot(scene.points.velocity_mps[:, ORIGINS.start], scene.frames.rotation[:, 0, :, 0])
+    speed: Floats = np.vecdot(scene.points.velocity_mps[:, BASE_POINT], scene.frames.rotation[:, 0, :, 0])
     return speed
+
+
+def _bending(scene: Scene) -> Floats:
+    """Rate of the joint's angle."""
+    rate = scene.frames.rate_radps
+    bending: Floats = np.vecdot(rate[:, 1] - rate[:, 0], scene.frames.rotation[:, 0, :, 2])
+    return bending

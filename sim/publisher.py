@@ -20,10 +20,8 @@ from protocol.messages import SensorBundle
 from protocol.readings import Reading
 from protocol.session import SessionConfig, open_session
 from sim.config import SimConfig
-from sim.recorder import Recording, record, write_truth
+from sim.recorder import Recording, write_truth
 from sim.simulator import Simulator
-
-__all__ = ["SimReport", "record", "run"]
 
 MATCH_POLL_S = 0.05
 PROGRESS_S = 0.2
@@ -102,11 +100,10 @@ def run(
     simulated time about five times a second. The truth and log folders are written at the end, whatever ends the run;
     readings are kept in memory for record_dir.
     """
-    simulator = Simulator(config)
-    recording = Recording(simulator) if record_dir else None
-    progress = _throttled(on_progress, clock) if on_progress else None
-    with _streams(config, session_config) as streams:
-        _await_subscribers(streams, config, session_config.endpoint, stop, clock)
+    with contextlib.closing(Simulator(config)) as simulator, _streams(simulator, session_config) as streams:
+        recording = Recording(simulator) if record_dir else None
+        progress = throttled(on_progress, clock) if on_progress else None
+        _await_subscribers(streams, simulator, session_config.endpoint, stop, clock)
         try:
             report = _drive(simulator, streams, stop, clock, recording, progress)
         finally:
@@ -127,7 +124,7 @@ def _drive(
 ) -> SimReport:
     start, bundles, readings = clock(), 0, 0
     pace = Pace(simulator.config.speed, stop, clock)
-    planned = simulator.config.bundles
+    planned = simulator.bundles
     for _ in itertools.count() if planned is None else range(planned):
         if stop.is_set():
             break
@@ -147,10 +144,10 @@ def _drive(
 
 
 @contextlib.contextmanager
-def _streams(config: SimConfig, session_config: SessionConfig) -> Iterator[list[Stream]]:
+def _streams(simulator: Simulator, session_config: SessionConfig) -> Iterator[list[Stream]]:
     session: Any = open_session(session_config)
     try:
-        streams = [Stream(session, config.site, name) for name in config.machine_names]
+        streams = [Stream(session, simulator.site.name, machine.name) for machine in simulator.machines]
         try:
             yield streams
         finally:
@@ -161,25 +158,27 @@ def _streams(config: SimConfig, session_config: SessionConfig) -> Iterator[list[
 
 
 def _await_subscribers(
-    streams: list[Stream], config: SimConfig, endpoint: str, stop: threading.Event, clock: Callable[[], float]
+    streams: list[Stream], simulator: Simulator, endpoint: str, stop: threading.Event, clock: Callable[[], float]
 ) -> None:
-    deadline = clock() + config.wait_s
+    wait_s = simulator.config.wait_s
+    deadline = clock() + wait_s
     while unheard := [s.machine for s in streams if not s.heard]:
         if stop.is_set():
             return
         if clock() >= deadline:
-            problem = f"nobody listens to machine {unheard[0]} of site {config.site}"
-            raise LinkError(endpoint, f"{problem}: start its agent with `sitegrid agent`, within {config.wait_s:g} s")
+            problem = f"nobody listens to machine {unheard[0]} of site {simulator.site.name}"
+            raise LinkError(endpoint, f"{problem}: start its agent with `sitegrid agent`, within {wait_s:g} s")
         stop.wait(MATCH_POLL_S)
 
 
-def _throttled(call: Callable[[float], None], clock: Callable[[], float]) -> Callable[[float], None]:
+def throttled(call: Callable[[float], None], clock: Callable[[], float]) -> Callable[[float], None]:
+    """The same call, but at most once in PROGRESS_S."""
     last = clock() - PROGRESS_S
 
-    def throttled(simulated_s: float) -> None:
+    def now_and_then(simulated_s: float) -> None:
         nonlocal last
         if clock() - last >= PROGRESS_S:
             last = clock()
             call(simulated_s)
 
-    return throttled
+    return now_and_then

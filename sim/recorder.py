@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 from protocol.errors import ConfigError
@@ -34,20 +37,38 @@ class Recording:
 
 
 def write_truth(folder: Path, simulator: Simulator) -> None:
-    """Write the truth map and the tracks so far: `truth_map.npz` and `tracks/<machine>.csv`."""
+    """Write the truth map and the tracks so far: `truth_map.npz` and `tracks/<machine>.csv`.
+
+    Where the ground changed, `truth_map_until_<second>s.npz` holds what was true before.
+    """
     simulator.truth_map.save(folder / MAP_FILE)
+    for until_s, former in simulator.former_truth_maps():
+        former.save(folder / f"{Path(MAP_FILE).stem}_until_{until_s:g}s.npz")
     save_tracks(folder / TRACKS_FOLDER, simulator.tracks())
 
 
-def record(config: SimConfig, record_dir: Path, truth_dir: Path | None = None) -> Simulator:
-    """Simulate `config.seconds` into log folders; the truth goes to truth_dir. Returns the simulator, at its end."""
-    if config.bundles is None:
-        raise ConfigError("seconds", "a recording needs an end: set seconds above 0")
-    simulator = Simulator(config)
-    recording = Recording(simulator)
-    for _ in range(config.bundles):
-        recording.add(simulator.advance())
-    recording.write(record_dir)
-    if truth_dir:
-        write_truth(truth_dir, simulator)
+def record(
+    config: SimConfig,
+    record_dir: Path,
+    truth_dir: Path | None = None,
+    *,
+    on_progress: Callable[[float], None] = lambda _: None,
+    stop: threading.Event | None = None,
+) -> Simulator:
+    """Simulate into log folders; the truth goes to truth_dir. Returns the simulator, at its end and closed.
+
+    on_progress gets the simulated time after every bundle. stop: once set, the recording ends with what it has.
+    """
+    with contextlib.closing(Simulator(config)) as simulator:
+        if simulator.bundles is None:
+            raise ConfigError("seconds", "a recording needs an end: set seconds above 0")
+        recording = Recording(simulator)
+        for _ in range(simulator.bundles):
+            if stop and stop.is_set():
+                break
+            recording.add(simulator.advance())
+            on_progress(simulator.simulated_s)
+        recording.write(record_dir)
+        if truth_dir:
+            write_truth(truth_dir, simulator)
     return simulator

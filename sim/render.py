@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,8 +17,9 @@ from sim.machine_model import FOLDER, MachineModel
 from sim.terrain import Terrain
 from sim.world import FleetState
 
-MESH_M = 1.0  # between the nodes of the drawn ground
-TEXTURE_M = 0.1  # size of a texel
+MESH_M, MAX_NODES = 1.0, 60_000  # between the nodes of the drawn ground; of a large site it is more
+TEXEL_M, MAX_TEXELS = 0.1, 6_000_000  # size of a texel, likewise
+MARGIN = 0.04  # of an overview's frame, around the site
 SKY_RGB = (196, 214, 232)
 GRAIN = 0.06  # brightness noise of the ground, so that an eye sees it move and bend
 SUN = (-0.8, 0.45, 1.0)  # in the north-west, as on maps: slopes that face it are brighter
@@ -41,30 +42,57 @@ class Camera:
     height: int = 720
 
 
-def overview(terrain: Terrain) -> Camera:
-    """A camera that sees the whole site."""
-    depth, width = (terrain.cell_m * (n - 1) for n in terrain.heights_m.shape)
-    middle = float(terrain.heights_m.mean())
-    return Camera((width * 0.515, depth * 0.41, middle), 0.95 * max(width, 1.3 * depth), yaw_deg=20.0, pitch_deg=43.0)
+def overview(terrain: Terrain, width: int = 1280, height: int = 720) -> Camera:
+    """The closest camera that sees the whole site, in a picture of this size [px]."""
+    camera = Camera((0.0, 0.0, 0.0), 1.0, yaw_deg=16.0, pitch_deg=43.0, width=width, height=height)
+    depth_m, width_m = (terrain.cell_m * (n - 1) for n in terrain.heights_m.shape)
+    low, high = float(terrain.heights_m.min()) - SKIRT_M, float(terrain.heights_m.max())
+    corners = np.array([(x, y, z) for x in (0, width_m) for y in (0, depth_m) for z in (low, high)])
+    right, up, forward = _axes(camera)
+    upwards = (1 - MARGIN) * np.tan(np.radians(camera.view_deg / 2))
+    distance, target = 0.0, corners.mean(axis=0)
+    # A corner p is inside where |axis . (p - target)| <= slope * (distance + forward . (p - target)).
+    for axis, slope in ((right, upwards * width / height), (up, upwards)):
+        across, away = (corners - target) @ axis, slope * ((corners - target) @ forward)
+        most, least = float((across - away).max()), float((across + away).min())
+        distance = max(distance, (most - least) / 2 / slope)
+        target = target + (most + least) / 2 * axis
+    x, y, z = target.tolist()
+    return replace(camera, target_m=(x, y, z), distance_m=distance)
 
 
-def closeup(state: FleetState, machine: int) -> Camera:
-    """A camera beside and ahead of one machine."""
+def _axes(camera: Camera) -> Floats:
+    """Right, up and forward of a camera in `map`, one per row."""
+    yaw, pitch = np.radians([camera.yaw_deg, camera.pitch_deg])
+    right = [np.cos(yaw), np.sin(yaw), 0.0]
+    forward = [-np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), -np.sin(pitch)]
+    return np.array([right, np.cross(right, forward), forward])
+
+
+def closeup(state: FleetState, machine: int, model: MachineModel, width: int = 1280, height: int = 720) -> Camera:
+    """A camera beside and ahead of one machine, for a picture of this size [px]."""
     x, y, z, yaw = (float(v[machine]) for v in (state.x_m, state.y_m, state.z_m, state.yaw_rad))
-    ahead_m = 2.0  # about the middle of a machine
+    ahead_m = 0.6 * model.wheelbase_m  # about the middle of a machine
     target = (x + ahead_m * np.cos(yaw), y + ahead_m * np.sin(yaw), z + 1.0)
-    return Camera(target, 13.0, yaw_deg=float(np.degrees(yaw)) + 35.0, pitch_deg=22.0)
+    away_m = model.wheelbase_m * max(2.7, 3.6 * height / width)
+    turned = float(np.degrees(yaw)) + 35.0
+    return Camera(target, away_m, yaw_deg=turned, pitch_deg=22.0, width=width, height=height)
 
 
-def render(terrain: Terrain, models: Sequence[MachineModel], state: FleetState, camera: Camera) -> AnyArray:
-    """Draw the machines of a state on their ground: (height, width, 3) uint8; blue, green, red as OpenCV has it."""
+def render(
+    terrain: Terrain, models: Sequence[MachineModel], state: FleetState, cameras: Sequence[Camera]
+) -> list[AnyArray]:
+    """Draw the machines of a state on their ground, a picture for each camera.
+
+    A picture is (height, width, 3) uint8; blue, green, red as OpenCV has it.
+    """
     client = pybullet.connect(pybullet.DIRECT)
     try:
         with TemporaryDirectory() as folder:
             _ground(client, terrain, _shades(models, state), Path(folder))
             for machine, model in enumerate(models):
                 _machine(client, model, state, machine)
-            return _photograph(client, camera)
+            return [_photograph(client, camera) for camera in cameras]
     finally:
         pybullet.disconnect(client)
 
@@ -105,8 +133,9 @@ def _strip(start: Floats, end: Floats, half_m: float) -> Floats:
 def _ground(client: int, terrain: Terrain, shades: list[Floats], folder: Path) -> None:
     """Put the ground up as a mesh with a picture of its zones on it."""
     rows, columns = terrain.heights_m.shape
-    east = np.arange(0, (columns - 1) * terrain.cell_m + 1e-6, MESH_M)
-    north = np.arange(0, (rows - 1) * terrain.cell_m + 1e-6, MESH_M)
+    size_m = (columns - 1) * terrain.cell_m, (rows - 1) * terrain.cell_m
+    mesh_m = max(MESH_M, float(np.sqrt(np.prod(size_m) / MAX_NODES)))
+    east, north = (np.linspace(0, side, round(side / mesh_m) + 1) for side in size_m)
     x, y = np.meshgrid(east, north)
     texture, mesh = folder / "ground.png", folder / "ground.obj"
     cv2.imwrite(str(texture), _picture(terrain, shades, float(east[-1]), float(north[-1])))
@@ -137,8 +166,9 @@ def _skirt(client: int, path: Path, edge: Floats, floor_m: float) -> None:
 
 def _picture(terrain: Terrain, shades: list[Floats], width_m: float, depth_m: float) -> AnyArray:
     """The zones from above in the paper's colours, softened and grained, dark under machines; north is up."""
-    x = np.arange(TEXTURE_M / 2, width_m, TEXTURE_M)
-    y = np.arange(TEXTURE_M / 2, depth_m, TEXTURE_M)[::-1]
+    texel_m = max(TEXEL_M, float(np.sqrt(width_m * depth_m / MAX_TEXELS)))
+    x = np.arange(texel_m / 2, width_m, texel_m)
+    y = np.arange(texel_m / 2, depth_m, texel_m)[::-1]
     grid = np.meshgrid(x, y)
     zone = terrain.zone(*grid)
     colours = np.array([z.bgr for z in ZONES], float)
@@ -149,7 +179,7 @@ def _picture(terrain: Terrain, shades: list[Floats], width_m: float, depth_m: fl
     relief = -RELIEF * cv2.GaussianBlur(SUN[0] * east + SUN[1] * north, (0, 0), 6)
     light: AnyArray = np.ones(zone.shape)
     for outline in shades:
-        texels = np.round((outline * [1, -1] + [0, depth_m]) / TEXTURE_M).astype(np.int32)
+        texels = np.round((outline * [1, -1] + [0, depth_m]) / texel_m).astype(np.int32)
         cv2.fillPoly(light, [texels], 1 - SHADE)
     light = cv2.GaussianBlur(light, (0, 0), 4) * (1 + GRAIN * grain + relief)
     image: AnyArray = np.clip(picture * light[..., None], 0, 255).astype(np.uint8)

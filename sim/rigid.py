@@ -10,9 +10,9 @@ from protocol.arrays import Floats, Ints
 from sim.multibody import Frames
 from sim.terrain import Terrain
 
-# Points that are followed, and the frame that each is fixed to: hubs, `base_link`, and the origin of `front_link`.
-HUBS, ORIGINS = slice(0, 4), slice(4, 6)
-POINT_FRAME = [1, 1, 2, 2, 0, 1]
+# Points that are followed, and the frame that each is fixed to: hubs and `base_link`.
+HUBS, BASE_POINT = slice(0, 4), 4
+POINT_FRAME = [1, 1, 2, 2, 0]
 _LEVI_CIVITA = np.zeros((3, 9))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _LEVI_CIVITA[_j, 3 * _i + _k] = 1.0
@@ -21,7 +21,7 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Points on machines, (n, 6, 3) in `map`: where they are and how they move."""
+    """Points on machines, (n, 5, 3) in `map`: where they are and how they move."""
 
     xyz_m: Floats
     velocity_mps: Floats
@@ -65,7 +65,7 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 def follow(frames: Frames, arms_m: Floats) -> Points:
-    """Follow points that lie at arms_m (n, 6, 3) from their frame's centre of mass, along its axes."""
+    """Follow points that lie at arms_m (n, 5, 3) from their frame's centre of mass, along its axes."""
     arms = (frames.rotation[:, POINT_FRAME] @ arms_m[..., None])[..., 0]
     turning = cross(frames.rate_radps[:, POINT_FRAME], arms)
     return Points(frames.centre_m[:, POINT_FRAME] + arms, frames.velocity_mps[:, POINT_FRAME] + turning)
@@ -74,8 +74,7 @@ def follow(frames: Frames, arms_m: Floats) -> Points:
 def touch(terrain: Terrain, frames: Frames, points: Points, guess_m: Floats) -> Ground:
     """Find the ground under wheels. guess_m: the previous points on it; the hub's foot moves little in a step."""
     x, y = guess_m[..., 0], guess_m[..., 1]
-    height = terrain.height(x, y)
-    east, north = terrain.gradient(x, y)
+    height, east, north = terrain.surface(x, y)
     hub = points.xyz_m[:, HUBS]
 
     up = np.empty_like(hub)

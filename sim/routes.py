@@ -1,73 +1,113 @@
-"""Closed routes: polygons with rounded corners, and the speed that their curves allow."""
+"""Routes: closed tours or cycles of legs with stops between them, and the speed that their curves allow."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from protocol.arrays import Floats
 
-SPACING_M = 0.5
+SPACING_M, FINE_M = 0.5, 0.1  # between points of a leg, and while corners are rounded
 ROUNDING_M = 7.0  # of a right angle this leaves a radius of 0.886 times as much; flatter corners come out wider
 LATERAL_MPS2 = 0.9
 BRAKING_MPS2 = 0.5
 
+Corners = tuple[tuple[float, float], ...]
+
 
 @dataclass(frozen=True)
-class Route:
-    """A closed route. points: (n, 2) in `map` [m], evenly spaced by spacing_m; the last is followed by the first."""
+class Leg:
+    """A line that a machine's joint follows. points: (k, 2) in `map` [m], in the order driven, spacing_m apart.
+
+    closed: driven round and round, the last point is followed by the first. reverse: driven backwards. At the end of an
+    open leg the machine stops for wait_s and its payload changes to payload_kg (None: it does not).
+    """
 
     points: Floats
     spacing_m: float
+    closed: bool = False
+    reverse: bool = False
+    wait_s: float = 0.0
+    payload_kg: float | None = None
 
     @property
     def length_m(self) -> float:
-        """Length of one lap."""
-        return len(self.points) * self.spacing_m
+        """Length from the first point to the last, or of one lap."""
+        return (len(self.points) - (not self.closed)) * self.spacing_m
 
-    def reversed(self) -> Route:
-        """Return the same route driven the other way."""
-        return Route(self.points[::-1].copy(), self.spacing_m)
-
-    def shifted(self, share: float) -> Route:
-        """Return the same route starting at this share of the lap."""
-        return Route(np.roll(self.points, -round(share * len(self.points)), axis=0), self.spacing_m)
+    def headings(self) -> tuple[float, float]:
+        """Direction of travel [rad] at the first and at the last point."""
+        first, last = self.points[1] - self.points[0], self.points[-1] - self.points[-2]
+        return float(np.arctan2(first[1], first[0])), float(np.arctan2(last[1], last[0]))
 
     def curvature(self) -> Floats:
-        """Signed curvature at every point [1/m], positive to the left."""
+        """Signed curvature at every point [1/m], positive to the left of the way; 0 at the ends of an open leg."""
         step = np.roll(self.points, -1, axis=0) - self.points
         heading = np.arctan2(step[:, 1], step[:, 0])
-        turn = heading - np.roll(heading, 1)
-        curvature: Floats = (turn + np.pi) % (2 * np.pi) - np.pi
-        return curvature / self.spacing_m
+        turn = (heading - np.roll(heading, 1) + np.pi) % (2 * np.pi) - np.pi
+        if not self.closed:
+            turn[[0, -1]] = 0.0
+        curvature: Floats = turn / self.spacing_m
+        return curvature
 
 
-def rounded(corners: tuple[tuple[float, float], ...], rounding_m: float = ROUNDING_M) -> Route:
-    """Round a polygon: its outline convolved with a Gaussian of `rounding_m` along the way."""
-    outline = resample(np.array(corners, float), SPACING_M)
-    frequency = np.fft.fftfreq(len(outline.points), outline.spacing_m)
-    gain = np.exp(-0.5 * (2 * np.pi * frequency * rounding_m) ** 2)
-    smooth = np.fft.ifft(np.fft.fft(outline.points @ [1, 1j]) * gain)
-    return resample(np.stack([smooth.real, smooth.imag], axis=1), SPACING_M)
+@dataclass(frozen=True)
+class Route:
+    """What a machine drives again and again: one closed leg, or open ones end to end."""
+
+    legs: tuple[Leg, ...]
+
+    @property
+    def length_m(self) -> float:
+        """Length of one cycle."""
+        return sum(leg.length_m for leg in self.legs)
+
+    def reversed(self) -> Route:
+        """The same closed tour driven the other way round."""
+        (tour,) = self.legs
+        return Route((replace(tour, points=tour.points[::-1].copy()),))
 
 
-def resample(points: Floats, spacing_m: float) -> Route:
-    """Spread points evenly along the closed line through `points` (n, 2)."""
-    closed = np.vstack([points, points[:1]])
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
-    count = round(way[-1] / spacing_m)
-    at = np.arange(count) * way[-1] / count
-    even = np.stack([np.interp(at, way, closed[:, 0]), np.interp(at, way, closed[:, 1])], axis=1)
-    return Route(even, float(way[-1] / count))
+def tour(corners: Corners, rounding_m: float = ROUNDING_M) -> Route:
+    """A closed route: a polygon with corners rounded by a Gaussian of `rounding_m` along the way."""
+    outline = _resample(np.array([*corners, corners[0]], float), FINE_M, closed=True)
+    points = _smooth(outline.points, rounding_m / outline.spacing_m)
+    return Route((_resample(np.vstack([points, points[:1]]), SPACING_M, closed=True),))
 
 
-def speed_limits(route: Route, drive_mps: float) -> Floats:
+def way(corners: Corners, rounding_m: float = ROUNDING_M) -> Leg:
+    """An open leg along corners; it keeps its ends and their directions, where the first and last straight are long."""
+    outline = _resample(np.array(corners, float), FINE_M, closed=False).points
+    # Continued by its point reflections, so that smoothing leaves the ends where they are.
+    sigma = rounding_m / FINE_M
+    margin = int(5 * sigma) + 1
+    line = np.pad(outline, ((margin, margin), (0, 0)), "reflect", reflect_type="odd")
+    points = _smooth(line, sigma)[margin : margin + len(outline)]
+    return _resample(points, SPACING_M, closed=False)
+
+
+def speed_limits(leg: Leg, drive_mps: float) -> Floats:
     """Speed that a driver aims at, at every point: slow in curves, and braking for them in time."""
-    limit = np.sqrt(LATERAL_MPS2 / np.maximum(np.abs(route.curvature()), 1e-6))
-    limit = np.minimum(limit, drive_mps)
-    gain = 2 * BRAKING_MPS2 * route.spacing_m
-    for i in reversed(range(2 * len(limit))):  # twice round, so that the seam of the lap is treated like the rest
+    limit = np.minimum(np.sqrt(LATERAL_MPS2 / np.maximum(np.abs(leg.curvature()), 1e-6)), drive_mps)
+    gain, laps = 2 * BRAKING_MPS2 * leg.spacing_m, 1 + leg.closed  # twice round: the seam is treated like the rest
+    for i in reversed(range(laps * len(limit) - (not leg.closed))):
         k, following = i % len(limit), limit[(i + 1) % len(limit)]
         limit[k] = min(limit[k], np.sqrt(following**2 + gain))
     return limit
+
+
+def _smooth(points: Floats, sigma: float) -> Floats:
+    """Convolve a closed line of points (k, 2) with a Gaussian of sigma points."""
+    gain = np.exp(-0.5 * (2 * np.pi * np.fft.fftfreq(len(points)) * sigma) ** 2)
+    smooth = np.fft.ifft(np.fft.fft(points @ [1, 1j]) * gain)
+    return np.stack([smooth.real, smooth.imag], axis=1)
+
+
+def _resample(line: Floats, spacing_m: float, *, closed: bool) -> Leg:
+    """Spread points evenly along a line (k, 2); a closed one comes with its first point at the end again."""
+    at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    count = max(round(at[-1] / spacing_m), 2)
+    even = np.linspace(0.0, at[-1], count + 1)[: count if closed else None]
+    points = np.stack([np.interp(even, at, line[:, 0]), np.interp(even, at, line[:, 1])], axis=1)
+    return Leg(points, float(at[-1] / count), closed)

@@ -1,85 +1,102 @@
-"""The simulator: a world, the sensors of its machines and their truth, one bundle of readings at a time."""
+"""The simulator: drivers, a world, the sensors of its machines and their truth, one bundle of readings at a time."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from protocol.arrays import Bools, Ints, Table
+from protocol.arrays import Bools, Floats, Ints, Table
+from protocol.errors import ConfigError
 from protocol.machine import MachineConfig
 from protocol.readings import Reading
 from protocol.site import Projection, SiteConfig
-from sim import paper_site
-from sim.config import STEP_MS, SimConfig
+from sim.config import STEP_MS, SimConfig, resolve
+from sim.course import Start, lay_course, line_up
+from sim.driver import DRIVER_STEPS, board, drive, hire, look_out
 from sim.fleet import Fleet
-from sim.machines import loader
-from sim.noise import generators
-from sim.sensors import (
-    ArticulationNoise,
-    ArticulationSensor,
-    GpsNoise,
-    GpsReceiver,
-    ImuNoise,
-    InertialUnit,
-    Sensor,
-    TorqueMeter,
-    TorqueNoise,
-    WheelEncoder,
-    sample_all,
-)
+from sim.ground import lay, pave
+from sim.machine_model import MachineModel
+from sim.machines import draw_bodies
+from sim.scenario import Scenario
+from sim.sensors import Sensors, Span
+from sim.terrain import Terrain
+from sim.traffic import APART_M, LOOK_OUT_STEPS
 from sim.truth import TRACK_DTYPE, TRACK_EVERY, TRACK_VALUES, TruthMap, truth_map
 from sim.vehicle import Bodies
-from sim.world import FleetState, World, machine_states, stack
+from sim.world import STEP_S, FleetState, World, stack
 
 STEP_NS = STEP_MS * 1_000_000
-MASS_SPREAD = 0.03  # a real machine is up to this much lighter or heavier than its nominal
-RADIUS_ERROR = 0.015
 
 
 class Simulator:
     """Simulates the machines of one site; the same config gives the same readings, bit for bit.
 
-    site, machines: what agents may know. truth_map, tracks(): what only an evaluation may see.
+    site, machines: what agents may know. truth_map, tracks(): what only an evaluation may see. close() ends the world.
     """
 
     def __init__(self, config: SimConfig) -> None:
         self.config = config
-        self.site: SiteConfig = paper_site.site(config.site)
-        self.machines: tuple[MachineConfig, ...] = tuple(
-            loader(name, config.gps, config.imus) for name in config.machine_names
-        )
-        terrain = paper_site.terrain(config.seed, config.roughness_m)
-        self.truth_map: TruthMap = truth_map(terrain, paper_site.WIDTH_M, paper_site.DEPTH_M)
-        streams = [generators(config.seed, i) for i in range(config.machines)]
-        bodies = draw_bodies(self.machines, [s["body"] for s in streams])
-        routes = [paper_site.route_of(i) for i in range(config.machines)]
-        self._world: World = Fleet(terrain, bodies, routes, config.drive_mps)
-        projection = Projection(self.site)
-        self._sensors = [
-            build_sensors(machine, config, projection, stream)
-            for machine, stream in zip(self.machines, streams, strict=True)
-        ]
+        self.scenario: Scenario = resolve(config)
+        self.site: SiteConfig = self.scenario.site
+        rigs = self.scenario.rigs()
+        self.machines: tuple[MachineConfig, ...] = tuple(rig.machine for rig in rigs)
+        self.models: tuple[MachineModel, ...] = tuple(rig.model for rig in rigs)
+        self.terrain: Terrain = lay(self.scenario.ground, self.scenario.seed)
+        self._changes = sorted(self.scenario.change, key=lambda change: change.at_s)
+
+        routes, speeds, shares = zip(*self.scenario.journeys(), strict=True)
+        try:
+            starts = line_up(routes, shares, APART_M if self.scenario.give_way else 0.0)
+        except ValueError as error:
+            raise ConfigError(f"scenario {config.scenario}", str(error)) from None
+        self._course = lay_course(routes, speeds)
+        self._crew, self._drivers = hire(self.models), board(starts)
+        bodies = draw_bodies(rigs, self.scenario.seed)
+        self._world = build_world(self.scenario.world, self.terrain, self.models, bodies, starts)
+        for machine, start in enumerate(starts):
+            if start.payload_kg:
+                self._world.set_payload(machine, start.payload_kg)
+        self._sensors = Sensors(rigs, self.scenario.seed, Projection(self.site))
         self._steps = 0
         self._tracks: list[Table] = []
+        self._truth_maps: list[tuple[float, TruthMap]] = []
 
     @property
     def simulated_s(self) -> float:
         """Simulated time since the start."""
         return self._steps * STEP_MS / 1000
 
+    @property
+    def bundles(self) -> int | None:
+        """How many bundles the run has; None if it ends only when it is stopped."""
+        seconds = self.scenario.seconds
+        return -int(-seconds * 1000 // self.config.bundle_ms) if seconds else None
+
+    @property
+    def state(self) -> FleetState:
+        """True state of all machines."""
+        return self._world.state
+
     def advance(self) -> dict[str, list[Reading]]:
         """Simulate the span of one bundle; returns the readings of each machine in the order of their stamps."""
+        span = self.sense()
+        return {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
+
+    def sense(self) -> Span:
+        """Simulate the span of one bundle; returns the readings of all machines as columns."""
         count = self.config.bundle_ms // STEP_MS
-        states = stack([self._world.step() for _ in range(count)])
-        steps = np.arange(self._steps + 1, self._steps + count + 1)
+        states = stack([self._step() for _ in range(count)])
+        steps = np.arange(self._steps - count + 1, self._steps + 1)
         stamps_ns = self.config.start_ns + steps * STEP_NS
-        self._steps += count
         due = steps % TRACK_EVERY == 0
         if due.any():
             self._tracks.append(_track_rows(stamps_ns[due], states, due))
-        return {
-            machine.name: sample_all(sensors, steps, stamps_ns, machine_states(states, i))
-            for i, (machine, sensors) in enumerate(zip(self.machines, self._sensors, strict=True))
-        }
+        return self._sensors.sample(steps, stamps_ns, states)
+
+    def close(self) -> None:
+        """End the world."""
+        self._world.close()
 
     def tracks(self) -> dict[str, Table]:
         """True way of each machine so far: rows of `truth.TRACK_DTYPE` at 10 Hz."""
@@ -87,56 +104,59 @@ class Simulator:
         rows = np.concatenate([empty, *self._tracks])
         return {machine.name: rows[:, i].copy() for i, machine in enumerate(self.machines)}
 
+    @property
+    def truth_map(self) -> TruthMap:
+        """The ground as it is now."""
+        ground = self.scenario.ground
+        return truth_map(self.terrain, ground.width_m, ground.depth_m, self.site.cell_m)
 
-def draw_bodies(machines: tuple[MachineConfig, ...], rngs: list[np.random.Generator]) -> Bodies:
-    """Draw the true bodies of machines around their nominal ones."""
-    mass = [m.mass_kg * (1 + MASS_SPREAD * rng.uniform(-1, 1)) for m, rng in zip(machines, rngs, strict=True)]
-    radius = [
-        m.wheel_radius_m * (1 + RADIUS_ERROR * rng.standard_normal()) for m, rng in zip(machines, rngs, strict=True)
-    ]
-    return Bodies(np.array(mass), np.array(radius))
+    def former_truth_maps(self) -> Sequence[tuple[float, TruthMap]]:
+        """The ground before each change so far, with the simulated second of that change."""
+        return self._truth_maps
+
+    def _step(self) -> FleetState:
+        """One step of the world; drivers look out, and act, less often."""
+        state = self._world.state
+        while self._changes and self._changes[0].at_s <= self.simulated_s:
+            self._repave()
+        if self._steps % LOOK_OUT_STEPS == 0 and self.scenario.give_way and len(self.machines) > 1:
+            self._drivers = look_out(self._course, self._crew, self._drivers, state)
+        if self._steps % DRIVER_STEPS == 0:
+            carried = self._drivers.payload_kg
+            dt = DRIVER_STEPS * STEP_S
+            self._drivers, self._commands = drive(self._course, self._crew, self._drivers, state, dt)
+            for machine in np.flatnonzero(self._drivers.payload_kg != carried).tolist():
+                self._world.set_payload(machine, float(self._drivers.payload_kg[machine]))
+        self._steps += 1
+        commands = self._commands
+        return self._world.advance(commands.steer_rad, commands.drive_n, commands.brake_n)
+
+    def _repave(self) -> None:
+        change = self._changes.pop(0)
+        self._truth_maps.append((change.at_s, self.truth_map))
+        self.terrain = pave(self.terrain, change.zone)
+        self._world.set_terrain(self.terrain)
 
 
-def build_sensors(
-    machine: MachineConfig, config: SimConfig, projection: Projection, rngs: dict[str, np.random.Generator]
-) -> list[Sensor]:
-    """Build the sensors that a machine's config names."""
-    turn_s = config.outage_period_s / max(config.gps, 1)  # receivers of one machine fail in turn ...
-    first_s = config.outage_period_s * rngs["outage"].uniform()  # ... and machines independently of each other
-    sensors: list[Sensor] = []
-    receivers = 0
-    for sensor in machine.sensors:
-        rng = rngs[sensor.name]
-        if sensor.kind == "gps":
-            noise = _gps_noise(config, first_s + receivers * turn_s)
-            sensors.append(GpsReceiver(sensor, noise, projection, rng))
-            receivers += 1
-        elif sensor.kind == "imu":
-            sensors.append(InertialUnit(sensor, ImuNoise(), rng))
-        elif sensor.kind == "encoder":
-            sensors.append(WheelEncoder(sensor))
-        elif sensor.kind == "torque":
-            sensors.append(TorqueMeter(sensor, TorqueNoise(), rng))
-        else:
-            sensors.append(ArticulationSensor(sensor, ArticulationNoise(), rng))
-    return sensors
+def build_world(
+    name: str, terrain: Terrain, models: Sequence[MachineModel], bodies: Bodies, starts: Sequence[Start]
+) -> World:
+    """Put machines into a world of that name, `pybullet` or `fast`, their joints on their starts."""
+    rear_m = np.array([model.rear_to_joint_m for model in models])
+    heading = np.array([start.heading_rad for start in starts])
+    joint = np.array([start.joint_m for start in starts])
+    base = joint - rear_m[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    places: Floats = np.column_stack([base, heading])
+    if name == "fast":
+        return Fleet(terrain, models, bodies, places)
+    from sim.bullet import BulletWorld  # imported here: the fast world needs no PyBullet
 
-
-def _gps_noise(config: SimConfig, phase_s: float) -> GpsNoise:
-    return GpsNoise(
-        drift_std_m=config.gps_drift_std_m,
-        drift_time_s=config.gps_drift_time_s,
-        white_std_m=config.gps_white_std_m,
-        outage_s=config.outage_s,
-        outage_period_s=config.outage_period_s,
-        phase_s=phase_s,
-    )
+    return BulletWorld(terrain, models, bodies, places)
 
 
 def _track_rows(stamps_ns: Ints, states: FleetState, due: Bools) -> Table:
     rows = np.empty(states.x_m[due].shape, TRACK_DTYPE)
     rows["stamp_ns"] = stamps_ns[:, None]
-    values = (states.x_m, states.y_m, states.yaw_rad, states.speed_mps, states.c_rr, states.grade_e, states.grade_n)
-    for name, value in zip(TRACK_VALUES, values, strict=True):
-        rows[name] = value[due]
+    for name, field in TRACK_VALUES.items():
+        rows[name] = getattr(states, field)[due]
     return rows

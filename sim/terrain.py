@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from protocol.arrays import Floats, Ints
+from sim import kernels
 
 
 @dataclass(frozen=True)
@@ -22,38 +24,28 @@ class Terrain:
     zones: Ints
     zone_cell_m: float
 
+    @cached_property
+    def grid(self) -> kernels.Grid:
+        """The same as a tuple of arrays, for kernels."""
+        heights, zones = np.ascontiguousarray(self.heights_m, float), np.ascontiguousarray(self.zones, np.int64)
+        return kernels.Grid(heights, float(self.cell_m), zones, float(self.zone_cell_m))
+
+    def surface(self, x_m: Floats, y_m: Floats) -> Floats:
+        """Height [m], bilinear, and its gradient to the east and north [m/m], as (3, ...)."""
+        found: Floats = kernels.surfaces(self.grid, x_m.ravel(), y_m.ravel())
+        return found.reshape(3, *x_m.shape)
+
     def height(self, x_m: Floats, y_m: Floats) -> Floats:
         """Height [m], bilinear."""
-        a, b, (h00, h10, h01, h11) = self._patch(x_m, y_m)
-        south, north = h00 + a * (h10 - h00), h01 + a * (h11 - h01)
-        return south + b * (north - south)
+        height: Floats = self.surface(x_m, y_m)[0]
+        return height
 
     def gradient(self, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         """Gradient of the bilinear patch, east and north [m/m]."""
-        a, b, (h00, h10, h01, h11) = self._patch(x_m, y_m)
-        east = ((h10 - h00) * (1 - b) + (h11 - h01) * b) / self.cell_m
-        north = ((h01 - h00) * (1 - a) + (h11 - h10) * a) / self.cell_m
+        _, east, north = self.surface(x_m, y_m)
         return east, north
 
     def zone(self, x_m: Floats, y_m: Floats) -> Ints:
         """Index into `soil.SOILS`."""
-        rows, columns = self.zones.shape
-        column = _index(x_m / self.zone_cell_m, columns - 1)
-        row = _index(y_m / self.zone_cell_m, rows - 1)
-        zone: Ints = self.zones[row, column]
-        return zone
-
-    def _patch(self, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats, tuple[Floats, ...]]:
-        """Position within the patch (0..1 each way) and the heights of its four corners."""
-        rows, columns = self.heights_m.shape
-        u, v = x_m / self.cell_m, y_m / self.cell_m
-        i, j = _index(u, columns - 2), _index(v, rows - 2)
-        a, b = np.minimum(np.maximum(u - i, 0.0), 1.0), np.minimum(np.maximum(v - j, 0.0), 1.0)
-        flat, k = self.heights_m.ravel(), j * columns + i
-        return a, b, (flat[k], flat[k + 1], flat[k + columns], flat[k + columns + 1])
-
-
-def _index(position: Floats, last: int) -> Ints:
-    # numpy's clip costs five times these two on a handful of wheels
-    index: Ints = np.minimum(np.maximum(position.astype(np.int64), 0), last)
-    return index
+        found: Ints = kernels.zones(self.grid, x_m.ravel(), y_m.ravel())
+        return found.reshape(x_m.shape)

@@ -16,7 +16,20 @@ from sim.soil import C_RR
 from sim.terrain import Terrain
 
 TRACK_EVERY = 10  # steps: 10 Hz
-TRACK_VALUES = ("x", "y", "yaw", "speed", "c_rr", "grade_e", "grade_n")  # m, rad, m/s, -, m/m
+# Column of a track -> what it takes from the state record [m, rad, m/s, kg, -, m/m]
+TRACK_VALUES = {
+    "x": "x_m",
+    "y": "y_m",
+    "z": "z_m",
+    "yaw": "yaw_rad",
+    "pitch": "pitch_rad",
+    "roll": "roll_rad",
+    "speed": "speed_mps",
+    "mass": "mass_kg",
+    "c_rr": "c_rr",
+    "grade_e": "grade_e",
+    "grade_n": "grade_n",
+}
 TRACK_DTYPE = np.dtype([("stamp_ns", "<i8"), *((name, "<f8") for name in TRACK_VALUES)])
 MAP_FILE = "truth_map.npz"
 

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from protocol.arrays import Floats
+from sim.terrain import Terrain
 
 STEP_S = 0.01
 
@@ -16,11 +17,12 @@ STEP_S = 0.01
 class FleetState:
     """True state of n machines at one instant; every array has the shape (n,), or (n, k) where k is given.
 
-    Position of `base_link` in `map`, attitude as yaw, pitch (nose down) and roll, speed along the ground.
-    rates, rates_dot: angular rate and acceleration in `base_link` (3). force: specific force at `base_link`, in its
-    axes, gravity included (3). wheel_*: of the rear axle, left and right (2). torque: at all wheels together. load: of
-    all wheels on the ground. c_rr, grade: of the ground under the wheels, weighted by their loads, and as the plane
-    through them.
+    Position of `base_link` in `map`, attitude as yaw, pitch (nose down) and roll, speed along the ground, negative in
+    reverse. rates, rates_dot: angular rate and acceleration in `base_link` (3). force: specific force at `base_link`,
+    in its axes, gravity included (3). articulation: angle of the front frame, its rate and acceleration; the frames are
+    rigid, so these carry rates and force over to the front one. wheel_*: of the rear axle, left and right (2). torque:
+    at all wheels together. load: of all wheels on the ground. mass: with what is carried. c_rr, grade: of the ground
+    under the wheels, weighted by their loads, and as the plane through them.
     """
 
     x_m: Floats
@@ -37,9 +39,12 @@ class FleetState:
     rates_dot_radps2: Floats
     force_mps2: Floats
     articulation_rad: Floats
+    articulation_radps: Floats
+    articulation_radps2: Floats
     drive_n: Floats
     torque_nm: Floats
     load_n: Floats
+    mass_kg: Floats
     wheel_radps: Floats
     wheel_rad: Floats
     c_rr: Floats
@@ -48,15 +53,27 @@ class FleetState:
 
 
 class World(Protocol):
-    """Moves all machines of a site by one step of 10 ms at a time."""
+    """Moves all machines of a site, under the commands of their drivers; they start straight, empty and at rest."""
 
     @property
     def state(self) -> FleetState:
         """The state after the last step."""
         ...
 
-    def step(self) -> FleetState:
-        """Advance by STEP_S and return the new state."""
+    def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
+        """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
+        ...
+
+    def set_payload(self, machine: int, payload_kg: float) -> None:
+        """Change what one machine carries."""
+        ...
+
+    def set_terrain(self, terrain: Terrain) -> None:
+        """Change the ground under the machines."""
+        ...
+
+    def close(self) -> None:
+        """Free what the world holds."""
         ...
 
 

@@ -61,7 +61,9 @@ def _add_demo(nouns: Nouns, common: Parent, _: Parent) -> None:
     demo = _noun(nouns, "demo", "router, map server, simulator and agents, each its own process; pictures", [common])
     demo.add_argument("--seconds", type=_positive, default=240.0, help="simulated time (default %(default)s)")
     demo.add_argument("--speed", type=_positive, default=4.0, help="times real time (default %(default)s)")
-    demo.add_argument("--machines", type=int, default=3, help="how many (default %(default)s)")
+    demo.add_argument("--scenario", default="paper_site", help="what is simulated (default %(default)s)")
+    demo.add_argument("--world", choices=("pybullet", "fast"), help="what moves the machines (over the scenario)")
+    demo.add_argument("--machines", type=int, help="machines of the scenario's first fleet (over the scenario)")
     demo.add_argument("--seed", type=int, default=0, help="seed of the simulation (default %(default)s)")
     demo.add_argument("--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores")
     demo.add_argument("--headless", action="store_true", help="no live display, plain lines only")
@@ -87,16 +89,21 @@ def _add_server(nouns: Nouns, common: Parent, network: Parent) -> None:
 def _add_sim(nouns: Nouns, common: Parent, network: Parent) -> None:
     sim = _noun(nouns, "sim", "the simulator: machines drive, their sensors are published", [common, network])
     sim.add_argument("--config", type=Path, help="options (config/sim.toml)")
+    sim.add_argument("--scenario", help="name of a scenario, or the path of its .toml file (over the config)")
+    sim.add_argument("--world", choices=("pybullet", "fast"), help="what moves the machines (over the scenario)")
+    sim.add_argument("--preset", help="paper, dgps, standalone, rtk, harsh: how bad sensors are (over the scenario)")
     for name, kind, what in (
         ("seconds", float, "simulated time, 0 until stopped"),
         ("speed", float, "times real time, 0 as fast as possible"),
-        ("machines", int, "how many machines"),
+        ("machines", int, "machines of the scenario's first fleet"),
         ("seed", int, "seed"),
     ):
         sim.add_argument(f"--{name}", type=kind, help=f"{what} (over the config)")
     sim.add_argument("--site", help="name of the site in keys (over the config)")
     sim.add_argument("--truth", type=Path, help="folder to write the true map and tracks to")
     sim.add_argument("--record", type=Path, help="folder to write a log folder per machine to, instead of publishing")
+    sim.add_argument("--all-sensors", action="store_true", help="every GPS receiver and IMU that the machines have")
+    sim.add_argument("--picture", type=Path, help="draw the site from above and in perspective into this file, and end")
     sim.add_argument("--write-configs", type=Path, help="write site.toml and one agent file per machine, and end")
 
 

@@ -1,4 +1,4 @@
-"""What a demo shows while it runs: a bar on a terminal, a plain line now and then elsewhere."""
+"""What a long run shows: a bar on a terminal, a plain line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ EVERY_S = 5.0  # between two plain lines
 
 
 class Display:
-    """Progress of a run; use it as a context."""
+    """Progress of a run; use it as a context. title: what goes on."""
 
-    def __init__(self, *, headless: bool) -> None:
+    def __init__(self, title: str, *, headless: bool) -> None:
         self._bar: Any = None
         self._task: Any = None
         self._next_s = 0.0
@@ -25,16 +25,15 @@ class Display:
 
             columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[what]}"))
             self._bar = Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True))
-            self._task = self._bar.add_task("machines drive", total=None, what="")
+            self._task = self._bar.add_task(title, total=None, what="")
 
-    def show(self, simulated_s: float, total_s: float, info: dict[str, Any]) -> None:
-        """Show how far the simulation is and what the map holds."""
-        what = f"{info.get('samples_merged', 0)} samples, {info.get('cells', 0)} cells"
+    def show(self, done_s: float, total_s: float, what: str) -> None:
+        """Show how many simulated seconds are done, and what there is to say."""
         if self._bar:
-            self._bar.update(self._task, completed=simulated_s, total=total_s, what=what)
+            self._bar.update(self._task, completed=done_s, total=total_s or None, what=what)
         elif time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + EVERY_S
-            note(f"{simulated_s:5.0f} of {total_s:g} s driven, {what}")
+            note(f"{done_s:5.0f} of {total_s:g} s, {what}")
 
     def __enter__(self) -> Display:
         if self._bar:

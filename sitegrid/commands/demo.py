@@ -21,7 +21,8 @@ from protocol.logfolder import LogFolder, open_log
 from protocol.queries import Region
 from protocol.session import free_endpoint
 from protocol.site import load_site
-from sim.config import SimConfig
+from sim.config import SimConfig, resolve
+from sim.scenario import Scenario
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.commands.plot import draw, draw_both
@@ -45,7 +46,8 @@ class Plan:
     out: Path
     work: Path
     endpoint: str
-    sim: SimConfig
+    config: SimConfig
+    scenario: Scenario
     configs: list[Path]
     log: LogFolder | None
     manifest: Path | None
@@ -61,7 +63,7 @@ def run(arguments: Namespace) -> int:
     began_s = time.monotonic()
     plan = _plan(arguments)
     with Children(plan.work) as children:
-        result = _drive(plan, children, stop, Display(headless=arguments.headless or arguments.json))
+        result = _drive(plan, children, stop, Display("machines drive", headless=arguments.headless or arguments.json))
     if result is None:
         note("stopped; everything is ended")
         return 130
@@ -72,17 +74,23 @@ def run(arguments: Namespace) -> int:
 
 def _plan(arguments: Namespace) -> Plan:
     try:
-        sim = SimConfig(
-            machines=arguments.machines, seed=arguments.seed, seconds=arguments.seconds, speed=arguments.speed
+        config = SimConfig(
+            scenario=arguments.scenario,
+            world=arguments.world,
+            machines=arguments.machines,
+            seed=arguments.seed,
+            seconds=arguments.seconds,
+            speed=arguments.speed,
         )
     except ValueError as error:
         raise ConfigError("sitegrid demo", str(error)) from None
+    scenario = resolve(config)
     work = arguments.out / "work"
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     manifest, data = _log_of(arguments)
     log = open_log(manifest, data) if manifest else None
-    return Plan(arguments.out, work, free_endpoint(), sim, write_configs(sim, work), log, manifest)
+    return Plan(arguments.out, work, free_endpoint(), config, scenario, write_configs(config, work), log, manifest)
 
 
 def _log_of(arguments: Namespace) -> tuple[Path | None, Path | None]:
@@ -108,8 +116,8 @@ def _drive(plan: Plan, children: Children, stop: threading.Event, display: Displ
     for child in agents.values():
         child.expect("ready", READY_S)
     sim = _start_sim(plan, children)
-    with connect(plan.endpoint, plan.sim.site) as client:
-        tracks = TrackRecorder(client.session, plan.sim.site)
+    with connect(plan.endpoint, plan.scenario.site.name) as client:
+        tracks = TrackRecorder(client.session, plan.scenario.site.name)
         with display:
             if not _watch(plan, client, tracks, (sim, agents), (stop, display)):
                 return None
@@ -141,9 +149,10 @@ def _start_agent(plan: Plan, children: Children, config: Path) -> Child:
 
 
 def _start_sim(plan: Plan, children: Children) -> Child:
-    c = plan.sim
-    options = ("--seconds", c.seconds, "--speed", c.speed, "--machines", c.machines, "--seed", c.seed)
-    return children.start("sim", "sim", "--endpoint", plan.endpoint, *options, "--truth", plan.work / "truth", "--json")
+    c = plan.config
+    options = {name: getattr(c, name) for name in ("scenario", "world", "machines", "seed", "seconds", "speed")}
+    words = [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]
+    return children.start("sim", "sim", "--endpoint", plan.endpoint, *words, "--truth", plan.work / "truth", "--json")
 
 
 def _watch(
@@ -161,7 +170,7 @@ def _watch(
             return False
         for line in sim.lines():
             simulated_s = line.get("simulated_s", simulated_s)
-        display.show(simulated_s, plan.sim.seconds, _info(client))
+        display.show(simulated_s, plan.scenario.seconds, _what(client))
         if time.monotonic() >= next_picture_s:
             draw(client, plan.out / "map.png", _whole(plan), tracks.tracks())
             next_picture_s = time.monotonic() + 3
@@ -170,17 +179,18 @@ def _watch(
     return True
 
 
-def _info(client: Client) -> dict[str, Any]:
+def _what(client: Client) -> str:
     try:
-        return client.info()
+        info = client.info()
     except (LinkError, QueryError):  # shown again in a moment
-        return {}
+        return "the map server is away"
+    return f"{info['samples_merged']} samples, {info['cells']} cells"
 
 
 def _whole(plan: Plan) -> list[float]:
     truth = _truth_file(plan)
     if not truth.exists():
-        return [0.0, 0.0, 200.0, 150.0]
+        return [0.0, 0.0, plan.scenario.ground.width_m, plan.scenario.ground.depth_m]
     true = TruthMap.load(truth)
     rows, columns = true.c_rr.shape
     return [true.west_m, true.south_m, true.west_m + columns * true.cell_m, true.south_m + rows * true.cell_m]
@@ -248,8 +258,8 @@ def _result(
     log_lost, log_double = (log["lost"], log["double"]) if log else (0, 0)
     return {
         "machines": len(reports),
-        "seconds": plan.sim.seconds,
-        "seed": plan.sim.seed,
+        "seconds": plan.scenario.seconds,
+        "seed": plan.scenario.seed,
         "samples_recorded": audit.recorded,
         "samples_merged": audit.merged,
         "lost": audit.lost + log_lost,

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from argparse import Namespace
 from pathlib import Path
 
 from protocol.errors import ConfigError
 from protocol.machine import machine_toml, plain_lines
 from protocol.session import SessionConfig
-from sim.config import SimConfig, load_sim
-from sim.publisher import record
+from sim.config import SimConfig, load_sim, resolve
 from sim.publisher import run as publish
-from sim.simulator import Simulator
+from sim.recorder import record
 from sitegrid.process import note, say, stop_flag
+from sitegrid.progress import Display
 
-OVER = ("seconds", "speed", "machines", "seed", "site")
+OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site")
+ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
 
 def run(arguments: Namespace) -> int:
-    """Publish, record, or write the configurations that go with the simulation."""
+    """Publish, record, draw, or write the configurations that go with the simulation."""
     stop = stop_flag()
     config = _config(arguments)
     if arguments.write_configs:
         write_configs(config, arguments.write_configs)
-        return 0
+    if arguments.picture:
+        _draw(config, arguments)
     if arguments.record:
-        record(config, arguments.record, arguments.truth)
-        say({"recorded": str(arguments.record), "machines": config.machines, "seconds": config.seconds})
+        return _record(config, arguments, stop)
+    if arguments.write_configs or arguments.picture:
         return 0
     report = publish(
         config,
@@ -43,13 +46,36 @@ def run(arguments: Namespace) -> int:
     return 0
 
 
+def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> int:
+    display = Display("machines drive", headless=arguments.json)
+    seconds = resolve(config).seconds
+    with display:
+        simulator = record(
+            config,
+            arguments.record,
+            arguments.truth,
+            on_progress=lambda now_s: display.show(now_s, seconds, "recording"),
+            stop=stop,
+        )
+    say({"recorded": str(arguments.record), "machines": len(simulator.machines), "seconds": simulator.simulated_s})
+    return 0
+
+
+def _draw(config: SimConfig, arguments: Namespace) -> None:
+    from sim.picture import draw  # imported here: a run without pictures needs no renderer
+
+    pictures = [str(path) for path in draw(config, arguments.picture)]
+    say({"pictures": pictures}) if arguments.json else note("\n".join(pictures))
+
+
 def write_configs(config: SimConfig, folder: Path) -> list[Path]:
     """Write `site.toml` and `<machine>.toml` for the agents: nominal values, nothing of the truth."""
-    simulator = Simulator(config)
+    scenario = resolve(config)
+    machines = [rig.machine for rig in scenario.rigs()]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "site.toml").write_text("\n".join(plain_lines(simulator.site)) + "\n", encoding="utf-8")
-    paths = [folder / f"{machine.name}.toml" for machine in simulator.machines]
-    for path, machine in zip(paths, simulator.machines, strict=True):
+    (folder / "site.toml").write_text("\n".join(plain_lines(scenario.site)) + "\n", encoding="utf-8")
+    paths = [folder / f"{machine.name}.toml" for machine in machines]
+    for path, machine in zip(paths, machines, strict=True):
         path.write_text(machine_toml(machine), encoding="utf-8")
     return paths
 
@@ -58,7 +84,9 @@ def _config(arguments: Namespace) -> SimConfig:
     config = load_sim(arguments.config) if arguments.config else SimConfig()
     over = {name: getattr(arguments, name) for name in OVER if getattr(arguments, name) is not None}
     if "machines" in over and over["machines"] != config.machines:
-        over["names"] = ()
+        over["names"] = None
+    if arguments.all_sensors:
+        over |= ALL_SENSORS
     try:
         return dataclasses.replace(config, **over)
     except ValueError as error:

@@ -79,13 +79,12 @@ def test_each_agent_has_a_name_and_a_spool_of_its_own():
 
 
 def test_agents_and_simulator_mean_the_same_machines_and_site():
-    from sim.config import load_sim
-    from sim.simulator import Simulator
+    from sim.config import load_sim, resolve
 
-    config = load_sim(ROOT / "config" / "sim.toml")
-    assert list(config.machine_names) == MACHINES
-    simulator, site = Simulator(config), load_site(ROOT / "config" / "site.toml")
-    assert (site.name, site.frame) == (config.site, simulator.site.frame)
+    scenario = resolve(load_sim(ROOT / "config" / "sim.toml"))
+    assert list(scenario.machine_names) == MACHINES
+    site = load_site(ROOT / "config" / "site.toml")
+    assert (site.name, site.frame) == (scenario.site.name, scenario.site.frame)
 
 
 def test_services_restart_and_need_no_privileges():

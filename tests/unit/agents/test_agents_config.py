@@ -9,8 +9,7 @@ from agents.config import AgentConfig, load_agent
 from protocol.errors import ConfigError
 from protocol.machine import MachineConfig, Mount, SensorConfig
 from protocol.site import SiteConfig, load_site
-from sim import paper_site
-from sim.machines import loader
+from sim.scenario_file import load_scenario
 
 CONFIG = Path(__file__).resolve().parents[3] / "config"
 
@@ -32,7 +31,7 @@ def unnamed(config: Any, named: dict[str, Any], place: str = "") -> list[str]:
 
 
 def test_agent_file_gives_the_defaults_and_the_simulated_loader() -> None:
-    assert load_agent(CONFIG / "agent.toml") == (loader("loader-1", 2, 1), AgentConfig())
+    assert load_agent(CONFIG / "agent.toml") == (load_scenario("paper_site").rigs()[0].machine, AgentConfig())
 
 
 def test_agent_file_names_every_option() -> None:
@@ -47,7 +46,7 @@ def test_agent_file_names_every_option_of_machine_and_sensor() -> None:
 
 
 def test_site_file_gives_the_paper_s_site_and_names_every_option() -> None:
-    assert load_site(CONFIG / "site.toml") == paper_site.site("paper")
+    assert load_site(CONFIG / "site.toml") == load_scenario("paper_site").site
     assert {f.name for f in fields(SiteConfig)} == set(table("site.toml"))
 
 

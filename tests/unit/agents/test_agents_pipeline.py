@@ -14,7 +14,7 @@ import agents
 import protocol
 from agents.pipeline import Pipeline, PipelineConfig
 from protocol.logfolder import open_log
-from protocol.machine import MachineConfig, Mount, SensorConfig
+from protocol.machine import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.readings import KINDS, Encoder, Gps, Imu, Reading, columns
 from protocol.samples import check_samples
 from sim.config import SimConfig
@@ -41,7 +41,7 @@ def with_trouble(readings: list[Reading]) -> list[Reading]:
     last = {r.sensor: r for r in found}
     for i in range(1, stand_ns // (10 * 1_000_000)):
         stamp = stop_ns + i * 10_000_000
-        still = Imu("imu-1", stamp, 0.001, 0.001, 0.003, 0.0, 0.0, 9.81)
+        still = Imu("imu-3", stamp, 0.001, 0.001, 0.003, 0.0, 0.0, 9.81)
         found += [still, *([replace(last["wheels"], stamp_ns=stamp)] if i % 5 == 0 else [])]
     for r in readings:
         if stop_ns < r.stamp_ns <= pause_ns:
@@ -121,10 +121,21 @@ def test_any_cutting_of_the_stream_gives_the_same_samples(
 def test_readings_of_unknown_sensors_are_counted_and_change_nothing(
     of: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any]
 ) -> None:
-    strangers = [replace(recorded[100], sensor="stranger"), Encoder("imu-1", recorded[100].stamp_ns, 0.0, 0.0)]
+    strangers = [replace(recorded[100], sensor="stranger"), Encoder("imu-3", recorded[100].stamp_ns, 0.0, 0.0)]
     samples, health = run(of, [*recorded[:101], *strangers, *recorded[101:]])
     assert samples == base[0]
     assert health["counters"].pop("reading_unknown_sensor") == 2
+    assert health == base[1]
+
+
+def test_readings_of_the_front_frame_are_counted_and_change_nothing(
+    of: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any]
+) -> None:
+    ahead = SensorConfig("imu-1", "imu", frame=FRONT)
+    strangers = [replace(r, sensor="imu-1") for r in recorded[:50] if isinstance(r, Imu)]
+    samples, health = run(replace(of, sensors=(*of.sensors, ahead)), [*recorded[:50], *strangers, *recorded[50:]])
+    assert samples == base[0]
+    assert health["counters"].pop("reading_front_frame") == len(strangers) > 10
     assert health == base[1]
 
 
@@ -186,7 +197,7 @@ def test_machine_that_aligns_late_loses_nothing_of_its_drive() -> None:
 
 def test_samples_do_not_depend_on_the_truth(tmp_path: Path) -> None:
     """Two recordings of the same drive, one of them with its truth moved by 100 m."""
-    config = SimConfig(machines=1, seed=5, seconds=20.0, speed=0.0)
+    config = SimConfig(world="fast", machines=1, seed=5, seconds=20.0)
     samples: list[bytes] = []
     for name in ("a", "b"):
         record(config, tmp_path / name / "logs", tmp_path / name / "truth")
@@ -327,8 +338,9 @@ SENSOR = [
     ("gps-1", {"drift_time_s": 10.0}),
     ("wheels", {"ticks_per_rev": 105}),
     ("wheels", {"use": False}),
-    ("imu-1", {"mount": Mount((0.4, 0.0, 0.9), (0.0, 3.0, 0.0))}),
-    ("imu-1", {"use": False}),
+    ("imu-3", {"mount": Mount((0.4, 0.0, 0.9), (0.0, 3.0, 0.0))}),
+    ("imu-3", {"use": False}),
+    ("imu-3", {"frame": FRONT}),
     ("torque", {"use": False}),
 ]
 

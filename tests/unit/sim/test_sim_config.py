@@ -1,42 +1,39 @@
 import dataclasses
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from protocol.config import load_toml
 from protocol.errors import ConfigError
-from sim.config import SimConfig, load_sim
+from sim.config import SimConfig, load_sim, resolve
+from sim.scenario_file import load_scenario
 
 EXAMPLE = Path(__file__).parents[3] / "config" / "sim.toml"
 
 
-def test_example_lists_every_option_with_its_default() -> None:
+def test_example_has_the_defaults_and_names_every_option() -> None:
     assert load_sim(EXAMPLE) == SimConfig()
-    assert set(load_toml(EXAMPLE)) == {f.name for f in dataclasses.fields(SimConfig)}
+    text = EXAMPLE.read_text()
+    shown = "\n".join(line.removeprefix("# ") for line in text.splitlines() if " = " in line)
+    assert set(tomllib.loads(shown)) == {f.name for f in dataclasses.fields(SimConfig)}
+
+
+def test_values_that_the_example_shows_are_those_of_the_scenario(tmp_path: Path) -> None:
+    shown = [line.removeprefix("# ") for line in EXAMPLE.read_text().splitlines() if " = " in line]
+    path = tmp_path / "sim.toml"
+    path.write_text("\n".join(shown))
+    full, plain = resolve(load_sim(path)), resolve(SimConfig())
+    assert dataclasses.replace(full, names=()) == plain
+    assert full.names == plain.machine_names
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("site", "Paper/*"),
-        ("machines", 0),
-        ("names", ("a", "b")),
-        ("names", ("a", "a", "b")),
         ("names", ("a", "*", "b")),
-        ("seed", -1),
-        ("seconds", -1.0),
-        ("seconds", float("nan")),
         ("speed", -0.5),
-        ("drive_mps", 0.1),
-        ("gps", 4),
-        ("imus", 0),
-        ("outage_s", -1.0),
-        ("outage_s", 11.0),
-        ("outage_period_s", 0.0),
-        ("gps_drift_std_m", -1.0),
-        ("gps_drift_time_s", 0.0),
-        ("gps_white_std_m", float("inf")),
-        ("roughness_m", 1.0),
+        ("speed", float("nan")),
         ("bundle_ms", 0),
         ("bundle_ms", 55),
         ("start_ns", 0),
@@ -48,6 +45,57 @@ def test_bad_option_is_refused_by_name(name: str, value: object) -> None:
         SimConfig(**{name: value})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"scenario": "mars"}, "there is no 'mars'; known: bad_machine, busy_site"),
+        ({"world": "flat"}, "world: 'flat' is neither pybullet nor fast"),
+        ({"machines": 0}, "count: 0 is not between 1 and 1000"),
+        ({"names": ("a", "b")}, "names: 2 names for 3 machines"),
+        ({"names": ("a", "a", "b")}, "two machines are named 'a'"),
+        ({"seed": -1}, "seed, seconds: negative"),
+        ({"seconds": float("nan")}, "seed, seconds: negative"),
+        ({"preset": "best"}, "'best'"),
+        ({"drive_mps": 0.1}, "drive_mps: 0.1 is not between"),
+        ({"gps": (4,)}, "gps.*4"),
+        ({"imu": (0,)}, "imu.*0"),
+        ({"attitude": (9,)}, "attitude.*9"),
+    ],
+)
+def test_option_that_does_not_fit_the_scenario_is_refused(options: dict, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem) as caught:
+        resolve(SimConfig(**options))
+    assert "\n" not in str(caught.value)
+
+
+def test_options_go_over_the_scenario() -> None:
+    scenario = resolve(
+        SimConfig(
+            site="pit",
+            world="fast",
+            machines=2,
+            names=("red", "blue"),
+            seed=9,
+            seconds=5.0,
+            preset="rtk",
+            drive_mps=2.0,
+            gps=(3,),
+            imu=(1, 4),
+            attitude=(4,),
+        )
+    )
+    assert (scenario.site.name, scenario.world, scenario.seed, scenario.seconds) == ("pit", "fast", 9, 5.0)
+    assert scenario.machine_names == ("red", "blue")
+    assert {rig.preset.name for rig in scenario.rigs()} == {"rtk"}
+    assert {speed for _, speed, _ in scenario.journeys()} == {2.0}
+    sensors = {s.name for s in scenario.rigs()[0].machine.sensors}
+    assert sensors == {"gps-3", "imu-1", "imu-4", "attitude-4", "torque", "wheels", "articulation"}
+
+
+def test_without_options_everything_is_as_the_scenario_says() -> None:
+    assert resolve(SimConfig(scenario="haul_road")) == load_scenario("haul_road")
+
+
 def test_unknown_key_is_refused_with_its_file(tmp_path: Path) -> None:
     path = tmp_path / "sim.toml"
     path.write_text("sped = 4\n")
@@ -55,12 +103,7 @@ def test_unknown_key_is_refused_with_its_file(tmp_path: Path) -> None:
         load_sim(path)
 
 
-def test_machines_are_named_by_number_or_by_config() -> None:
-    assert SimConfig(machines=2).machine_names == ("loader-1", "loader-2")
-    assert SimConfig(machines=2, names=("a", "b")).machine_names == ("a", "b")
-
-
-def test_bundles_cover_the_seconds() -> None:
-    assert SimConfig(seconds=120.0).bundles == 2400
-    assert SimConfig(seconds=0.12).bundles == 3
-    assert SimConfig(seconds=0.0).bundles is None
+def test_machines_are_numbered_or_named() -> None:
+    assert resolve(SimConfig(machines=1)).machine_names == ("loader-1",)
+    assert resolve(SimConfig(machines=2)).machine_names == ("loader-1", "loader-2")
+    assert resolve(SimConfig(machines=2, names=("a", "b"))).machine_names == ("a", "b")

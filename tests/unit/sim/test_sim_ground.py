@@ -1,16 +1,20 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sim import paper_site
-from sim.paper_site import DEPTH_M, SLOPE_FOOT_M, SLOPE_TOP_M, TOURS, WIDTH_M
-from sim.routes import rounded, speed_limits
+from sim.ground import GroundConfig, Ramp, Zone, lay, pave
+from sim.scenario_file import load_scenario
 from sim.soil import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT
 from sim.terrain import Terrain
 from sim.truth import truth_map
 
-SMOOTH = paper_site.terrain(0, 0.0)
+PAPER = load_scenario("paper_site").ground
+FOOT_M, TOP_M = PAPER.ramp[0].foot_m[0], PAPER.ramp[0].top_m[0]
+
+
+SMOOTH = lay(replace(PAPER, roughness_m=0.0), 0)
 
 
 def test_gradient_is_the_slope_of_the_height() -> None:
@@ -51,63 +55,64 @@ def test_soils_have_the_papers_resistance() -> None:
 
 
 def test_slope_has_15_degrees_and_rises_6_m() -> None:
-    x = np.linspace(SLOPE_FOOT_M + 2, SLOPE_TOP_M - 2, 50)
+    x = np.linspace(FOOT_M + 2, TOP_M - 2, 50)
     east, north = SMOOTH.gradient(x, np.full(50, 60.0))
     np.testing.assert_allclose(np.degrees(np.arctan(east)), 15.0, atol=0.01)
     assert not north.any()
     np.testing.assert_allclose(SMOOTH.height(np.array([10.0, 190.0]), np.array([75.0, 75.0])), [0, 6], atol=1e-9)
 
 
+def test_foot_and_crown_of_a_ramp_are_rounded() -> None:
+    x = np.arange(FOOT_M - 3, FOOT_M + 3, 0.25)
+    east, _ = SMOOTH.gradient(x, np.full(x.shape, 60.0))
+    bends = np.diff(east)
+    assert bends.max() < 0.2 * math.tan(math.radians(15))  # no kink: at least five cells share the bend
+
+
+def test_ramps_may_face_any_way() -> None:
+    ground = GroundConfig(100, 100, "gravel", 0.5, 0.0, ramp=(Ramp((30.0, 30.0), (60.0, 70.0), 5.0),))
+    east, north = lay(ground, 0).gradient(np.array([45.0]), np.array([50.0]))
+    np.testing.assert_allclose([east[0], north[0]], np.array([0.6, 0.8]) * 5.0 / 50.0, atol=1e-3)
+
+
 def test_roughness_has_the_deviation_asked_for_and_follows_the_seed() -> None:
-    rough = [paper_site.terrain(seed, 0.02).heights_m - SMOOTH.heights_m for seed in (3, 3, 4)]
+    rough = [lay(replace(PAPER, roughness_m=0.02), seed).heights_m - SMOOTH.heights_m for seed in (3, 3, 4)]
     assert rough[0].std() == pytest.approx(0.02, rel=1e-6)
     assert np.array_equal(rough[0], rough[1])
     assert not np.array_equal(rough[0], rough[2])
 
 
-@pytest.mark.parametrize("machine", range(12))
-def test_route_is_drivable_and_stays_on_the_site(machine: int) -> None:
-    route = paper_site.route_of(machine)
-    assert 1 / np.abs(route.curvature()).max() > 8.0
-    clearance = np.minimum(route.points, [WIDTH_M, DEPTH_M] - route.points).min()
-    assert clearance > 8.0
-    step = np.hypot(*np.diff(route.points, axis=0, append=route.points[:1]).T)
-    np.testing.assert_allclose(step, route.spacing_m, rtol=0.02)
+def test_later_zones_cover_earlier_ones_and_paving_covers_all() -> None:
+    square = ((2.0, 2.0), (8.0, 2.0), (8.0, 8.0), (2.0, 8.0))
+    ground = GroundConfig(10, 10, "sand", 0.5, 0.0, (Zone("gravel", square), Zone("wet dirt", square)))
+    before = lay(ground, 0)
+    after = pave(before, Zone("dry concrete", square))
+    places = np.array([1.0, 5.0]), np.array([1.0, 5.0])
+    assert before.zone(*places).tolist() == [SAND, WET_DIRT]
+    assert after.zone(*places).tolist() == [SAND, CONCRETE]
 
 
-def test_routes_together_cover_all_zones_and_the_slope() -> None:
-    points = np.vstack([paper_site.route_of(i).points for i in range(len(TOURS))])
-    share = np.bincount(SMOOTH.zone(*points.T), minlength=5) / len(points)
-    assert share.min() > 0.05, share
-    on_slope = (points[:, 0] > SLOPE_FOOT_M) & (points[:, 0] < SLOPE_TOP_M)
-    assert on_slope.mean() > 0.05
-
-
-def test_routes_share_ground() -> None:
-    for i, j in ((0, 1), (1, 2)):
-        a, b = paper_site.route_of(i).points, paper_site.route_of(j).points
-        apart = np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)).min(axis=1)
-        assert (apart < 0.5).sum() > 40, (i, j)
-
-
-def test_later_machines_drive_the_other_way_from_elsewhere() -> None:
-    first, second = paper_site.route_of(0), paper_site.route_of(len(TOURS))
-    assert np.hypot(*(first.points[0] - second.points[0])) > 50
-    ways = [np.sign(r.curvature().sum()) for r in (first, second)]
-    assert ways[0] == -ways[1]
-
-
-def test_drivers_slow_down_for_curves_in_time() -> None:
-    route = rounded(((0, 0), (100, 0), (100, 100), (0, 100)), 5.0)
-    limit = speed_limits(route, 6.0)
-    assert limit.max() == 6.0
-    assert limit.min() == pytest.approx(math.sqrt(0.9 / np.abs(route.curvature()).max()))
-    braking = (limit**2 - np.roll(limit, -1) ** 2) / (2 * route.spacing_m)
-    assert braking.max() <= 0.5 + 1e-9
+@pytest.mark.parametrize(
+    ("make", "problem"),
+    [
+        (lambda: Zone("lava", ((0, 0), (1, 0), (1, 1))), "soil: 'lava' is none of dry concrete, gravel"),
+        (lambda: Zone("sand", ((0, 0), (1, 0))), "outline: 2 corners"),
+        (lambda: Ramp((0, 0), (0, 0), 1.0), "foot_m, top_m"),
+        (lambda: Ramp((0, 0), (5, 0), 6.0), "rise_m: 6 m over 5.0 m is steeper"),
+        (lambda: GroundConfig(5.0, 100, "sand"), "width_m: 5.0 is not between"),
+        (lambda: GroundConfig(100, 100, "sand", math.nan), "cell_m: nan is not between"),
+        (lambda: GroundConfig(100, 100, "sand", roughness_m=0.2), "roughness_m"),
+        (lambda: GroundConfig(1e4, 1e4, "sand", 0.1), "cell_m: 0.1 m is too fine"),
+        (lambda: GroundConfig(100, 100, "mud"), "soil: 'mud'"),
+    ],
+)
+def test_impossible_ground_is_refused(make, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        make()
 
 
 def test_truth_map_holds_the_cells_centres() -> None:
-    truth = truth_map(SMOOTH, WIDTH_M, DEPTH_M)
+    truth = truth_map(SMOOTH, PAPER.width_m, PAPER.depth_m)
     assert truth.c_rr.shape == truth.grade_east.shape == (150, 200)
     assert truth.c_rr.dtype == truth.grade_north.dtype == np.float32
     assert truth.c_rr[20, 20] == np.float32(0.008)

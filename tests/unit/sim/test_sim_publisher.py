@@ -13,11 +13,11 @@ from protocol.errors import LinkError
 from protocol.logfolder import open_log
 from protocol.messages import SensorBundle
 from protocol.session import SessionConfig, free_endpoint, open_session
-from sim.config import SimConfig
+from sim.config import SimConfig, resolve
 from sim.publisher import Pace, run
 from sim.simulator import Simulator
 
-CONFIG = SimConfig(site="pit", machines=2, seed=3, seconds=0.5, speed=0.0, wait_s=10.0)
+CONFIG = SimConfig(site="pit", world="fast", machines=2, seed=3, seconds=0.5, speed=0.0, wait_s=10.0)
 
 
 class Listener:
@@ -58,7 +58,7 @@ def published(config: SimConfig, act: Callable[[Listener, threading.Event], None
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         result = pool.submit(run, config, SessionConfig(endpoint, mode="router"), stop, **options)
-        with listening(SessionConfig(endpoint, wait_s=10.0), config.site, config.machine_names) as listener:
+        with listening(SessionConfig(endpoint, wait_s=10.0), "pit", resolve(config).machine_names) as listener:
             act(listener, stop)
             report = result.result(timeout=30)
             assert all(e.wait(10) for e in listener.ended.values()), "a stream has not ended"
@@ -129,7 +129,7 @@ def test_run_takes_as_long_as_its_speed_says() -> None:
     with ThreadPoolExecutor(1) as pool:
         session_config = SessionConfig(endpoint, mode="router")
         result = pool.submit(run, config, session_config, stop, clock=lambda: stop.now)
-        with listening(SessionConfig(endpoint, wait_s=10.0), config.site, config.machine_names):
+        with listening(SessionConfig(endpoint, wait_s=10.0), "pit", resolve(config).machine_names):
             assert result.result(timeout=30).wall_s == pytest.approx(2.5)
 
 

@@ -1,6 +1,8 @@
 import numpy as np
-from sim_bullet_worlds import LOADER, bullet, plane
+import pytest
+from sim_bullet_worlds import LOADER, placed, plane
 
+from sim.fleet import Fleet
 from sim.render import SKY_RGB, Camera, closeup, overview, render
 from sim.soil import GRAVEL
 
@@ -8,11 +10,11 @@ from sim.soil import GRAVEL
 def test_machine_ground_and_sky_are_in_the_picture() -> None:
     terrain = plane(GRAVEL)
     terrain = type(terrain)(np.zeros((3, 3)), 15.0, terrain.zones, 1000.0)
-    with bullet(terrain, LOADER, starts=[(15, 15, 0.5)]) as world:
-        camera = closeup(world.state, 0)
+    with placed(Fleet, terrain, LOADER, starts=[(15, 15, 0.5)]) as world:
+        camera = closeup(world.state, 0, LOADER)
         small = Camera(camera.target_m, camera.distance_m, camera.yaw_deg, 10.0, width=320, height=180)
-        image = render(terrain, [LOADER], world.state, small)
-        empty = render(terrain, [], world.state, small)
+        (image,) = render(terrain, [LOADER], world.state, [small])
+        (empty,) = render(terrain, [], world.state, [small])
     assert image.shape == (180, 320, 3)
     assert (image[0, 0] == SKY_RGB[::-1]).all()
     blue, _, red = image[-1].mean(axis=0)
@@ -23,8 +25,14 @@ def test_machine_ground_and_sky_are_in_the_picture() -> None:
     assert yellow.sum() > 100
 
 
-def test_overview_sees_the_whole_site() -> None:
-    terrain = plane(GRAVEL)
-    terrain = type(terrain)(np.zeros((4, 5)), 50.0, terrain.zones, 1000.0)
-    assert overview(terrain).target_m[0] == 103.0
-    assert overview(terrain).distance_m > 150
+@pytest.mark.parametrize(("rows", "columns"), [(4, 5), (3, 9), (7, 2)])
+@pytest.mark.parametrize(("width", "height"), [(160, 90), (90, 120)])
+def test_overview_sees_the_whole_site_and_fills_its_frame(rows, columns, width, height) -> None:
+    flat = plane(GRAVEL)
+    terrain = type(flat)(np.zeros((rows, columns)), 50.0, flat.zones, 1000.0)
+    with placed(Fleet, terrain, LOADER, starts=[(15, 15, 0.5)]) as world:
+        (image,) = render(terrain, [], world.state, [overview(terrain, width, height)])
+    ground = (image != SKY_RGB[::-1]).any(axis=-1)
+    assert not any(edge.any() for edge in (ground[0], ground[-1], ground[:, 0], ground[:, -1]))
+    spans = [np.ptp(np.flatnonzero(ground.any(axis=axis))) + 1 for axis in (0, 1)]
+    assert max(spans[0] / width, spans[1] / height) > 0.9

@@ -1,29 +1,35 @@
+import os
+import subprocess
+import sys
+import threading
+from contextlib import closing
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pybullet
 import pytest
 
 from protocol.errors import ConfigError, StoreError
 from protocol.logfolder import open_log
 from protocol.readings import Gps, Imu, Reading, parse_reading
 from protocol.site import Projection
-from sim import paper_site
 from sim.config import SimConfig
+from sim.presets import load_preset
 from sim.recorder import record
 from sim.simulator import Simulator
 from sim.truth import TRACK_VALUES, TruthMap
 
-CONFIG = SimConfig(seed=11, seconds=1.6)
+CONFIG = SimConfig(seed=11, seconds=1.6, world="fast")
 
 
 def run(config: SimConfig) -> dict[str, list[Reading]]:
-    simulator = Simulator(config)
-    readings: dict[str, list[Reading]] = {m.name: [] for m in simulator.machines}
-    for _ in range(config.bundles or 0):
-        for name, new in simulator.advance().items():
-            readings[name] += new
+    with closing(Simulator(config)) as simulator:
+        readings: dict[str, list[Reading]] = {m.name: [] for m in simulator.machines}
+        for _ in range(simulator.bundles or 0):
+            for name, new in simulator.advance().items():
+                readings[name] += new
     return readings
 
 
@@ -34,24 +40,34 @@ def changed(**options: object) -> SimConfig:
 BASE = run(CONFIG)
 
 
-def test_same_seed_repeats_every_reading() -> None:
-    assert run(CONFIG) == BASE
-    assert run(changed(seed=12)) != BASE
+@pytest.mark.parametrize("world", ["pybullet", "fast"])
+def test_same_seed_repeats_every_reading(world: str) -> None:
+    base = run(changed(world=world))
+    assert run(changed(world=world)) == base
+    assert run(changed(world=world, seed=12)) != base
+    assert (base == BASE) == (world == "fast")
 
 
 def test_readings_do_not_depend_on_other_machines() -> None:
-    assert run(changed(machines=1))["loader-1"] == BASE["loader-1"]
-    more = run(changed(machines=7))
-    assert all(more[name] == BASE[name] for name in BASE)
+    """Where they need not give way."""
+    busy = changed(scenario="busy_site", machines=3)
+    base = run(busy)
+    assert run(replace(busy, machines=1))["loader-1"] == base["loader-1"]
+    more = run(replace(busy, machines=7))
+    assert all(more[name] == base[name] for name in base)
 
 
 def test_readings_do_not_depend_on_the_other_sensors() -> None:
     def of(config: SimConfig, sensor: str) -> list[Reading]:
         return [r for r in run(config)["loader-2"] if r.sensor == sensor]
 
-    for sensor in ("gps-1", "imu-1", "torque", "wheels"):
-        assert of(changed(imus=3), sensor) == of(CONFIG, sensor)
-    assert of(changed(gps=1, outage_s=0.0), "gps-1") == of(changed(gps=3, outage_s=0.0), "gps-1")
+    for sensor in ("gps-1", "imu-3", "torque", "wheels"):
+        assert of(changed(imu=(1, 2, 3), attitude=(2,)), sensor) == of(CONFIG, sensor)
+    others = [run(changed(gps=gps, preset="rtk", seconds=4.0)) for gps in ((1,), (1, 2, 3))]
+    fixes = [{r.stamp_ns: r for r in found["loader-2"] if r.sensor == "gps-1"} for found in others]
+    both = set(fixes[0]) & set(fixes[1])  # receivers share their outages out
+    assert len(both) > 8
+    assert all(fixes[0][stamp] == fixes[1][stamp] for stamp in both)
 
 
 def test_readings_do_not_depend_on_the_bundles() -> None:
@@ -74,9 +90,12 @@ def test_bundle_spans_what_the_config_says() -> None:
 
 def test_readings_come_at_their_rates() -> None:
     counts: dict[str, int] = {}
-    for reading in run(changed(outage_s=0.0))["loader-1"]:
+    for reading in run(changed(attitude=(3,)))["loader-1"]:
         counts[reading.sensor] = counts.get(reading.sensor, 0) + 1
-    assert counts == {"gps-1": 8, "gps-2": 8, "imu-1": 160, "wheels": 32, "torque": 80, "articulation": 32}
+    silent = [16 - counts.pop("gps-1") - counts.pop("gps-2")]
+    assert 0 <= silent[0] <= 6
+    attitude = round(1.6 * load_preset("dgps").attitude.rate_hz)
+    assert counts == {"imu-3": 160, "attitude-3": attitude, "wheels": 32, "torque": 80, "articulation": 32}
 
 
 def test_readings_are_valid_and_of_configured_sensors() -> None:
@@ -93,7 +112,7 @@ def test_truth_is_never_in_the_readings() -> None:
     projection = Projection(simulator.site)
     for _ in range(40):
         bundles = simulator.advance()
-        state = simulator._world.state
+        state = simulator.state
         for i, readings in enumerate(bundles.values()):
             truths = np.concatenate([np.ravel(getattr(state, f.name)[i]) for f in fields(state)])
             truths = truths[(truths != 0) & (truths != np.round(truths))]
@@ -105,13 +124,13 @@ def test_truth_is_never_in_the_readings() -> None:
 
 
 def gps_fixes(config: SimConfig, sensor: str = "gps-1") -> np.ndarray:
-    projection = Projection(paper_site.site(config.site))
+    projection = Projection(Simulator(config).site)
     fixes = [r for r in run(config)["loader-1"] if isinstance(r, Gps) and r.sensor == sensor]
     return np.array([(r.stamp_ns, *projection.to_map(r.lat_deg, r.lon_deg, r.height_m)[:2]) for r in fixes])
 
 
 def test_receivers_are_silent_in_turn() -> None:
-    config = changed(machines=1, gps=3, seconds=10.0)
+    config = changed(machines=1, gps=(1, 2, 3), seconds=10.0)
     stamps = [set(gps_fixes(config, f"gps-{i}")[:, 0].tolist()) for i in (1, 2, 3)]
     every = set.union(*stamps)
     assert [len(s) for s in stamps] == [45, 45, 45]
@@ -119,48 +138,91 @@ def test_receivers_are_silent_in_turn() -> None:
     assert not any(a & b for a, b in pairwise(silent))
 
 
-def test_gps_options_change_the_noise() -> None:
-    quiet = changed(machines=1, seconds=6.0, outage_s=0.0, gps_drift_std_m=0.0, gps_white_std_m=0.0)
-    clean = gps_fixes(quiet)
-    white = gps_fixes(replace(quiet, gps_white_std_m=0.7)) - clean
-    assert white[:, 1:].std() == pytest.approx(0.7, rel=0.3)
-    slow = gps_fixes(replace(quiet, gps_drift_std_m=1.2))[:, 1:] - clean[:, 1:]
-    fast = gps_fixes(replace(quiet, gps_drift_std_m=1.2, gps_drift_time_s=0.5))[:, 1:] - clean[:, 1:]
-    steps = [np.diff(e, axis=0).std() for e in (slow, fast)]
-    assert steps[0] == pytest.approx(1.2 * np.sqrt(2 * (1 - np.exp(-0.2 / 60))), rel=0.3)
-    assert steps[1] == pytest.approx(1.2 * np.sqrt(2 * (1 - np.exp(-0.2 / 0.5))), rel=0.3)
-
-
-def test_outage_options_change_the_silence() -> None:
-    shares = [
-        len(gps_fixes(changed(machines=1, seconds=12.0, **o))) / 60
-        for o in ({"outage_s": 0.0}, {"outage_s": 3.0, "outage_period_s": 6.0})
-    ]
-    assert shares == [1.0, 0.5]
+def test_preset_changes_the_noise() -> None:
+    spread = {}
+    for preset in ("rtk", "dgps", "standalone"):
+        errors = []
+        for seed in range(12):
+            config = changed(machines=1, seconds=1.6, seed=seed, preset=preset)
+            with closing(Simulator(config)) as simulator:
+                for _ in range(32):
+                    simulator.advance()
+                track = simulator.tracks()["loader-1"]
+            fix = gps_fixes(config)[-1]
+            at = np.abs(track["stamp_ns"] - fix[0]).argmin()
+            errors.append(np.hypot(fix[1] - track["x"][at], fix[2] - track["y"][at]))
+        spread[preset] = np.sqrt(np.mean(np.square(errors)))
+    assert spread["rtk"] < 1.2 < spread["dgps"] < 4.0 < spread["standalone"]  # an antenna's lever arm is 0.8 m
 
 
 def test_drive_speed_is_reached() -> None:
     for drive_mps in (2.0, 4.0):
-        simulator = Simulator(changed(machines=2, seconds=0.0, drive_mps=drive_mps))
-        for _ in range(160):
-            simulator.advance()
-        top = simulator.tracks()["loader-2"]["speed"].max()
+        with closing(Simulator(changed(machines=2, seconds=0.0, drive_mps=drive_mps))) as simulator:
+            for _ in range(200):
+                simulator.sense()
+            top = simulator.tracks()["loader-2"]["speed"].max()
         assert drive_mps - 0.3 < top < drive_mps + 1.0
 
 
 def test_plain_options_reach_the_readings() -> None:
-    simulator = Simulator(changed(site="pit", machines=2, names=("red", "blue"), gps=3, imus=2))
+    simulator = Simulator(changed(site="pit", machines=2, names=("red", "blue"), gps=(1, 3), imu=(3, 4)))
     assert simulator.site.name == "pit"
     assert [m.name for m in simulator.machines] == ["red", "blue"]
-    assert {s.name for s in simulator.machines[0].sensors} >= {"gps-3", "imu-2"}
+    assert {s.name for s in simulator.machines[0].sensors} >= {"gps-3", "imu-4"}
     shifted = run(changed(start_ns=CONFIG.start_ns + 5_000_000_000))["loader-1"]
     assert [r.stamp_ns - 5_000_000_000 for r in shifted] == [r.stamp_ns for r in BASE["loader-1"]]
-    smooth, rough = (Simulator(changed(roughness_m=v)).truth_map.grade_north for v in (0.0, 0.03))
-    assert abs(smooth).max() == 0 < abs(rough).max()
+
+
+def test_ground_changes_when_the_scenario_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "rain.toml"
+    path.write_text(
+        'base = "paper_site"\nseconds = 3.0\n'
+        '[[change]]\nat_s = 2.0\nsoil = "wet dirt"\noutline = [[0, 0], [200, 0], [200, 150], [0, 150]]\n'
+        '[[change]]\nat_s = 1.0\nsoil = "sand"\noutline = [[0, 0], [200, 0], [200, 150], [0, 150]]\n'
+    )
+    for world in ("pybullet", "fast"):
+        simulator = record(SimConfig(scenario=str(path), world=world), tmp_path / world, tmp_path / f"{world}-truth")
+        track = simulator.tracks()["loader-1"]["c_rr"]
+        np.testing.assert_allclose(track[[11, 18, 21, 28]], [0.25, 0.25, 0.06, 0.06])
+        assert track[8] < 0.25
+        maps = [
+            TruthMap.load(tmp_path / f"{world}-truth" / f"truth_map{name}.npz")
+            for name in ("_until_1s", "_until_2s", "")
+        ]
+        assert [m.c_rr.max() for m in maps] == pytest.approx([0.25, 0.25, 0.06])
+        assert [m.c_rr.min() for m in maps] == pytest.approx([0.008, 0.25, 0.06])
+
+
+def test_machine_faults_reach_the_readings(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    fault = '[[fault]]\nmachine = "loader-2"\ntorque_scale = 2.0\nantenna_off_m = [0.0, 5.0, 0.0]\n'
+    path.write_text(f'base = "paper_site"\n{fault}')
+    good, bad = run(CONFIG), run(changed(scenario=str(path)))
+    assert bad["loader-1"] == good["loader-1"]
+    pairs = [(a, b) for a, b in zip(good["loader-2"], bad["loader-2"], strict=True) if a != b]
+    assert {a.kind for a, _ in pairs} == {"torque", "gps"}
+    a, b = next((a, b) for a, b in pairs if isinstance(a, Gps) and isinstance(b, Gps))
+    projection = Projection(Simulator(CONFIG).site)
+    places = [np.array(projection.to_map(r.lat_deg, r.lon_deg, r.height_m)) for r in (a, b)]
+    assert np.linalg.norm(places[1] - places[0]) == pytest.approx(5.0, abs=0.01)
+
+
+def test_machines_start_apart_or_the_scenario_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no room for 150 machines"):
+        Simulator(SimConfig(machines=150))
+
+
+def test_close_ends_the_physics() -> None:
+    simulator = Simulator(changed(world="pybullet", machines=1))
+    client = simulator._world._multi._client  # type: ignore[attr-defined]
+    assert pybullet.isConnected(client)
+    simulator.close()
+    assert not pybullet.isConnected(client)
 
 
 def test_machines_differ_from_nominal_by_a_few_per_cent() -> None:
-    bodies = Simulator(changed(machines=100))._world._bodies  # type: ignore[attr-defined]
+    simulator = Simulator(changed(scenario="busy_site"))
+    bodies = simulator._world._bodies  # type: ignore[attr-defined]
     mass = bodies.mass_kg / 17_500 - 1
     assert 0.02 < abs(mass).max() <= 0.03
     assert (bodies.wheel_radius_m / 0.75).std() == pytest.approx(0.015, rel=0.25)
@@ -174,7 +236,8 @@ def test_tracks_are_the_true_ways_at_10_hz() -> None:
     for i, track in enumerate(simulator.tracks().values()):
         assert np.diff(track["stamp_ns"]).tolist() == [100_000_000] * 19
         assert track["stamp_ns"][0] == CONFIG.start_ns + 100_000_000
-        assert track["x"][-1] == simulator._world.state.x_m[i]
+        assert track["x"][-1] == simulator.state.x_m[i]
+        assert track["mass"][-1] == simulator.state.mass_kg[i]
         moved = np.hypot(np.diff(track["x"]), np.diff(track["y"]))
         np.testing.assert_allclose(moved, 0.1 * track["speed"][1:], atol=0.02)
 
@@ -203,6 +266,39 @@ def test_recording_holds_the_same_readings_and_the_truth(tmp_path: Path) -> None
 def test_recording_without_an_end_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="seconds"):
         record(changed(seconds=0.0), tmp_path)
+
+
+def folder_bytes(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.parametrize("world", ["pybullet", "fast"])
+def test_same_seed_records_the_same_bytes_also_in_another_process(tmp_path: Path, world: str) -> None:
+    config = changed(world=world, gps=(1, 2, 3), imu=(1, 2, 3, 4), attitude=(1, 3), seconds=3.0)
+    record(config, tmp_path / "a", tmp_path / "a-truth")
+    code = f"from pathlib import Path; from sim.config import SimConfig; from sim.recorder import record; {config!r}"
+    code = code.replace("SimConfig(", "record(SimConfig(", 1) + ", Path('b'), Path('b-truth'))"
+    path = {"PYTHONPATH": ":".join(p for p in sys.path if p)}
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, env=os.environ | path, capture_output=True)
+    for name in ("", "-truth"):
+        first, second = folder_bytes(tmp_path / f"a{name}"), folder_bytes(tmp_path / f"b{name}")
+        assert first == second
+        assert len(first) >= 4
+
+
+def test_recording_stops_early_with_what_it_has_and_reports_progress(tmp_path: Path) -> None:
+    stop, seen = threading.Event(), list[float]()
+
+    def progress(simulated_s: float) -> None:
+        seen.append(simulated_s)
+        if simulated_s >= 0.5:
+            stop.set()
+
+    simulator = record(CONFIG, tmp_path, on_progress=progress, stop=stop)
+    assert seen == pytest.approx(np.arange(1, 11) * 0.05)
+    assert simulator.simulated_s == pytest.approx(0.5)
+    last = max(r.stamp_ns for r in open_log(tmp_path / "loader-1").readings())
+    assert last == CONFIG.start_ns + 500_000_000
 
 
 def test_broken_truth_map_is_refused(tmp_path: Path) -> None:

@@ -1,157 +1,168 @@
+"""The fast world's own physics, and what both worlds take from the models."""
+
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from sim_bullet_worlds import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, nominal, placed, plane
 
-from sim import paper_site
-from sim.driver import MAX_ARTICULATION_RAD
 from sim.fleet import Fleet
-from sim.paper_site import SLOPE_FOOT_M, SLOPE_TOP_M
-from sim.soil import SOILS
+from sim.machine_model import MachineModel
+from sim.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
 from sim.terrain import Terrain
-from sim.vehicle import GRAVITY, WHEEL_INERTIA_KG, Bodies, advance, standing
+from sim.vehicle import GRAVITY, chassis_of, drive_force_n, steering_radps, weigh
 from sim.world import STEP_S, FleetState, stack
 
-BODY = Bodies(np.array([17_500.0]), np.array([0.75]))
+
+def wheels(model: MachineModel, state: FleetState) -> np.ndarray:
+    """Places (4, 2) of the only machine's wheels: front left, front right, rear left, rear right."""
+    yaw, front = state.yaw_rad[0], state.yaw_rad[0] + state.articulation_rad[0]
+    rear_axle = np.array([state.x_m[0], state.y_m[0]])
+    ahead, ahead_front = (np.array([math.cos(a), math.sin(a)]) for a in (yaw, front))
+    front_axle = rear_axle + model.rear_to_joint_m * ahead + model.front_to_joint_m * ahead_front
+    half = 0.5 * model.track_m
+    left, left_front = (half * np.array([-math.sin(a), math.cos(a)]) for a in (yaw, front))
+    return np.array([front_axle + left_front, front_axle - left_front, rear_axle + left, rear_axle - left])
 
 
-def plane(zone: int, grade_east: float = 0.0, grade_north: float = 0.0) -> Terrain:
-    x, y = np.meshgrid([-500.0, 500.0], [-500.0, 500.0])
-    heights = grade_east * x + grade_north * y  # a plane shifted by its corner: only the gradient matters
-    return Terrain(heights, 1000.0, np.full((1, 1), zone), 1000.0)
-
-
-def drive_on(terrain: Terrain, speed: float, seconds: float, steer: float = 0.0, yaw: float = 0.0) -> list[FleetState]:
-    """One machine held at a speed from the middle of a plane."""
-    state = standing(BODY, terrain, np.array([500.0]), np.array([500.0]), np.array([yaw]))
-    states, integral = [], 0.0
-    for i in range(round(seconds / STEP_S)):
-        error = min(speed, 0.8 * i * STEP_S) - float(state.speed_mps[0])
-        integral += 40e3 * STEP_S * error
-        state = advance(BODY, terrain, state, np.array([steer]), np.array([50e3 * error + integral]), STEP_S)
-        states.append(state)
-    return states
-
-
-@pytest.mark.parametrize("zone", range(5), ids=[s.name for s in SOILS])
-def test_steady_traction_on_the_level_is_the_rolling_resistance(zone: int) -> None:
-    last = drive_on(plane(zone), 3.0, 10.0)[-1]
-    ratio = last.torque_nm / BODY.wheel_radius_m / last.load_n
-    assert ratio[0] == pytest.approx(SOILS[zone].c_rr, rel=0.01)
-    assert last.c_rr[0] == pytest.approx(SOILS[zone].c_rr)
-
-
-@pytest.mark.parametrize("zone", [0, 1, 2, 3], ids=[s.name for s in SOILS[:4]])
-@pytest.mark.parametrize("uphill", [1, -1])
-def test_steady_traction_on_15_degrees_adds_the_slope(zone: int, uphill: int) -> None:
-    tangent = math.tan(math.radians(15))
-    last = drive_on(plane(zone, grade_east=uphill * tangent), 2.0, 11.0)[-1]
-    assert last.drive_n[0] / last.load_n[0] == pytest.approx(SOILS[zone].c_rr + uphill * tangent, abs=0.005)
-    assert last.load_n[0] == pytest.approx(17_500 * GRAVITY * math.cos(math.radians(15)), rel=1e-3)
-    assert math.degrees(last.pitch_rad[0]) == pytest.approx(-15 * uphill, abs=0.05)
-
-
-def test_the_estimators_equation_holds_at_every_instant() -> None:
-    # F/m - f_x - (lambda-1) dv = c g cos(theta): the accelerometer contains gravity's share (DESIGN)
-    for state in drive_on(plane(3, grade_east=0.1, grade_north=0.05), 3.0, 6.0, yaw=0.4)[200:]:
-        left = state.drive_n / 17_500 - state.force_mps2[:, 0] - WHEEL_INERTIA_KG / 17_500 * state.accel_mps2
-        assert left[0] == pytest.approx(0.06 * state.load_n[0] / 17_500, abs=1e-3)
-
-
-@pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
-def test_grade_and_attitude_are_those_of_the_plane(yaw: float) -> None:
-    last = drive_on(plane(0, 0.12, -0.07), 2.0, 8.0, steer=0.2, yaw=yaw)[-1]
-    assert last.grade_e[0] == pytest.approx(0.12, abs=1e-9)
-    assert last.grade_n[0] == pytest.approx(-0.07, abs=1e-9)
-    normal = np.array([-0.12, 0.07, 1.0]) / math.sqrt(1 + 0.12**2 + 0.07**2)
-    tilt = math.cos(last.pitch_rad[0]) * math.cos(last.roll_rad[0])
-    assert tilt == pytest.approx(normal[2], abs=2e-3)
-
-
-def test_at_rest_the_specific_force_is_gravity_upwards() -> None:
-    state = standing(BODY, plane(0, 0.2, 0.1), np.array([500.0]), np.array([500.0]), np.array([0.7]))
-    assert np.linalg.norm(state.force_mps2) == pytest.approx(GRAVITY)
-    level = standing(BODY, plane(0), np.array([500.0]), np.array([500.0]), np.array([0.7]))
-    np.testing.assert_allclose(level.force_mps2[0], [0, 0, GRAVITY], atol=1e-12)
+@BOTH
+def test_neither_axle_slips_sideways_while_the_joint_turns(model: MachineModel) -> None:
+    with placed(Fleet, plane(0), model, starts=[(500, 500, 0.4)]) as world:
+        hold_speed(world, 2.0, 4.0)
+        states = [world.advance(np.array([0.5]), np.array([3e3]), np.zeros(1)) for _ in range(150)]
+    for old, new in pairwise(states):
+        moved = (wheels(model, new) - wheels(model, old)) / STEP_S
+        for axle, yaw in ((slice(0, 2), new.yaw_rad + new.articulation_rad), (slice(2, 4), new.yaw_rad)):
+            mean = moved[axle].mean(axis=0)
+            turned_in_a_step = 0.005
+            assert abs(mean @ [-math.sin(yaw[0]), math.cos(yaw[0])]) < turned_in_a_step * np.hypot(*mean) + 1e-3
 
 
 @pytest.mark.parametrize("steer", [0.2, -0.4, 0.6])
-def test_turning_radius_is_that_of_the_articulation(steer: float) -> None:
-    states = stack(drive_on(plane(0), 2.0, 10.0, steer)[600:])
-    x, y = states.x_m[:, 0], states.y_m[:, 0]
-    # algebraic circle fit: x^2 + y^2 = 2 a x + 2 b y + c
-    a, b, c = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], 1), x**2 + y**2, rcond=None)[0]
-    assert math.sqrt(c + a * a + b * b) == pytest.approx(1.65 / math.tan(abs(steer) / 2), rel=1e-3)
-    rates, speed = states.rates_radps[-1, 0], states.speed_mps[-1, 0]
-    assert rates[2] == pytest.approx(speed * math.tan(steer / 2) / 1.65, rel=1e-6)
-    assert states.force_mps2[-1, 0, 1] == pytest.approx(speed * rates[2], rel=1e-3)
+def test_turning_is_that_of_equal_arms(steer: float) -> None:
+    with placed(Fleet, plane(0), LOADER) as world:
+        last = hold_speed(world, 2.0, 14.0, steer)[-1]
+    rates, speed = last.rates_radps[0], last.speed_mps[0]
+    assert rates[2] == pytest.approx(speed * math.tan(steer / 2) / LOADER.rear_to_joint_m, rel=1e-5)
+    assert last.force_mps2[0, 1] == pytest.approx(speed * rates[2], rel=1e-3)
+
+
+@BOTH
+def test_the_estimators_equation_holds_at_every_instant(model: MachineModel) -> None:
+    # F/m - f_x - (lambda-1) dv = c g cos(theta): the accelerometer contains gravity's share (DESIGN)
+    rolling = 4 * model.wheel_inertia_kgm2 / model.wheel_radius_m**2
+    with placed(Fleet, plane(3, 0.1, 0.05), model, starts=[(500, 500, 0.4)]) as world:
+        for state in hold_speed(world, 3.0, 6.0)[300:]:
+            force = state.torque_nm[0] / model.wheel_radius_m - rolling * state.accel_mps2[0]
+            left = force / model.mass_kg - state.force_mps2[0, 0]
+            assert left == pytest.approx(0.06 * state.load_n[0] / model.mass_kg, abs=1e-3)
+
+
+@BOTH
+@pytest.mark.parametrize("steer", [0.0, 0.5])
+def test_machines_rest_on_three_points_of_rough_ground(model: MachineModel, steer: float) -> None:
+    rng = np.random.default_rng(5)
+    terrain = Terrain(rng.normal(0, 0.1, (60, 60)), 0.5, rng.integers(0, 5, (30, 30)), 1.0)
+    with placed(Fleet, terrain, model, starts=[(12, 13, 0.8)]) as world:
+        for _ in range(400):
+            state = world.advance(np.array([steer]), np.zeros(1), np.full(1, 1e6))
+    places = wheels(model, state)
+    points = np.column_stack([places, terrain.height(*places.T)])
+    front, rear = points[:2].mean(axis=0), points[2:].mean(axis=0)
+    axle = points[0] - points[1] if model.rolls_with_front else points[2] - points[3]
+    up = np.cross(front - rear, axle)
+    c, s = math.cos(state.yaw_rad[0]), math.sin(state.yaw_rad[0])
+    felt = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ up / np.linalg.norm(up)
+    pitch, roll = state.pitch_rad[0], state.roll_rad[0]
+    np.testing.assert_allclose([math.tan(pitch), math.sin(roll)], [felt[0] / felt[2], -felt[1]], atol=1e-6)
+    assert state.z_m[0] == pytest.approx(rear[2])
+
+    left = points[0] - points[1] + points[2] - points[3]
+    through_all = np.cross(front - rear, left)
+    gradient = -through_all[:2] / through_all[2]
+    np.testing.assert_allclose([state.grade_e[0], state.grade_n[0]], gradient, atol=1e-9)
+    zones = terrain.zone(*places.T)
+    assert C_RR[zones].min() <= state.c_rr[0] <= C_RR[zones].max()
+
+
+def test_brakes_hold_without_any_creep_and_slide_beyond_the_grip() -> None:
+    with placed(Fleet, plane(0, GRADE_15), TRUCK, starts=[(500, 500, 0.7)]) as world:
+        start = world.state
+        held = idle(world, 5.0, TRUCK.max_brake_n)
+        assert (held.x_m, held.y_m, held.speed_mps) == (start.x_m, start.y_m, 0.0)
+        assert held.torque_nm[0] > 0  # it keeps from rolling back
+        assert idle(world, 1.0, 1e3).speed_mps[0] < -0.5
+    with placed(Fleet, plane(3, 0.6), TRUCK) as world:
+        assert idle(world, 1.0, TRUCK.max_brake_n).speed_mps[0] < -0.5
 
 
 def test_inner_wheel_turns_more_slowly() -> None:
-    last = drive_on(plane(0), 2.0, 10.0, steer=0.4)[-1]
+    with placed(Fleet, plane(0), LOADER) as world:
+        last = hold_speed(world, 2.0, 10.0, 0.4)[-1]
     left, right = last.wheel_radps[0]
     assert (right - left) * 0.75 == pytest.approx(2.2 * last.rates_radps[0, 2], rel=0.02)
 
 
-def test_wheels_slip_more_on_soft_ground_and_less_when_braking() -> None:
-    slips = []
-    for zone in (0, 4):
-        last = drive_on(plane(zone), 3.0, 10.0)[-1]
-        slips.append(last.wheel_radps[0, 0] * 0.75 / last.speed_mps[0])
-    assert 1.0 < slips[0] < 1.001
-    assert 1.05 < slips[1] < 1.2
-    downhill = drive_on(plane(0, grade_east=-0.2), 2.0, 8.0)[-1]
-    assert 0.95 < downhill.wheel_radps[0, 0] * 0.75 / downhill.speed_mps[0] < 1.0
+@pytest.mark.parametrize("grade", [0.15, -0.2])
+@pytest.mark.parametrize("zone", [0, SAND])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_wheels_slip_as_the_soil_table_says(zone: int, grade: float, direction: int) -> None:
+    with placed(Fleet, plane(zone, grade), LOADER) as world:
+        last = hold_speed(world, 2.0 * direction, 10.0)[-1]
+    use = direction * last.torque_nm[0] / LOADER.wheel_radius_m / last.load_n[0]
+    slip = np.arctanh(use / TRACTION[zone]) * TRACTION[zone] / SLIP_STIFFNESS[zone]
+    wheel = last.wheel_radps[0] * LOADER.wheel_radius_m
+    measured = (wheel - last.speed_mps) / max(abs(wheel[0]), abs(last.speed_mps[0])) * direction
+    np.testing.assert_allclose(measured, slip, rtol=1e-3)
 
 
-def test_machine_rolls_out_by_its_resistance_and_stays() -> None:
-    terrain = plane(1)
-    state = drive_on(terrain, 3.0, 10.0)[-1]
-    start, speed = float(state.x_m[0]), float(state.speed_mps[0])
-    for _ in range(2700):
-        state = advance(BODY, terrain, state, np.zeros(1), np.zeros(1), STEP_S)
-    way = speed**2 / (2 * 0.02 * GRAVITY) * (1 + WHEEL_INERTIA_KG / 17_500)
-    assert state.x_m[0] - start == pytest.approx(way, rel=0.05)
-    assert abs(state.speed_mps[0]) < 0.01
+def test_machines_do_not_feel_each_other() -> None:
+    together = [(500, 500, 0.3), (500, 520, 1.0)]
+    steer, drive = np.array([0.2, -0.3]), np.array([40e3, 60e3])
+    with placed(Fleet, plane(2, 0.05), LOADER, TRUCK, starts=together) as both:
+        joint = stack([both.advance(steer, drive, np.zeros(2)) for _ in range(200)])
+    for i, model in enumerate((LOADER, TRUCK)):
+        with placed(Fleet, plane(2, 0.05), model, starts=[together[i]]) as alone:
+            own = stack([alone.advance(steer[i : i + 1], drive[i : i + 1], np.zeros(1)) for _ in range(200)])
+        np.testing.assert_array_equal(joint.x_m[:, i], own.x_m[:, 0])
+        np.testing.assert_array_equal(joint.force_mps2[:, i], own.force_mps2[:, 0])
 
 
-@pytest.fixture(scope="module")
-def tour() -> tuple[FleetState, list[np.ndarray]]:
-    """Six machines for 125 s on rough ground: every tour in both directions, a whole lap."""
-    routes = [paper_site.route_of(i) for i in range(6)]
-    terrain = paper_site.terrain(5, 0.01)
-    fleet = Fleet(terrain, Bodies(np.full(6, 18_000.0), np.full(6, 0.75)), routes, 4.0)
-    states = [fleet.step() for _ in range(12_500)]
-    return stack(states[::10]), [r.points for r in routes]
+def test_chassis_takes_each_machine_from_its_model() -> None:
+    chassis = chassis_of([LOADER, TRUCK, LOADER])
+    np.testing.assert_allclose(chassis.front_to_joint_m, [1.65, 1.2, 1.65])
+    assert chassis.rolls_with_front.tolist() == [True, False, True]
 
 
-def test_nobody_gets_stuck(tour: tuple[FleetState, list[np.ndarray]]) -> None:
-    states, routes = tour
-    assert states.speed_mps[100:].min() > 1.5
-    assert states.speed_mps.max() < 5.5
-    lap = np.array([0.5 * len(points) for points in routes])
-    assert (states.speed_mps.sum(axis=0) * 0.1 > lap).all()
+@BOTH
+def test_weight_follows_the_model_at_any_load(model: MachineModel) -> None:
+    for payload in (0.0, 1234.0, model.payload_kg):
+        weight = weigh(chassis_of([model]), nominal(model), np.array([payload]))
+        assert weight.mass_kg[0] == pytest.approx(model.mass_kg + payload)
+        assert weight.front_share[0] == pytest.approx(model.front_share(payload))
+        assert weight.centre_height_m[0] == pytest.approx(model.centre_height_m(payload))
 
 
-def test_machines_keep_to_their_routes_and_steer_within_the_limit(tour: tuple[FleetState, list[np.ndarray]]) -> None:
-    states, routes = tour
-    for i, points in enumerate(routes):
-        off = np.hypot(states.x_m[::5, i, None] - points[:, 0], states.y_m[::5, i, None] - points[:, 1]).min(axis=1)
-        assert off.max() < 1.0, i
-    assert abs(states.articulation_rad).max() <= MAX_ARTICULATION_RAD
+def test_hydraulics_and_engine_follow_with_their_lags_and_limits() -> None:
+    chassis, zero = chassis_of([LOADER]), np.zeros(1)
+    rate, angle, drive = zero, zero, zero
+    for _ in range(8):  # one lag of the steering
+        rate = steering_radps(chassis, np.array([9.0]), zero, rate)
+    assert rate[0] / LOADER.steer_radps == pytest.approx(1 - math.exp(-1), abs=0.03)
+    for _ in range(1000):
+        rate = steering_radps(chassis, np.array([9.0]), angle, rate)
+        angle = angle + STEP_S * rate
+        assert angle[0] <= LOADER.max_articulation_rad + 1e-9
+    assert angle[0] == pytest.approx(LOADER.max_articulation_rad)
+    for _ in range(15):  # one lag of the engine
+        drive = drive_force_n(chassis, np.array([-9e3]), drive, np.array([8e3]))
+    assert drive[0] / -9e3 == pytest.approx(1 - math.exp(-1), abs=0.03)
+    for _ in range(60):
+        drive = drive_force_n(chassis, np.array([-9e3]), drive, np.array([8e3]))
+    assert drive[0] == -8e3
 
 
-def test_three_machines_see_all_zones_and_the_slope_in_120_s(tour: tuple[FleetState, list[np.ndarray]]) -> None:
-    states, _ = tour
-    x, y, speed = (v[:1200, :3] for v in (states.x_m, states.y_m, states.speed_mps))
-    zones = paper_site.terrain(5, 0.0).zone(x, y)
-    metres = np.bincount(zones.ravel(), (speed * 0.1).ravel(), minlength=5)
-    assert metres.min() > 80, metres
-    assert (speed * 0.1)[(x > SLOPE_FOOT_M) & (x < SLOPE_TOP_M)].sum() > 80
-
-
-def test_body_moves_smoothly(tour: tuple[FleetState, list[np.ndarray]]) -> None:
-    states, _ = tour
-    assert np.isfinite(states.force_mps2).all()
-    assert abs(states.force_mps2[:, :, 2] - GRAVITY).max() < 3.0
-    assert abs(states.rates_radps).max() < 0.6
+def test_at_rest_the_specific_force_is_gravity() -> None:
+    with placed(Fleet, plane(0, 0.2, 0.1), LOADER, starts=[(500, 500, 0.7)]) as world:
+        assert np.linalg.norm(world.state.force_mps2) == pytest.approx(GRAVITY)

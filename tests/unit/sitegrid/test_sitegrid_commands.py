@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,11 +15,13 @@ from protocol.logfolder import open_log
 from protocol.machine import machine_toml
 from protocol.session import free_endpoint
 from protocol.site import load_site
-from sim.machines import loader
+from sim.config import resolve
+from sim.scenario_file import load_scenario
 from sim.truth import TruthMap
 from sitegrid.cli import build_parser, main
 from sitegrid.commands import agent, sim
 
+MACHINE = load_scenario("paper_site").rigs()[0].machine
 MANIFEST = Path(__file__).parents[3] / "evaluation/logs/rl_test1_husky/log.toml"
 
 
@@ -30,11 +33,14 @@ def test_sim_options_go_over_the_config(tmp_path: Path):
     file = tmp_path / "sim.toml"
     file.write_text('seconds = 5.0\nseed = 3\nmachines = 2\nnames = ["a", "b"]\n')
     plain = sim._config(parse("sim", "--config", file))
-    assert (plain.seconds, plain.seed, plain.machine_names) == (5, 3, ("a", "b"))
+    assert (plain.seconds, plain.seed, resolve(plain).machine_names) == (5, 3, ("a", "b"))
     words = ("--seconds", 7, "--speed", 2, "--machines", 1, "--seed", 4, "--site", "pit")
+    words = (*words, "--scenario", "repaved", "--world", "fast", "--preset", "rtk", "--all-sensors")
     over = sim._config(parse("sim", "--config", file, *words))
     assert (over.seconds, over.speed, over.seed, over.site) == (7, 2, 4, "pit")
-    assert over.machine_names == ("loader-1",)
+    assert (over.scenario, over.world, over.preset) == ("repaved", "fast", "rtk")
+    assert (over.gps, over.imu, over.attitude) == ((1, 2, 3), (1, 2, 3, 4), (1, 2, 3, 4))
+    assert resolve(over).machine_names == ("loader-1",)
 
 
 def test_sim_records_log_folders_and_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -54,7 +60,7 @@ def test_sim_writes_what_agents_need(tmp_path: Path):
         parse("agent", "--spool", "x", "--config", tmp_path / "loader-2.toml", "--site-file", tmp_path / "site.toml"),
         None,
     )
-    assert machine == loader("loader-2", 2, 1)
+    assert machine == load_scenario("paper_site").rigs()[1].machine
 
 
 def test_sim_publishes_nothing_without_a_router(capsys: pytest.CaptureFixture[str]):
@@ -64,7 +70,7 @@ def test_sim_publishes_nothing_without_a_router(capsys: pytest.CaptureFixture[st
 
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
-    (tmp_path / "agent.toml").write_text("linger_s = 3.5\n" + machine_toml(loader("digger", 1, 1)))
+    (tmp_path / "agent.toml").write_text("linger_s = 3.5\n" + machine_toml(replace(MACHINE, name="digger")))
     (tmp_path / "site.toml").write_text('name = "pit"\norigin_lat_deg = 49.0\norigin_lon_deg = 8.0\n')
     return tmp_path
 

@@ -21,8 +21,29 @@ def plan(tmp_path: Path, *words: str) -> demo.Plan:
 
 
 def test_options_reach_the_simulation(tmp_path: Path):
-    sim = plan(tmp_path, "--seconds", "33", "--speed", "7", "--machines", "2", "--seed", "9", "--no-log").sim
-    assert (sim.seconds, sim.speed, sim.machines, sim.seed) == (33, 7, 2, 9)
+    words = ("--seconds", "33", "--speed", "7", "--machines", "2", "--seed", "9", "--scenario", "repaved")
+    found = plan(tmp_path, *words, "--world", "fast", "--no-log")
+    scenario = found.scenario
+    assert (scenario.seconds, scenario.seed, scenario.world, len(scenario.change)) == (33, 9, "fast", 2)
+    assert (scenario.machine_names, found.config.speed) == (("loader-1", "loader-2"), 7)
+
+
+def test_the_demo_drives_the_papers_site_in_pybullet_unless_told_otherwise(tmp_path: Path):
+    found = plan(tmp_path, "--no-log")
+    assert (found.scenario.site.name, found.scenario.world) == ("paper", "pybullet")
+    assert len(found.configs) == 3
+
+
+def test_every_option_is_passed_on_to_the_simulator(tmp_path: Path):
+    class Started:
+        def start(self, name: str, *words: object) -> list[str]:
+            return [str(word) for word in words]
+
+    options = ("--seconds", "33.0", "--speed", "7.0", "--machines", "2", "--seed", "9")
+    options = (*options, "--scenario", "repaved", "--world", "fast")
+    words = demo._start_sim(plan(tmp_path, *options, "--no-log"), Started())
+    pairs = dict(zip(options[::2], options[1::2], strict=True))
+    assert all(words[words.index(name) + 1] == value for name, value in pairs.items())
 
 
 def test_the_plan_writes_a_file_for_the_site_and_each_machine(tmp_path: Path):
@@ -65,19 +86,19 @@ class Terminal(io.StringIO):
 
 def test_a_terminal_gets_a_bar_and_headless_gets_lines(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
-    with Display(headless=False) as display:
-        display.show(5, 10, {"samples_merged": 7, "cells": 3})
+    with Display("machines drive", headless=False) as display:
+        display.show(5, 10, "7 samples, 3 cells")
         assert display._bar.tasks[0].completed == 5
-    with Display(headless=True) as display:
+    with Display("machines drive", headless=True) as display:
         assert display._bar is None
-        display.show(5, 10, {"samples_merged": 7, "cells": 3})
-    assert "5 of 10 s driven, 7 samples, 3 cells" in sys.stderr.getvalue()
+        display.show(5, 10, "7 samples, 3 cells")
+    assert "5 of 10 s, 7 samples, 3 cells" in sys.stderr.getvalue()
 
 
 def test_plain_lines_come_now_and_then_only(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     now = iter([100.0, 100.0, 101.0, 106.0, 106.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
-    display = Display(headless=True)
+    display = Display("machines drive", headless=True)
     for second in (1, 2, 3):
-        display.show(second, 10, {})
-    assert capsys.readouterr().err.count("driven") == 2
+        display.show(second, 10, "recording")
+    assert capsys.readouterr().err.count("recording") == 2

@@ -1,0 +1,138 @@
+"""The routes of all machines side by side, so that drivers look all of them up at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocol.arrays import Bools, Floats, Ints
+from sim.routes import SPACING_M, Leg, Route, speed_limits
+
+BEYOND_M = 24.0  # every leg goes on for so long, for drivers to look ahead
+
+
+@dataclass(frozen=True)
+class Course:
+    """Legs of n machines one after another. points, limits_mps: of all legs, each from `first` on.
+
+    The other arrays have one value per leg; following: the leg driven after it. payload_kg: NaN where it stays.
+    """
+
+    points: Floats
+    limits_mps: Floats
+    first: Ints
+    last: Ints
+    spacing_m: Floats
+    length_m: Floats
+    closed: Bools
+    travel: Floats  # 1 forwards, -1 in reverse
+    wait_s: Floats
+    payload_kg: Floats
+    following: Ints
+
+    def at(self, leg: Ints, way_m: Floats) -> tuple[Floats, Floats]:
+        """Point (n, 2) after way_m (n,) along legs (n,), and the direction of the leg there (n, 2)."""
+        index, share = self._locate(leg, way_m)
+        here = self.points[index]
+        step = self.points[index + 1] - here
+        return here + share[:, None] * step, step / self.spacing_m[leg][:, None]
+
+    def limit(self, leg: Ints, way_m: Floats) -> Floats:
+        """Speed to aim at [m/s]."""
+        limit: Floats = self.limits_mps[self._locate(leg, way_m)[0]]
+        return limit
+
+    def _locate(self, leg: Ints, way_m: Floats) -> tuple[Ints, Floats]:
+        steps = way_m / self.spacing_m[leg]
+        whole = np.maximum(np.floor(steps), 0.0)
+        index = np.minimum(self.first[leg] + whole.astype(np.int64), self.last[leg] - 1)
+        return index, steps - whole
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a machine begins: leg of the course, way along it [m], what it carries [kg]; its joint and its heading."""
+
+    leg: int
+    way_m: float
+    payload_kg: float
+    joint_m: Floats
+    heading_rad: float
+
+
+def lay_course(routes: Sequence[Route], drive_mps: Sequence[float]) -> Course:
+    """Prepare one route and one speed per machine."""
+    legs = [leg for route in routes for leg in route.legs]
+    speeds = [speed for route, speed in zip(routes, drive_mps, strict=True) for _ in route.legs]
+    lines = [_beyond(leg) for leg in legs]
+    limits = [_limits(leg, speed, len(line)) for leg, speed, line in zip(legs, speeds, lines, strict=True)]
+    ends = np.cumsum([len(line) for line in lines])
+    counts = np.array([len(route.legs) for route in routes])
+    begins = np.cumsum(counts) - counts
+    return Course(
+        points=np.vstack(lines),
+        limits_mps=np.concatenate(limits),
+        first=ends - [len(line) for line in lines],
+        last=ends - 1,
+        spacing_m=np.array([leg.spacing_m for leg in legs]),
+        length_m=np.array([leg.length_m for leg in legs]),
+        closed=np.array([leg.closed for leg in legs]),
+        travel=np.array([-1.0 if leg.reverse else 1.0 for leg in legs]),
+        wait_s=np.array([leg.wait_s for leg in legs]),
+        payload_kg=np.array([math.nan if leg.payload_kg is None else leg.payload_kg for leg in legs]),
+        following=np.concatenate([b + (np.arange(k) + 1) % k for b, k in zip(begins, counts, strict=True)]),
+    )
+
+
+def line_up(routes: Sequence[Route], shares: Sequence[float], apart_m: float = 0.0) -> list[Start]:
+    """Place one machine per route, each after a share (0 to 1) of its cycle, moved on until it is apart from others.
+
+    A ValueError tells that there is no room.
+    """
+    starts: list[Start] = []
+    begin = 0
+    for route, share in zip(routes, shares, strict=True):
+        others = np.array([start.joint_m for start in starts]).reshape(-1, 2)
+        for moved_m in np.arange(0.0, route.length_m, SPACING_M):
+            start = _start(route, begin, share + moved_m / route.length_m)
+            if not apart_m or (np.hypot(*(others - start.joint_m).T) >= apart_m).all():
+                break
+        else:
+            raise ValueError(f"the routes have no room for {len(routes)} machines {apart_m:g} m apart")
+        starts.append(start)
+        begin += len(route.legs)
+    return starts
+
+
+def _start(route: Route, begin: int, share: float) -> Start:
+    """Find the place on the route, and what the machine carries there."""
+    way = share % 1.0 * route.length_m
+    number = 0
+    while number < len(route.legs) - 1 and way >= route.legs[number].length_m:
+        way -= route.legs[number].length_m
+        number += 1
+    leg = route.legs[number]
+    before = [*route.legs[number:], *route.legs[:number]]
+    payload = next((other.payload_kg for other in reversed(before) if other.payload_kg is not None), 0.0)
+    index = min(int(way / leg.spacing_m), len(leg.points) - 1)
+    line = _beyond(leg)
+    ahead = line[index + 1] - line[index]
+    heading = math.atan2(ahead[1], ahead[0]) + math.pi * leg.reverse
+    return Start(begin + number, index * leg.spacing_m, payload, line[index], heading)
+
+
+def _beyond(leg: Leg) -> Floats:
+    """Points of a leg with BEYOND_M more: the next lap, or straight on."""
+    more = math.ceil(BEYOND_M / leg.spacing_m)
+    if leg.closed:
+        return np.take(leg.points, range(len(leg.points) + more), axis=0, mode="wrap")
+    step = leg.points[-1] - leg.points[-2]
+    return np.vstack([leg.points, leg.points[-1] + np.arange(1, more + 1)[:, None] * step])
+
+
+def _limits(leg: Leg, drive_mps: float, count: int) -> Floats:
+    """Speed limits for the points of `_beyond`."""
+    return np.take(speed_limits(leg, drive_mps), range(count), mode="wrap" if leg.closed else "clip")

@@ -1,0 +1,142 @@
+"""The ground of a site as a scenario describes it: zones of soil, ramps and roughness; and the terrain made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from protocol.arrays import Floats, Ints
+from sim.soil import SOILS
+from sim.terrain import Terrain
+
+FILLET_M = 2.0  # length over which the foot and the crown of a ramp are rounded
+ROUGHNESS_LENGTH_M = 1.2
+ROUGHNESS_STREAM = 2**32 - 1  # keeps the ground's noise apart from the machines', which are numbered from 0
+MAX_NODES = 20_000_000
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Zone:
+    """A polygon of one soil. outline: corners in `map` [m]."""
+
+    soil: str
+    outline: tuple[Point, ...]
+
+    def __post_init__(self) -> None:
+        soil_index(self.soil)
+        if len(self.outline) < 3:
+            raise ValueError(f"outline: {len(self.outline)} corners are no area")
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A plane slope from its foot to its top, as wide as the site; beyond both the ground is level."""
+
+    foot_m: Point
+    top_m: Point
+    rise_m: float
+
+    def __post_init__(self) -> None:
+        if not np.hypot(*self.way_m) > 0:
+            raise ValueError("foot_m, top_m: the same place")
+        if abs(self.rise_m) > np.hypot(*self.way_m):
+            raise ValueError(f"rise_m: {self.rise_m:g} m over {np.hypot(*self.way_m):.1f} m is steeper than 45 degrees")
+
+    @property
+    def way_m(self) -> Floats:
+        """From foot to top (2,)."""
+        way: Floats = np.array(self.top_m) - np.array(self.foot_m)
+        return way
+
+
+@dataclass(frozen=True)
+class GroundConfig:
+    """A rectangle from the origin of `map` to the north-east. soil: wherever no zone lies; later zones cover earlier.
+
+    cell_m: of the terrain's height and zones. roughness_m: standard deviation of the unevenness.
+    """
+
+    width_m: float
+    depth_m: float
+    soil: str
+    cell_m: float = 0.25
+    roughness_m: float = 0.01
+    zone: tuple[Zone, ...] = ()
+    ramp: tuple[Ramp, ...] = ()
+
+    def __post_init__(self) -> None:
+        soil_index(self.soil)
+        limits = {"width_m": (10, 1e5), "depth_m": (10, 1e5), "cell_m": (0.05, 5), "roughness_m": (0, 0.1)}
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:  # also false for NaN
+                raise ValueError(f"{name}: {getattr(self, name)!r} is not between {low:g} and {high:g}")
+        if self.width_m * self.depth_m / self.cell_m**2 > MAX_NODES:
+            raise ValueError(f"cell_m: {self.cell_m:g} m is too fine for so large a site, over {MAX_NODES} nodes")
+
+    def contains(self, points_m: Floats, margin_m: float) -> bool:
+        """Whether all points (k, 2) lie on the site, this far from its edges."""
+        inside = (points_m >= margin_m) & (points_m <= np.array([self.width_m, self.depth_m]) - margin_m)
+        return bool(inside.all())
+
+
+def soil_index(name: str) -> int:
+    """Index of a soil in `soil.SOILS`; a ValueError names the known ones."""
+    names = [soil.name for soil in SOILS]
+    if name not in names:
+        raise ValueError(f"soil: {name!r} is none of {', '.join(names)}")
+    return names.index(name)
+
+
+def lay(ground: GroundConfig, seed: int) -> Terrain:
+    """Make the terrain; its unevenness is drawn from the seed."""
+    rows, columns = round(ground.depth_m / ground.cell_m), round(ground.width_m / ground.cell_m)
+    heights = _profile(ground, rows, columns)
+    if ground.roughness_m:
+        heights += _unevenness(ground, heights.shape, seed)
+    zones = np.full((rows, columns), soil_index(ground.soil), np.int64)
+    terrain = Terrain(heights, ground.cell_m, zones, ground.cell_m)
+    for zone in ground.zone:
+        terrain = pave(terrain, zone)
+    return terrain
+
+
+def pave(terrain: Terrain, zone: Zone) -> Terrain:
+    """The same terrain with one zone laid over it."""
+    zones = terrain.zones.astype(np.uint8)
+    corners = np.round(np.array(zone.outline) / terrain.zone_cell_m).astype(np.int32)
+    cv2.fillPoly(zones, [corners], soil_index(zone.soil))
+    paved: Ints = zones.astype(np.int64)
+    return replace(terrain, zones=paved)
+
+
+def _profile(ground: GroundConfig, rows: int, columns: int) -> Floats:
+    """Heights (rows + 1, columns + 1) of all ramps, foot and crown rounded."""
+    x, y = np.meshgrid(np.arange(columns + 1) * ground.cell_m, np.arange(rows + 1) * ground.cell_m)
+    heights: Floats = np.zeros_like(x)
+    for ramp in ground.ramp:
+        length = float(np.hypot(*ramp.way_m))
+        east, north = ramp.way_m / length
+        along = (x - ramp.foot_m[0]) * east + (y - ramp.foot_m[1]) * north
+        # a running mean of the clipped way, by its antiderivative
+        ahead, behind = (_area(along + side * FILLET_M / 2, length) for side in (1, -1))
+        heights += ramp.rise_m / length * (ahead - behind) / FILLET_M
+    return heights
+
+
+def _area(way: Floats, length: float) -> Floats:
+    """Antiderivative of min(max(way, 0), length)."""
+    inside = np.clip(way, 0, length)
+    area: Floats = 0.5 * inside**2 + length * np.maximum(way - length, 0)
+    return area
+
+
+def _unevenness(ground: GroundConfig, shape: tuple[int, ...], seed: int) -> Floats:
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(ROUGHNESS_STREAM,)))
+    blur = ROUGHNESS_LENGTH_M / ground.cell_m
+    uneven = np.asarray(cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), blur), np.float64)
+    rough: Floats = uneven * (ground.roughness_m / uneven.std())
+    return rough

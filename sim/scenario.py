@@ -1,0 +1,222 @@
+"""Scenarios: what is simulated, as the tables of a TOML file say it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from protocol.site import NAME, SiteConfig
+from sim.ground import GroundConfig, Point, Zone
+from sim.machine_model import load_model
+from sim.machines import Faults, Rig, machine_config
+from sim.presets import Preset, load_preset
+from sim.routes import ROUNDING_M, Leg, Route, tour, way
+
+WORLDS = ("pybullet", "fast")
+MAX_MACHINES = 1000
+GOLDEN = 0.618  # the golden section spreads any number of machines over a route
+
+
+@dataclass(frozen=True)
+class LegConfig:
+    """One leg of a work cycle: corners of its way [m], backwards or not, and what happens at its end."""
+
+    corners: tuple[Point, ...]
+    reverse: bool = False
+    rounding_m: float = ROUNDING_M
+    wait_s: float = 0.0
+    payload_kg: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_line(self.corners, self.rounding_m, 2)
+        if not 0 <= self.wait_s <= 86400:
+            raise ValueError(f"wait_s: {self.wait_s!r} is not between 0 and 86400")
+
+
+@dataclass(frozen=True)
+class RouteConfig:
+    """A route: `corners` of a closed tour, or `leg`s end to end that are driven again and again."""
+
+    name: str
+    corners: tuple[Point, ...] = ()
+    rounding_m: float = ROUNDING_M
+    leg: tuple[LegConfig, ...] = ()
+
+    def __post_init__(self) -> None:
+        if bool(self.corners) == bool(self.leg):
+            raise ValueError("either corners or legs are needed, not both")
+        if self.corners:
+            _check_line(self.corners, self.rounding_m, 3)
+
+    def build(self) -> Route:
+        """The lines to drive."""
+        if self.corners:
+            return tour(self.corners, self.rounding_m)
+        return Route(tuple(_leg(leg) for leg in self.leg))
+
+
+@dataclass(frozen=True)
+class FleetConfig:
+    """Machines of one kind. name: of a single one; counted ones are numbered, name-1, name-2, ...
+
+    routes: taken in turn; other_way: every second lap of turns the other way round. start: share of the cycle at which
+    the first begins. gps, imu, attitude: numbers of the sensors, as the machine's URDF has them.
+    """
+
+    name: str
+    routes: tuple[str, ...]
+    count: int | None = None
+    model: str = "wheel_loader"
+    preset: str = "dgps"
+    drive_mps: float = 4.0
+    start: float = 0.0
+    other_way: bool = False
+    gps: tuple[int, ...] = (1, 2)
+    imu: tuple[int, ...] = (3,)
+    attitude: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not NAME.fullmatch(self.name):
+            raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
+        if not self.routes:
+            raise ValueError("routes: none is named")
+        if self.count is not None and not 1 <= self.count <= MAX_MACHINES:
+            raise ValueError(f"count: {self.count} is not between 1 and {MAX_MACHINES}")
+        limits = {"drive_mps": (0.5, 12), "start": (0, 1)}
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:  # also false for NaN
+                raise ValueError(f"{name}: {getattr(self, name)!r} is not between {low:g} and {high:g}")
+
+    @property
+    def size(self) -> int:
+        """How many machines they are."""
+        return 1 if self.count is None else self.count
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each machine."""
+        return (self.name,) if self.count is None else tuple(f"{self.name}-{i + 1}" for i in range(self.count))
+
+
+@dataclass(frozen=True)
+class FaultConfig(Faults):
+    """What is wrong with one machine."""
+
+    machine: str = ""
+
+
+@dataclass(frozen=True)
+class Change:
+    """Ground that becomes another soil while machines drive. at_s: simulated seconds after the start."""
+
+    at_s: float
+    soil: str
+    outline: tuple[Point, ...]
+
+    def __post_init__(self) -> None:
+        if not self.at_s > 0:
+            raise ValueError(f"at_s: {self.at_s!r} is not positive")
+        self.zone  # noqa: B018 - checks soil and outline
+
+    @property
+    def zone(self) -> Zone:
+        """The ground that it lays."""
+        return Zone(self.soil, self.outline)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What is simulated. world: pybullet, or fast. give_way: drivers wait for machines in their way."""
+
+    description: str
+    site: SiteConfig
+    ground: GroundConfig
+    route: tuple[RouteConfig, ...]
+    fleet: tuple[FleetConfig, ...]
+    world: str = "pybullet"
+    seed: int = 0
+    seconds: float = 120.0
+    give_way: bool = True
+    fault: tuple[FaultConfig, ...] = ()
+    change: tuple[Change, ...] = ()
+    presets: Mapping[str, Preset] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.world not in WORLDS:
+            raise ValueError(f"world: {self.world!r} is neither {' nor '.join(WORLDS)}")
+        if not (0 <= self.seed < 2**63 and 0 <= self.seconds <= 1e7):
+            raise ValueError("seed, seconds: negative, or too large")
+        _check_once("route", [route.name for route in self.route])
+        if sum(fleet.size for fleet in self.fleet) > MAX_MACHINES:
+            raise ValueError(f"fleet: more than {MAX_MACHINES} machines")
+        machines = self.machine_names
+        _check_once("machine", machines)
+        if unknown := next((f.machine for f in self.fault if f.machine not in machines), None):
+            raise ValueError(f"fault: there is no machine {unknown!r}; there are {_few(machines)}")
+
+    @property
+    def machine_names(self) -> tuple[str, ...]:
+        """Name of every machine."""
+        return self.names or tuple(name for fleet in self.fleet for name in fleet.names)
+
+    def preset(self, name: str) -> Preset:
+        """A preset of this scenario or of the library."""
+        return self.presets[name] if name in self.presets else load_preset(name)
+
+    def rigs(self) -> list[Rig]:
+        """Sensors of every machine."""
+        rigs: list[Rig] = []
+        faults = {f.machine: f for f in self.fault}
+        for fleet, name in zip(self._fleets(), self.machine_names, strict=True):
+            model, preset = load_model(fleet.model), self.preset(fleet.preset)
+            config = machine_config(name, model, preset, fleet.gps, fleet.imu, fleet.attitude)
+            rigs.append(Rig(config, model, preset, faults.get(name, Faults())))
+        return rigs
+
+    def journeys(self) -> list[tuple[Route, float, float]]:
+        """Route, speed [m/s] and share of the cycle to start at, of every machine."""
+        built = {route.name: route.build() for route in self.route}
+        journeys = []
+        for fleet in self.fleet:
+            for i in range(fleet.size):
+                turn, lap = i % len(fleet.routes), i // len(fleet.routes)
+                route = built[fleet.routes[turn]]
+                if fleet.other_way and lap % 2:
+                    route = route.reversed()
+                journeys.append((route, fleet.drive_mps, (fleet.start + lap * GOLDEN) % 1.0))
+        return journeys
+
+    def _fleets(self) -> list[FleetConfig]:
+        """The fleet of every machine."""
+        return list(itertools.chain.from_iterable([fleet] * fleet.size for fleet in self.fleet))
+
+
+def _check_line(corners: Sequence[Point], rounding_m: float, least: int) -> None:
+    if len(corners) < least:
+        raise ValueError(f"corners: {len(corners)} are too few, at least {least} are needed")
+    if not all(map(math.isfinite, itertools.chain.from_iterable(corners))):
+        raise ValueError("corners: not a number")
+    steps = np.hypot(*np.diff(np.array(corners), axis=0).T)
+    if not steps.min() > 1:
+        raise ValueError("corners: two neighbours are less than 1 m apart")
+    if not 0.1 <= rounding_m <= 100:
+        raise ValueError(f"rounding_m: {rounding_m!r} is not between 0.1 and 100")
+
+
+def _check_once(what: str, names: Sequence[str]) -> None:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"two {what}s are named {twice[0]!r}")
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+
+
+def _leg(config: LegConfig) -> Leg:
+    line = way(config.corners, config.rounding_m)
+    return replace(line, reverse=config.reverse, wait_s=config.wait_s, payload_kg=config.payload_kg)

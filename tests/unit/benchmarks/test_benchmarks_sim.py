@@ -1,0 +1,53 @@
+import json
+import math
+
+import pytest
+
+from benchmarks import sim
+from benchmarks.__main__ import main
+
+SMALL = (sim.Case("paper_site", "pybullet", 2, 20.0), sim.Case("busy_site", "fast", 3, 40.0))
+
+
+def test_the_goals_are_those_of_the_issue() -> None:
+    goals = {(case.world, case.machines): case.goal for case in sim.CASES}
+    slow = {("pybullet", 1): 25.0, ("pybullet", 4): 20.0, ("pybullet", 8): 15.0, ("pybullet", 32): 8.0}
+    assert goals == slow | {("fast", 100): 40.0, ("fast", 1000): 12.0}
+
+
+def test_sim_prints_one_json_object_with_a_row_for_every_fleet(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sim, "CASES", SMALL)
+    assert main(["sim", "--json", "--seconds", "0.5", "--runs", "2"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["benchmark"], result["seconds"], result["runs"]) == ("sim", 0.5, 2)
+    rows = result["rows"]
+    assert [(r["world"], r["machines"], r["give_way"]) for r in rows] == [("pybullet", 2, True), ("fast", 3, False)]
+    assert [row["goal"] for row in rows] == [20.0, 40.0]
+    figures = [row[name] for row in rows for name in ("sim_seconds_per_cpu_second", "start_up_cpu_s")]
+    assert all(math.isfinite(figure) and figure > 0 for figure in figures)
+
+
+def test_sim_prints_a_table(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sim, "CASES", SMALL[1:])
+    main(["sim", "--seconds", "0.1", "--runs", "1"])
+    names, row = (line.split() for line in capsys.readouterr().out.splitlines())
+    assert names[:4] == ["world", "machines", "give_way", "sim_seconds_per_cpu_second"]
+    assert row[:3] == ["fast", "3", "False"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["sim", "--samples", "100"],
+        ["merge", "--seconds", "5"],
+        ["ingest", "--seconds", "5"],
+        ["sim", "--seconds", "0"],
+        ["sim", "--seconds", "nan"],
+        ["sim", "--runs", "0"],
+    ],
+)
+def test_an_option_that_does_nothing_or_makes_no_sense_is_refused(words, capsys) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert words[1] in capsys.readouterr().err

@@ -1,0 +1,94 @@
+"""Rigs and made-up states for tests of the sensors: many machines at once are many draws of every error."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+
+from protocol.site import Projection, SiteConfig
+from sim.bank import Block
+from sim.datasheets import GpsNoise
+from sim.machine_model import load_model
+from sim.machines import Faults, Rig, machine_config
+from sim.presets import Preset, load_preset
+from sim.sensors import Sensors
+from sim.world import FleetState
+
+SEED = 7
+GRAVITY = 9.80665
+LOADER = load_model("wheel_loader")
+DGPS = load_preset("dgps")
+PROJECTION = Projection(SiteConfig("pit", 49.0, 8.4, 110.0))
+WIDTHS = {"rates_radps": 3, "rates_dot_radps2": 3, "force_mps2": 3, "wheel_radps": 2, "wheel_rad": 2}
+KEPT = ("_time_s", "_period_s", "_speed_mps", "correlation_s")  # no errors, and not to be 0
+
+
+def perfect() -> Preset:
+    """A preset without any errors; tests switch on the one that they look at."""
+    return Preset("perfect", *(_quiet(getattr(DGPS, f.name)) for f in fields(Preset) if f.name != "name"))
+
+
+def _quiet(sheet: object) -> object:
+    assert is_dataclass(sheet)
+    names = [f.name for f in fields(sheet) if f.type == "float" and not f.name.endswith(KEPT)]
+    zeros = replace(sheet, **dict.fromkeys(names, 0.0))
+    return replace(zeros, scale=1.0) if isinstance(sheet, GpsNoise) else zeros
+
+
+def noisy(kind: str, **values: float) -> Preset:
+    """The perfect preset with these errors of one kind of sensor."""
+    preset = perfect()
+    return replace(preset, **{kind: replace(getattr(preset, kind), **values)})
+
+
+def rig(
+    preset: Preset = DGPS,
+    gps: Sequence[int] = (1,),
+    imu: Sequence[int] = (3,),
+    attitude: Sequence[int] = (),
+    only: str | None = None,
+    faults: Faults = Faults(),  # noqa: B008 - frozen
+) -> Rig:
+    """A loader with these sensors. only: leave all other kinds aside."""
+    machine = machine_config("loader", LOADER, preset, tuple(gps), tuple(imu), tuple(attitude))
+    kept = tuple(s for s in machine.sensors if only in (None, s.kind))
+    return Rig(replace(machine, sensors=kept), LOADER, preset, faults)
+
+
+def still(k: int, n: int = 1, **values: object) -> FleetState:
+    """States (k, n, ...) of machines at rest at the origin, but for these values."""
+    arrays = {f.name: (k, n, WIDTHS[f.name]) if f.name in WIDTHS else (k, n) for f in fields(FleetState)}
+    given = {"force_mps2": (0.0, 0.0, GRAVITY), **values}
+    return FleetState(**{name: np.broadcast_to(given.get(name, 0.0), shape) for name, shape in arrays.items()})
+
+
+def blocks(rigs: Sequence[Rig], states: FleetState, seed: int = SEED) -> dict[str, Block]:
+    """What sensors say of states at 100 Hz, by kind."""
+    steps = np.arange(1, len(states.x_m) + 1)
+    span = Sensors(rigs, seed, PROJECTION).sample(steps, steps * 10_000_000, states)
+    return {block.kind: block for block in span.blocks}
+
+
+def values(one: Rig, kind: str, seconds: float, n: int = 1, **states: object) -> np.ndarray:
+    """Readings (r, n, columns) of n machines with one and the same rig."""
+    return blocks([one] * n, still(round(100 * seconds), n, **states))[kind].values
+
+
+def to_map(fixes: np.ndarray) -> np.ndarray:
+    """Fixes (..., latitude, longitude, height, ...) in `map`, (..., 3)."""
+    lat, lon, height = np.moveaxis(fixes[..., :3], -1, 0)
+    x, y = PROJECTION._proj(lon.ravel(), lat.ravel())
+    return np.stack([x.reshape(lat.shape), y.reshape(lat.shape), height - 110.0], axis=-1)
+
+
+def check_deviation(errors: np.ndarray, std: float, draws: int) -> None:
+    """Errors have this standard deviation about 0. draws: how many are independent; five standard errors may be."""
+    assert math.sqrt((errors**2).mean()) == pytest.approx(std, rel=5 / math.sqrt(2 * draws)), f"seed {SEED}"
+
+
+def check_correlation(errors: np.ndarray, lag: int, expected: float, draws: int) -> None:
+    """Errors (r, ...) that many rows apart correlate like this. draws: as in check_deviation."""
+    found = (errors[lag:] * errors[:-lag]).mean() / (errors**2).mean()
+    assert found == pytest.approx(expected, abs=5 / math.sqrt(draws)), f"seed {SEED}"

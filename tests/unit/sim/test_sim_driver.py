@@ -1,0 +1,137 @@
+import itertools
+import math
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sim_drives import Driven, drive
+
+from sim.config import SimConfig
+from sim.driver import bend
+from sim.ground import lay
+from sim.vehicle import GRAVITY
+from sim.world import FleetState
+
+
+@pytest.fixture(scope="module")
+def paper() -> dict[str, Driven]:
+    """The paper's three tours for 125 s in both worlds: a whole lap."""
+    return {world: drive(SimConfig(seed=5, world=world), 125.0) for world in ("pybullet", "fast")}
+
+
+@pytest.fixture(scope="module")
+def quarry() -> Driven:
+    """Trucks and a loader at work for eight minutes."""
+    return drive(SimConfig(scenario="haul_road", world="fast", seed=1), 480.0)
+
+
+@pytest.mark.parametrize("steer", [0.1, -0.4, 0.6])
+@pytest.mark.parametrize(("rear", "front"), [(1.65, 1.65), (3.0, 1.2)])
+def test_bend_is_the_articulation_of_the_joints_circle(steer: float, rear: float, front: float) -> None:
+    rear_radius = (front + rear * math.cos(steer)) / math.sin(steer)  # neither axle slides sideways
+    joint_radius = math.copysign(math.hypot(rear_radius, rear), rear_radius)
+    assert bend(np.array(rear), np.array(front), np.array(1 / joint_radius)) == pytest.approx(steer, abs=1e-9)
+
+
+@pytest.mark.parametrize("world", ["pybullet", "fast"])
+def test_nobody_gets_stuck_or_lost(paper: dict[str, Driven], world: str) -> None:
+    driven = paper[world]
+    states = driven.states
+    assert all(np.isfinite(getattr(states, f.name)).all() for f in fields(FleetState))
+    assert states.speed_mps.max() < 5.5
+    lengths = [route.length_m for route, _, _ in driven.scenario.journeys()]
+    assert (states.speed_mps.sum(axis=0) * 0.1 > lengths).all()
+    assert driven.off_m[4:].max() < 0.6
+    assert abs(states.articulation_rad).max() <= 0.6
+    assert abs(states.rates_radps).max() < 0.6
+    assert abs(states.force_mps2[10:, :, 2] - GRAVITY).max() < 6.0
+
+
+@pytest.mark.parametrize("route", ["west", "east", "middle"])
+def test_both_worlds_drive_the_same_tour_alike(route: str, tmp_path: Path) -> None:
+    """A whole lap over all soils and the slope, alone: where machines meet, a centimetre may decide who goes first."""
+    path = tmp_path / "alone.toml"
+    path.write_text(f'base = "paper_site"\n[[fleet]]\nname = "loader"\nroutes = ["{route}"]\n')
+    one, other = (drive(SimConfig(scenario=str(path), seed=7, world=w), 125.0).states for w in ("pybullet", "fast"))
+    apart = np.hypot(one.x_m - other.x_m, one.y_m - other.y_m)
+    faster = one.speed_mps - other.speed_mps
+    assert np.sqrt((apart**2).mean()) < 0.1
+    assert np.sqrt((faster**2).mean()) < 0.05
+
+
+def test_three_machines_see_all_zones_and_the_slope(paper: dict[str, Driven]) -> None:
+    driven = paper["fast"]
+    x, y, metres = driven.states.x_m, driven.states.y_m, abs(driven.states.speed_mps) * 0.1
+    zones = lay(driven.scenario.ground, 5).zone(x, y)
+    assert np.bincount(zones.ravel(), metres.ravel(), minlength=5).min() > 80
+    (ramp,) = driven.scenario.ground.ramp
+    assert metres[(x > ramp.foot_m[0]) & (x < ramp.top_m[0])].sum() > 80
+
+
+def test_drivers_keep_their_speed_and_slow_down_in_curves(paper: dict[str, Driven]) -> None:
+    states = paper["pybullet"].states
+    straight = abs(states.articulation_rad[300:]) < 0.02
+    assert np.median(states.speed_mps[300:][straight]) == pytest.approx(4.0, abs=0.15)
+    tight = abs(states.articulation_rad) > 0.3
+    assert tight.any()
+    assert states.speed_mps[tight].max() < 4.0
+    sideways = abs(states.speed_mps * states.rates_radps[..., 2])
+    assert np.quantile(sideways, 0.999) < 1.3
+
+
+def test_work_cycles_load_reverse_dump_and_wait(quarry: Driven) -> None:
+    speed, payload = quarry.states.speed_mps, quarry.payload_kg
+    loader, truck = 4, 0
+    assert speed[:, loader].min() < -1.0 < 2.0 < speed[:, loader].max()
+    assert speed[:, truck].min() > -0.2
+    for machine, most in ((loader, 4500.0), (truck, 22000.0)):
+        assert payload[:, machine].max() == pytest.approx(most)
+        assert payload[:, machine].min() == pytest.approx(0.0)
+        changing = np.abs(np.diff(payload[:, machine])) > 1e-6
+        slowest = np.minimum(abs(speed[:-1, machine]), abs(speed[1:, machine]))
+        assert slowest[changing].max() < 0.05  # nobody is loaded on the way
+        mass = quarry.states.mass_kg[:, machine] - payload[:, machine]
+        assert np.ptp(mass) < 1.0
+    still = (abs(speed[:, loader]) < 0.02).sum() * 0.1
+    cycles = (np.diff((payload[:, loader] > 2000).astype(int)) == 1).sum()
+    assert cycles >= 4
+    assert still > (cycles - 1) * 10.0  # 6 s at the pile and 4 s at the hopper
+
+
+def test_reversing_machines_keep_to_their_way(quarry: Driven) -> None:
+    assert quarry.off_m[4:].max() < 0.6
+
+
+def test_loaded_trucks_are_slower_uphill(quarry: Driven) -> None:
+    states = quarry.states
+    uphill = (abs(states.pitch_rad[:, :4]) > math.radians(4)) & (states.pitch_rad[:, :4] < 0)
+    loaded = quarry.payload_kg[:, :4] > 20e3
+    assert (uphill & loaded).sum() > 50
+    assert (uphill & ~loaded).sum() > 50
+    assert np.median(states.speed_mps[:, :4][uphill & loaded]) < np.median(states.speed_mps[:, :4][uphill & ~loaded])
+
+
+@pytest.mark.parametrize("machines", [5, 9])
+def test_machines_give_way(machines: int) -> None:
+    driven = drive(SimConfig(world="fast", machines=machines, seed=2), 300.0)
+    joints = driven.joint_m
+    nearest = min(
+        np.hypot(*(joints[:, i] - joints[:, j]).T).min() for i, j in itertools.combinations(range(machines), 2)
+    )
+    assert nearest > 5.0  # half as far, and frames would touch
+    assert (abs(driven.states.speed_mps).sum(axis=0) * 0.1 > 900).all()
+
+
+def test_without_give_way_machines_drive_on() -> None:
+    driven = drive(SimConfig(scenario="busy_site", seed=2), 30.0)
+    assert len(driven.scenario.machine_names) == 100
+    assert driven.states.speed_mps[100:].min() > 1.0
+
+
+def test_machines_do_not_touch_in_pybullet() -> None:
+    """Contact shows as a jolt: nothing else on the site shakes a frame so hard."""
+    driven = drive(SimConfig(machines=6, seed=3), 100.0)
+    level = driven.states.force_mps2[20:, :, :2]
+    assert abs(level).max() < 6.0
+    assert (abs(driven.states.speed_mps).sum(axis=0) * 0.1 > 250).all()

@@ -1,0 +1,99 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from protocol.errors import ConfigError
+from protocol.ground import ZONES
+from sim import picture
+from sim.canvas import WRITTEN, Canvas
+from sim.config import SimConfig, resolve
+from sim.plan import draw_plan, stops_of
+from sim.render import render
+from sim.simulator import Simulator
+
+
+def plan(monkeypatch: pytest.MonkeyPatch, scenario: str, **options: object) -> tuple[np.ndarray, list[str]]:
+    """The plan of a scenario, and the labels written on it."""
+    written: list[str] = []
+    label = Canvas.label
+
+    def noted(self: Canvas, words: str, *rest: object) -> bool:
+        found = label(self, words, *rest)
+        written.extend([words] * found)
+        return found
+
+    monkeypatch.setattr(Canvas, "label", noted)
+    simulator = Simulator(SimConfig(scenario=scenario, world="fast", **options))
+    try:
+        return draw_plan(simulator.scenario, simulator.models, simulator.state), written
+    finally:
+        simulator.close()
+
+
+def test_the_plan_names_routes_machines_and_slope(monkeypatch) -> None:
+    image, written = plan(monkeypatch, "paper_site")
+    machines, routes = ["loader-1", "loader-2", "loader-3"], ["west", "east", "middle"]
+    assert sorted(written) == sorted([*machines, *routes, "15 deg uphill"])
+    colours = set(map(tuple, image.reshape(-1, 3).tolist()))
+    pale = [tuple(round(0.6 * c + 102) for c in zone.bgr) for zone in ZONES]
+    assert colours.issuperset(pale)
+
+
+def test_the_plan_tells_what_happens_at_the_stops(monkeypatch) -> None:
+    _, written = plan(monkeypatch, "haul_road")
+    assert {"loads 22 t in 30 s", "dumps 22 t in 15 s", "loads 4.5 t in 6 s", "dumps 4.5 t in 4 s"} <= set(written)
+    assert {"9 deg uphill", "5 deg uphill"} <= set(written)
+
+
+def test_the_plan_tells_what_will_change(monkeypatch) -> None:
+    _, written = plan(monkeypatch, "repaved")
+    assert {"after 150 s: dry concrete", "after 200 s: wet dirt"} <= set(written)
+
+
+def test_many_machines_are_dots_without_names(monkeypatch) -> None:
+    _, written = plan(monkeypatch, "busy_site")
+    assert sorted(written) == sorted(["west", "east", "middle", "15 deg uphill"])
+
+
+def test_a_faulty_machine_is_called_so(monkeypatch) -> None:
+    _, written = plan(monkeypatch, "bad_machine")
+    assert "loader-2, faulty" in written
+
+
+def test_a_change_of_direction_is_no_stop() -> None:
+    routes = {route.name: route.build() for route in resolve(SimConfig(scenario="haul_road")).route}
+    assert stops_of(routes["stockpile"].legs) == ["loads 4.5 t in 6 s", "", "dumps 4.5 t in 4 s", ""]
+
+
+def test_labels_lie_apart_until_there_is_no_room() -> None:
+    canvas = Canvas(np.full((60, 160, 3), 255, np.uint8), np.zeros((60, 160), np.uint8), 1.0)
+    covered = [0]
+    while canvas.label("label", np.array([80.0, 30.0]), (0, 0, 0)):
+        covered.append(int((canvas.busy == WRITTEN).sum()))
+    added = np.diff(covered)
+    assert 2 <= len(added) < 10
+    assert (added > 0.75 * added[0]).all()  # only margins may be shared
+
+
+def test_one_sheet_is_written(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(picture, "DRIVE_S", 1.0)
+    cameras = []
+    monkeypatch.setattr(picture, "render", lambda *scene: cameras.extend(scene[-1]) or render(*scene))
+    path = tmp_path / "haul.png"
+    assert picture.draw(SimConfig(scenario="haul_road", world="fast"), path) == [path]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["haul.png"]
+    height, width, _ = cv2.imread(str(path)).shape
+    assert 1200 <= width <= 1850
+    assert height <= 1850
+    assert len(cameras) == 3  # the site, a truck, a loader
+
+
+@pytest.mark.parametrize("name", ["plan", "plan.txt", "nowhere/plan.png", "folder.png"])
+def test_a_file_that_cannot_be_written_is_refused_in_one_line(tmp_path, name) -> None:
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(ConfigError) as refused:
+        picture.draw(SimConfig(), tmp_path / Path(name))
+    assert name in str(refused.value)
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,78 @@
+import math
+
+import numpy as np
+import pytest
+
+from sim.course import BEYOND_M, lay_course, line_up
+from sim.routes import SPACING_M, Route, speed_limits, tour, way
+
+SQUARE = ((0.0, 0.0), (100.0, 0.0), (100.0, 100.0), (0.0, 100.0))
+HOOK = ((0.0, 0.0), (40.0, 0.0), (50.0, 20.0), (50.0, 60.0))
+
+
+def test_tour_is_even_closed_and_rounded() -> None:
+    (lap,) = tour(SQUARE, 5.0).legs
+    step = np.hypot(*np.diff(lap.points, axis=0, append=lap.points[:1]).T)
+    np.testing.assert_allclose(step, lap.spacing_m, rtol=0.01)
+    assert lap.spacing_m == pytest.approx(SPACING_M, rel=0.01)
+    assert lap.length_m == pytest.approx(step.sum(), rel=1e-3)
+    assert 1 / np.abs(lap.curvature()).max() == pytest.approx(0.886 * 5.0, rel=0.05)
+    assert lap.curvature().sum() * lap.spacing_m == pytest.approx(2 * math.pi)
+
+
+def test_open_way_keeps_its_ends_and_their_directions() -> None:
+    leg = way(HOOK, 5.0)
+    np.testing.assert_allclose(leg.points[[0, -1]], [HOOK[0], HOOK[-1]], atol=1e-3)
+    assert leg.headings() == pytest.approx((0.0, math.pi / 2), abs=1e-3)
+    assert leg.length_m == pytest.approx((len(leg.points) - 1) * leg.spacing_m)
+    short = way(((5.0, 5.0), (5.0, 9.0)))
+    np.testing.assert_allclose(short.points[:, 0], 5.0, atol=1e-3)
+    assert short.length_m == pytest.approx(4.0, abs=1e-3)
+
+
+def test_reversed_tour_is_the_same_line() -> None:
+    there = tour(SQUARE)
+    back = there.reversed()
+    np.testing.assert_array_equal(back.legs[0].points, there.legs[0].points[::-1])
+    assert back.legs[0].curvature().sum() < 0 < there.legs[0].curvature().sum()
+
+
+def test_drivers_slow_down_for_curves_in_time() -> None:
+    (lap,) = tour(SQUARE, 5.0).legs
+    limit = speed_limits(lap, 6.0)
+    assert limit.max() == 6.0
+    assert limit.min() == pytest.approx(math.sqrt(0.9 / np.abs(lap.curvature()).max()))
+    braking = (limit**2 - np.roll(limit, -1) ** 2) / (2 * lap.spacing_m)
+    assert braking.max() <= 0.5 + 1e-9
+    leg = way(HOOK, 5.0)
+    braking = np.diff(speed_limits(leg, 6.0)[::-1] ** 2) / (2 * leg.spacing_m)
+    assert braking.max() <= 0.5 + 1e-9
+
+
+def test_course_follows_laps_and_goes_straight_on_beyond_open_ends() -> None:
+    lap, hook = tour(SQUARE), way(HOOK)
+    course = lay_course([lap, Route((hook,))], [4.0, 2.0])
+    legs = np.array([0, 1])
+    start, direction = course.at(legs, np.zeros(2))
+    np.testing.assert_allclose(start, [lap.legs[0].points[0], hook.points[0]])
+    np.testing.assert_allclose(np.hypot(*direction.T), 1.0, rtol=0.02)
+    ahead, _ = course.at(legs, course.length_m[legs] + 10.0)
+    again, _ = course.at(legs, np.array([10.0, 0.0]))
+    np.testing.assert_allclose(ahead[0], again[0], atol=1e-6)
+    np.testing.assert_allclose(ahead[1], [50.0, 70.0], atol=0.01)
+    assert course.limit(legs, np.full(2, 30.0)).max() == 4.0
+    far, _ = course.at(legs, course.length_m[legs] + 10 * BEYOND_M)  # nobody looks so far; nothing breaks
+    assert np.isfinite(far).all()
+
+
+def test_machines_line_up_by_share_and_apart() -> None:
+    routes = [tour(SQUARE)] * 4
+    length = routes[0].length_m
+    starts = line_up(routes, [0.0, 0.25, 0.25, 1.0])
+    assert [round(s.way_m / length, 2) for s in starts] == [0.0, 0.25, 0.25, 0.0]
+    apart = line_up(routes, [0.0, 0.25, 0.25, 1.0], 12.0)
+    joints = np.array([s.joint_m for s in apart])
+    gaps = np.hypot(*(joints[:, None] - joints[None]).transpose(2, 0, 1)) + 1e3 * np.eye(4)
+    assert 12.0 <= gaps.min() < 13.0
+    with pytest.raises(ValueError, match="no room for 60 machines 12 m apart"):
+        line_up([routes[0]] * 60, [0.0] * 60, 12.0)
