@@ -27,3 +27,4 @@ check: venv
 bench: venv
 	$(BIN)/python -m benchmarks merge
 	$(BIN)/python -m benchmarks ingest
+	$(BIN)/python -m benchmarks sim

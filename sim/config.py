@@ -10,7 +10,7 @@ from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from protocol.readings import MAX_STAMP_NS
 from protocol.site import NAME
-from sim.scenario import FleetConfig, Scenario
+from sim.scenario import MAX_MACHINES, FleetConfig, Scenario
 from sim.scenario_file import check, load_scenario
 
 T = TypeVar("T", FleetConfig, Scenario)
@@ -54,6 +54,8 @@ class SimConfig:
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:  # also false for NaN
                 raise ValueError(f"{name}: {getattr(self, name)!r} is not between {low:g} and {high:g}")
+        if self.machines is not None and not 1 <= self.machines <= MAX_MACHINES:
+            raise ValueError(f"machines: {self.machines} is not between 1 and {MAX_MACHINES}")
         if self.bundle_ms % STEP_MS:
             raise ValueError(f"bundle_ms: {self.bundle_ms} is not a multiple of {STEP_MS}")
         for name in (*([self.site] if self.site is not None else []), *(self.names or ())):

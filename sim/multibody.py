@@ -10,10 +10,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import pybullet
 
 from protocol.arrays import Floats
 from protocol.machine import BASE, FRONT
+from sim.engine import pybullet
 from sim.machine_model import PAYLOAD, WHEELS, MachineModel
 from sim.urdf import rigid_urdf
 from sim.vehicle import GRAVITY

@@ -9,10 +9,10 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-import pybullet
 
 from protocol.arrays import AnyArray, Floats, Ints
 from protocol.ground import ZONES
+from sim.engine import pybullet
 from sim.machine_model import FOLDER, MachineModel
 from sim.terrain import Terrain
 from sim.world import FleetState

@@ -35,9 +35,10 @@ class Simulator:
     site, machines: what agents may know. truth_map, tracks(): what only an evaluation may see. close() ends the world.
     """
 
-    def __init__(self, config: SimConfig) -> None:
+    def __init__(self, config: SimConfig, scenario: Scenario | None = None) -> None:
+        """scenario: in place of the one that config names."""
         self.config = config
-        self.scenario: Scenario = resolve(config)
+        self.scenario: Scenario = scenario or resolve(config)
         self.site: SiteConfig = self.scenario.site
         rigs = self.scenario.rigs()
         self.machines: tuple[MachineConfig, ...] = tuple(rig.machine for rig in rigs)
@@ -86,7 +87,7 @@ class Simulator:
     def sense(self) -> Span:
         """Simulate the span of one bundle; returns the readings of all machines as columns."""
         count = self.config.bundle_ms // STEP_MS
-        states = stack([self._step() for _ in range(count)])
+        states = stack([self.step() for _ in range(count)])
         steps = np.arange(self._steps - count + 1, self._steps + 1)
         stamps_ns = self.config.start_ns + steps * STEP_NS
         due = steps % TRACK_EVERY == 0
@@ -114,8 +115,11 @@ class Simulator:
         """The ground before each change so far, with the simulated second of that change."""
         return self._truth_maps
 
-    def _step(self) -> FleetState:
-        """One step of the world; drivers look out, and act, less often."""
+    def step(self) -> FleetState:
+        """Simulate STEP_S without reading the sensors; returns the true state after it.
+
+        Drivers look out, and act, less often than the world moves.
+        """
         state = self._world.state
         while self._changes and self._changes[0].at_s <= self.simulated_s:
             self._repave()

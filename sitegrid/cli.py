@@ -48,7 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     network.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="router to connect to (default %(default)s)")
     parser = argparse.ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_demo, _add_router, _add_server, _add_sim, _add_agent, _add_query, _add_plot):
+    for add in (_add_demo, _add_router, _add_server, _add_sim, _add_agent, _add_query, _add_plot, _add_eval):
         add(nouns, common, network)
     return parser
 
@@ -64,7 +64,7 @@ def _add_demo(nouns: Nouns, common: Parent, _: Parent) -> None:
     demo.add_argument("--scenario", default="paper_site", help="what is simulated (default %(default)s)")
     demo.add_argument("--world", choices=("pybullet", "fast"), help="what moves the machines (over the scenario)")
     demo.add_argument("--machines", type=int, help="machines of the scenario's first fleet (over the scenario)")
-    demo.add_argument("--seed", type=int, default=0, help="seed of the simulation (default %(default)s)")
+    demo.add_argument("--seed", type=int, help="seed of the simulation (over the scenario)")
     demo.add_argument("--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores")
     demo.add_argument("--headless", action="store_true", help="no live display, plain lines only")
     demo.add_argument("--log", type=Path, help="manifest of a real log that a further agent replays")
@@ -150,12 +150,27 @@ def _add_plot(nouns: Nouns, common: Parent, network: Parent) -> None:
     plot.add_argument("--pictures", type=int, default=0, help="with --follow: end after so many pictures")
 
 
+def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
+    evaluation = _noun(nouns, "eval", "run the experiments behind the project's figures", [common])
+    asks = evaluation.add_subparsers(metavar="WHAT", required=True, dest="what")
+    physics = asks.add_parser("physics", help="the simulator against mechanics, and its two worlds against each other")
+    physics.add_argument("--seeds", type=_count, default=3, help="how many, for the tours (default %(default)s)")
+    physics.add_argument("--first-seed", type=int, default=0, help="the first of them (default %(default)s)")
+
+
 def _noun(nouns: Nouns, name: str, what: str, parents: list[Parent]) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = nouns.add_parser(
         name, help=what, description=what[0].upper() + what[1:] + ".", parents=parents
     )
     parser.set_defaults(module=f"sitegrid.commands.{name}")
     return parser
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not positive")
+    return value
 
 
 def _positive(text: str) -> float:

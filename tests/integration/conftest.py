@@ -21,4 +21,6 @@ def children(tmp_path: Path) -> Iterator[Children]:
 
 @pytest.fixture
 def site_run(tmp_path: Path, children: Children) -> SiteRun:
-    return SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=3, seconds=40, speed=8, seed=3))
+    return SiteRun(
+        tmp_path, children, free_endpoint(), SimConfig(machines=3, seconds=40, speed=8, seed=3, world="pybullet")
+    )

@@ -8,7 +8,7 @@ from pathlib import Path
 from evaluation.audit import AuditResult, audit_store
 from mapserver.config import ServerConfig
 from protocol.site import load_site
-from sim.config import SimConfig
+from sim.config import SimConfig, resolve
 from sitegrid import Client, connect
 from sitegrid.commands.sim import write_configs
 from sitegrid.processes import Child, Children, wait_until
@@ -24,6 +24,7 @@ class SiteRun:
         self.children = children
         self.endpoint = endpoint
         self.sim = sim
+        self.site = resolve(sim).site.name
         self.configs = write_configs(sim, folder)
         self.agents: dict[str, Child] = {}
 
@@ -55,14 +56,14 @@ class SiteRun:
             self.start_agent(config)
 
     def start_sim(self) -> Child:
-        options = {"seconds": self.sim.seconds, "speed": self.sim.speed, "machines": self.sim.machines}
-        words = [w for name, value in options.items() for w in (f"--{name}", str(value))]
+        names = ("seconds", "speed", "machines", "seed", "world")
+        words = [w for name in names for w in (f"--{name}", getattr(self.sim, name))]
         truth = ("--truth", self.folder / "truth")
-        place = ("--endpoint", self.endpoint, "--site", self.sim.site, "--seed", self.sim.seed)
+        place = ("--endpoint", self.endpoint, "--site", self.site)
         return self.children.start("sim", "sim", *place, *words, *truth, "--json")
 
     def connect(self) -> Client:
-        return connect(self.endpoint, self.sim.site)
+        return connect(self.endpoint, self.site)
 
     def wait_merged(self, client: Client, samples: int) -> None:
         wait_until(lambda: client.info()["samples_merged"] >= samples, READY_S, f"{samples} samples merged")

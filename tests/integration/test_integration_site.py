@@ -109,8 +109,8 @@ def test_two_sites_do_not_mix(tmp_path, children: Children):
     servers = [run.start_server() for run in runs]
     for run in runs:
         run.start_agents()
-        config = tmp_path / f"{run.sim.site}-sim.toml"
-        config.write_text(f'site = "{run.sim.site}"\nmachines = 1\nnames = ["{run.sim.names[0]}"]\n')
+        config = tmp_path / f"{run.site}-sim.toml"
+        config.write_text(f'site = "{run.site}"\nmachines = 1\nnames = ["{run.sim.names[0]}"]\n')
         words = ("--seconds", run.sim.seconds, "--speed", run.sim.speed, "--seed", run.sim.seed)
         children.start("sim", "sim", "--endpoint", endpoint, "--config", config, *words, "--json")
     reports = [run.end_of_agents() for run in runs]

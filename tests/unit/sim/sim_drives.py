@@ -31,7 +31,7 @@ def drive(config: SimConfig, seconds: float) -> Driven:
         rear = np.array([model.rear_to_joint_m for model in simulator.models])
         lines = [np.vstack([leg.points for leg in route.legs]) for route, _, _ in simulator.scenario.journeys()]
         for i in range(round(seconds * 100)):
-            state = simulator._step()
+            state = simulator.step()
             if i % EVERY:
                 continue
             yaw = np.stack([np.cos(state.yaw_rad), np.sin(state.yaw_rad)], -1)

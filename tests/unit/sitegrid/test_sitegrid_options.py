@@ -10,6 +10,7 @@ import pytest
 from mapserver.config import ServerConfig
 from protocol.geometry import Bounds
 from protocol.logfolder import open_log
+from sim.scenario_file import FOLDER, load_scenario
 from sitegrid.cli import build_parser
 from sitegrid.commands import agent, demo, plot, server
 
@@ -103,4 +104,5 @@ def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch: pytes
 
 
 def test_the_demo_keeps_off_the_seeds_that_reports_are_made_on():
-    assert build_parser().parse_args(["demo"]).seed < 1000
+    assert build_parser().parse_args(["demo"]).seed is None
+    assert all(load_scenario(path.stem).seed < 1000 for path in FOLDER.glob("*.toml"))
