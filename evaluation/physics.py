@@ -22,7 +22,7 @@ from sim.terrain import Terrain
 from sim.vehicle import GRAVITY, Bodies
 from sim.world import STEP_S, FleetState, World, stack
 
-WORLDS = {"pybullet": BulletWorld, "fast": Fleet}
+WORLDS: dict[str, type[BulletWorld] | type[Fleet]] = {"pybullet": BulletWorld, "fast": Fleet}
 GRADE_15 = math.tan(math.radians(15))
 SPEED_MPS = 2.0
 TOUR_S = 125.0  # a lap of the longest tour of the paper's site
