@@ -28,3 +28,4 @@ bench: venv
 	$(BIN)/python -m benchmarks merge
 	$(BIN)/python -m benchmarks ingest
 	$(BIN)/python -m benchmarks sim
+	$(BIN)/python -m benchmarks filter

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from agents.estimation.ground import EstimationConfig, GroundEstimator
-from agents.localisation.localiser import LocalisationConfig, Localiser, PoseBelief
-from agents.localisation.model import ModelConfig
+from agents.localisation.belief import PoseBelief
+from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.order import Order, Verdict
 from agents.sampling import NOTHING, Sampler, SamplingConfig
 from protocol.arrays import Table
-from protocol.machine import BASE, MachineConfig
+from protocol.machine import MachineConfig
 from protocol.readings import Reading
 from protocol.site import Projection, SiteConfig
 
@@ -31,7 +31,6 @@ class PipelineConfig:
     gap_s: float = 5.0
     late_s: float = 0.5
     localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
-    model: ModelConfig = field(default_factory=ModelConfig)
     estimation: EstimationConfig = field(default_factory=EstimationConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
 
@@ -82,9 +81,6 @@ class Pipeline:
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
             return []
-        if sensor.frame != BASE:  # the front frame moves by itself; the filter knows the rear one alone
-            self._counters["reading_front_frame"] += 1
-            return []
         verdict = self._order.judge(reading)
         if verdict is Verdict.REFUSE:
             return []
@@ -107,6 +103,6 @@ class Pipeline:
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""
         config, machine = self._config, self._machine
-        self._localiser = Localiser(machine, self._projection, config.localisation, config.model)
+        self._localiser = Localiser(machine, self._projection, config.localisation)
         self._estimator = GroundEstimator(machine, config.estimation)
         self._sampler = Sampler(machine.load_centre_m, config.sampling)

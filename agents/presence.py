@@ -7,7 +7,7 @@ from typing import Any
 
 import zenoh
 
-from agents.localisation.localiser import PoseBelief
+from agents.localisation.belief import PoseBelief
 from protocol import keys
 from protocol.codec import encode_health, encode_pose
 from protocol.messages import Health, Pose

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.estimation.ground import GroundEstimate
-from agents.localisation.localiser import PoseBelief
+from agents.localisation.belief import PoseBelief
 from protocol.arrays import Table
 from protocol.samples import SAMPLE_DTYPE
 
@@ -62,8 +62,8 @@ class PoseHistory:
         return self._poses[-1] if self._poses else None
 
     def append(self, pose: PoseBelief) -> None:
-        """Remember a pose; one that is not newer than the last replaces it."""
-        if self._poses and pose.stamp_ns <= self._poses[-1].stamp_ns:
+        """Remember a pose; it replaces those that are not older."""
+        while self._poses and pose.stamp_ns <= self._poses[-1].stamp_ns:
             self._poses.pop()
         self._poses.append(pose)
         if pose.stamp_ns - self._poses[0].stamp_ns > 2 * self._history_ns:  # in bulk: removing in front is slow

@@ -1,5 +1,6 @@
-"""Speed, measured: `python -m benchmarks merge` (fold kernels) and `ingest` (bytes to disk to grid).
+"""Speed, measured: `python -m benchmarks merge` (fold kernels), `ingest` (bytes to disk to grid), `sim`, `filter`.
 
-Each prints a small table, or with `--json` one JSON object; `--samples` makes a run longer or shorter. Figures of a
-shared machine scatter: variants are measured in turn within one run and given as medians, so trust their ratios.
+Each prints small tables, or with `--json` one JSON object; `--samples` and the like make a run longer or shorter.
+Figures of a shared machine scatter: variants are measured in turn within one run and given as medians, so trust their
+ratios.
 """

@@ -7,18 +7,21 @@ import json
 import math
 import sys
 from collections.abc import Sequence
+from typing import Any
 
+from benchmarks import filter as filters
 from benchmarks import ingest, merge, sim
 from benchmarks.measure import Result
 
-SAMPLES, SECONDS, RUNS = 20_000, 20.0, 5
+SAMPLES, SECONDS, STEPS, RUNS = 20_000, 20.0, 1000, 5
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run one benchmark and print what it found."""
     arguments = _parser().parse_args(words)
     result: Result = arguments.run(arguments.size, arguments.runs)
-    print(json.dumps(result) if arguments.json else _table(result))
+    tables = [result[name] for name in ("rows", "agent") if name in result]
+    print(json.dumps(result) if arguments.json else "\n\n".join(map(_table, tables)))
     return 0
 
 
@@ -29,7 +32,9 @@ def _parser() -> argparse.ArgumentParser:
     merges = names.add_parser("merge", help="samples that the map server folds into its grid")
     ingests = names.add_parser("ingest", help="samples that the map server takes, from their bytes to the grid")
     sims = names.add_parser("sim", help="simulated time of small and large fleets, sensors on")
-    for benchmark, run in ((merges, merge.run), (ingests, ingest.run), (sims, sim.run)):
+    steps = names.add_parser("filter", help="steps of the localisation filters, and a whole agent's CPU and memory")
+    runs = ((merges, merge.run), (ingests, ingest.run), (sims, sim.run), (steps, filters.run))
+    for benchmark, run in runs:
         benchmark.set_defaults(run=run)
         benchmark.add_argument("--json", action="store_true", help="print one JSON object")
         benchmark.add_argument(
@@ -42,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     sims.add_argument(
         "--seconds", metavar="S", dest="size", type=_seconds, default=SECONDS, help="simulated, in a run (%(default)s)"
     )
+    steps.add_argument("--steps", metavar="N", dest="size", type=_count, default=STEPS, help="in a run (%(default)s)")
     return parser
 
 
@@ -57,10 +63,10 @@ def _seconds(word: str) -> float:
     return seconds
 
 
-def _table(result: Result) -> str:
+def _table(rows: list[dict[str, Any]]) -> str:
     """Rows under their names, numbers to the right."""
-    names = list(result["rows"][0])
-    lines = [names, *([str(row[name]) for name in names] for row in result["rows"])]
+    names = list(rows[0])
+    lines = [names, *([str(row[name]) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(names))]
     return "\n".join("  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True)) for line in lines)
 

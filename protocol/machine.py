@@ -17,6 +17,9 @@ from protocol.readings import KINDS
 from protocol.site import NAME
 
 BASE, FRONT = "base_link", "front_link"
+# What readings of a kind say, by name, where a sensor may give a part of it: an IMU without an accelerometer, an
+# orientation whose heading is of no use.
+GIVES = {"imu": ("rate", "force"), "attitude": ("tilt", "heading")}
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class Mount:
 class SensorConfig:
     """One sensor of a machine.
 
-    name: as readings carry it. use: false leaves the sensor's readings aside. frame: which frame of an articulated
+    name: as readings carry it. use: false leaves the sensor's readings aside. gives: what of its readings is meant, by
+    the names in GIVES; empty: all. frame: which frame of an articulated
     machine carries it; `front_link` starts at the joint, at the height of the wheels' hubs. drift_share, drift_time_s:
     of a GPS receiver, the share of its stated variance that is a slow error, and that error's correlation time.
     ticks_per_rev: of an encoder.
@@ -52,6 +56,7 @@ class SensorConfig:
     kind: str
     mount: Mount = field(default_factory=Mount)
     use: bool = True
+    gives: tuple[str, ...] = ()
     frame: str = BASE
     drift_share: float = 0.75
     drift_time_s: float = 45.0
@@ -62,6 +67,8 @@ class SensorConfig:
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
         if self.kind not in KINDS:
             raise ValueError(f"kind: {self.kind!r} is none of {', '.join(KINDS)}")
+        if unknown := sorted(set(self.gives) - set(GIVES.get(self.kind, ()))):
+            raise ValueError(f"gives: a {self.kind} has no {unknown[0]!r}, but {', '.join(GIVES.get(self.kind, ()))}")
         if self.frame not in (BASE, FRONT):
             raise ValueError(f"frame: {self.frame!r} is neither {BASE} nor {FRONT}")
         if not 0 <= self.drift_share <= 1:
@@ -127,4 +134,5 @@ def plain_lines(config: Any) -> list[str]:
     """The plain values of a dataclass as TOML keys."""
     values = {f.name: getattr(config, f.name) for f in fields(config)}
     plain = {name: value for name, value in values.items() if isinstance(value, bool | int | float | str)}
-    return [f"{name} = {json.dumps(value)}" for name, value in plain.items()]
+    names = {name: list(value) for name, value in values.items() if name == "gives"}
+    return [f"{name} = {json.dumps(value)}" for name, value in {**plain, **names}.items()]

@@ -18,7 +18,16 @@ from typing import TypeAlias
 from protocol.errors import SitegridError
 from protocol.session import DEFAULT_ENDPOINT
 
-EXTRA = {"numba": "server", "cv2": "server", "filterpy": "agent", "pyproj": "agent", "rich": "sim"}
+EXTRA = {
+    "numba": "server",
+    "cv2": "server",
+    "filterpy": "agent",
+    "pyproj": "agent",
+    "rich": "sim",
+    "pybullet": "sim",
+    "scipy": "eval",
+    "matplotlib": "eval",
+}
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -153,9 +162,39 @@ def _add_plot(nouns: Nouns, common: Parent, network: Parent) -> None:
 def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
     evaluation = _noun(nouns, "eval", "run the experiments behind the project's figures", [common])
     asks = evaluation.add_subparsers(metavar="WHAT", required=True, dest="what")
-    physics = asks.add_parser("physics", help="the simulator against mechanics, and its two worlds against each other")
-    physics.add_argument("--seeds", type=_count, default=3, help="how many, for the tours (default %(default)s)")
-    physics.add_argument("--first-seed", type=int, default=0, help="the first of them (default %(default)s)")
+    quiet = argparse.ArgumentParser(add_help=False)  # no default: it would undo a --json before WHAT
+    quiet.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help="print JSON for machines")
+    physics = asks.add_parser(
+        "physics", help="the simulator against mechanics, and its two worlds against each other", parents=[quiet]
+    )
+    _add_seeds(physics, 3)
+    table = asks.add_parser("localisation", help="the paper's table on recordings of its site", parents=[quiet])
+    _add_seeds(table, 12)
+    table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
+    table.add_argument("--seconds", type=_positive, default=1200.0, help="of each recording (default %(default)g)")
+    table.add_argument("--plots", type=Path, help="folder to draw errors over time, tracks and the table into")
+    table.add_argument(
+        "--out", type=Path, default=Path("eval-output"), help="folder of recordings and results (default %(default)s)"
+    )
+    table.add_argument("--processes", type=_count, help="how many at a time (default: one per core)")
+    log = asks.add_parser("log", help="a real log against fixes that were withheld, or its truth", parents=[quiet])
+    log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
+    log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
+    log.add_argument(
+        "--withhold",
+        action="append",
+        type=_withhold,
+        metavar="OFF/PERIOD",
+        help="seconds without GPS of every so many, again for more (default none, 1/10, 10/30 and 30/60)",
+    )
+    log.add_argument("--gps", type=_count, help="use the first receivers only")
+    log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="default %(default)s")
+    log.add_argument("--profile", choices=("default", "paper"), default="default", help="default %(default)s")
+
+
+def _add_seeds(ask: argparse.ArgumentParser, count: int) -> None:
+    ask.add_argument("--seeds", type=_count, default=count, help="how many (default %(default)s)")
+    ask.add_argument("--first-seed", type=_seed, default=0, help="the first of them (default %(default)s)")
 
 
 def _noun(nouns: Nouns, name: str, what: str, parents: list[Parent]) -> argparse.ArgumentParser:
@@ -185,6 +224,27 @@ def _not_negative(text: str) -> float:
     if not 0 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is negative")
     return value
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def _withhold(text: str) -> tuple[float, float]:
+    """Seconds off and period: `10/30`; `none` withholds nothing."""
+    if text == "none":
+        return 0.0, 1.0
+    off, _, period = text.partition("/")
+    try:
+        off_s, period_s = float(off), float(period)
+    except ValueError:
+        off_s = period_s = 0.0
+    if not 0 < off_s < period_s < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither OFF/PERIOD in seconds, as 10/30, nor none")
+    return off_s, period_s
 
 
 def _fail(problem: str, as_json: bool) -> int:  # noqa: FBT001 - the user's own flag

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from agents.estimation.attitude import AttitudeConfig, SlopeFilter
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
-from protocol.machine import MachineConfig, SensorConfig
+from protocol.machine import BASE, MachineConfig, SensorConfig
 from protocol.readings import Imu, Reading, Torque
 
 
@@ -88,7 +88,7 @@ class GroundEstimator:
         if isinstance(reading, Torque):
             self._drive_n = reading.torque_nm / self._machine.wheel_radius_m
             self._torque_ns = reading.stamp_ns
-        elif isinstance(reading, Imu) and self._sensor in (None, reading.sensor):
+        elif isinstance(reading, Imu) and sensor.frame == BASE and self._sensor in (None, reading.sensor):
             self._sensor = reading.sensor
             if reading.sensor not in self._rotation:
                 self._rotation[reading.sensor] = sensor.mount.base_from_sensor()

@@ -4,57 +4,89 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
-from agents.localisation import model
-from agents.localisation.odometry import Alignment, Dead, DeadReckoning, align, mean_std, step_between
-from agents.localisation.ukf import VectorisedUkf
+from agents.localisation import sensing
+from agents.localisation.belief import Belief, Filter, Measurement, Motion, PoseBelief
+from agents.localisation.ekf import Ekf
+from agents.localisation.fusion import Fusion, FusionConfig
+from agents.localisation.kinematics import GpsError, MotionConfig, motion
+from agents.localisation.odometry import Alignment, Dead, DeadReckoning, align, mean_std
+from agents.localisation.sensing import SensingConfig
+from agents.localisation.state import ACCELERATION, ATTITUDE, POSITION, RATE, SPEED, VELOCITY, YAW, Layout
+from agents.localisation.steps import Step, Steps
+from agents.localisation.unscented import Ukf
+from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import MachineConfig, SensorConfig
 from protocol.readings import Gps, Reading
 from protocol.site import Projection
 
-TWO_PI = 2 * math.pi
-COLLECTED = 12_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
-MIN_DRIFT_M2 = 1e-6  # a receiver that was never heard, or has no slow error, must not make the covariance singular
+COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
+MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
+START_MPS = 3.0  # how unsure the first speed is: the machine may drive already, and wheels take a moment to tell
+ROLLING_S = 0.5
+UNKNOWN_STD = 1e4  # of what a sensor does not give
+TOLD_STD_M, TOLD_STD_RAD = 0.5, 0.02  # of a start that is told
+ENGINES = {"ekf": Ekf, "ukf": Ukf}
+PROFILES = ("default", "paper")
+POSITIVE = (  # numbers of the configuration
+    "step_s",
+    "align_way_m",
+    "align_spread_m",
+    "standstill_s",
+    "slip_std",
+    "slip_time_s",
+    "gyro_bias_radps",
+    "wheel_scale",
+)
 
 
 @dataclass(frozen=True)
 class LocalisationConfig:
-    """How GPS is used and how often the filter steps.
+    """How positions are found.
 
-    align_way_m: how far to drive before the start heading is taken from GPS. align_spread_m: how far the positions
-    must spread. step_s: longest prediction step. gate_sigma: fixes further off are refused. relock_fixes: so many
-    refused in a row, and the filter opens up again. min_fix_std_m: no fix is taken for better than this.
-    standstill_s: after this long without travel the gyro's rate is taken as its bias.
+    filter: ekf or ukf. profile: "paper" takes GPS errors as white; "default" estimates a slow error of each receiver, a
+    bias of each yaw gyro and the wheels' scale. step_s: of the filter. align_way_m: how far to drive before the start
+    heading is taken from GPS. align_spread_m: how far the positions must spread. standstill_s: after this long without
+    travel the machine stands. start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed
+    then, nor GPS. slip, slip_soft, slip_std: wheel slip per traction on firm ground, how much it rises with the rolling
+    resistance (ground that resists gives way), and how unsure both are together. slip_time_s: how long a ground's slip
+    stays the same. gyro_bias_radps, wheel_scale: standard deviations at first.
     """
 
+    filter: str = "ukf"
+    profile: str = "default"
+    step_s: float = 0.05
     align_way_m: float = 12.0
     align_spread_m: float = 3.0
-    step_s: float = 0.1
-    gate_sigma: float = 4.0
-    relock_fixes: int = 15
-    min_fix_std_m: float = 0.3
     standstill_s: float = 1.0
+    start: tuple[float, ...] = ()
+    slip: float = 0.1
+    slip_soft: float = 0.9
+    slip_std: float = 0.08
+    slip_time_s: float = 5.0
+    gyro_bias_radps: float = 5e-3
+    wheel_scale: float = 0.03
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    sensing: SensingConfig = field(default_factory=SensingConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: must be positive")
-
-
-@dataclass(frozen=True)
-class PoseBelief:
-    """Pose in `map` at a stamp: position [m], heading [rad, in +-pi], wheel speed [m/s], covariance (2, 2) [m2]."""
-
-    stamp_ns: int
-    x_m: float
-    y_m: float
-    heading_rad: float
-    speed_mps: float
-    covariance_m2: Floats
+        if self.filter not in ENGINES:
+            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(ENGINES)}")
+        if self.profile not in PROFILES:
+            raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
+        for name in POSITIVE:
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: must be positive and finite")
+        if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
+            raise ValueError("slip: must be from 0 to below 1, slip_soft not negative")
+        if len(self.start) not in (0, 3) or not np.isfinite(self.start).all():
+            raise ValueError("start: must be x, y and heading, or empty")
 
 
 @dataclass(frozen=True)
@@ -63,187 +95,235 @@ class _Fix:
 
     stamp_ns: int
     receiver: int
+    sensor: str
     position_m: Floats
-    white_m2: Floats
-    drift_m2: float
+    variance_m2: Floats
     dead: Dead
 
 
 class Localiser:
-    """UKF over pose, gyro bias, wheel scale and GPS errors.
+    """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order."""
 
-    `update` takes readings in the order of their stamps and returns the new beliefs; after the alignment these start
-    with the pose at which the alignment began, so nothing that was driven is lost.
-    """
-
-    def __init__(
-        self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, noise: model.ModelConfig
-    ) -> None:
-        self.counters: Counter[str] = Counter()
-        self.dead = DeadReckoning(machine, noise.slip)
-        self.last_nis = math.nan
-        self._config = config
-        self._noise = noise
-        self._projection = projection
-        receivers = [s for s in machine.sensors if s.kind == "gps" and s.use]
-        self._receivers = {s.name: i for i, s in enumerate(receivers)}
-        self._levers = [(s.mount.xyz_m[0], s.mount.xyz_m[1]) for s in receivers]
-        self._drift_time_s = np.array([s.drift_time_s for s in receivers])
-        self._drift_m2 = np.full(len(receivers), MIN_DRIFT_M2)
+    def __init__(self, machine: MachineConfig, projection: Projection, config: LocalisationConfig) -> None:
+        self.dead = DeadReckoning(machine, config.slip)
+        self._config, self._projection = config, projection
+        self._own: Counter[str] = Counter()
+        self._steps = Steps(machine, config.step_s)
+        self._sensors = {s.name: s for s in machine.sensors if s.use}
+        self._receivers = [s for s in machine.sensors if s.kind == "gps" and s.use]
+        self._imus = [s.name for s in machine.sensors if s.kind == "imu" and s.use]
+        augmented = config.profile == "default"
+        self._layout = Layout(len(self._imus), True, len(self._receivers)) if augmented else Layout()
+        self._errors = [GpsError(MIN_DRIFT_M2, s.drift_time_s) for s in self._receivers] if augmented else []
         self._heard: set[int] = set()
-        self._filter: VectorisedUkf | None = None
-        self._at = Dead(0, 0.0, 0.0, 0.0, 0.0)  # dead-reckoned pose of the filter's last step
-        self._track: deque[Dead] = deque(maxlen=COLLECTED)
+        self._traction = 0.0
+        self._rolling = 0.0  # resistance, low-passed
+        self._engine: Filter = ENGINES[config.filter]()
+        self._fusion: Fusion | None = None
+        self._waiting: deque[Step] = deque(maxlen=COLLECTED)
         self._fixes: deque[_Fix] = deque(maxlen=COLLECTED)
-        self._gated: Counter[int] = Counter()
-        self._still: deque[Dead] = deque()
+        self._track: deque[Dead] = deque(maxlen=COLLECTED)
 
     @property
     def is_aligned(self) -> bool:
         """Whether the heading is known."""
-        return self._filter is not None
+        return self._fusion is not None
+
+    @property
+    def counters(self) -> Counter[str]:
+        """What was used, gated and refused."""
+        return self._own + self._steps.counters + (self._fusion.counters if self._fusion else Counter())
+
+    @property
+    def belief(self) -> Belief | None:
+        """The whole state, once it is known."""
+        return self._fusion.belief if self._fusion else None
 
     def update(self, reading: Reading, sensor: SensorConfig) -> list[PoseBelief]:
-        """Take in one reading; returns beliefs that it made possible, oldest first."""
+        """Take in one reading; returns beliefs that it made possible or changed, oldest first."""
         if isinstance(reading, Gps):
-            return self._update_gps(reading, sensor)
+            return self._take_fix(self._fix(reading))
         self.dead.update(reading, sensor)
-        return self._step_if_due()
-
-    def _step_if_due(self) -> list[PoseBelief]:
-        now = self.dead.now()
-        last = self._track[-1].stamp_ns if self._track and not self.is_aligned else self._at.stamp_ns
-        if now.stamp_ns - last < self._config.step_s * 1e9:
+        step = self._steps.take(reading, sensor, self.dead)
+        if step is None:
             return []
-        if self._filter is None:
-            self._track.append(now)
-            return []
-        self._predict(self._filter, now)
-        self._watch_standstill(self._filter, now)
-        return [self._belief(self._filter)]
+        if self._fusion is None:
+            self._waiting.append(step)
+            self._track.append(self.dead.now())
+            return self._start_as_told() if self._config.start else []
+        return self._take_step(self._fusion, step)
 
-    # --- GPS ---------------------------------------------------------------------------------------------------------
+    # --- measurements ------------------------------------------------------------------------------------------------
 
-    def _update_gps(self, gps: Gps, sensor: SensorConfig) -> list[PoseBelief]:
-        fix = self._fix(gps, sensor)
-        if self._filter is None:
+    def _take_step(self, fusion: Fusion, step: Step) -> list[PoseBelief]:
+        self._traction = step.traction
+        measurements = self._measurements(step)
+        return self._poses(fusion.add(measurements) if measurements else [])
+
+    def _measurements(self, step: Step) -> list[Measurement]:
+        c, stamp = self._config.sensing, step.stamp_ns
+        found = []
+        if not self._layout.imus:  # the default leaves headings aside: near steel they are wrong for minutes
+            for name, (rpy, variances) in step.orientations.items():
+                tilt, heading = self._gives(name, "tilt", "heading")
+                R = np.diag(np.where([tilt, tilt, heading], variances, UNKNOWN_STD**2))
+                found.append(sensing.orientation(stamp, name, rpy, R, c.gate_sigma))
+        for i, name in enumerate(self._imus):
+            if felt := step.felt.get(name):
+                bias = self._layout.gyro_bias(i) if self._layout.imus else None
+                lever = np.array(self._sensors[name].mount.xyz_m)
+                R = (
+                    np.diag(
+                        np.where(self._gives(name, "rate", "force"), (c.rate_radps, c.force_mps2), UNKNOWN_STD).repeat(
+                            3
+                        )
+                    )
+                    ** 2
+                )
+                found.append(
+                    sensing.inertial(stamp, name, felt.rates_radps, felt.force_mps2, R, lever, bias, c.gate_sigma)
+                )
+        return found + self._of_wheels(step) if step.rolled else found  # silent ones are not at rest
+
+    def _of_wheels(self, step: Step) -> list[Measurement]:
+        c, stamp = self._config.sensing, step.stamp_ns
+        speed = step.speed_mps * (1 - self._slip(step) * math.copysign(1.0, step.speed_mps))
+        R = np.diag([c.speed_mps**2, c.side_mps**2, c.side_mps**2])
+        scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
+        found = [sensing.wheels(stamp, "wheels", np.array([speed, 0.0, 0.0]), R, scale, c.gate_sigma)]
+        if step.still_s >= self._config.standstill_s:
+            found.append(sensing.standstill(stamp, c))
+        return found
+
+    def _slip(self, step: Step) -> float:
+        """Slip of the wheels, from traction and from the part of it that is no climb and no acceleration."""
+        ahead = next((f.force_mps2[0] for n, f in step.felt.items() if self._gives(n, "force")[0]), None)
+        if ahead is not None:
+            rolling = abs(step.traction - ahead / GRAVITY_MPS2)
+            self._rolling += min(self._config.step_s / ROLLING_S, 1.0) * (rolling - self._rolling)
+        return step.traction * (self._config.slip + self._config.slip_soft * self._rolling)
+
+    def _gives(self, sensor: str, *names: str) -> list[bool]:
+        """Whether a sensor gives each of these."""
+        given = self._sensors[sensor].gives
+        return [not given or name in given for name in names]
+
+    def _take_fix(self, fix: _Fix) -> list[PoseBelief]:
+        if self._fusion is None:
             self._fixes.append(fix)
             return self._try_align()
-        self._predict(self._filter, fix.dead)
-        self._condition(self._filter, fix)
-        return [self._belief(self._filter)]
+        return self._poses(self._add_fix(self._fusion, fix))
 
-    def _fix(self, gps: Gps, sensor: SensorConfig) -> _Fix:
+    def _add_fix(self, fusion: Fusion, fix: _Fix) -> list[Belief]:
+        sensor, c = self._receivers[fix.receiver], self._config.sensing
+        error, change = None, None
+        variance = np.maximum(fix.variance_m2, c.min_fix_std_m**2)
+        if self._layout.receivers:
+            drift_m2 = max(sensor.drift_share * float(fix.variance_m2.mean()), MIN_DRIFT_M2)
+            variance = np.maximum(fix.variance_m2 * (1 - sensor.drift_share), c.min_fix_std_m**2)
+            self._errors[fix.receiver] = GpsError(drift_m2, sensor.drift_time_s)
+            error = self._layout.gps_error(fix.receiver)
+            if fix.receiver not in self._heard:  # a receiver that comes late brings its own unknown error
+                change = partial(_renewed, states=error, variance=drift_m2)
+        lever = np.array(sensor.mount.xyz_m)
+        measurement = sensing.fix(
+            fix.stamp_ns, fix.sensor, fix.position_m, np.diag(variance), lever, error, c.gps_gate_sigma
+        )
+        beliefs = fusion.add([measurement], change)
+        if beliefs:
+            self._heard.add(fix.receiver)
+        return beliefs
+
+    def _fix(self, gps: Gps) -> _Fix:
         x, y, _ = self._projection.to_map(gps.lat_deg, gps.lon_deg, gps.height_m)
+        receiver = next(i for i, s in enumerate(self._receivers) if s.name == gps.sensor)
         variance = np.array([gps.var_e_m2, gps.var_n_m2])
-        drift_m2 = max(sensor.drift_share * float(variance.mean()), MIN_DRIFT_M2)
-        white = np.maximum(variance * (1 - sensor.drift_share), self._config.min_fix_std_m**2)
-        dead = self.dead.now()
-        stamped = Dead(max(dead.stamp_ns, gps.stamp_ns), dead.travel_m, dead.angle_rad, dead.x_m, dead.y_m, dead.pull)
-        return _Fix(gps.stamp_ns, self._receivers[gps.sensor], np.array([x, y]), white, drift_m2, stamped)
+        return _Fix(gps.stamp_ns, receiver, gps.sensor, np.array([x, y]), variance, self.dead.now())
 
-    def _condition(self, ukf: VectorisedUkf, fix: _Fix) -> None:
-        lever, receiver = self._levers[fix.receiver], fix.receiver
-        if receiver not in self._heard:  # a receiver that comes late brings its own unknown error
-            self._heard.add(receiver)
-            states = model.drift_states(receiver)
-            ukf.P[states, states] = np.eye(2) * fix.drift_m2
-        self._drift_m2[receiver] = fix.drift_m2
-        R = np.diag(fix.white_m2)
-        y, S, cross = ukf.innovation(fix.position_m, lambda s: model.antenna(s, lever, receiver), R)
-        self.last_nis = float(y @ np.linalg.solve(S, y))
-        if self.last_nis > self._config.gate_sigma**2:
-            self._gated[receiver] += 1
-            self.counters["gps_gated"] += 1
-            if self._gated[receiver] < self._config.relock_fixes:
-                return
-            self.counters["gps_relocked"] += 1
-            ukf.P[model.POSITION, model.POSITION] += np.outer(y, y) + np.eye(2)
-            y, S, cross = ukf.innovation(fix.position_m, lambda s: model.antenna(s, lever, receiver), R)
-        self._gated[receiver] = 0
-        self.counters["gps_used"] += 1
-        ukf.condition(y, S, cross)
+    # --- beliefs -----------------------------------------------------------------------------------------------------
 
-    # --- prediction --------------------------------------------------------------------------------------------------
+    def _motion(self, belief: Belief, dt_s: float) -> Motion:
+        c = self._config
+        slip_m2 = c.slip_std**2 * 2 * c.slip_time_s * (self._traction * float(belief.x[SPEED])) ** 2 * dt_s
+        return motion(self._layout, c.motion, belief, dt_s, self._errors, slip_m2)
 
-    def _predict(self, ukf: VectorisedUkf, to: Dead) -> None:
-        step = step_between(self._at, to)
-        if step.dt_s > 0:
-            decay = np.exp(-step.dt_s / self._drift_time_s)
-            noise = model.process_noise(step, float(ukf.x[model.HEADING]), decay, self._drift_m2, self._noise)
-            ukf.predict_with(lambda sigmas: model.move(sigmas, step, decay), noise)
-            self._at = to
-
-    def _watch_standstill(self, ukf: VectorisedUkf, now: Dead) -> None:
-        """At rest the gyro shows its bias: condition on it once per standstill_s, unless the frame turns (steering)."""
-        if self._still and now.travel_m != self._still[0].travel_m:
-            self._still.clear()
-        self._still.append(now)
-        step = step_between(self._still[0], now)
-        if step.dt_s >= self._config.standstill_s:
-            rate, R = np.array([step.turn_rad / step.dt_s]), np.array([[1e-6]])
-            y, S, cross = ukf.innovation(rate, lambda s: s[:, model.GYRO_BIAS, None], R)
-            is_bias = y[0] ** 2 <= self._config.gate_sigma**2 * S[0, 0]
-            self.counters["standstill_updates" if is_bias else "standstill_gated"] += 1
-            if is_bias:
-                ukf.condition(y, S, cross)
-            self._still.clear()
-
-    def _belief(self, ukf: VectorisedUkf) -> PoseBelief:
-        heading = float((ukf.x[model.HEADING] + math.pi) % TWO_PI - math.pi)
-        x, y = ukf.x[model.POSITION]
-        covariance = ukf.P[model.POSITION, model.POSITION].copy()
+    def _poses(self, beliefs: list[Belief]) -> list[PoseBelief]:
         speed = self.dead.wheels.speed_mps
-        return PoseBelief(self._at.stamp_ns, float(x), float(y), heading, speed, covariance)
+        return [
+            PoseBelief(b.stamp_ns, float(b.x[0]), float(b.x[1]), _wrapped(float(b.x[YAW])), speed, b.P[:2, :2].copy())
+            for b in beliefs
+        ]
 
     # --- alignment ---------------------------------------------------------------------------------------------------
 
     def _try_align(self) -> list[PoseBelief]:
         """Start the filter once the way driven shows the heading, and run it over what was collected."""
-        if self.dead.way_m < self._config.align_way_m or len(self._fixes) < 4 or not self._track:
+        c = self._config
+        if self.dead.way_m < c.align_way_m or len(self._fixes) < 4 or not self._track:
             return []
         antennas = np.array([self._dead_antenna(fix) for fix in self._fixes])
-        if float(np.sqrt(((antennas - antennas.mean(axis=0)) ** 2).sum(axis=1).mean())) < self._config.align_spread_m:
+        if float(np.sqrt(((antennas - antennas.mean(axis=0)) ** 2).sum(axis=1).mean())) < c.align_spread_m:
             return []
-        fixes = np.array([fix.position_m for fix in self._fixes])
-        std = mean_std([fix.drift_m2 + float(fix.white_m2.mean()) for fix in self._fixes])
-        found = align(antennas, fixes, std)
+        std = mean_std([float(fix.variance_m2.mean()) for fix in self._fixes])
+        found = align(antennas, np.array([fix.position_m for fix in self._fixes]), std)
         return self._start(found, std) if found else []
 
     def _dead_antenna(self, fix: _Fix) -> tuple[float, float]:
-        lever, c, s = self._levers[fix.receiver], math.cos(fix.dead.angle_rad), math.sin(fix.dead.angle_rad)
+        lever = self._receivers[fix.receiver].mount.xyz_m
+        c, s = math.cos(fix.dead.angle_rad), math.sin(fix.dead.angle_rad)
         return fix.dead.x_m + c * lever[0] - s * lever[1], fix.dead.y_m + s * lever[0] + c * lever[1]
 
-    def _start(self, found: Alignment, fix_std_m: float) -> list[PoseBelief]:
-        first = self._track[0]
-        c, s = math.cos(found.rotation_rad), math.sin(found.rotation_rad)
-        x = np.zeros(model.BASE_STATES + 2 * len(self._receivers))
-        x[0] = found.origin_m[0] + c * first.x_m - s * first.y_m
-        x[1] = found.origin_m[1] + s * first.x_m + c * first.y_m
-        x[model.HEADING] = found.rotation_rad + first.angle_rad
-        for fix in self._fixes:
-            self._drift_m2[fix.receiver] = fix.drift_m2
-            self._heard.add(fix.receiver)
-        self._filter = VectorisedUkf(x, self._start_covariance(len(x), found, fix_std_m))
-        self._at = first
-        events: list[Dead | _Fix] = [*list(self._track)[1:], *self._fixes]
-        beliefs = [self._belief(self._filter)]
-        for event in sorted(events, key=lambda e: e.stamp_ns):
-            dead = event.dead if isinstance(event, _Fix) else event
-            self._predict(self._filter, dead)
-            if isinstance(event, _Fix):
-                self._condition(self._filter, event)
-            beliefs.append(self._belief(self._filter))
-        self._track.clear()
-        self._fixes.clear()
-        return beliefs
+    def _start_as_told(self) -> list[PoseBelief]:
+        x, y, heading = self._config.start
+        dead = self._track[0]
+        rotation = heading - dead.angle_rad
+        return self._start(Alignment(rotation, TOLD_STD_RAD, (x - dead.x_m, y - dead.y_m)), TOLD_STD_M)
 
-    def _start_covariance(self, n: int, found: Alignment, fix_std_m: float) -> Floats:
-        """Start covariance: the fixes are used again by the filter, so the position is left wide."""
-        variance = np.zeros(n)
-        variance[model.POSITION] = (2 * fix_std_m) ** 2
-        variance[model.HEADING] = min(0.5, 2 * found.std_rad + 0.05) ** 2
-        variance[model.GYRO_BIAS] = self._noise.gyro_bias_radps**2
-        variance[model.WHEEL_SCALE] = self._noise.wheel_scale**2
-        variance[model.BASE_STATES :] = np.repeat(self._drift_m2, 2)
-        return np.diag(variance)
+    def _start(self, found: Alignment, fix_std_m: float) -> list[PoseBelief]:
+        start = self._start_belief(found, fix_std_m)
+        self._fusion = Fusion(self._engine, self._motion, start, self._config.fusion)
+        events: list[Step | _Fix] = [*list(self._waiting)[1:], *self._fixes]
+        poses = self._poses([start])
+        for event in sorted(events, key=lambda e: e.stamp_ns):
+            if isinstance(event, Step):
+                poses += self._take_step(self._fusion, event)
+            else:
+                poses += self._poses(self._add_fix(self._fusion, event))
+        for collected in (self._waiting, self._fixes, self._track):
+            collected.clear()
+        return poses
+
+    def _start_belief(self, found: Alignment, fix_std_m: float) -> Belief:
+        """Belief at the first step: the fixes are used again by the filter, so the position is left wide."""
+        step, dead = self._waiting[0], self._track[0]
+        c, s = math.cos(found.rotation_rad), math.sin(found.rotation_rad)
+        x, variance = np.zeros(self._layout.n), np.full(self._layout.n, 1e-6)
+        x[:2] = found.origin_m + np.array([c * dead.x_m - s * dead.y_m, s * dead.x_m + c * dead.y_m])
+        x[YAW] = _wrapped(found.rotation_rad + dead.angle_rad)
+        x[SPEED] = step.speed_mps
+        if step.felt:
+            ahead, left, _ = np.mean([felt.force_mps2 for felt in step.felt.values()], axis=0) / GRAVITY_MPS2
+            x[ATTITUDE.start], x[ATTITUDE.start + 1] = (
+                math.asin(np.clip(left, -0.7, 0.7)),
+                -math.asin(np.clip(ahead, -0.7, 0.7)),
+            )
+        variance[POSITION] = (2 * fix_std_m) ** 2
+        variance[ATTITUDE] = 0.1**2
+        variance[YAW] = min(0.5, 2 * found.std_rad + 0.05) ** 2
+        variance[VELOCITY], variance[RATE], variance[ACCELERATION] = START_MPS**2, 0.1**2, 1.0
+        if self._layout.imus:
+            variance[self._layout.gyro_biases] = self._config.gyro_bias_radps**2
+            variance[self._layout.wheel_scales] = self._config.wheel_scale**2
+        return Belief(step.stamp_ns, x, np.diag(variance))
+
+
+def _renewed(belief: Belief, states: slice, variance: float) -> Belief:
+    """The belief with states that nothing is known of."""
+    x, P = belief.x.copy(), belief.P.copy()
+    x[states], P[states, :], P[:, states] = 0.0, 0.0, 0.0
+    P[states, states] = np.eye(states.stop - states.start) * variance
+    return Belief(belief.stamp_ns, x, P)
+
+
+def _wrapped(angle_rad: float) -> float:
+    return (angle_rad + math.pi) % (2 * math.pi) - math.pi

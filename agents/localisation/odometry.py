@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.localisation.model import Step
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
-from protocol.machine import MachineConfig, SensorConfig
+from protocol.machine import BASE, MachineConfig, SensorConfig
 from protocol.readings import Encoder, Imu, Odometry, Reading, Torque
 
 MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
@@ -28,22 +27,22 @@ class WheelTracker:
         self.speed_mps = 0.0
         self.accel_mps2 = 0.0
         self._tau_s = tau_s
-        self._travel_m = 0.0
+        self.travel_m = 0.0
         self._stamp_ns = 0
 
     def update(self, stamp_ns: int, travel_m: float) -> None:
         """Take in the wheel travel so far."""
         dt = (stamp_ns - self._stamp_ns) * 1e-9
         if not self._stamp_ns or dt > 1:  # the first, or a pause: start from here
-            self._travel_m, self._stamp_ns = travel_m, stamp_ns
+            self.travel_m, self._stamp_ns = travel_m, stamp_ns
             return
         if dt <= 0:
             return
         fade = math.exp(-dt / self._tau_s)
-        self._travel_m += dt * (self.speed_mps + 0.5 * self.accel_mps2 * dt)
+        self.travel_m += dt * (self.speed_mps + 0.5 * self.accel_mps2 * dt)
         self.speed_mps += dt * self.accel_mps2
-        error = travel_m - self._travel_m
-        self._travel_m += (1 - fade**3) * error
+        error = travel_m - self.travel_m
+        self.travel_m += (1 - fade**3) * error
         self.speed_mps += 1.5 * (1 - fade) ** 2 * (1 + fade) * error / dt
         self.accel_mps2 += (1 - fade) ** 3 * error / dt**2
         self._stamp_ns = stamp_ns
@@ -51,14 +50,13 @@ class WheelTracker:
 
 @dataclass(frozen=True)
 class Dead:
-    """Dead-reckoned pose in a frame of its own: travel [m], angle [rad], x, y [m] at a stamp, pull as in `Step`."""
+    """Dead-reckoned pose in a frame of its own: travel [m], angle [rad], x, y [m] at a stamp."""
 
     stamp_ns: int
     travel_m: float
     angle_rad: float
     x_m: float
     y_m: float
-    pull: float = 0.0
 
 
 class DeadReckoning:
@@ -76,10 +74,8 @@ class DeadReckoning:
         self.way_m = 0.0
         self._machine = machine
         self._slip = slip
-        self._traction = 0.0
+        self.traction = 0.0
         self._rolled_m = 0.0
-        self._rolled_ns = 0
-        self._pull = 0.0
         self._rotation: dict[str, Floats] = {}
         self._imu: Imu | None = None
         self._wheel_reading: Encoder | Odometry | None = None
@@ -88,20 +84,20 @@ class DeadReckoning:
 
     def update(self, reading: Reading, sensor: SensorConfig) -> None:
         """Take in a reading of the gyro or the wheels; others change nothing."""
-        if isinstance(reading, Imu):
+        if isinstance(reading, Imu) and sensor.frame == BASE:
             self._turn(reading, sensor)
         elif isinstance(reading, Encoder | Odometry):
             self._roll(reading, sensor)
         elif isinstance(reading, Torque):
             weight_n = self._machine.mass_kg * GRAVITY_MPS2
-            self._traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
+            self.traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
 
     def now(self) -> Dead:
         """The dead-reckoned pose of this moment."""
-        return Dead(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m, self._pull)
+        return Dead(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
 
     def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
-        """Integrate the vertical rate of the first IMU in use (the others serve later issues)."""
+        """Integrate the vertical rate of the first IMU on the rear frame."""
         if self._imu is not None and self._imu.sensor != imu.sensor:
             return
         if imu.sensor not in self._rotation:
@@ -133,23 +129,12 @@ class DeadReckoning:
     def _advance(self, stamp_ns: int, rolled_m: float) -> None:
         self._rolled_m += rolled_m
         self.wheels.update(stamp_ns, self._rolled_m)
-        dt_s = (stamp_ns - self._rolled_ns) * 1e-9
-        travel_m = rolled_m * (1 - self._slip * self._traction * math.copysign(1.0, rolled_m))
-        if 0 < dt_s < 1:
-            self._pull += (self._traction * rolled_m) ** 2 / dt_s
-        self._rolled_ns = stamp_ns
+        travel_m = rolled_m * (1 - self._slip * self.traction * math.copysign(1.0, rolled_m))
         self.travel_m += travel_m
         self.way_m += abs(travel_m)
         self._x_m += travel_m * math.cos(self.angle_rad)
         self._y_m += travel_m * math.sin(self.angle_rad)
         self.stamp_ns = max(self.stamp_ns, stamp_ns)
-
-
-def step_between(before: Dead, after: Dead) -> Step:
-    """Travel, turn and time between two dead-reckoned poses."""
-    dt_s = (after.stamp_ns - before.stamp_ns) * 1e-9
-    travel_m, turn_rad = after.travel_m - before.travel_m, after.angle_rad - before.angle_rad
-    return Step(travel_m, turn_rad, dt_s, after.pull - before.pull)
 
 
 @dataclass(frozen=True)

@@ -6,24 +6,82 @@ from argparse import Namespace
 from collections.abc import Sequence
 from typing import Any
 
-from evaluation import physics
 from sitegrid.process import note, plain, say
+from sitegrid.progress import Display
+
+Tables = dict[str, Any]
+SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
 
 def run(arguments: Namespace) -> int:
     """Run one evaluation and print what it found."""
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    result = physics.run(seeds, on_progress=lambda what: note(what))
+    asks = {"physics": _physics, "localisation": _localisation, "log": _log}
+    result = asks[arguments.what](arguments)
     if arguments.json:
         say(plain(result))
     else:
-        for rows in result.values():
-            print(table(rows) + "\n")
+        print("\n\n".join(_lines(result)))
     return 0
+
+
+def _physics(arguments: Namespace) -> Tables:
+    from evaluation import physics
+
+    return physics.run(_seeds(arguments), on_progress=note)
+
+
+def _localisation(arguments: Namespace) -> Tables:
+    from evaluation import table
+    from evaluation.configurations import HEADLINE, SENSORS, configurations
+    from evaluation.workers import cores
+
+    plan = table.Plan(
+        seeds=tuple(_seeds(arguments)),
+        seconds=arguments.seconds,
+        rows=tuple(configurations(HEADLINE if arguments.rows == "headline" else SENSORS)),
+        cache=arguments.out,
+        processes=arguments.processes or cores(),
+    )
+    with Display("machines drive, filters follow", headless=arguments.json) as display:
+        result, outcomes = table.run(plan, display.show)
+    if arguments.plots:
+        from evaluation import plots  # imported here: only pictures need matplotlib
+
+        result["plots"] = [str(path) for path in plots.draw(result, outcomes, arguments.plots)]
+    return result
+
+
+def _log(arguments: Namespace) -> Tables:
+    from evaluation import reallog
+    from evaluation.configurations import Configuration, select
+
+    with reallog.opened(arguments.manifest, arguments.data) as log:
+        machine = select(log.machine, gps=arguments.gps)
+        row = Configuration(arguments.filter, reallog.receivers(machine), 1, arguments.profile)
+        return reallog.run(log, machine, row, arguments.withhold or reallog.WITHHOLD, on_progress=note)
+
+
+def _seeds(arguments: Namespace) -> range:
+    return range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+
+
+def _lines(result: Tables) -> list[str]:
+    """For people: values on a line of their own, rows as tables."""
+    lines = []
+    for name, value in result.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            lines.append(table([{k: v for k, v in row.items() if not isinstance(v, SHOWN)} for row in value]))
+        elif value not in ([], {}):
+            lines.append(f"{name}: {value}")
+    return lines
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Rows under their names, numbers to the right."""
-    lines = [list(rows[0]), *([str(value) for value in row.values()] for row in rows)]
+    lines = [list(rows[0]), *([_text(value) for value in row.values()] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(w.rjust(width) for w, width in zip(line, widths, strict=True)) for line in lines)
+
+
+def _text(value: Any) -> str:
+    return "-" if value is None else str(value)

@@ -49,7 +49,7 @@ def test_withheld_fixes_never_reach_the_pipeline(of: MachineConfig, made: Drive)
     assert pipelines[0].pose
     assert pipelines[1].pose
     assert pipelines[0].pose.x_m == pipelines[1].pose.x_m
-    assert "gps_gated" not in pipelines[1].health()["counters"]
+    assert not any("gated" in name for name in pipelines[1].health()["counters"])
 
 
 @pytest.mark.parametrize("off_m", [0.0, 3.0])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from agents_drives import START_NS, Drive, Leg, changed_sensor, drive, machine
 
-from agents.localisation.odometry import Dead, DeadReckoning, WheelTracker, align, mean_std, step_between
+from agents.localisation.odometry import DeadReckoning, WheelTracker, align, mean_std
 from agents.physics import GRAVITY_MPS2
 from protocol.machine import MachineConfig, Mount, SensorConfig
 from protocol.readings import Encoder, Odometry, Torque
@@ -116,8 +116,9 @@ def test_slip_is_taken_off_where_torque_drives(direction: int) -> None:
     rolled_m = 2 * math.pi * of.wheel_radius_m
     assert dead.travel_m == pytest.approx(direction * 0.98 * rolled_m)
     assert dead.way_m == pytest.approx(0.98 * rolled_m)
-    speed_mps = rolled_m / 5
-    assert dead.now().pull == pytest.approx((0.1 * speed_mps) ** 2 * 5, rel=0.02)
+    assert dead.traction == pytest.approx(direction * 0.1)
+    now = dead.now()
+    assert (now.stamp_ns, now.travel_m, now.x_m) == (START_NS + 5 * 10**9, dead.travel_m, dead.travel_m)
 
 
 def test_braking_makes_the_wheels_slower_than_the_machine() -> None:
@@ -159,12 +160,6 @@ def test_more_ticks_per_turn_are_less_way() -> None:
     made = drive([Leg(4, 0.5)], of)
     finer = reckon(changed_sensor(of, "wheels", ticks_per_rev=200), made)
     assert finer.travel_m == pytest.approx(reckon(of, made).travel_m / 2)
-
-
-def test_step_between_is_the_difference() -> None:
-    step = step_between(Dead(10**9, 1.0, 0.1, 0.0, 0.0, 0.5), Dead(3 * 10**9, 4.0, 0.4, 9.0, 9.0, 0.7))
-    assert (step.travel_m, step.turn_rad, step.dt_s) == pytest.approx((3.0, 0.3, 2.0))
-    assert step.pull == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents.estimation.ground import GroundEstimate
-from agents.localisation.localiser import PoseBelief
+from agents.localisation.belief import PoseBelief
 from agents.sampling import PoseHistory, Sampler, SamplingConfig
 from protocol.arrays import Table
 from protocol.samples import check_samples

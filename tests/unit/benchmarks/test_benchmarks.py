@@ -34,7 +34,7 @@ def test_without_json_a_table_is_printed(capsys):
     assert len({len(line) for line in lines}) == 1
 
 
-@pytest.mark.parametrize("words", [["merge", "--samples", "-1"], ["merge", "--runs", "0"], ["filter"], []])
+@pytest.mark.parametrize("words", [["merge", "--samples", "-1"], ["merge", "--runs", "0"], ["query"], []])
 def test_wrong_usage_ends_with_two(words, capsys):
     with pytest.raises(SystemExit) as ended:
         main(words)

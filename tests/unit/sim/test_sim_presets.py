@@ -39,9 +39,10 @@ def test_stated_rms_is_what_the_values_give(name: str) -> None:
     assert rms == pytest.approx(float(stated[1]), abs=0.5 * 10.0 ** -len(stated[1].split(".")[1]))
 
 
-def test_paper_receivers_are_2_m_off_and_mostly_slowly() -> None:
+def test_paper_receivers_are_2_m_off_before_their_scale_and_mostly_slowly() -> None:
     gps = load_preset("paper").gps
-    assert (gps.scale, gps.shared, gps.drift_time_s) == (1.0, 0.0, 45.0)
+    assert (gps.shared, gps.drift_time_s) == (0.0, 45.0)
+    assert math.sqrt(2 * (gps.drift_std_m**2 + gps.white_std_m**2)) == pytest.approx(2.0, abs=0.01)
     assert gps.white_std_m == pytest.approx(gps.drift_std_m / 3, abs=1e-3)
     assert gps.outage_s / gps.outage_period_s == 0.1
 

@@ -1,0 +1,94 @@
+"""What a filter believes, what it is told, and what it makes of that: the types between the parts of localisation.
+
+x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k), as in the filtering literature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from protocol.arrays import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """Mean and covariance of the state at a stamp."""
+
+    stamp_ns: int
+    x: Floats
+    P: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How the state moves over a time step.
+
+    f: states (m, n) after the step from those before it, angles not wrapped. jacobian: df/dx (n, n) at a state (n,).
+    Q: noise (n, n). angles: components of the state that are angles [rad]; a filter brings their mean into +-pi.
+    """
+
+    f: Callable[[Floats], Floats]
+    jacobian: Callable[[Floats], Floats]
+    Q: Floats
+    angles: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What a sensor says of the state.
+
+    h: measurements (m, k) that states (m, n) would give. jacobian: dh/dx (k, n) at a state (n,). angles: components of
+    z that are angles [rad]. gate_sigma: refused if the innovation is this many standard deviations off, 0 never.
+    relocks: believed again after too many refusals in a row; not so what is assumed rather than sensed.
+    """
+
+    sensor: str
+    stamp_ns: int
+    z: Floats
+    R: Floats
+    h: Callable[[Floats], Floats]
+    jacobian: Callable[[Floats], Floats]
+    angles: tuple[int, ...] = ()
+    gate_sigma: float = 0.0
+    relocks: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Conditioned:
+    """A belief after a measurement: the prior unchanged where that was refused.
+
+    innovation: (k,), its covariance: (k, k), nis: normalised innovation squared [-], NaN where nothing could be
+    computed. accepted: whether the belief took the measurement in.
+    """
+
+    belief: Belief
+    innovation: Floats
+    innovation_covariance: Floats
+    nis: float
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class PoseBelief:
+    """Pose in `map` at a stamp: position [m], heading [rad, in +-pi], wheel speed [m/s], covariance (2, 2) [m2]."""
+
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    covariance_m2: Floats
+
+
+class Filter(Protocol):
+    """An EKF or UKF: pure steps, equal to use."""
+
+    def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
+        """Move the belief through a motion, to its new stamp."""
+        ...
+
+    def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
+        """Condition the belief on a measurement of its stamp."""
+        ...

@@ -1,0 +1,179 @@
+"""Measurements in any order: a filter with a history, that goes back to where a late measurement belongs.
+
+The history holds nodes: a stamp, the measurements of that stamp, and the belief after them. A measurement that comes
+late is put into its place, and everything after it is filtered again.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from agents.localisation.belief import Belief, Conditioned, Filter, Measurement, Motion
+from agents.localisation.state import POSITION
+
+Motions = Callable[[Belief, float], Motion]  # how a belief moves on over so many seconds
+Change = Callable[[Belief], Belief]
+NOBODY: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """window_s: how far back measurements may come. relock: so many refused in a row, and a sensor is believed."""
+
+    window_s: float = 1.0
+    relock: int = 15
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: must be positive and finite")
+
+
+@dataclass
+class _Node:
+    """One stamp. changes: made to the belief before its measurements. reopened: sensors that were believed again."""
+
+    stamp_ns: int
+    measurements: list[Measurement] = field(default_factory=list)
+    belief: Belief | None = None
+    changes: list[Change] = field(default_factory=list)
+    reopened: set[str] = field(default_factory=set)
+
+
+class Fusion:
+    """Filters measurements into beliefs; `counters` tells what was used, gated and refused, by sensor."""
+
+    def __init__(self, engine: Filter, motions: Motions, start: Belief, config: FusionConfig) -> None:
+        self.counters: Counter[str] = Counter()
+        self.last: dict[str, Conditioned] = {}  # of each sensor
+        self._engine, self._motions, self._config = engine, motions, config
+        self._window_ns = round(config.window_s * 1e9)
+        self._nodes = [_Node(start.stamp_ns, [], start)]
+        self._refused: Counter[str] = Counter()  # in a row
+
+    @property
+    def belief(self) -> Belief:
+        """The newest belief."""
+        belief = self._nodes[-1].belief
+        assert belief is not None
+        return belief
+
+    def at(self, stamp_ns: int) -> Belief:
+        """The belief at a stamp: the last one before it, moved on."""
+        index = bisect_right(self._nodes, stamp_ns, key=_stamp) - 1
+        belief = self._nodes[max(index, 0)].belief
+        assert belief is not None
+        return self._moved(belief, stamp_ns)
+
+    def add(self, measurements: Sequence[Measurement], change: Change | None = None) -> list[Belief]:
+        """Take in measurements of one stamp; returns the beliefs that they changed, oldest first, none if refused.
+
+        change: made to the belief before it, as when a state that was unknown gets its first value.
+        """
+        stamp_ns = measurements[0].stamp_ns
+        if self._is_too_late(stamp_ns):
+            self.counters["too_late"] += len(measurements)
+            return []
+        index = self._place(stamp_ns)
+        node = self._nodes[index]
+        known = {m.sensor for m in node.measurements}
+        fresh = {m.sensor: m for m in measurements if m.sensor not in known}
+        self.counters["duplicate"] += len(measurements) - len(fresh)
+        if not fresh:
+            return []
+        node.measurements += fresh.values()
+        changes = [change] if change else []
+        node.changes += changes
+        if index == len(self._nodes) - 1 and node.belief is not None:  # more of the same stamp: nothing to do again
+            node.belief = self._condition(_changed(node.belief, changes), node, fresh.values(), fresh.keys())
+        else:
+            self._filter_from(index, fresh.keys())
+        changed = [n.belief for n in self._nodes[index:] if n.belief is not None]
+        self._forget()
+        return changed
+
+    def _is_too_late(self, stamp_ns: int) -> bool:
+        """Whether it lies before the window, or not after the first node, whose belief stands."""
+        first, newest = self._nodes[0], self._nodes[-1]
+        before = stamp_ns < max(first.stamp_ns, newest.stamp_ns - self._window_ns)
+        return before or (stamp_ns == first.stamp_ns and first is not newest)
+
+    def _place(self, stamp_ns: int) -> int:
+        """Index of the node of a stamp, which is made if there is none."""
+        index = bisect_left(self._nodes, stamp_ns, key=_stamp)
+        if index == len(self._nodes) or self._nodes[index].stamp_ns != stamp_ns:
+            self._nodes.insert(index, _Node(stamp_ns))
+        return index
+
+    def _filter_from(self, index: int, fresh: Collection[str]) -> None:
+        """Filter from a node on, at which these sensors are new; the node before it stands."""
+        for i in range(index, len(self._nodes)):
+            before, node = self._nodes[i - 1].belief, self._nodes[i]
+            assert before is not None
+            prior = _changed(self._moved(before, node.stamp_ns), node.changes)
+            node.belief = self._condition(prior, node, node.measurements, fresh if i == index else NOBODY)
+
+    def _moved(self, belief: Belief, stamp_ns: int) -> Belief:
+        dt_s = (stamp_ns - belief.stamp_ns) * 1e-9
+        return self._engine.predict(belief, self._motions(belief, dt_s), stamp_ns) if dt_s > 0 else belief
+
+    def _condition(
+        self, belief: Belief, node: _Node, measurements: Iterable[Measurement], fresh: Collection[str]
+    ) -> Belief:
+        """Condition on measurements in turn; only fresh ones count, those filtered again were counted before."""
+        for measurement in measurements:
+            result = self._engine.condition(belief, measurement)
+            if measurement.sensor in fresh:
+                self._judge(node, measurement, result)
+            if not result.accepted and measurement.sensor in node.reopened:
+                result = self._engine.condition(_opened(belief, result), replace(measurement, gate_sigma=0.0))
+            belief = result.belief
+        return belief
+
+    def _judge(self, node: _Node, measurement: Measurement, result: Conditioned) -> None:
+        """Count, and believe a sensor again that was refused too often."""
+        sensor = measurement.sensor
+        self.last[sensor] = result
+        if result.accepted:
+            self._refused[sensor] = 0
+            self.counters[f"{sensor}_used"] += 1
+            return
+        if not math.isfinite(result.nis):
+            self.counters[f"{sensor}_invalid"] += 1
+            return
+        self._refused[sensor] += 1
+        self.counters[f"{sensor}_gated"] += 1
+        if measurement.relocks and self._refused[sensor] >= self._config.relock:
+            self._refused[sensor] = 0
+            self.counters[f"{sensor}_relocked"] += 1
+            node.reopened.add(sensor)
+
+    def _forget(self) -> None:
+        """Drop nodes that are older than the window; one before it stays to start from."""
+        oldest_ns = self._nodes[-1].stamp_ns - self._window_ns
+        del self._nodes[: max(bisect_right(self._nodes, oldest_ns, key=_stamp) - 1, 0)]
+
+
+def _changed(belief: Belief, changes: Iterable[Change]) -> Belief:
+    for change in changes:
+        belief = change(belief)
+    return belief
+
+
+def _opened(belief: Belief, result: Conditioned) -> Belief:
+    """The belief with a position as unsure as a fix is off; what else is measured, the state follows by itself."""
+    if len(result.innovation) != 2:
+        return belief
+    P, at = belief.P.copy(), slice(POSITION.start, POSITION.start + 2)
+    P[at, at] += np.outer(result.innovation, result.innovation) + np.eye(2)
+    return Belief(belief.stamp_ns, belief.x, P)
+
+
+def _stamp(node: _Node) -> int:
+    return node.stamp_ns

@@ -1,0 +1,78 @@
+"""The state: the 15 of robot_localization, and behind them the slow errors of the sensors that are estimated with it.
+
+Frames as in REP-103 and REP-105: `map` is east, north, up; `base_link` is forward, left, up.
+map_from_base = Rz(yaw) Ry(pitch) Rx(roll).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+POSITION = slice(0, 3)  # [m], in map
+ATTITUDE = slice(3, 6)  # roll, pitch, yaw [rad]
+VELOCITY = slice(6, 9)  # [m/s], in base_link
+RATE = slice(9, 12)  # [rad/s], in base_link
+ACCELERATION = slice(12, 15)  # rate of change of VELOCITY [m/s2], in base_link
+X, Y, Z, ROLL, PITCH, YAW, SPEED = range(7)  # SPEED: forward
+YAW_RATE = 11
+BASE_STATES = 15
+ANGLES = (ROLL, PITCH, YAW)
+# What a machine on a plane has not: height, tilt, and what changes them (two_d_mode of robot_localization).
+OFF_PLANE = [Z, ROLL, PITCH, 8, 9, 10, 14]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where in the state each error stands: gyro biases, then the wheel scale, then the GPS errors.
+
+    imus: with a yaw gyro bias each [rad/s]. wheel_scale: whether there is one [-]: the wheels turn 1 + scale times the
+    way. receivers: GPS receivers with an error east and north each [m]. Without any, the 15 states of the paper.
+    """
+
+    imus: int = 0
+    wheel_scale: bool = False
+    receivers: int = 0
+
+    def __post_init__(self) -> None:
+        if self.imus < 0 or self.receivers < 0:
+            raise ValueError("imus and receivers must not be negative")
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers
+
+    @property
+    def angles(self) -> tuple[int, ...]:
+        """States that are angles."""
+        return ANGLES
+
+    @property
+    def gyro_biases(self) -> slice:
+        """One per IMU [rad/s]."""
+        return slice(BASE_STATES, BASE_STATES + self.imus)
+
+    @property
+    def wheel_scales(self) -> slice:
+        """The one wheel scale [-], or none."""
+        first = self.gyro_biases.stop
+        return slice(first, first + self.wheel_scale)
+
+    @property
+    def gps_errors(self) -> slice:
+        """Two per receiver [m]."""
+        first = self.wheel_scales.stop
+        return slice(first, first + 2 * self.receivers)
+
+    def gyro_bias(self, imu: int) -> int:
+        """State of the bias of one yaw gyro."""
+        if not 0 <= imu < self.imus:
+            raise IndexError(f"no IMU {imu} among {self.imus}")
+        return BASE_STATES + imu
+
+    def gps_error(self, receiver: int) -> slice:
+        """States of the error of one receiver: east, north."""
+        if not 0 <= receiver < self.receivers:
+            raise IndexError(f"no receiver {receiver} among {self.receivers}")
+        first = self.gps_errors.start + 2 * receiver
+        return slice(first, first + 2)

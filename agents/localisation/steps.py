@@ -1,0 +1,138 @@
+"""Readings of fast sensors gathered into filter steps: means of IMUs in `base_link`, the wheels' speed at the end."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.localisation.odometry import DeadReckoning, WheelTracker
+from protocol.arrays import Floats
+from protocol.machine import FRONT, MachineConfig, SensorConfig
+from protocol.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading
+
+MIN_NORM = 0.5  # a reference that has not found itself yet sends a quaternion of zeros
+
+
+@dataclass(frozen=True)
+class Felt:
+    """Mean angular rate and specific force of one IMU over a step, (3,) each, in `base_link`."""
+
+    rates_radps: Floats
+    force_mps2: Floats
+
+
+@dataclass(frozen=True)
+class Step:
+    """What fast sensors said up to a stamp.
+
+    orientations: the last roll, pitch, yaw (3,) of each attitude reference and their variances (3,). rolled: whether
+    the wheels spoke in this step, else their speed is an old one. traction: drive force over weight; still_s: how long
+    without travel.
+    """
+
+    stamp_ns: int
+    felt: dict[str, Felt]
+    orientations: dict[str, tuple[Floats, Floats]]
+    speed_mps: float
+    rolled: bool
+    traction: float
+    still_s: float
+
+
+class Steps:
+    """Gathers readings; `take` returns a step whenever step_s have passed."""
+
+    def __init__(self, machine: MachineConfig, step_s: float) -> None:
+        self.counters: Counter[str] = Counter()
+        self._step_ns = round(step_s * 1e9)
+        self._rotations = {s.name: s.mount.base_from_sensor() for s in machine.sensors if s.kind == "imu"}
+        self._sums: dict[str, tuple[int, Floats]] = {}
+        self._orientations: dict[str, tuple[Floats, Floats]] = {}
+        self._begin_ns = 0
+        self._joint = WheelTracker()  # the angle of articulation, smoothed alike
+        self._knows_joint = False
+        self._rolled = False
+        self._still_since = (0, math.nan)
+
+    def take(self, reading: Reading, sensor: SensorConfig, dead: DeadReckoning) -> Step | None:
+        """Take in one reading, after dead reckoning did; returns the step that it ends."""
+        if isinstance(reading, Articulation):
+            self._joint.update(reading.stamp_ns, reading.angle_rad)
+            self._knows_joint = True
+        elif isinstance(reading, Imu):
+            self._gather(reading, sensor)
+        elif isinstance(reading, Attitude):
+            self._orient(reading, sensor)
+        elif isinstance(reading, Encoder | Odometry):
+            self._rolled = True
+        self._begin_ns = self._begin_ns or reading.stamp_ns
+        if reading.stamp_ns - self._begin_ns < self._step_ns:
+            return None
+        return self._finish(reading.stamp_ns, dead)
+
+    def _gather(self, imu: Imu, sensor: SensorConfig) -> None:
+        rotation = self._rotations[imu.sensor]
+        rates = rotation @ (imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)
+        force = rotation @ (imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)
+        if sensor.frame == FRONT:
+            if not self._knows_joint:
+                self.counters["front_imu_without_articulation"] += 1
+                return
+            rates, force = self._to_rear(rates, force)
+        count, total = self._sums.get(imu.sensor, (0, np.zeros(6)))
+        self._sums[imu.sensor] = (count + 1, total + np.concatenate([rates, force]))
+
+    def _orient(self, attitude: Attitude, sensor: SensorConfig) -> None:
+        """Orientation of `base_link`: map_from_sensor times sensor_from_base. One on the front frame is left aside."""
+        if sensor.frame == FRONT:
+            self.counters["front_attitude_unused"] += 1
+            return
+        if math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw) < MIN_NORM:
+            self.counters["attitude_without_direction"] += 1
+            return
+        rotation = _rotation(attitude) @ sensor.mount.base_from_sensor().T
+        variances = np.array([attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2])
+        self._orientations[attitude.sensor] = (_angles(rotation), variances)
+
+    def _to_rear(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
+        """Turn by the articulation, and take its rate off."""
+        angle = self._joint.travel_m
+        c, s = math.cos(angle), math.sin(angle)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        rates = turn @ rates
+        rates[2] -= self._joint.speed_mps
+        return rates, turn @ force
+
+    def _finish(self, stamp_ns: int, dead: DeadReckoning) -> Step:
+        felt = {name: Felt(total[:3] / n, total[3:] / n) for name, (n, total) in self._sums.items()}
+        orientations, self._orientations = self._orientations, {}
+        self._sums.clear()
+        self._begin_ns = stamp_ns
+        if dead.travel_m != self._still_since[1]:
+            self._still_since = (stamp_ns, dead.travel_m)
+        still_s = (stamp_ns - self._still_since[0]) * 1e-9
+        rolled, self._rolled = self._rolled, False
+        return Step(stamp_ns, felt, orientations, dead.wheels.speed_mps, rolled, dead.traction, still_s)
+
+
+def _rotation(attitude: Attitude) -> Floats:
+    """Matrix (3, 3) of the quaternion."""
+    x, y, z, w = np.array([attitude.qx, attitude.qy, attitude.qz, attitude.qw]) / math.sqrt(
+        attitude.qx**2 + attitude.qy**2 + attitude.qz**2 + attitude.qw**2
+    )
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _angles(rotation: Floats) -> Floats:
+    """Roll, pitch and yaw (3,) of map_from_base."""
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    return np.array([roll, -math.asin(max(-1.0, min(1.0, rotation[2, 0]))), math.atan2(rotation[1, 0], rotation[0, 0])])

@@ -1,0 +1,96 @@
+"""The configurations of the paper's table: filter, sensors, profile, and how each becomes options of the pipeline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from agents.localisation.localiser import LocalisationConfig
+from agents.pipeline import PipelineConfig
+from protocol.errors import SitegridError
+from protocol.machine import MachineConfig
+
+FILTERS = ("ekf", "ukf")
+PROFILES = ("paper", "default")
+SENSORS = ((0, 1), (1, 1), (1, 2), (1, 3), (2, 1), (2, 2), (2, 3), (3, 3), (3, 1))  # GPS, IMU; the last is ours
+HEADLINE = ((1, 1), (2, 1), (3, 1))
+
+# The paper's tables 1 and 2: net RMSE [m] by filter, GPS receivers and IMUs.
+PAPER_NET_M = {
+    ("ekf", 0, 1): 75.3671,
+    ("ekf", 1, 1): 3.7363,
+    ("ekf", 1, 2): 3.2963,
+    ("ekf", 1, 3): 3.7660,
+    ("ekf", 2, 1): 2.7474,
+    ("ekf", 2, 2): 2.6517,
+    ("ekf", 2, 3): 2.4747,
+    ("ekf", 3, 3): 2.2980,
+    ("ukf", 0, 1): 65.4774,
+    ("ukf", 1, 1): 2.3234,
+    ("ukf", 1, 2): 2.2781,
+    ("ukf", 1, 3): 2.5742,
+    ("ukf", 2, 1): 1.7217,
+    ("ukf", 2, 2): 1.5460,
+    ("ukf", 2, 3): 1.4024,
+    ("ukf", 3, 3): 1.2458,
+}
+
+
+class UnsupportedError(SitegridError):
+    """The pipeline cannot run a configuration; the message says why."""
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """One row of the table: filter, number of GPS receivers and IMUs, profile."""
+
+    filter: str
+    gps: int
+    imu: int
+    profile: str
+
+    @property
+    def name(self) -> str:
+        """A name for files."""
+        return f"{self.filter}-{self.profile}-{self.gps}gps-{self.imu}imu"
+
+    @property
+    def paper_net_m(self) -> float | None:
+        """Net RMSE [m] that the paper reports; None where it has no such row. It knows one profile, `paper`."""
+        return PAPER_NET_M.get((self.filter, self.gps, self.imu))
+
+
+def configurations(sensors: Sequence[tuple[int, int]] = SENSORS) -> list[Configuration]:
+    """All rows of the table: both filters and both profiles with each set of sensors."""
+    return [Configuration(f, gps, imu, p) for gps, imu in sensors for p in PROFILES for f in FILTERS]
+
+
+def configure(machine: MachineConfig, row: Configuration) -> tuple[MachineConfig, PipelineConfig]:
+    """The machine with the sensors of a row in use, and the pipeline's options; raises UnsupportedError."""
+    return select(machine, row.gps, row.imu), pipeline_options(row)
+
+
+def pipeline_options(row: Configuration) -> PipelineConfig:
+    """Options of the pipeline for a row. The only place that knows how filters and profiles are asked for."""
+    return PipelineConfig(localisation=LocalisationConfig(filter=row.filter, profile=row.profile))
+
+
+def started_at(options: PipelineConfig, pose: tuple[float, float, float]) -> PipelineConfig:
+    """The options of a machine without GPS, which is told where it starts: x, y [m] and heading [rad]."""
+    return replace(options, localisation=replace(options.localisation, start=pose))
+
+
+def select(machine: MachineConfig, gps: int | None = None, imu: int | None = None) -> MachineConfig:
+    """Use the first receivers, and the first IMUs with an orientation of each; None leaves them as they are."""
+    limits = {"gps": gps, "imu": imu, "attitude": imu}
+    counts = dict.fromkeys(limits, 0)
+    sensors = []
+    for sensor in machine.sensors:
+        limit = limits.get(sensor.kind)
+        if limit is not None:
+            counts[sensor.kind] += 1
+            sensor = replace(sensor, use=counts[sensor.kind] <= limit)
+        sensors.append(sensor)
+    if gps is not None and counts["gps"] < gps:
+        raise UnsupportedError(f"{machine.name} has {counts['gps']} GPS receivers, not {gps}")
+    return replace(machine, sensors=tuple(sensors))

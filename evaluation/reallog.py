@@ -1,0 +1,207 @@
+"""Real logs: errors against fixes that were withheld, and against the truth where there is one.
+
+What only an evaluation may know stands in `evaluation.toml` beside the manifest; agents never read that file:
+
+    [truth]                    # the true way of base_link, metres in `map`
+    file = "truth.csv.gz"      # in the data folder; stamp counts as in the manifest
+    stamp = "t"
+    x_m = "x"
+    y_m = "y"
+
+    [[planar]]                 # a GPS file in metres of `map`: gets the columns lat_deg and lon_deg
+    file = "gps_sim1.csv.gz"
+    x_m = "x"
+    y_m = "y"
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import IO, Any
+
+import numpy as np
+
+from agents.holdout import Holdout, HoldoutConfig
+from agents.pipeline import Pipeline
+from evaluation.configurations import Configuration, pipeline_options
+from evaluation.replay import Trace, Truth, errors, replay, root_mean_square, score
+from protocol.config import from_table, load_toml
+from protocol.errors import ConfigError, LogFolderError
+from protocol.logfolder import MANIFEST, LogFolder, open_log
+from protocol.machine import MachineConfig
+from protocol.readings import Reading
+from protocol.site import Projection
+from protocol.units import stamp_ns, stamp_scale
+
+SIDE_FILE = "evaluation.toml"
+WITHHOLD = ((0.0, 1.0), (1.0, 10.0), (10.0, 30.0), (30.0, 60.0))  # seconds off, of every so many; the first is nothing
+
+
+@dataclass(frozen=True)
+class TruthFile:
+    """Where the true way of `base_link` lies: a CSV file of the data folder, and its columns."""
+
+    file: str
+    stamp: str
+    x_m: str
+    y_m: str
+    stamp_unit: str = "s"
+
+
+@dataclass(frozen=True)
+class PlanarFile:
+    """A GPS file whose fixes are metres in `map`, and its columns."""
+
+    file: str
+    x_m: str
+    y_m: str
+
+
+@dataclass(frozen=True)
+class Side:
+    """`evaluation.toml`: what only an evaluation may know of a log."""
+
+    truth: TruthFile | None = None
+    planar: tuple[PlanarFile, ...] = ()
+
+
+@dataclass(frozen=True)
+class RealLog:
+    """A real log as it is evaluated."""
+
+    log: LogFolder
+    truth: Truth | None
+
+    @property
+    def machine(self) -> MachineConfig:
+        """What the agent may know of the machine."""
+        return self.log.machine
+
+
+@contextmanager
+def opened(manifest: Path, data: Path | None = None) -> Iterator[RealLog]:
+    """Open a log with its side file; planar fixes are converted into a folder that lasts as long as the context."""
+    log = open_log(manifest, data)
+    side_file = (manifest if manifest.is_dir() else manifest.parent) / SIDE_FILE
+    side = from_table(Side, load_toml(side_file), str(side_file)) if side_file.is_file() else Side()
+    if unknown := {p.file for p in side.planar} - {s.file for s in log.sources}:
+        raise ConfigError(side_file, f"planar: {MANIFEST} has no sensor with the file {min(unknown)!r}")
+    truth = read_truth(log, side.truth) if side.truth else None
+    with TemporaryDirectory(prefix="sitegrid-") as folder:
+        made = {planar.file: str(convert(log, planar, Path(folder))) for planar in side.planar}
+        log.sources = tuple(replace(source, file=made.get(source.file, source.file)) for source in log.sources)
+        yield RealLog(log, truth)
+
+
+def run(
+    real: RealLog,
+    machine: MachineConfig,
+    row: Configuration,
+    patterns: Sequence[tuple[float, float]] = WITHHOLD,
+    on_progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Replay a log once per pattern of withheld GPS, (seconds off, period); returns the report in plain values.
+
+    `rows`: rms_m, median_m, max_m against the withheld fixes after the first 40 s; truth_* against the truth from the
+    first pose on, truth_withheld_m of the times without GPS alone.
+    """
+    sensors = {sensor.name: sensor for sensor in machine.sensors}
+    log = replace(real.log, sources=tuple(replace(s, sensor=sensors[s.sensor.name]) for s in real.log.sources))
+    readings = list(log.readings())
+    rows = []
+    for off_s, period_s in patterns:
+        on_progress(f"{log.name}: {withheld_name(off_s, period_s)}")
+        rows.append(_row(real, Pipeline(log.site, machine, pipeline_options(row)), readings, (off_s, period_s)))
+    return {
+        "log": log.name,
+        "filter": row.filter,
+        "profile": row.profile,
+        "gps": row.gps,
+        "readings": len(readings),
+        "refused": dict(log.refused),
+        "rows": rows,
+    }
+
+
+def receivers(machine: MachineConfig) -> int:
+    """How many GPS receivers are in use."""
+    return sum(sensor.use and sensor.kind == "gps" for sensor in machine.sensors)
+
+
+def withheld_name(off_s: float, period_s: float) -> str:
+    """As the command line has it."""
+    return f"{off_s:g}/{period_s:g}" if off_s else "none"
+
+
+def read_truth(log: LogFolder, described: TruthFile) -> Truth:
+    """The true way that a log's side file names."""
+    rows, scale = _read(log.data / described.file), stamp_scale(described.stamp_unit)
+    try:
+        stamps = [log.start_ns + stamp_ns(row[described.stamp], scale) for row in rows]
+        places = [(float(row[described.x_m]), float(row[described.y_m])) for row in rows]
+    except (KeyError, ValueError, TypeError) as error:
+        raise LogFolderError(log.data / described.file, f"is no truth as described: {error}") from None
+    return Truth(np.array(stamps, np.int64), np.array(places))
+
+
+def convert(log: LogFolder, planar: PlanarFile, folder: Path) -> Path:
+    """Write a copy of a GPS file with latitude and longitude, by the projection of the log's site; returns its path."""
+    source = log.data / planar.file
+    rows = _read(source)
+    try:
+        x, y = (np.array([float(row[name]) for row in rows]) for name in (planar.x_m, planar.y_m))
+    except (KeyError, ValueError, TypeError) as error:
+        raise LogFolderError(source, f"has no planar fixes as described: {error}") from None
+    places = Projection(log.site).to_geodetic_many(x, y, np.zeros(len(x)))
+    path = folder / f"{source.name.split('.')[0]}.csv"
+    with path.open("w", encoding="utf-8", newline="") as text:
+        writer = csv.DictWriter(text, [*(rows[0] if rows else ()), "lat_deg", "lon_deg"])
+        writer.writeheader()
+        for row, lat, lon in zip(rows, places[0], places[1], strict=True):
+            writer.writerow({**row, "lat_deg": repr(float(lat)), "lon_deg": repr(float(lon))})
+    return path
+
+
+def _row(
+    real: RealLog, pipeline: Pipeline, readings: Sequence[Reading], pattern: tuple[float, float]
+) -> dict[str, Any]:
+    off_s, period_s = pattern
+    config = HoldoutConfig(period_s=period_s, off_s=off_s) if off_s else None
+    holdout = Holdout(real.log.site, real.machine, config) if config else None
+    trace = replay(pipeline, readings, holdout)
+    against_fixes = holdout.report() if holdout else {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None}
+    row = {"withhold": withheld_name(off_s, period_s), **against_fixes}
+    if real.truth:
+        row |= _against_truth(trace, real.truth, pattern)
+    row["us_per_second"] = round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None
+    return {**row, "counters": pipeline.health()["counters"]}
+
+
+def _against_truth(trace: Trace, truth: Truth, pattern: tuple[float, float]) -> dict[str, float]:
+    found = asdict(score(trace, truth))
+    off = np.hypot(*errors(trace, truth).T)
+    dark = np.isfinite(off) & (trace.since_start_s % pattern[1] < pattern[0])
+    shown = ("rmse_x_m", "rmse_y_m", "net_m", "max_m", "nees", "coverage95", "covered")
+    values = {f"truth_{name}": found[name] for name in shown} | {"truth_withheld_m": root_mean_square(off[dark])}
+    return {name: round(value, 4) for name, value in values.items()}
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file, by column."""
+    try:
+        with _text(path) as text:
+            return list(csv.DictReader(text))
+    except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
+        raise LogFolderError(path, f"cannot be read: {error}") from None
+
+
+def _text(path: Path) -> IO[str]:
+    if path.suffix == ".gz":
+        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
+    return path.open(encoding="utf-8-sig", newline="")

@@ -1,0 +1,159 @@
+"""Run the pure pipeline over readings, and compare what it believed with the truth.
+
+A belief is compared at its own stamp, as it was known after the readings of that 100 ms: nothing that came later
+helps it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from agents.holdout import Holdout
+from agents.localisation.belief import PoseBelief
+from agents.pipeline import Pipeline
+from evaluation.consistency import normalised_square, summarise
+from protocol.arrays import Floats, Ints
+from protocol.readings import Reading
+
+STEP_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True way of `base_link`: stamps (n,), positions (n, 2) in `map` [m]."""
+
+    stamp_ns: Ints
+    position_m: Floats
+
+    def at(self, stamp_ns: Ints) -> Floats:
+        """True positions (m, 2); NaN before the first and after the last that is known."""
+        t, known = (np.asarray(s - self.stamp_ns[0], float) * 1e-9 for s in (stamp_ns, self.stamp_ns))
+        columns = [np.interp(t, known, column, math.nan, math.nan) for column in self.position_m.T]
+        return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a pipeline believed, once per STEP_NS from its first pose on.
+
+    stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2) in `map`. first_ns, last_ns: of the readings. cpu_s:
+    processor time that the pipeline took.
+    """
+
+    stamp_ns: Ints
+    position_m: Floats
+    covariance_m2: Floats
+    first_ns: int
+    last_ns: int
+    cpu_s: float
+
+    @property
+    def seconds(self) -> float:
+        """How long the readings last."""
+        return (self.last_ns - self.first_ns) * 1e-9
+
+    @property
+    def since_start_s(self) -> Floats:
+        """Stamps (n,) as seconds after the first reading."""
+        return np.asarray(self.stamp_ns - self.first_ns, float) * 1e-9
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of one run, counted from its first pose on.
+
+    rmse_x_m, rmse_y_m, net_m: root mean squares; net is that of the distance. nees: mean, 2 where the covariance is
+    right; nees_low, nees_high: its 95 % interval then. coverage95: share of time that the 95 % ellipse holds the truth.
+    covered: share of time with a pose. us_per_second: processor time [us] per second of readings.
+    """
+
+    rmse_x_m: float
+    rmse_y_m: float
+    net_m: float
+    max_m: float
+    nees: float
+    nees_low: float
+    nees_high: float
+    coverage95: float
+    covered: float
+    us_per_second: float
+
+
+def replay(pipeline: Pipeline, readings: Sequence[Reading], holdout: Holdout | None = None) -> Trace:
+    """Give readings to a pipeline, in the order of their stamps; holdout keeps its fixes back."""
+    poses: list[PoseBelief] = []
+    cpu_s = 0.0
+    for span in _spans(readings):
+        seen = holdout.split(span) if holdout else span
+        began_s = time.process_time()
+        pipeline.step(seen)
+        pose = pipeline.pose
+        cpu_s += time.process_time() - began_s
+        if holdout:
+            holdout.compare(pipeline)
+        if pose and (not poses or pose.stamp_ns > poses[-1].stamp_ns):
+            poses.append(pose)
+    return Trace(
+        stamp_ns=np.array([p.stamp_ns for p in poses], np.int64),
+        position_m=np.array([(p.x_m, p.y_m) for p in poses]).reshape(-1, 2),
+        covariance_m2=np.array([p.covariance_m2 for p in poses]).reshape(-1, 2, 2),
+        first_ns=readings[0].stamp_ns if readings else 0,
+        last_ns=readings[-1].stamp_ns if readings else 0,
+        cpu_s=cpu_s,
+    )
+
+
+def errors(trace: Trace, truth: Truth) -> Floats:
+    """Errors (n, 2) [m] of a trace; NaN where the truth is not known."""
+    return trace.position_m - truth.at(trace.stamp_ns)
+
+
+def score(trace: Trace, truth: Truth) -> Score:
+    """Errors of a trace, NaN where it has none."""
+    off = errors(trace, truth)
+    known = np.isfinite(off).all(axis=1)
+    off, covariance = off[known], trace.covariance_m2[known]
+    nees = summarise(normalised_square(off, covariance), dof=2)
+    x, y = (root_mean_square(column) for column in off.T)
+    steps = max(1, round(trace.seconds * 1e9 / STEP_NS))
+    return Score(
+        rmse_x_m=x,
+        rmse_y_m=y,
+        net_m=math.hypot(x, y),
+        max_m=float(np.hypot(*off.T).max()) if len(off) else math.nan,
+        nees=nees.mean,
+        nees_low=nees.low,
+        nees_high=nees.high,
+        coverage95=nees.coverage,
+        covered=min(1.0, len(trace.stamp_ns) / steps),
+        us_per_second=trace.cpu_s * 1e6 / trace.seconds if trace.seconds else math.nan,
+    )
+
+
+def root_mean_square(values: Floats) -> float:
+    """Root mean square, NaN of nothing."""
+    return float(np.sqrt((values**2).mean())) if len(values) else math.nan
+
+
+def read_track(path: Path) -> Truth:
+    """The truth that a simulation wrote: `tracks/<machine>.csv`."""
+    table = np.genfromtxt(path, delimiter=",", names=True, dtype=None)
+    return Truth(table["stamp_ns"].astype(np.int64), np.stack([table["x"], table["y"]], axis=1))
+
+
+def _spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:
+    """Cut readings at the multiples of STEP_NS."""
+    span: list[Reading] = []
+    for reading in readings:
+        if span and reading.stamp_ns // STEP_NS != span[0].stamp_ns // STEP_NS:
+            yield span
+            span = []
+        span.append(reading)
+    if span:
+        yield span

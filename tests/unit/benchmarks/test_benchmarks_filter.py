@@ -1,0 +1,65 @@
+import json
+import math
+
+import numpy as np
+import pytest
+
+from agents.pipeline import Pipeline, PipelineConfig
+from benchmarks import agent
+from benchmarks import filter as filters
+from benchmarks.__main__ import main
+
+STEPS = ("predict", "update position", "update rate")
+
+
+def test_filter_prints_one_json_object_with_every_step_of_every_filter(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(agent, "SECONDS", 20)
+    assert main(["filter", "--json", "--steps", "3", "--runs", "1"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["benchmark"], result["steps"], result["runs"]) == ("filter", 3, 1)
+    rows = result["rows"]
+    kinds = ("stock ukf", "stock ukf, angles", "ukf", "ekf")
+    assert [(row["filter"], row["step"]) for row in rows] == [(kind, step) for kind in kinds for step in STEPS]
+    assert all(
+        math.isfinite(row[name]) and row[name] > 0 for row in rows for name in ("us", "x_stock", "x_stock_angles")
+    )
+    (whole,) = result["agent"]
+    assert whole["seconds"] == 20
+    assert whole["cpu_percent"] > 0
+    assert whole["memory_mb"] > 20
+
+
+def test_filter_prints_two_tables(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(agent, "measured", lambda runs: {"seconds": 1, "cpu_percent": 0.5, "memory_mb": 100.0})
+    main(["filter", "--steps", "1", "--runs", "1"])
+    steps, whole = capsys.readouterr().out.split("\n\n")
+    assert steps.splitlines()[0].split() == ["filter", "step", "us", "x_stock", "x_stock_angles"]
+    assert len(steps.splitlines()) == 13
+    assert whole.split() == ["seconds", "cpu_percent", "memory_mb", "1", "0.5", "100.0"]
+
+
+def test_own_and_stock_move_alike() -> None:
+    """What is compared is the same work."""
+    start = filters._start()
+    moves = filters.motion(filters.LAYOUT, filters.CONFIG, start, 0.3)
+    np.testing.assert_allclose(filters._stock_motion(start.x, 0.3), moves.f(start.x[None])[0], atol=1e-14)
+
+
+def test_the_agents_readings_come_at_the_rates_of_the_issue_and_give_a_pose() -> None:
+    pipeline = Pipeline(agent.SITE, agent.machine(), PipelineConfig())
+    for readings in agent.bundles(20):
+        counts = {s.name: sum(r.sensor == s.name for r in readings) for s in agent.machine().sensors}
+        assert counts == {"imu": 100, "wheels": 50, "gps-1": 5, "gps-2": 5}
+        assert [r.stamp_ns for r in readings] == sorted(r.stamp_ns for r in readings)
+        pipeline.step(readings)
+    pose = pipeline.pose
+    assert pose is not None
+    assert math.dist((pose.x_m, pose.y_m), agent.place(agent.way(20)[0])[:2]) < 1.0
+
+
+@pytest.mark.parametrize("words", [["filter", "--samples", "5"], ["filter", "--steps", "0"], ["merge", "--steps", "5"]])
+def test_an_option_that_does_nothing_or_makes_no_sense_is_refused(words, capsys) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert words[1] in capsys.readouterr().err

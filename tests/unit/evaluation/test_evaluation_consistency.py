@@ -1,0 +1,97 @@
+"""Consistency on Gaussian errors whose answer is known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from evaluation.consistency import (
+    ellipse_limit,
+    independent_values,
+    is_white,
+    mean_interval,
+    normalised_square,
+    summarise,
+)
+
+COVARIANCE = np.array([[4.0, 1.2], [1.2, 1.0]])
+
+
+def drawn(n: int, scale: float = 1.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of COVARIANCE times scale squared, and covariances that say COVARIANCE."""
+    errors = np.random.default_rng(seed).multivariate_normal([0, 0], COVARIANCE * scale**2, n)
+    return errors, np.broadcast_to(COVARIANCE, (n, 2, 2))
+
+
+def slow(n: int, correlation: float, seed: int = 2) -> np.ndarray:
+    draws = np.random.default_rng(seed).standard_normal(n)
+    out = np.empty(n)
+    out[0] = draws[0]
+    for i in range(1, n):
+        out[i] = correlation * out[i - 1] + math.sqrt(1 - correlation**2) * draws[i]
+    return out
+
+
+def test_normalised_square_is_the_squared_mahalanobis_distance():
+    covariances = np.array([np.diag([4.0, 9.0]), [[2.0, 1.0], [1.0, 2.0]]])
+    assert normalised_square(np.array([[2.0, 3.0], [1.0, 1.0]]), covariances) == pytest.approx([2.0, 2 / 3])
+    assert normalised_square(np.array([[3.0]]), np.array([[[4.0]]])) == pytest.approx([2.25])  # of one component
+
+
+def test_errors_as_large_as_stated_are_consistent():
+    found = summarise(normalised_square(*drawn(4000)), dof=2)
+    assert found.is_consistent
+    assert found.mean == pytest.approx(2.0, rel=0.06)
+    assert found.coverage == pytest.approx(0.95, abs=0.012)
+    assert found.independent == pytest.approx(4000, rel=0.15)
+
+
+@pytest.mark.parametrize(("scale", "mean", "coverage"), [(1.2, 2.88, 0.875), (0.8, 1.28, 0.9907), (2.0, 8.0, 0.527)])
+def test_a_wrong_sigma_shows(scale: float, mean: float, coverage: float):
+    """Coverage of a 2-D ellipse is 1 - exp(-limit / (2 scale^2))."""
+    found = summarise(normalised_square(*drawn(4000, scale)), dof=2)
+    assert not found.is_consistent
+    assert found.mean == pytest.approx(mean, rel=0.06)
+    assert found.coverage == pytest.approx(coverage, abs=0.02)
+
+
+def test_limits_are_those_of_the_tables():
+    assert ellipse_limit(2) == pytest.approx(5.991, abs=1e-3)
+    assert ellipse_limit(3) == pytest.approx(7.815, abs=1e-3)
+    low, high = mean_interval(2, 50)  # chi-square with 100 degrees of freedom: 74.222 to 129.561
+    assert (low, high) == (pytest.approx(74.222 / 50, abs=1e-3), pytest.approx(129.561 / 50, abs=1e-3))
+
+
+def test_interval_holds_the_mean_of_consistent_errors_19_times_in_20():
+    inside = [summarise(normalised_square(*drawn(200, seed=s)), 2, independent=200).is_consistent for s in range(400)]
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.03)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9, 0.98])
+def test_slow_errors_are_worth_fewer_values(correlation: float):
+    n = 40_000
+    assert independent_values(slow(n, correlation)) == pytest.approx(
+        n * (1 - correlation) / (1 + correlation), rel=0.25
+    )
+
+
+def test_slow_errors_of_the_right_size_are_consistent_although_their_mean_wanders():
+    errors = np.stack([slow(3000, 0.995, seed) for seed in (3, 4)], axis=1)
+    found = summarise(normalised_square(errors, np.broadcast_to(np.eye(2), (3000, 2, 2))), dof=2)
+    assert found.is_consistent
+    narrow = summarise(normalised_square(errors, np.broadcast_to(np.eye(2), (3000, 2, 2))), dof=2, independent=3000)
+    assert found.high - found.low > 3 * (narrow.high - narrow.low)
+
+
+def test_nothing_has_no_summary():
+    found = summarise(np.empty(0), dof=2)
+    assert math.isnan(found.mean)
+    assert not found.is_consistent
+    assert independent_values(np.ones(5)) == 1.0
+
+
+def test_white_innovations_are_told_from_slow_ones():
+    white = [is_white(np.random.default_rng(seed).standard_normal((500, 2))) for seed in range(200)]
+    assert np.mean(white) == pytest.approx(0.95, abs=0.04)
+    assert not is_white(np.stack([slow(500, 0.4), slow(500, 0.0)], axis=1))
+    assert is_white(np.zeros((50, 2)))

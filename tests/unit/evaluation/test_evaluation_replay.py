@@ -1,0 +1,101 @@
+"""Replay and score on beliefs whose errors are known."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.localisation.belief import PoseBelief
+from evaluation.replay import STEP_NS, Trace, Truth, read_track, replay, score
+from protocol.readings import Articulation, Reading
+
+START_NS = 1_767_225_600_000_000_000
+
+
+def trace_of(error_m: Sequence[tuple[float, float]], std_m: float = 1.0, before: int = 0) -> tuple[Trace, Truth]:
+    """One belief per step beside a truth that drives east with 1 m/s, after steps without one."""
+    n = len(error_m)
+    stamps = START_NS + (np.arange(before + n + 1)) * STEP_NS
+    true = np.stack([np.arange(before + n + 1) * 0.1, np.zeros(before + n + 1)], axis=1)
+    believed = true[before + 1 :] + np.array(error_m)
+    covariance = np.broadcast_to(np.eye(2) * std_m**2, (n, 2, 2))
+    trace = Trace(stamps[before + 1 :], believed, covariance, START_NS, int(stamps[-1]), cpu_s=0.01)
+    return trace, Truth(stamps, true)
+
+
+class Scripted:
+    """Stands in for the pipeline: has a pose from the second reading on, at the reading's own stamp."""
+
+    def __init__(self) -> None:
+        self.spans: list[list[Reading]] = []
+        self.pose: PoseBelief | None = None
+
+    def step(self, readings: list[Reading]) -> None:
+        self.spans.append(readings)
+        if len(self.spans) > 1 and readings:
+            self.pose = PoseBelief(readings[-1].stamp_ns, 1.0, 2.0, 0.0, 0.0, np.eye(2))
+
+
+def test_errors_per_axis_and_their_net():
+    found = score(*trace_of([(3.0, 0.0), (0.0, 4.0)]))
+    assert found.rmse_x_m == pytest.approx(math.sqrt(4.5))
+    assert found.rmse_y_m == pytest.approx(math.sqrt(8.0))
+    assert found.net_m == pytest.approx(math.sqrt(12.5))
+    assert found.max_m == pytest.approx(4.0)
+    assert found.nees == pytest.approx(12.5)
+    assert found.coverage95 == 0.0
+    assert found.us_per_second == pytest.approx(0.01e6 / 0.2)
+
+
+def test_coverage_and_nees_follow_the_stated_sigma():
+    errors = [tuple(e) for e in np.random.default_rng(3).standard_normal((5000, 2))]
+    honest, vain = (score(*trace_of(errors, std)) for std in (1.0, 0.5))
+    assert honest.coverage95 == pytest.approx(0.95, abs=0.01)
+    assert honest.nees_low < honest.nees < honest.nees_high
+    assert vain.coverage95 < 0.6
+    assert vain.nees == pytest.approx(8.0, rel=0.05)
+
+
+def test_time_without_a_pose_is_told_and_not_counted_as_error():
+    found = score(*trace_of([(1.0, 0.0)] * 30, before=10))
+    assert found.covered == pytest.approx(0.75)
+    assert found.net_m == pytest.approx(1.0)
+
+
+def test_no_pose_is_no_error_but_nan():
+    trace, truth = trace_of([(0.0, 0.0)])
+    none = Trace(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)), trace.first_ns, trace.last_ns, 0.0)
+    found = score(none, truth)
+    assert found.covered == 0.0
+    assert all(math.isnan(v) for v in (found.net_m, found.max_m, found.nees, found.coverage95))
+
+
+def test_truth_is_interpolated_and_unknown_beyond_its_ends():
+    truth = Truth(START_NS + np.array([0, 10**9]), np.array([[0.0, 5.0], [4.0, 5.0]]))
+    places = truth.at(START_NS + np.array([-1, 0, 250_000_000, 10**9, 10**9 + 1]))
+    assert places[1:4] == pytest.approx(np.array([[0.0, 5.0], [1.0, 5.0], [4.0, 5.0]]))
+    assert np.isnan(places[[0, 4]]).all()
+
+
+def test_a_belief_is_taken_once_per_step_with_nothing_that_came_later():
+    readings = [Articulation("joint", START_NS + i * STEP_NS // 4, 0.0) for i in range(12)]
+    pipeline: Any = Scripted()
+    trace = replay(pipeline, readings)
+    assert [len(span) for span in pipeline.spans] == [4, 4, 4]
+    assert trace.stamp_ns.tolist() == [readings[7].stamp_ns, readings[11].stamp_ns]
+    assert trace.covariance_m2.shape == (2, 2, 2)
+    assert trace.seconds == pytest.approx(0.275)
+
+
+def test_replay_of_nothing_is_empty():
+    pipeline: Any = Scripted()
+    assert replay(pipeline, []).position_m.shape == (0, 2)
+
+
+def test_track_of_a_simulation_keeps_exact_stamps(tmp_path):
+    (tmp_path / "a.csv").write_text(f"stamp_ns,x,y,z\n{START_NS + 1},1.5,2.5,0\n{START_NS + 100_000_001},2.5,3.5,0\n")
+    truth = read_track(tmp_path / "a.csv")
+    assert truth.stamp_ns.tolist() == [START_NS + 1, START_NS + 100_000_001]
+    assert truth.position_m.tolist() == [[1.5, 2.5], [2.5, 3.5]]
