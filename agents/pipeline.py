@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -74,6 +74,9 @@ class Pipeline:
             "position_std_m": std_m,
             "counters": dict(self._counters + self._order.counters + self._localiser.counters),
             "withheld": dict(self._sampler.withheld),
+            "consistency": {
+                name: {**asdict(found), "good": found.is_good} for name, found in self._localiser.consistency.items()
+            },
         }
 
     def _step_one(self, reading: Reading) -> list[Table]:
@@ -81,6 +84,8 @@ class Pipeline:
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
             return []
+        if sensor.delay_s:
+            reading = replace(reading, stamp_ns=reading.stamp_ns - round(sensor.delay_s * 1e9))
         verdict = self._order.judge(reading)
         if verdict is Verdict.REFUSE:
             return []

@@ -46,10 +46,11 @@ class SensorConfig:
     """One sensor of a machine.
 
     name: as readings carry it. use: false leaves the sensor's readings aside. gives: what of its readings is meant, by
-    the names in GIVES; empty: all. frame: which frame of an articulated
-    machine carries it; `front_link` starts at the joint, at the height of the wheels' hubs. drift_share, drift_time_s:
-    of a GPS receiver, the share of its stated variance that is a slow error, and that error's correlation time.
-    ticks_per_rev: of an encoder.
+    the names in GIVES; empty: all. delay_s: how much later than it was true a reading is stamped. gate_sigma: refused
+    if further off than so many standard deviations; 0: as the filter's options say. frame: which frame of an
+    articulated machine carries it; `front_link` starts at the joint, at the height of the wheels' hubs. drift_share,
+    drift_time_s: of a GPS receiver, the share of its stated variance that is a slow error, and that error's
+    correlation time. ticks_per_rev: of an encoder.
     """
 
     name: str
@@ -57,6 +58,8 @@ class SensorConfig:
     mount: Mount = field(default_factory=Mount)
     use: bool = True
     gives: tuple[str, ...] = ()
+    delay_s: float = 0.0
+    gate_sigma: float = 0.0
     frame: str = BASE
     drift_share: float = 0.75
     drift_time_s: float = 45.0
@@ -71,6 +74,8 @@ class SensorConfig:
             raise ValueError(f"gives: a {self.kind} has no {unknown[0]!r}, but {', '.join(GIVES.get(self.kind, ()))}")
         if self.frame not in (BASE, FRONT):
             raise ValueError(f"frame: {self.frame!r} is neither {BASE} nor {FRONT}")
+        if not (0 <= self.delay_s <= 10 and 0 <= self.gate_sigma <= 1000):
+            raise ValueError("delay_s must be between 0 and 10, gate_sigma between 0 and 1000")
         if not 0 <= self.drift_share <= 1:
             raise ValueError(f"drift_share: {self.drift_share} is not between 0 and 1")
         if self.drift_time_s <= 0 or self.ticks_per_rev <= 0:

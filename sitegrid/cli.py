@@ -168,6 +168,12 @@ def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
         "physics", help="the simulator against mechanics, and its two worlds against each other", parents=[quiet]
     )
     _add_seeds(physics, 3)
+    parity = asks.add_parser(
+        "parity", help="the final poses that robot_localization's own tests assert, on its data", parents=[quiet]
+    )
+    parity.add_argument(
+        "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
+    )
     table = asks.add_parser("localisation", help="the paper's table on recordings of its site", parents=[quiet])
     _add_seeds(table, 12)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")

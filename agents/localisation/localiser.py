@@ -19,6 +19,7 @@ from agents.localisation.sensing import SensingConfig
 from agents.localisation.state import ACCELERATION, ATTITUDE, POSITION, RATE, SPEED, VELOCITY, YAW, Layout
 from agents.localisation.steps import Step, Steps
 from agents.localisation.unscented import Ukf
+from agents.localisation.watch import Consistency, Watch
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import MachineConfig, SensorConfig
@@ -111,11 +112,15 @@ class Localiser:
         self._steps = Steps(machine, config.step_s)
         self._sensors = {s.name: s for s in machine.sensors if s.use}
         self._receivers = [s for s in machine.sensors if s.kind == "gps" and s.use]
+        self._wheel_gate = max(
+            (s.gate_sigma for s in machine.sensors if s.kind in ("encoder", "odometry")), default=0.0
+        )
         self._imus = [s.name for s in machine.sensors if s.kind == "imu" and s.use]
         augmented = config.profile == "default"
         self._layout = Layout(len(self._imus), True, len(self._receivers)) if augmented else Layout()
         self._errors = [GpsError(MIN_DRIFT_M2, s.drift_time_s) for s in self._receivers] if augmented else []
         self._heard: set[int] = set()
+        self._watches = {s.name: Watch() for s in self._receivers}
         self._traction = 0.0
         self._rolling = 0.0  # resistance, low-passed
         self._engine: Filter = ENGINES[config.filter]()
@@ -133,6 +138,12 @@ class Localiser:
     def counters(self) -> Counter[str]:
         """What was used, gated and refused."""
         return self._own + self._steps.counters + (self._fusion.counters if self._fusion else Counter())
+
+    @property
+    def consistency(self) -> dict[str, Consistency]:
+        """How consistent the filter is with each GPS receiver, of those that were heard enough."""
+        found = {name: watch.consistency() for name, watch in self._watches.items()}
+        return {name: value for name, value in found.items() if value}
 
     @property
     def belief(self) -> Belief | None:
@@ -161,36 +172,35 @@ class Localiser:
         return self._poses(fusion.add(measurements) if measurements else [])
 
     def _measurements(self, step: Step) -> list[Measurement]:
-        c, stamp = self._config.sensing, step.stamp_ns
-        found = []
-        if not self._layout.imus:  # the default leaves headings aside: near steel they are wrong for minutes
-            for name, (rpy, variances) in step.orientations.items():
-                tilt, heading = self._gives(name, "tilt", "heading")
-                R = np.diag(np.where([tilt, tilt, heading], variances, UNKNOWN_STD**2))
-                found.append(sensing.orientation(stamp, name, rpy, R, c.gate_sigma))
-        for i, name in enumerate(self._imus):
-            if felt := step.felt.get(name):
-                bias = self._layout.gyro_bias(i) if self._layout.imus else None
-                lever = np.array(self._sensors[name].mount.xyz_m)
-                R = (
-                    np.diag(
-                        np.where(self._gives(name, "rate", "force"), (c.rate_radps, c.force_mps2), UNKNOWN_STD).repeat(
-                            3
-                        )
-                    )
-                    ** 2
-                )
-                found.append(
-                    sensing.inertial(stamp, name, felt.rates_radps, felt.force_mps2, R, lever, bias, c.gate_sigma)
-                )
+        found = [self._inertial(step, i, name) for i, name in enumerate(self._imus) if name in step.felt]
+        if self._config.profile == "paper":  # the default leaves headings aside: near steel they are wrong for minutes
+            found += [self._orientation(step, name) for name in step.orientations]
         return found + self._of_wheels(step) if step.rolled else found  # silent ones are not at rest
+
+    def _inertial(self, step: Step, imu: int, name: str) -> Measurement:
+        c, felt = self._config.sensing, step.felt[name]
+        stds = np.where(self._gives(name, "rate", "force"), (c.rate_radps, c.force_mps2), UNKNOWN_STD)
+        R = np.diag(np.repeat(stds, 3) ** 2)
+        bias = self._layout.gyro_bias(imu) if self._layout.imus else None
+        lever = np.array(self._sensors[name].mount.xyz_m)
+        gate = self._sensors[name].gate_sigma or c.gate_sigma
+        return sensing.inertial(step.stamp_ns, name, felt.rates_radps, felt.force_mps2, R, lever, bias, gate)
+
+    def _orientation(self, step: Step, name: str) -> Measurement:
+        rpy, variances = step.orientations[name]
+        tilt, heading = self._gives(name, "tilt", "heading")
+        R = np.diag(np.where([tilt, tilt, heading], variances, UNKNOWN_STD**2))
+        gate = self._sensors[name].gate_sigma or self._config.sensing.gate_sigma
+        return sensing.orientation(step.stamp_ns, name, rpy, R, gate)
 
     def _of_wheels(self, step: Step) -> list[Measurement]:
         c, stamp = self._config.sensing, step.stamp_ns
         speed = step.speed_mps * (1 - self._slip(step) * math.copysign(1.0, step.speed_mps))
         R = np.diag([c.speed_mps**2, c.side_mps**2, c.side_mps**2])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
-        found = [sensing.wheels(stamp, "wheels", np.array([speed, 0.0, 0.0]), R, scale, c.gate_sigma)]
+        found = [
+            sensing.wheels(stamp, "wheels", np.array([speed, 0.0, 0.0]), R, scale, self._wheel_gate or c.gate_sigma)
+        ]
         if step.still_s >= self._config.standstill_s:
             found.append(sensing.standstill(stamp, c))
         return found
@@ -227,11 +237,18 @@ class Localiser:
                 change = partial(_renewed, states=error, variance=drift_m2)
         lever = np.array(sensor.mount.xyz_m)
         measurement = sensing.fix(
-            fix.stamp_ns, fix.sensor, fix.position_m, np.diag(variance), lever, error, c.gps_gate_sigma
+            fix.stamp_ns,
+            fix.sensor,
+            fix.position_m,
+            np.diag(variance),
+            lever,
+            error,
+            sensor.gate_sigma or c.gps_gate_sigma,
         )
         beliefs = fusion.add([measurement], change)
         if beliefs:
             self._heard.add(fix.receiver)
+            self._watches[fix.sensor].note(fusion.last[fix.sensor])
         return beliefs
 
     def _fix(self, gps: Gps) -> _Fix:

@@ -15,7 +15,7 @@ SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
 def run(arguments: Namespace) -> int:
     """Run one evaluation and print what it found."""
-    asks = {"physics": _physics, "localisation": _localisation, "log": _log}
+    asks = {"physics": _physics, "localisation": _localisation, "log": _log, "parity": _parity}
     result = asks[arguments.what](arguments)
     if arguments.json:
         say(plain(result))
@@ -59,6 +59,12 @@ def _log(arguments: Namespace) -> Tables:
         machine = select(log.machine, gps=arguments.gps)
         row = Configuration(arguments.filter, reallog.receivers(machine), 1, arguments.profile)
         return reallog.run(log, machine, row, arguments.withhold or reallog.WITHHOLD, on_progress=note)
+
+
+def _parity(arguments: Namespace) -> Tables:
+    from evaluation import parity
+
+    return parity.run(arguments.data, on_progress=note)
 
 
 def _seeds(arguments: Namespace) -> range:

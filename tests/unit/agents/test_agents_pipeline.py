@@ -331,6 +331,10 @@ BODY = {
 SENSOR = [
     ("gps-1", {"mount": Mount((5.0, 0.0, 3.35))}),
     ("gps-1", {"use": False}),
+    ("gps-1", {"delay_s": 0.3}),
+    ("gps-1", {"gate_sigma": 0.3}),
+    ("imu-3", {"gate_sigma": 0.2}),
+    ("wheels", {"gate_sigma": 0.2}),
     ("gps-1", {"drift_share": 0.1}),
     ("gps-1", {"drift_time_s": 10.0}),
     ("wheels", {"ticks_per_rev": 105}),

@@ -1,0 +1,86 @@
+"""Parity with robot_localization: the final poses that its own tests assert, on its own recorded data.
+
+Its tests fuse wheel velocity, orientation, angular rate and acceleration; no GPS. Here the profile `paper` does the
+same from a told start at the origin, with a filter step for every reading (step_s 0.02 s).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from agents.localisation.localiser import LocalisationConfig, Localiser
+from protocol.logfolder import LogFolder, open_log
+from protocol.site import Projection
+
+LOGS = Path(__file__).parent / "logs"
+STEP_S = 0.02
+
+
+@dataclass(frozen=True)
+class Asserted:
+    """What a test of robot_localization asserts: final position [m] and how far off it may be [m], by filter."""
+
+    log: str
+    position_m: dict[str, tuple[float, float, float]]
+    tolerance_m: dict[str, float]
+
+
+ASSERTED = (
+    Asserted(
+        "rl_test1_husky",
+        {"ekf": (-40.0454, -76.9988, -2.6974), "ukf": (-39.7333, -76.9820, -2.4427)},
+        {"ekf": 1.0452, "ukf": 1.2910},
+    ),
+    Asserted(
+        "rl_test2_jackal",
+        {"ekf": (1.0206, 3.4292, 0.7419), "ukf": (1.0438, 3.4940, 0.7260)},
+        {"ekf": 0.1383, "ukf": 0.2351},
+    ),
+)
+
+
+def run(data: Path, on_progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Run both filters on both logs; data: the folder that holds a folder of each log's name."""
+    rows = []
+    for asserted in ASSERTED:
+        log = _without_gps(open_log(LOGS / asserted.log, data / asserted.log))
+        readings = list(log.readings())
+        for name, expected in asserted.position_m.items():
+            on_progress(f"{asserted.log}: {name}")
+            found = _final_position(log, readings, name)
+            off = math.dist(found, expected)
+            rows.append(
+                {
+                    "log": asserted.log,
+                    "filter": name,
+                    "x_m": round(found[0], 4),
+                    "y_m": round(found[1], 4),
+                    "z_m": round(found[2], 4),
+                    "off_m": round(off, 4),
+                    "tolerance_m": asserted.tolerance_m[name],
+                    "within": off <= asserted.tolerance_m[name],
+                }
+            )
+    return {"rows": rows}
+
+
+def _final_position(log: LogFolder, readings: list[Any], name: str) -> tuple[float, float, float]:
+    config = LocalisationConfig(filter=name, profile="paper", start=(0.0, 0.0, 0.0), step_s=STEP_S)
+    localiser = Localiser(log.machine, Projection(log.site), config)
+    sensors = {sensor.name: sensor for sensor in log.machine.sensors}
+    for reading in readings:
+        localiser.update(reading, sensors[reading.sensor])
+    assert localiser.belief is not None
+    x, y, z = localiser.belief.x[:3].tolist()
+    return x, y, z
+
+
+def _without_gps(log: LogFolder) -> LogFolder:
+    """Every sensor of the log in use but GPS, also those that the manifest leaves aside."""
+    machine = replace(log.machine, sensors=tuple(replace(s, use=s.kind != "gps") for s in log.machine.sensors))
+    sources = tuple(replace(s, sensor=replace(s.sensor, use=s.sensor.kind != "gps")) for s in log.sources)
+    return replace(log, machine=machine, sources=sources)
