@@ -166,7 +166,8 @@ def draw_tracks(outcomes: Sequence[Outcome]) -> Figure:
         axes.set_title(_sensors(*group), loc="left", fontsize=9, weight="bold")
         axes.set_aspect("equal")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
-    figure.supxlabel("east [m]", fontsize=9)
+    for axes in panels[-1]:
+        axes.set_xlabel("east [m]", fontsize=9)
     figure.supylabel("north [m]", fontsize=9)
     title = f"Seed {drive.seed}, tour {drive.tour}, the last lap; circles: 95 % radius that the default UKF states"
     figure.suptitle(title, x=0.01, ha="left", fontsize=9)
