@@ -109,7 +109,7 @@ class Localiser:
         self.dead = DeadReckoning(machine, config.slip)
         self._config, self._projection = config, projection
         self._own: Counter[str] = Counter()
-        self._steps = Steps(machine, config.step_s)
+        self._steps = Steps(machine, config.step_s, orients=config.profile == "paper")
         self._sensors = {s.name: s for s in machine.sensors if s.use}
         self._receivers = [s for s in machine.sensors if s.kind == "gps" and s.use]
         self._wheel_gate = max(

@@ -13,6 +13,7 @@ from protocol.arrays import Floats
 from protocol.machine import FRONT, MachineConfig, SensorConfig
 from protocol.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading
 
+NOTHING = (0.0,) * 7  # count and sums
 MIN_NORM = 0.5  # a reference that has not found itself yet sends a quaternion of zeros
 
 
@@ -43,13 +44,15 @@ class Step:
 
 
 class Steps:
-    """Gathers readings; `take` returns a step whenever step_s have passed."""
+    """Gathers readings; `take` returns a step whenever step_s have passed. orients: whether orientations are wanted."""
 
-    def __init__(self, machine: MachineConfig, step_s: float) -> None:
+    def __init__(self, machine: MachineConfig, step_s: float, *, orients: bool = True) -> None:
         self.counters: Counter[str] = Counter()
         self._step_ns = round(step_s * 1e9)
-        self._rotations = {s.name: s.mount.base_from_sensor() for s in machine.sensors if s.kind == "imu"}
-        self._sums: dict[str, tuple[int, Floats]] = {}
+        self._rotations = {s.name: s.mount.base_from_sensor() for s in machine.sensors}
+        self._front = {s.name for s in machine.sensors if s.frame == FRONT}
+        self._sums: dict[str, tuple[float, ...]] = {}
+        self._orients = orients
         self._orientations: dict[str, tuple[Floats, Floats]] = {}
         self._begin_ns = 0
         self._joint = WheelTracker()  # the angle of articulation, smoothed alike
@@ -64,7 +67,7 @@ class Steps:
             self._knows_joint = True
         elif isinstance(reading, Imu):
             self._gather(reading, sensor)
-        elif isinstance(reading, Attitude):
+        elif isinstance(reading, Attitude) and self._orients:
             self._orient(reading, sensor)
         elif isinstance(reading, Encoder | Odometry):
             self._rolled = True
@@ -74,16 +77,27 @@ class Steps:
         return self._finish(reading.stamp_ns, dead)
 
     def _gather(self, imu: Imu, sensor: SensorConfig) -> None:
-        rotation = self._rotations[imu.sensor]
-        rates = rotation @ (imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)
-        force = rotation @ (imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)
-        if sensor.frame == FRONT:
-            if not self._knows_joint:
-                self.counters["front_imu_without_articulation"] += 1
-                return
-            rates, force = self._to_rear(rates, force)
-        count, total = self._sums.get(imu.sensor, (0, np.zeros(6)))
-        self._sums[imu.sensor] = (count + 1, total + np.concatenate([rates, force]))
+        """Add up what an IMU says in its own axes: they are turned once per step, as turning is linear."""
+        if sensor.frame == FRONT and not self._knows_joint:
+            self.counters["front_imu_without_articulation"] += 1
+            return
+        n, wx, wy, wz, fx, fy, fz = self._sums.get(imu.sensor, NOTHING)
+        self._sums[imu.sensor] = (
+            n + 1,
+            wx + imu.gyro_x_radps,
+            wy + imu.gyro_y_radps,
+            wz + imu.gyro_z_radps,
+            fx + imu.force_x_mps2,
+            fy + imu.force_y_mps2,
+            fz + imu.force_z_mps2,
+        )
+
+    def _mean(self, name: str) -> Felt:
+        """Mean of an IMU over the step, in `base_link`."""
+        n, *total = self._sums[name]
+        mean = np.array(total) / n
+        rates, force = self._rotations[name] @ mean[:3], self._rotations[name] @ mean[3:]
+        return Felt(*(self._to_rear(rates, force) if name in self._front else (rates, force)))
 
     def _orient(self, attitude: Attitude, sensor: SensorConfig) -> None:
         """Orientation of `base_link`: map_from_sensor times sensor_from_base. One on the front frame is left aside."""
@@ -93,13 +107,13 @@ class Steps:
         if math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw) < MIN_NORM:
             self.counters["attitude_without_direction"] += 1
             return
-        rotation = _rotation(attitude) @ sensor.mount.base_from_sensor().T
+        rotation = _rotation(attitude) @ self._rotations[attitude.sensor].T
         variances = np.array([attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2])
         self._orientations[attitude.sensor] = (_angles(rotation), variances)
 
     def _to_rear(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
-        """Turn by the articulation, and take its rate off."""
-        angle = self._joint.travel_m
+        """Turn by the articulation in the middle of the step, and take its rate off."""
+        angle = self._joint.travel_m - 0.5e-9 * self._step_ns * self._joint.speed_mps
         c, s = math.cos(angle), math.sin(angle)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         rates = turn @ rates
@@ -107,7 +121,7 @@ class Steps:
         return rates, turn @ force
 
     def _finish(self, stamp_ns: int, dead: DeadReckoning) -> Step:
-        felt = {name: Felt(total[:3] / n, total[3:] / n) for name, (n, total) in self._sums.items()}
+        felt = {name: self._mean(name) for name in self._sums}
         orientations, self._orientations = self._orientations, {}
         self._sums.clear()
         self._begin_ns = stamp_ns
