@@ -7,11 +7,10 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 from benchmarks import filter as filters
 from benchmarks import ingest, merge, sim
-from benchmarks.measure import Result
+from benchmarks.measure import Result, table
 
 SAMPLES, SECONDS, STEPS, RUNS = 20_000, 20.0, 1000, 5
 
@@ -21,7 +20,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(words)
     result: Result = arguments.run(arguments.size, arguments.runs)
     tables = [result[name] for name in ("rows", "agent") if name in result]
-    print(json.dumps(result) if arguments.json else "\n\n".join(map(_table, tables)))
+    print(json.dumps(result) if arguments.json else "\n\n".join(map(table, tables)))
     return 0
 
 
@@ -61,14 +60,6 @@ def _seconds(word: str) -> float:
     if not 0 < (seconds := float(word)) < math.inf:
         raise argparse.ArgumentTypeError("must be positive")
     return seconds
-
-
-def _table(rows: list[dict[str, Any]]) -> str:
-    """Rows under their names, numbers to the right."""
-    names = list(rows[0])
-    lines = [names, *([str(row[name]) for name in names] for row in rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(names))]
-    return "\n".join("  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True)) for line in lines)
 
 
 if __name__ == "__main__":

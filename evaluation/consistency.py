@@ -98,14 +98,3 @@ def autocorrelation(series: Floats) -> Floats | None:
         return None
     correlation: Floats = products / products[0]
     return correlation
-
-
-def is_white(innovations: Floats) -> bool:
-    """Whether innovations (n, k) of one sensor have no memory: correlation of neighbours within its 95 % bound.
-
-    Slow GPS errors that a filter takes for white noise show here first.
-    """
-    n = len(innovations)
-    found = [c[1] for column in innovations.T if (c := autocorrelation(column)) is not None]
-    bound = float(stats.norm.ppf(1 - (1 - CONFIDENCE) / 2 / max(1, len(found)))) / math.sqrt(max(1, n))
-    return all(abs(correlation) <= bound for correlation in found)

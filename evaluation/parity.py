@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from agents.localisation.localiser import LocalisationConfig, Localiser
+from evaluation.reallog import refitted
 from protocol.logfolder import LogFolder, open_log
+from protocol.readings import Reading
 from protocol.site import Projection
 
 LOGS = Path(__file__).parent / "logs"
@@ -68,7 +70,7 @@ def run(data: Path, on_progress: Callable[[str], None] = lambda _: None) -> dict
     return {"rows": rows}
 
 
-def _final_position(log: LogFolder, readings: list[Any], name: str) -> tuple[float, float, float]:
+def _final_position(log: LogFolder, readings: list[Reading], name: str) -> tuple[float, float, float]:
     config = LocalisationConfig(filter=name, profile="paper", start=(0.0, 0.0, 0.0), step_s=STEP_S)
     localiser = Localiser(log.machine, Projection(log.site), config)
     sensors = {sensor.name: sensor for sensor in log.machine.sensors}
@@ -81,6 +83,5 @@ def _final_position(log: LogFolder, readings: list[Any], name: str) -> tuple[flo
 
 def _without_gps(log: LogFolder) -> LogFolder:
     """Every sensor of the log in use but GPS, also those that the manifest leaves aside."""
-    machine = replace(log.machine, sensors=tuple(replace(s, use=s.kind != "gps") for s in log.machine.sensors))
-    sources = tuple(replace(s, sensor=replace(s.sensor, use=s.sensor.kind != "gps")) for s in log.sources)
-    return replace(log, machine=machine, sources=sources)
+    sensors = tuple(replace(sensor, use=sensor.kind != "gps") for sensor in log.machine.sensors)
+    return refitted(log, replace(log.machine, sensors=sensors))

@@ -111,8 +111,7 @@ def run(
     `rows`: rms_m, median_m, max_m against the withheld fixes after the first 40 s; truth_* against the truth from the
     first pose on, truth_withheld_m of the times without GPS alone.
     """
-    sensors = {sensor.name: sensor for sensor in machine.sensors}
-    log = replace(real.log, sources=tuple(replace(s, sensor=sensors[s.sensor.name]) for s in real.log.sources))
+    log = refitted(real.log, machine)
     readings = list(log.readings())
     rows = []
     for off_s, period_s in patterns:
@@ -127,6 +126,13 @@ def run(
         "refused": dict(log.refused),
         "rows": rows,
     }
+
+
+def refitted(log: LogFolder, machine: MachineConfig) -> LogFolder:
+    """The log with the sensors of this machine, of which others may be in use."""
+    sensors = {sensor.name: sensor for sensor in machine.sensors}
+    sources = tuple(replace(source, sensor=sensors[source.sensor.name]) for source in log.sources)
+    return replace(log, machine=machine, sources=sources)
 
 
 def receivers(machine: MachineConfig) -> int:
@@ -180,7 +186,8 @@ def _row(
     if real.truth:
         row |= _against_truth(trace, real.truth, pattern)
     row["us_per_second"] = round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None
-    return {**row, "counters": pipeline.health()["counters"]}
+    health = pipeline.health()
+    return {**row, "counters": health["counters"], "consistency": health["consistency"]}
 
 
 def _against_truth(trace: Trace, truth: Truth, pattern: tuple[float, float]) -> dict[str, float]:

@@ -71,7 +71,7 @@ class SensorConfig:
         if self.kind not in KINDS:
             raise ValueError(f"kind: {self.kind!r} is none of {', '.join(KINDS)}")
         if unknown := sorted(set(self.gives) - set(GIVES.get(self.kind, ()))):
-            raise ValueError(f"gives: a {self.kind} has no {unknown[0]!r}, but {', '.join(GIVES.get(self.kind, ()))}")
+            raise ValueError(f"gives: {self.kind} has no {unknown[0]!r}, but {', '.join(GIVES.get(self.kind, ()))}")
         if self.frame not in (BASE, FRONT):
             raise ValueError(f"frame: {self.frame!r} is neither {BASE} nor {FRONT}")
         if not (0 <= self.delay_s <= 10 and 0 <= self.gate_sigma <= 1000):
@@ -80,6 +80,10 @@ class SensorConfig:
             raise ValueError(f"drift_share: {self.drift_share} is not between 0 and 1")
         if self.drift_time_s <= 0 or self.ticks_per_rev <= 0:
             raise ValueError("drift_time_s and ticks_per_rev must be positive")
+
+    def says(self, name: str) -> bool:
+        """Whether its readings mean this, one of GIVES."""
+        return not self.gives or name in self.gives
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -94,6 +94,12 @@ def board(starts: Sequence[Start]) -> Drivers:
     )
 
 
+def idle(machines: int) -> Commands:
+    """What is asked for before drivers act: nothing."""
+    zero = np.zeros(machines)
+    return Commands(zero, zero, zero, zero)
+
+
 def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float) -> tuple[Drivers, Commands]:
     """Return the drivers' next memory and what they ask for."""
     # Where on the leg the machine is; at its end it stops, waits, loads, and takes up the next leg.
@@ -133,8 +139,7 @@ def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float
 
 def look_out(course: Course, crew: Crew, old: Drivers, state: FleetState) -> Drivers:
     """Drivers look how far their way is clear of other machines."""
-    clear = clear_way(course, crew.body, old.leg, old.way_m, joint(crew, state), state)
-    return Drivers(old.leg, old.way_m, old.aim_mps, old.integral_n, old.waited_s, old.payload_kg, clear)
+    return replace(old, clear_m=clear_way(course, crew.body, old.leg, old.way_m, joint(crew, state), state))
 
 
 def joint(crew: Crew, state: FleetState) -> Floats:

@@ -13,7 +13,7 @@ from protocol.readings import Reading
 from protocol.site import Projection, SiteConfig
 from sim.config import STEP_MS, SimConfig, resolve
 from sim.course import Start, lay_course, line_up
-from sim.driver import DRIVER_STEPS, board, drive, hire, look_out
+from sim.driver import DRIVER_STEPS, board, drive, hire, idle, look_out
 from sim.fleet import Fleet
 from sim.ground import lay, pave
 from sim.machine_model import MachineModel
@@ -52,7 +52,7 @@ class Simulator:
         except ValueError as error:
             raise ConfigError(f"scenario {config.scenario}", str(error)) from None
         self._course = lay_course(routes, speeds)
-        self._crew, self._drivers = hire(self.models), board(starts)
+        self._crew, self._drivers, self._commands = hire(self.models), board(starts), idle(len(starts))
         bodies = draw_bodies(rigs, self.scenario.seed)
         self._world = build_world(self.scenario.world, self.terrain, self.models, bodies, starts)
         for machine, start in enumerate(starts):

@@ -80,8 +80,3 @@ class World(Protocol):
 def stack(states: list[FleetState]) -> FleetState:
     """Join k states into one with arrays (k, n, ...)."""
     return FleetState(*(np.array([getattr(s, f.name) for s in states]) for f in fields(FleetState)))
-
-
-def machine_states(block: FleetState, machine: int) -> FleetState:
-    """The k states of one machine, arrays (k, ...), out of stacked ones."""
-    return FleetState(*(getattr(block, f.name)[:, machine] for f in fields(FleetState)))

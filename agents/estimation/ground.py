@@ -88,7 +88,7 @@ class GroundEstimator:
         if isinstance(reading, Torque):
             self._drive_n = reading.torque_nm / self._machine.wheel_radius_m
             self._torque_ns = reading.stamp_ns
-        elif isinstance(reading, Imu) and sensor.frame == BASE and self._sensor in (None, reading.sensor):
+        elif isinstance(reading, Imu) and self._is_ours(sensor):
             self._sensor = reading.sensor
             if reading.sensor not in self._rotation:
                 self._rotation[reading.sensor] = sensor.mount.base_from_sensor()
@@ -96,6 +96,10 @@ class GroundEstimator:
             self._imu_ns = reading.stamp_ns
             if 0 < dt_s < 1:
                 self._step(reading, self._rotation[reading.sensor], dt_s, speed_mps, accel_mps2)
+
+    def _is_ours(self, sensor: SensorConfig) -> bool:
+        """Whether it is the first IMU on the rear frame that has an accelerometer."""
+        return sensor.frame == BASE and sensor.says("force") and self._sensor in (None, sensor.name)
 
     def now(self, speed_mps: float) -> GroundEstimate:
         """The estimate of this moment."""

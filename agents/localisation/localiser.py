@@ -112,9 +112,8 @@ class Localiser:
         self._steps = Steps(machine, config.step_s, orients=config.profile == "paper")
         self._sensors = {s.name: s for s in machine.sensors if s.use}
         self._receivers = [s for s in machine.sensors if s.kind == "gps" and s.use]
-        self._wheel_gate = max(
-            (s.gate_sigma for s in machine.sensors if s.kind in ("encoder", "odometry")), default=0.0
-        )
+        wheels = (s for s in self._sensors.values() if s.kind in ("encoder", "odometry"))
+        self._wheel_gate = next((s.gate_sigma for s in wheels), 0.0)  # of the one that dead reckoning uses, the first
         self._imus = [s.name for s in machine.sensors if s.kind == "imu" and s.use]
         augmented = config.profile == "default"
         self._layout = Layout(len(self._imus), True, len(self._receivers)) if augmented else Layout()
@@ -178,19 +177,19 @@ class Localiser:
         return found + self._of_wheels(step) if step.rolled else found  # silent ones are not at rest
 
     def _inertial(self, step: Step, imu: int, name: str) -> Measurement:
-        c, felt = self._config.sensing, step.felt[name]
-        stds = np.where(self._gives(name, "rate", "force"), (c.rate_radps, c.force_mps2), UNKNOWN_STD)
-        R = np.diag(np.repeat(stds, 3) ** 2)
+        c, felt, sensor = self._config.sensing, step.felt[name], self._sensors[name]
+        rate_std = c.rate_radps if sensor.says("rate") else UNKNOWN_STD
+        force_std = c.force_mps2 if sensor.says("force") else UNKNOWN_STD
+        R = np.diag([rate_std**2] * 3 + [force_std**2] * 3)
         bias = self._layout.gyro_bias(imu) if self._layout.imus else None
-        lever = np.array(self._sensors[name].mount.xyz_m)
-        gate = self._sensors[name].gate_sigma or c.gate_sigma
+        lever, gate = np.array(sensor.mount.xyz_m), sensor.gate_sigma or c.gate_sigma
         return sensing.inertial(step.stamp_ns, name, felt.rates_radps, felt.force_mps2, R, lever, bias, gate)
 
     def _orientation(self, step: Step, name: str) -> Measurement:
-        rpy, variances = step.orientations[name]
-        tilt, heading = self._gives(name, "tilt", "heading")
-        R = np.diag(np.where([tilt, tilt, heading], variances, UNKNOWN_STD**2))
-        gate = self._sensors[name].gate_sigma or self._config.sensing.gate_sigma
+        (rpy, variances), sensor = step.orientations[name], self._sensors[name]
+        said = [sensor.says("tilt"), sensor.says("tilt"), sensor.says("heading")]
+        R = np.diag(np.where(said, variances, UNKNOWN_STD**2))
+        gate = sensor.gate_sigma or self._config.sensing.gate_sigma
         return sensing.orientation(step.stamp_ns, name, rpy, R, gate)
 
     def _of_wheels(self, step: Step) -> list[Measurement]:
@@ -207,16 +206,14 @@ class Localiser:
 
     def _slip(self, step: Step) -> float:
         """Slip of the wheels, from traction and from the part of it that is no climb and no acceleration."""
-        ahead = next((f.force_mps2[0] for n, f in step.felt.items() if self._gives(n, "force")[0]), None)
-        if ahead is not None:
-            rolling = abs(step.traction - ahead / GRAVITY_MPS2)
+        if forces := self._forces(step):
+            rolling = abs(step.traction - forces[0][0] / GRAVITY_MPS2)
             self._rolling += min(self._config.step_s / ROLLING_S, 1.0) * (rolling - self._rolling)
         return step.traction * (self._config.slip + self._config.slip_soft * self._rolling)
 
-    def _gives(self, sensor: str, *names: str) -> list[bool]:
-        """Whether a sensor gives each of these."""
-        given = self._sensors[sensor].gives
-        return [not given or name in given for name in names]
+    def _forces(self, step: Step) -> list[Floats]:
+        """Specific forces (3,) of the IMUs that measure them."""
+        return [felt.force_mps2 for name, felt in step.felt.items() if self._sensors[name].says("force")]
 
     def _take_fix(self, fix: _Fix) -> list[PoseBelief]:
         if self._fusion is None:
@@ -318,8 +315,8 @@ class Localiser:
         x[:2] = found.origin_m + np.array([c * dead.x_m - s * dead.y_m, s * dead.x_m + c * dead.y_m])
         x[YAW] = _wrapped(found.rotation_rad + dead.angle_rad)
         x[SPEED] = step.speed_mps
-        if step.felt:
-            ahead, left, _ = np.mean([felt.force_mps2 for felt in step.felt.values()], axis=0) / GRAVITY_MPS2
+        if forces := self._forces(step):
+            ahead, left, _ = np.mean(forces, axis=0) / GRAVITY_MPS2
             x[ATTITUDE.start], x[ATTITUDE.start + 1] = (
                 math.asin(np.clip(left, -0.7, 0.7)),
                 -math.asin(np.clip(ahead, -0.7, 0.7)),

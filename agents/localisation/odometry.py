@@ -84,7 +84,7 @@ class DeadReckoning:
 
     def update(self, reading: Reading, sensor: SensorConfig) -> None:
         """Take in a reading of the gyro or the wheels; others change nothing."""
-        if isinstance(reading, Imu) and sensor.frame == BASE:
+        if isinstance(reading, Imu) and sensor.frame == BASE and sensor.says("rate"):
             self._turn(reading, sensor)
         elif isinstance(reading, Encoder | Odometry):
             self._roll(reading, sensor)
@@ -97,7 +97,7 @@ class DeadReckoning:
         return Dead(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
 
     def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
-        """Integrate the vertical rate of the first IMU on the rear frame."""
+        """Integrate the vertical rate of the first gyro on the rear frame."""
         if self._imu is not None and self._imu.sensor != imu.sensor:
             return
         if imu.sensor not in self._rotation:

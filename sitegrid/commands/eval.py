@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.measure import table
 from sitegrid.process import note, plain, say
 from sitegrid.progress import Display
 
@@ -80,14 +80,3 @@ def _lines(result: Tables) -> list[str]:
         elif value not in ([], {}):
             lines.append(f"{name}: {value}")
     return lines
-
-
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows under their names, numbers to the right."""
-    lines = [list(rows[0]), *([_text(value) for value in row.values()] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(w.rjust(width) for w, width in zip(line, widths, strict=True)) for line in lines)
-
-
-def _text(value: Any) -> str:
-    return "-" if value is None else str(value)

@@ -128,6 +128,15 @@ def test_readings_of_unknown_sensors_are_counted_and_change_nothing(
     assert health == base[1]
 
 
+def test_an_imu_without_accelerometer_invents_no_slope(of: MachineConfig, recorded: list[Reading]) -> None:
+    """Its columns of force are filled with something: they must not reach the map as a grade."""
+    sensors = tuple(replace(s, gives=("rate",)) if s.kind == "imu" else s for s in of.sensors)
+    rows = Pipeline(simulated(3, 40.0)[0], replace(of, sensors=sensors), PipelineConfig()).step(recorded)
+    assert len(rows) > 50
+    assert np.isnan(rows["grade_e"]).all()
+    assert np.isnan(rows["grade_n"]).all()
+
+
 def test_doubled_readings_are_counted_and_change_nothing(
     of: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any]
 ) -> None:

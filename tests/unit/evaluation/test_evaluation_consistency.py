@@ -8,7 +8,6 @@ import pytest
 from evaluation.consistency import (
     ellipse_limit,
     independent_values,
-    is_white,
     mean_interval,
     normalised_square,
     summarise,
@@ -88,10 +87,3 @@ def test_nothing_has_no_summary():
     assert math.isnan(found.mean)
     assert not found.is_consistent
     assert independent_values(np.ones(5)) == 1.0
-
-
-def test_white_innovations_are_told_from_slow_ones():
-    white = [is_white(np.random.default_rng(seed).standard_normal((500, 2))) for seed in range(200)]
-    assert np.mean(white) == pytest.approx(0.95, abs=0.04)
-    assert not is_white(np.stack([slow(500, 0.4), slow(500, 0.0)], axis=1))
-    assert is_white(np.zeros((50, 2)))

@@ -51,11 +51,37 @@ def test_impossible_machine_is_refused(change):
 
 
 @pytest.mark.parametrize(
-    "change", [{"name": "a b"}, {"kind": "sonar"}, {"drift_share": 1.5}, {"drift_time_s": 0.0}, {"ticks_per_rev": 0}]
+    "change",
+    [
+        {"name": "a b"},
+        {"kind": "sonar"},
+        {"drift_share": 1.5},
+        {"drift_time_s": 0.0},
+        {"ticks_per_rev": 0},
+        {"frame": "bucket_link"},
+        {"gives": ("force",)},
+        {"delay_s": -0.1},
+        {"delay_s": float("nan")},
+        {"gate_sigma": -1.0},
+    ],
 )
 def test_impossible_sensor_is_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         dataclasses.replace(GPS, **change)
+
+
+def test_a_sensor_may_give_a_part_of_what_its_kind_does():
+    imu = SensorConfig("imu", "imu", gives=("rate",))
+    assert (imu.says("rate"), imu.says("force")) == (True, False)
+    assert SensorConfig("imu", "imu").says("force")
+    with pytest.raises(ValueError, match="gives: imu has no 'tilt', but rate, force"):
+        SensorConfig("imu", "imu", gives=("tilt",))
+
+
+def test_every_option_of_a_sensor_is_written_and_read_back():
+    imu = SensorConfig("imu", "imu", use=False, gives=("rate",), delay_s=0.2, gate_sigma=5.0, frame="front_link")
+    table = tomllib.loads(machine_toml(MachineConfig("a", sensors=(imu,))))
+    assert from_table(SensorConfig, table["sensor"][0], "x") == imu
 
 
 def test_errors_of_a_machine_name_the_file():

@@ -1,7 +1,7 @@
 import numpy as np
 
 from protocol.machine import Mount
-from sim.frames import body_rates, compose, cross, map_from_base, quaternion, rotation, seen_turned, turned, up_in_base
+from sim.frames import compose, cross, map_from_base, quaternion, rotation, seen_turned, turned
 
 ROLL, PITCH, YAW = 0.1, -0.3, 2.0
 ONE = (np.array([YAW]), np.array([PITCH]), np.array([ROLL]))
@@ -22,18 +22,7 @@ def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 def test_frames_agree_with_the_mounts_rotation() -> None:
     turn = matrix(ROLL, PITCH, YAW)
     np.testing.assert_allclose(map_from_base(VECTOR[:, None], *ONE)[:, 0], turn @ VECTOR)
-    np.testing.assert_allclose(up_in_base(ONE[1], ONE[2])[0], turn.T @ [0, 0, 1])
     np.testing.assert_allclose(rotate(quaternion(*ONE), VECTOR[:, None])[:, 0], turn @ VECTOR)
-
-
-def test_body_rates_are_those_of_the_turning_frame() -> None:
-    def at(t: float) -> np.ndarray:
-        return matrix(0.1 + 0.3 * t, -0.2 + 0.1 * t, 1 - 0.5 * t)
-
-    h = 1e-6
-    turn = at(0).T @ (at(h) - at(-h)) / (2 * h)
-    one = [np.array([v]) for v in (-0.5, 0.1, 0.3, -0.2, 0.1)]
-    np.testing.assert_allclose(body_rates(*one)[0], [turn[2, 1], turn[0, 2], turn[1, 0]], atol=1e-8)
 
 
 def test_quaternions_compose_like_matrices() -> None:

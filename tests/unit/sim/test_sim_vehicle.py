@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from sim_bullet_worlds import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, nominal, placed, plane
 
+from protocol.machine import Mount
 from sim.fleet import Fleet
 from sim.machine_model import MachineModel
 from sim.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
@@ -166,3 +167,17 @@ def test_hydraulics_and_engine_follow_with_their_lags_and_limits() -> None:
 def test_at_rest_the_specific_force_is_gravity() -> None:
     with placed(Fleet, plane(0, 0.2, 0.1), LOADER, starts=[(500, 500, 0.7)]) as world:
         assert np.linalg.norm(world.state.force_mps2) == pytest.approx(GRAVITY)
+
+
+def test_rates_are_those_of_the_turning_frame() -> None:
+    """Angular rate in `base_link`, against what the rotation matrix does from step to step."""
+    with placed(Fleet, plane(0, 0.12, -0.07), LOADER) as world:
+        states = hold_speed(world, 2.0, 6.0, 0.4)[-2:]
+    matrices = []
+    for state in states:
+        angles = np.degrees([state.roll_rad[0], state.pitch_rad[0], state.yaw_rad[0]])
+        matrices.append(Mount(rpy_deg=tuple(angles)).base_from_sensor())
+    turn = matrices[0].T @ (matrices[1] - matrices[0]) / STEP_S
+    expected = [turn[2, 1], turn[0, 2], turn[1, 0]]
+    assert abs(expected[2]) > 0.1
+    np.testing.assert_allclose(states[1].rates_radps[0], expected, atol=2e-3)
