@@ -10,14 +10,18 @@ from typing import Any
 
 import zenoh
 
+from agents import calibration_file
 from agents.audit import AuditLog
 from agents.config import AgentConfig
 from agents.drivers import Driver
+from agents.estimation.calibration import Calibration
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Presence
 from agents.spool import Spool
 from agents.uplink import Uplink, UplinkState, linger
+from protocol.arrays import Table
+from protocol.errors import StoreError
 from protocol.machine import MachineConfig
 from protocol.site import SiteConfig
 
@@ -26,10 +30,11 @@ HEALTH_S = 1.0
 
 @dataclass(frozen=True)
 class Places:
-    """Files of an agent: its spool, and where asked for an audit file."""
+    """Files of an agent: its spool, and where asked for an audit file and one that keeps the calibration."""
 
     spool: Path
     audit: Path | None = None
+    calibration: Path | None = None
 
 
 class Agent:
@@ -46,7 +51,10 @@ class Agent:
         withhold: bool = False,
     ) -> None:
         self._config = config
-        self._pipeline = Pipeline(site, machine, config.pipeline)
+        self._machine, self._calibration_file = machine.name, places.calibration
+        self._calibration_problem = ""
+        self._pipeline = Pipeline(site, machine, config.pipeline, self._known())
+        self._kept_ns = self._pipeline.calibration.stamp_ns
         self._holdout = Holdout(site, machine, config.holdout) if withhold else None
         self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
         self._presence = Presence(session, site.name, machine.name)
@@ -72,8 +80,11 @@ class Agent:
             self._step(list(readings))
             if clock() >= health_s:
                 health_s = clock() + HEALTH_S
+                self._keep_calibration()
                 self._presence.show_health(self._newest_ns, self.report(driver))
         driver.close()
+        self._deliver(self._pipeline.finish())
+        self._keep_calibration()
         delivered = linger(self._is_delivered, wait, clock, 0.0 if is_stopped() else self._config.linger_s)
         report = {**self.report(driver), "delivered": delivered}
         self._presence.show_health(self._newest_ns, report)
@@ -88,6 +99,7 @@ class Agent:
             "driver": dict(driver.counters()),
             "pipeline": self._pipeline.health(),
             "spool": self._spool.counters(),
+            "calibration_problem": self._calibration_problem,
             "uplink": {"problem": uplink.problem, "counters": dict(uplink.counters)},
             "holdout": self._holdout.report() if self._holdout else None,
         }
@@ -105,12 +117,35 @@ class Agent:
         rows = self._pipeline.step(self._holdout.split(readings) if self._holdout else readings)
         if self._holdout:
             self._holdout.compare(self._pipeline)
+        self._deliver(rows)
+        if pose := self._pipeline.pose:
+            self._presence.show_pose(pose)
+
+    def _deliver(self, rows: Table) -> None:
         if len(rows):
             self._spool.record(rows)
             self._samples += len(rows)
             self._uplink.wake()
-        if pose := self._pipeline.pose:
-            self._presence.show_pose(pose)
+
+    def _known(self) -> Calibration | None:
+        """The calibration from before; one that cannot be read is reported, and found anew."""
+        try:
+            return calibration_file.load(self._calibration_file, self._machine) if self._calibration_file else None
+        except StoreError as error:
+            self._calibration_problem = str(error)
+            return None
+
+    def _keep_calibration(self) -> None:
+        """Write the calibration down when it is a new one; a full disk must not stop the machine."""
+        calibration = self._pipeline.calibration
+        if not self._calibration_file or calibration.stamp_ns <= self._kept_ns:
+            return
+        try:
+            calibration_file.save(self._calibration_file, self._machine, calibration)
+        except StoreError as error:
+            self._calibration_problem = str(error)
+        else:
+            self._kept_ns, self._calibration_problem = calibration.stamp_ns, ""
 
     def _is_delivered(self) -> bool:
         return self._spool.counters()["depth"] == 0

@@ -1,10 +1,14 @@
-"""When and where a sample is made: one per stretch driven, placed where the ground produced the estimate."""
+"""When and where a sample is made: one per stretch driven, where the machine was, with the estimate of that ground.
+
+It is made a little later than the machine was there, as long as the estimator wants to look ahead.
+"""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,23 +16,25 @@ import numpy as np
 from agents.estimation.ground import GroundEstimate
 from agents.localisation.belief import PoseBelief
 from protocol.arrays import Table
+from protocol.readings import Encoder, Odometry, Reading
 from protocol.samples import SAMPLE_DTYPE
 
 NOTHING = np.empty(0, SAMPLE_DTYPE)
+SILENT_NS = 500_000_000  # wheels that say nothing for so long are not there
+MIN_SPEED_MPS = 0.3  # of a way by the filter's speed alone: below it, it is noise
 
 
 @dataclass(frozen=True)
 class SamplingConfig:
     """When samples are made.
 
-    every_m: one sample per so many metres driven. lag_s: how long ago the ground produced an estimate.
-    max_pitch_rate_radps: while the slope changes faster, samples are withheld. max_std_m: samples of a position less
-    sure than this are withheld. history_s: how long poses are remembered.
+    every_m: one sample per so many metres driven. lag_s: how much later a sample is made than the machine was there, so
+    that the estimator has seen what came next. max_std_m: samples of a position less sure than this are withheld.
+    history_s: how long poses are remembered.
     """
 
     every_m: float = 0.5
-    lag_s: float = 0.6
-    max_pitch_rate_radps: float = 0.026
+    lag_s: float = 1.5
     max_std_m: float = 20.0
     history_s: float = 30.0
 
@@ -42,11 +48,10 @@ class SamplingConfig:
 
 @dataclass(frozen=True)
 class Mark:
-    """An estimate that wants a place: made at stamp_ns, after distance_m more metres driven."""
+    """A place that wants an estimate: where the machine was at stamp_ns, after distance_m more metres driven."""
 
     stamp_ns: int
     distance_m: float
-    estimate: GroundEstimate
 
 
 class PoseHistory:
@@ -79,58 +84,84 @@ class PoseHistory:
         return _interpolate(self._poses[i - 1], self._poses[i], stamp_ns)
 
 
+class Way:
+    """Counts the way driven, up in reverse too: by the wheels, or by the filter's speed while they are silent."""
+
+    def __init__(self) -> None:
+        self._way_m = self._wheels_m = 0.0
+        self._wheels_ns = self._counted_ns = 0
+
+    def update(self, reading: Reading, wheels_m: float, speed_mps: float) -> float:
+        """Take in a reading, the way of the wheels so far and the filter's speed; returns the way [m]."""
+        now_ns = reading.stamp_ns
+        if isinstance(reading, Encoder | Odometry):
+            self._wheels_ns = now_ns
+        self._way_m += wheels_m - self._wheels_m
+        self._wheels_m = wheels_m
+        if now_ns - self._wheels_ns > SILENT_NS and abs(speed_mps) > MIN_SPEED_MPS:
+            since_ns = max(self._wheels_ns, self._counted_ns)
+            self._way_m += abs(speed_mps) * max(now_ns - since_ns, 0) * 1e-9
+        self._counted_ns = max(self._counted_ns, now_ns)
+        return self._way_m
+
+
 class Sampler:
-    """Makes samples from estimates and poses. `withheld` counts what was not sampled, by reason."""
+    """Makes samples; counts by reason what is `withheld` and what is sampled `without_resistance`."""
 
     def __init__(self, load_centre_m: float, config: SamplingConfig) -> None:
         self.withheld: Counter[str] = Counter()
+        self.without_resistance: Counter[str] = Counter()
         self.poses = PoseHistory(config.history_s)
         self._load_centre_m = load_centre_m
         self._config = config
+        self._lag_ns = round(config.lag_s * 1e9)
         self._way_m = 0.0
-        self._marks: deque[Mark] = deque()
+        self._marks: deque[Mark] = deque()  # wait for the estimator
+        self._estimated: deque[tuple[Mark, GroundEstimate]] = deque()  # wait for a pose
 
     @property
     def waiting(self) -> int:
-        """How many marks have no place yet."""
-        return len(self._marks)
+        """How many marks are not sampled yet."""
+        return len(self._marks) + len(self._estimated)
 
     def is_due(self, way_m: float) -> bool:
         """Whether the machine has driven far enough since the last mark; way_m counts up in reverse too."""
         return way_m - self._way_m >= self._config.every_m
 
-    def mark(self, stamp_ns: int, way_m: float, estimate: GroundEstimate) -> None:
-        """Note an estimate that is due."""
+    def mark(self, stamp_ns: int, way_m: float) -> None:
+        """Note that a sample is due."""
         distance_m = way_m - self._way_m
         self._way_m = way_m
-        if abs(estimate.pitch_rate_radps) > self._config.max_pitch_rate_radps:
-            self.withheld["pitch_transient"] += 1
-            return
-        self._marks.append(Mark(stamp_ns, min(distance_m, 2 * self._config.every_m), estimate))
+        self._marks.append(Mark(stamp_ns, min(distance_m, 2 * self._config.every_m)))
 
-    def take(self) -> Table:
-        """Samples (n,) of all marks whose place is known by now."""
+    def take(self, now_ns: int, estimate_at: Callable[[int], GroundEstimate], *, waits: bool = True) -> Table:
+        """Samples (n,) of all marks whose ground and place are known; waits: only of those that are lag_s old."""
+        while self._marks and self._marks[0].stamp_ns <= now_ns - self._lag_ns * waits:
+            mark = self._marks.popleft()
+            self._estimated.append((mark, estimate_at(mark.stamp_ns)))
         newest = self.poses.newest
-        if not self._marks or not newest or self._place_ns(self._marks[0]) > newest.stamp_ns:
+        if not self._estimated or not newest or self._estimated[0][0].stamp_ns > newest.stamp_ns:
             return NOTHING
         rows = []
-        while self._marks and self._place_ns(self._marks[0]) <= newest.stamp_ns:
-            mark = self._marks.popleft()
-            if pose := self.poses.at(self._place_ns(mark)):
-                rows += self._sample(mark, pose)
+        while self._estimated and self._estimated[0][0].stamp_ns <= newest.stamp_ns:
+            mark, estimate = self._estimated.popleft()
+            if pose := self.poses.at(mark.stamp_ns):
+                rows += self._sample(mark, pose, estimate)
             else:
                 self.withheld["no_pose"] += 1
         return np.array(rows, SAMPLE_DTYPE)
 
-    def _place_ns(self, mark: Mark) -> int:
-        return mark.stamp_ns - round(self._config.lag_s * 1e9)
-
-    def _sample(self, mark: Mark, pose: PoseBelief) -> list[tuple[float, ...]]:
+    def _sample(self, mark: Mark, pose: PoseBelief, e: GroundEstimate) -> list[tuple[float, ...]]:
         (xx, xy), (_, yy) = pose.covariance_m2
         if max(xx, yy) > self._config.max_std_m**2:
             self.withheld["unsure_position"] += 1
             return []
-        c, s, e = math.cos(pose.heading_rad), math.sin(pose.heading_rad), mark.estimate
+        if e.is_blurred:
+            self.withheld[e.reason] += 1
+            return []
+        if e.reason:
+            self.without_resistance[e.reason] += 1
+        c, s = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         x, y = pose.x_m + c * self._load_centre_m, pose.y_m + s * self._load_centre_m
         grade = (c * e.slope_x - s * e.slope_y, s * e.slope_x + c * e.slope_y, e.slope_var)
         place = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)

@@ -61,7 +61,10 @@ def _start() -> Belief:
 
 
 def _own(kind: Filter) -> dict[str, Step]:
-    """What an agent does for each step, the making of the motion and of the measurement included."""
+    """What an agent does for each step, the making of the motion and of the measurement included.
+
+    As in a drive a step finds the factor of its belief's covariance, and computes that of the belief it makes.
+    """
     belief = _start()
     steps: dict[str, Step] = {"predict": lambda: kind.predict(belief, motion(LAYOUT, CONFIG, belief, DT_S), 10_000_000)}
     for name, states in MEASURED.items():

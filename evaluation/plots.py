@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from evaluation.configurations import Configuration
-from evaluation.recordings import MACHINE
+from evaluation.recordings import track_file
 from evaluation.replay import Truth, read_track
 from evaluation.table import TRACE_S, Outcome
 from protocol.arrays import Floats
@@ -148,7 +148,7 @@ def _over_seeds(outcomes: Sequence[Outcome]) -> tuple[Floats, Floats, Floats]:
 def draw_tracks(outcomes: Sequence[Outcome]) -> Figure:
     """Truth and estimates of one recording from above, one panel per set of sensors."""
     drive = outcomes[0].task.drive
-    truth = read_track(drive.folder(outcomes[0].task.cache) / "truth" / "tracks" / f"{MACHINE}.csv")
+    truth = read_track(track_file(drive.folder(outcomes[0].task.cache)))
     groups = _groups(outcomes)
     columns = min(3, len(groups))
     lines = -(-len(groups) // columns)

@@ -1,11 +1,12 @@
-"""Recordings of the paper's site, one machine on one tour each, kept so that every configuration sees the same."""
+"""Recordings of one machine on one route each, kept so that every configuration sees the same."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,50 +18,73 @@ from protocol.logfolder import open_log
 from protocol.machine import MachineConfig
 from protocol.readings import Reading
 from protocol.site import SiteConfig
-from sim.config import SimConfig, resolve
+from sim.config import SimConfig
 from sim.presets import load_preset
 from sim.recorder import record
+from sim.scenario import FleetConfig, Scenario
+from sim.scenario_file import load_scenario
 
 ROOT = Path(__file__).parents[1]
-SCENARIO, MACHINE = "paper_site", "loader"
-TOURS = ("west", "east", "middle")
-GPS, IMU = (1, 2, 3), (3, 4, 1)  # IMUs 3 and 4 sit under the rear frame, which is `base_link`, 1 under the front one
-FLEET = """base = "{scenario}"
+MACHINE = "loader"
 
-[[fleet]]
-name = "{machine}"
-routes = ["{tour}"]
-preset = "{preset}"
-gps = {gps}
-imu = {imu}
-attitude = {imu}
-"""
+
+@dataclass(frozen=True)
+class Setup:
+    """What all drives of an experiment share: a scenario, routes that take turns with the seeds, and sensors.
+
+    Everything else of the machine is as the scenario's first fleet has it. world: over the scenario's.
+    """
+
+    scenario: str
+    routes: tuple[str, ...]
+    gps: tuple[int, ...]
+    imu: tuple[int, ...]
+    attitude: tuple[int, ...] = ()
+    world: str | None = None
+
+
+# IMUs 3 and 4 sit under the rear frame, which is `base_link`, 1 under the front one.
+PAPER = Setup("paper_site", ("west", "east", "middle"), gps=(1, 2, 3), imu=(3, 4, 1), attitude=(3, 4, 1))
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What is recorded: one machine with all sensors on one tour; tours take turns with the seeds."""
+    """What is recorded: one machine on one route."""
 
     seed: int
     seconds: float
     preset: str = "paper"
+    setup: Setup = PAPER
 
     @property
     def tour(self) -> str:
         """Name of the route."""
-        return TOURS[self.seed % len(TOURS)]
+        return self.setup.routes[self.seed % len(self.setup.routes)]
+
+    @property
+    def fleet(self) -> FleetConfig:
+        """The machine, its route and sensors."""
+        s = self.setup
+        first = replace(_scenario(s.scenario).fleet[0], name=MACHINE, count=None, other_way=False)
+        return replace(first, routes=(self.tour,), preset=self.preset, gps=s.gps, imu=s.imu, attitude=s.attitude)
 
     @property
     def scenario_toml(self) -> str:
         """The scenario file of this drive."""
-        tour, preset = self.tour, self.preset
-        return FLEET.format(scenario=SCENARIO, machine=MACHINE, tour=tour, preset=preset, gps=list(GPS), imu=list(IMU))
+        setup = self.setup
+        top = {"base": setup.scenario, "world": setup.world}
+        return f"{_toml(top)}\n\n[[fleet]]\n{_toml(vars(self.fleet))}\n"
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of this drive; its ground is what an evaluation may know."""
+        alone = replace(_scenario(self.setup.scenario), fleet=(self.fleet,), fault=(), names=())
+        return replace(alone, world=self.setup.world or alone.world, seed=self.seed, seconds=self.seconds)
 
     @property
     def machine(self) -> MachineConfig:
         """What an agent may know of the machine."""
-        every = SimConfig(SCENARIO, machines=1, names=(MACHINE,), preset=self.preset, gps=GPS, imu=IMU, attitude=IMU)
-        return resolve(every).rigs()[0].machine
+        return self.scenario.rigs()[0].machine
 
     def folder(self, cache_dir: Path) -> Path:
         """Where the recording lies; another simulator, another folder."""
@@ -98,10 +122,15 @@ def make(drive: Drive, cache_dir: Path) -> Path:
 def load(folder: Path) -> Recording:
     """Read what `make` wrote, all sensors of it."""
     log = open_log(folder / "logs" / MACHINE)
-    track = folder / "truth" / "tracks" / f"{MACHINE}.csv"
+    track = track_file(folder)
     first = np.genfromtxt(track, delimiter=",", names=True, max_rows=1)
     start = (float(first["x"]), float(first["y"]), float(first["yaw"]))
     return Recording(log.site, log.machine, tuple(log.readings()), read_track(track), start)
+
+
+def track_file(folder: Path) -> Path:
+    """Where a recording keeps the machine's true way."""
+    return folder / "truth" / "tracks" / f"{MACHINE}.csv"
 
 
 def gps_error(preset: str) -> dict[str, Any]:
@@ -130,6 +159,16 @@ def code_version(*names: str) -> str:
 def digest(*texts: str) -> str:
     """Ten hex digits that tell texts apart."""
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:10]
+
+
+@cache
+def _scenario(name: str) -> Scenario:
+    return load_scenario(name)
+
+
+def _toml(values: Mapping[str, Any]) -> str:
+    """Plain values as TOML keys, those that are None left out."""
+    return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items() if value is not None)
 
 
 def _sources(path: Path) -> Iterable[Path]:

@@ -51,9 +51,12 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
 
 def section(table: dict[str, Any], name: str, where: str) -> dict[str, Any]:
     """Take the sub-table `name` out of `table`, empty where it is absent."""
-    value = table.pop(name, {})
+    return _table(table.pop(name, {}), f"{where} {name}")
+
+
+def _table(value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ConfigError(f"{where} {name}", f"a table is expected, not {type(value).__name__}")
+        raise ConfigError(where, f"a table is expected, not {type(value).__name__}")
     return value
 
 
@@ -63,10 +66,11 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         return _convert(value, next(a for a in typing.get_args(hint) if a is not type(None)), where)
     if origin is tuple:
         return _convert_tuple(value, typing.get_args(hint), where)
+    if origin is Mapping:
+        _, of = typing.get_args(hint)
+        return {name: _convert(v, of, f"{where}.{name}") for name, v in _table(value, where).items()}
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        if not isinstance(value, dict):
-            raise ConfigError(where, f"a table is expected, not {type(value).__name__}")
-        return from_table(hint, value, where)
+        return from_table(hint, _table(value, where), where)
     if hint is float and type(value) is int:
         return float(value)
     if hint is float and type(value) is float and not math.isfinite(value):

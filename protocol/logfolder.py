@@ -209,6 +209,7 @@ def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
         "",
         "[site]",
         *plain_lines(site),
+        *_known_ground(site),
         "",
         "[machine]",
         *plain_lines(machine),
@@ -217,3 +218,15 @@ def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
         lines += ["", "[[sensor]]", *sensor_lines(sensor), f'file = "{sensor.name}.csv"', "[sensor.columns]"]
         lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(sensor.kind))]
     return "\n".join(lines) + "\n"
+
+
+def _known_ground(site: SiteConfig) -> list[str]:
+    areas = [
+        f"{{ name = {json.dumps(area.name)}, c_rr = {float(area.c_rr)!r}, outline = {_floats(area.outline)} }}"
+        for area in site.known_ground
+    ]
+    return [f"known_ground = [{', '.join(areas)}]"] if areas else []
+
+
+def _floats(points: Iterable[Iterable[float]]) -> list[list[float]]:
+    return [[float(value) for value in point] for point in points]

@@ -17,9 +17,20 @@ from protocol.readings import KINDS
 from protocol.site import NAME
 
 BASE, FRONT = "base_link", "front_link"
-# What readings of a kind say, by name, where a sensor may give a part of it: an IMU without an accelerometer, an
-# orientation whose heading is of no use.
-GIVES = {"imu": ("rate", "force"), "attitude": ("tilt", "heading")}
+# What readings of a kind say of the motion, by name. A sensor may give a part of it: an IMU without an accelerometer,
+# an orientation whose heading is of no use.
+GIVES = {
+    "gps": ("position",),
+    "imu": ("rate", "force"),
+    "attitude": ("tilt", "heading"),
+    "odometry": ("speed", "rate"),
+    "encoder": ("speed",),
+    "steering": ("rate",),
+}
+# How values are meant. Differential: successive ones make a rate. Relative: the first is what the filter believes at
+# that moment, later ones count from it (Moore & Stouch, robot_localization).
+MODES = ABSOLUTE, DIFFERENTIAL, RELATIVE = ("absolute", "differential", "relative")
+WITH_MODE = ("gps", "attitude")
 
 
 @dataclass(frozen=True)
@@ -46,11 +57,13 @@ class SensorConfig:
     """One sensor of a machine.
 
     name: as readings carry it. use: false leaves the sensor's readings aside. gives: what of its readings is meant, by
-    the names in GIVES; empty: all. delay_s: how much later than it was true a reading is stamped. gate_sigma: refused
-    if further off than so many standard deviations; 0: as the filter's options say. frame: which frame of an
+    the names in GIVES; empty: all. std: standard deviations by these names, instead of what readings state or the
+    filter's options say: `position` [m]; `tilt`, `heading` [rad]; `rate` [rad/s]; `force` [m/s2]; `speed` [m/s].
+    mode: one of MODES, for GPS and attitude. delay_s: how much later than it was true a reading is stamped. gate_sigma:
+    refused if further off than so many standard deviations; 0: as the filter's options say. frame: which frame of an
     articulated machine carries it; `front_link` starts at the joint, at the height of the wheels' hubs. drift_share,
-    drift_time_s: of a GPS receiver, the share of its stated variance that is a slow error, and that error's
-    correlation time. ticks_per_rev: of an encoder.
+    drift_time_s: of a GPS receiver, the share of its variance that is a slow error, and that error's correlation time.
+    ticks_per_rev: of an encoder.
     """
 
     name: str
@@ -58,6 +71,8 @@ class SensorConfig:
     mount: Mount = field(default_factory=Mount)
     use: bool = True
     gives: tuple[str, ...] = ()
+    std: Mapping[str, float] = field(default_factory=dict, hash=False)
+    mode: str = ABSOLUTE
     delay_s: float = 0.0
     gate_sigma: float = 0.0
     frame: str = BASE
@@ -70,8 +85,7 @@ class SensorConfig:
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
         if self.kind not in KINDS:
             raise ValueError(f"kind: {self.kind!r} is none of {', '.join(KINDS)}")
-        if unknown := sorted(set(self.gives) - set(GIVES.get(self.kind, ()))):
-            raise ValueError(f"gives: {self.kind} has no {unknown[0]!r}, but {', '.join(GIVES.get(self.kind, ()))}")
+        self._check_meaning()
         if self.frame not in (BASE, FRONT):
             raise ValueError(f"frame: {self.frame!r} is neither {BASE} nor {FRONT}")
         if not (0 <= self.delay_s <= 10 and 0 <= self.gate_sigma <= 1000):
@@ -80,6 +94,20 @@ class SensorConfig:
             raise ValueError(f"drift_share: {self.drift_share} is not between 0 and 1")
         if self.drift_time_s <= 0 or self.ticks_per_rev <= 0:
             raise ValueError("drift_time_s and ticks_per_rev must be positive")
+
+    def _check_meaning(self) -> None:
+        """Refuse names and modes that its kind does not have."""
+        known = GIVES.get(self.kind, ())
+        for option, names in (("gives", self.gives), ("std", self.std)):
+            if unknown := sorted(set(names) - set(known)):
+                instead = ", ".join(known) or "nothing"
+                raise ValueError(f"{option}: {self.name}: {self.kind} has no {unknown[0]!r}, but {instead}")
+        for name, std in self.std.items():
+            if not 0 < std < math.inf:
+                raise ValueError(f"std: {self.name}: {name} must be positive and finite, not {std}")
+        modes = MODES if self.kind in WITH_MODE else (ABSOLUTE,)
+        if self.mode not in modes:
+            raise ValueError(f"mode: {self.name}: {self.kind} has no {self.mode!r}, but {', '.join(modes)}")
 
     def says(self, name: str) -> bool:
         """Whether its readings mean this, one of GIVES."""
@@ -92,6 +120,11 @@ class MachineConfig:
 
     load_centre_m: how far ahead of `base_link` the wheel loads' centre lies. rotating_mass_factor: mass plus the
     wheels' inertia over mass. A machine without a drive torque sensor needs no mass.
+
+    The rest, 0 where not known: wheelbase_m: from the rear axle to the front one, straight ahead. axle_stiffness_npm:
+    vertical, of the two tyres of one axle together. cog_height_m: of the empty machine's centre of mass above the
+    ground. payload_x_m, payload_z_m: where the centre of what it carries lies, ahead of `base_link` when it stands
+    straight, and above the ground.
     """
 
     name: str
@@ -99,6 +132,11 @@ class MachineConfig:
     wheel_radius_m: float = 0.75
     load_centre_m: float = 1.5
     rotating_mass_factor: float = 1.07
+    wheelbase_m: float = 0.0
+    axle_stiffness_npm: float = 0.0
+    cog_height_m: float = 0.0
+    payload_x_m: float = 0.0
+    payload_z_m: float = 0.0
     sensors: tuple[SensorConfig, ...] = ()
 
     def __post_init__(self) -> None:
@@ -108,6 +146,11 @@ class MachineConfig:
             raise ValueError("mass_kg and wheel_radius_m must be positive")
         if self.rotating_mass_factor < 1:
             raise ValueError("rotating_mass_factor: below 1")
+        for name in ("wheelbase_m", "axle_stiffness_npm", "cog_height_m", "payload_z_m"):
+            if not 0 <= getattr(self, name) < math.inf:  # also false for NaN
+                raise ValueError(f"{name}: {getattr(self, name)!r} is not a positive number, nor 0 for not known")
+        if not self.wheelbase_m and (blind := [s.name for s in self.sensors if s.kind == "steering" and s.use]):
+            raise ValueError(f"wheelbase_m: {blind[0]}: steering is of no use without it, so give it or `use = false`")
         names = [s.name for s in self.sensors]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise ValueError(f"sensors: two are named {twice[0]!r}")
@@ -128,7 +171,9 @@ def parse_machine(table: Mapping[str, Any], sensors: tuple[SensorConfig, ...], w
 def sensor_lines(sensor: SensorConfig) -> list[str]:
     """The keys of one sensor as TOML."""
     xyz_m, rpy_deg = ([float(v) for v in values] for values in (sensor.mount.xyz_m, sensor.mount.rpy_deg))
-    return [*plain_lines(sensor), f"mount = {{ xyz_m = {xyz_m}, rpy_deg = {rpy_deg} }}"]
+    std = ", ".join(f"{name} = {float(value)}" for name, value in sensor.std.items())
+    table = f"std = {{ {std} }}" if std else "std = {}"
+    return [*plain_lines(sensor), table, f"mount = {{ xyz_m = {xyz_m}, rpy_deg = {rpy_deg} }}"]
 
 
 def machine_toml(machine: MachineConfig) -> str:

@@ -132,8 +132,28 @@ class Articulation(Reading):
     angle_rad: float
 
 
+@dataclass(frozen=True, slots=True)
+class Payload(Reading):
+    """What the machine carries, as its weighing system states it."""
+
+    kind: ClassVar[str] = "payload"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"payload_kg": (0, 500_000)}
+
+    payload_kg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Steering(Reading):
+    """Angle of the front wheels against straight ahead, as of one in the middle, positive to the left."""
+
+    kind: ClassVar[str] = "steering"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"angle_rad": (-1.5, 1.5)}  # across there is no turn rate
+
+    angle_rad: float
+
+
 KINDS: dict[str, type[Reading]] = {
-    cls.kind: cls for cls in (Gps, Imu, Attitude, Odometry, Encoder, Torque, Articulation)
+    cls.kind: cls for cls in (Gps, Imu, Attitude, Odometry, Encoder, Torque, Articulation, Steering, Payload)
 }
 
 

@@ -23,11 +23,39 @@ NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 
 
 @dataclass(frozen=True)
+class KnownGround:
+    """An area of known rolling resistance, on which machines calibrate themselves. outline: corners in `map` [m]."""
+
+    name: str
+    c_rr: float
+    outline: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.c_rr <= 1:
+            raise ValueError(f"c_rr: {self.c_rr} is not between 0 and 1")
+        if len(self.outline) < 3:
+            raise ValueError(f"outline: {self.name}: {len(self.outline)} corners are no area")
+
+    def inside_m(self, x_m: float, y_m: float) -> float:
+        """How far inside of the outline a place lies [m]; negative outside."""
+        corners = np.array(self.outline)
+        ways = np.roll(corners, -1, axis=0) - corners
+        off = np.array([x_m, y_m]) - corners
+        share = np.clip((off * ways).sum(axis=1) / np.maximum((ways**2).sum(axis=1), 1e-12), 0, 1)
+        edge_m = float(np.hypot(*(off - share[:, None] * ways).T).min())
+        above, next_above = off[:, 1] < 0, np.roll(off[:, 1], -1) < 0
+        left = ways[:, 0] * off[:, 1] - ways[:, 1] * off[:, 0]
+        crossings = (above != next_above) & ((left < 0) == next_above)
+        return edge_m if crossings.sum() % 2 else -edge_m
+
+
+@dataclass(frozen=True)
 class SiteConfig:
     """One construction site.
 
     clock: "data" takes the newest accepted stamp as now, "wall" also refuses stamps beyond the wall clock.
-    extent_m: positions further than this from the origin, east or north, are refused.
+    extent_m: positions further than this from the origin, east or north, are refused. known_ground: where the rolling
+    resistance is known.
     """
 
     name: str
@@ -39,6 +67,7 @@ class SiteConfig:
     extent_m: float = 20_000.0
     clock: str = "data"
     clock_tolerance_s: float = 5.0
+    known_ground: tuple[KnownGround, ...] = ()
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):

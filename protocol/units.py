@@ -22,6 +22,8 @@ _UNITS: dict[str, dict[str, float]] = {
     "Nm": {"_nm": 1.0},
     "kNm": {"_nm": 1e3},
     "ticks": {"_ticks": 1.0},
+    "kg": {"_kg": 1.0},
+    "t": {"_kg": 1e3},
 }
 _NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 

@@ -10,7 +10,7 @@ import numpy as np
 from protocol.arrays import Floats
 from sim.machine_model import WHEELS, MachineModel
 from sim.multibody import MultiBodies
-from sim.observe import Drive, observe
+from sim.observe import Burden, Drive, observe
 from sim.rigid import POINT_FRAME, Ground, look
 from sim.soil import TRACTION
 from sim.terrain import Terrain
@@ -47,7 +47,7 @@ class BulletWorld:
         self._terrain, self._bodies, self._chassis = terrain, bodies, chassis_of(models)
         mass_factor = bodies.mass_kg / np.array([m.mass_kg for m in models])
         self._multi = MultiBodies(models, mass_factor, _standing(terrain, models, starts), STEP_S)
-        self._payload_kg = np.zeros(len(models))
+        self._burden = Burden(bodies.mass_kg, np.zeros(len(models)))
         for machine in range(len(models)):
             self.set_payload(machine, 0.0)
 
@@ -61,7 +61,7 @@ class BulletWorld:
         wheels = np.zeros((len(models), 2))
         self._inputs = Inputs(zero, zero, zero)
         self._state = observe(
-            self._scene, self._scene, self._wheel_load_n, self._mass_kg, Drive(zero, zero, wheels, wheels)
+            self._scene, self._scene, self._wheel_load_n, self._burden, Drive(zero, zero, wheels, wheels)
         )
         for _ in range(SETTLE_STEPS):
             self.advance(zero, zero, hold)
@@ -80,8 +80,9 @@ class BulletWorld:
     def set_payload(self, machine: int, payload_kg: float) -> None:
         """Change what one machine carries."""
         self._multi.set_payload(machine, payload_kg)
-        self._payload_kg[machine] = payload_kg
-        self._mass_kg = self._bodies.mass_kg + self._payload_kg
+        carried = self._burden.payload_kg.copy()  # past states keep theirs
+        carried[machine] = payload_kg
+        self._burden = Burden(self._bodies.mass_kg + carried, carried)
 
     def set_terrain(self, terrain: Terrain) -> None:
         """Change the ground under the machines."""
@@ -109,7 +110,7 @@ class BulletWorld:
         rear = self._rolling.spin_radps[:, 2:]
         turned = self._state.wheel_rad + STEP_S * rear
         drive = Drive(self._inputs.drive_n, forces.torque_nm.sum(axis=-1), rear, turned)
-        self._state = observe(before, self._scene, self._wheel_load_n, self._mass_kg, drive)
+        self._state = observe(before, self._scene, self._wheel_load_n, self._burden, drive)
         return self._state
 
     def _obey(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> Inputs:

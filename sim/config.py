@@ -22,9 +22,9 @@ class SimConfig:
     """What is simulated, and how fast. Options that are None are as the scenario says.
 
     scenario: a name of `sim/scenarios/`, or the path of a TOML file. machines: of the scenario's first fleet. names: of
-    all machines. seconds: simulated time, 0 runs until stopped. preset, drive_mps, gps, imu, attitude: of every fleet.
-    speed: times real time, 0 as fast as possible. wait_s: how long to wait for a subscriber of every machine before
-    driving.
+    all machines. seconds: simulated time, 0 runs until stopped. preset, drive_mps, gps, imu, attitude, payload: of
+    every fleet. speed: times real time, 0 as fast as possible. wait_s: how long to wait for a subscriber of every
+    machine before driving.
     """
 
     scenario: str = "paper_site"
@@ -39,6 +39,7 @@ class SimConfig:
     gps: tuple[int, ...] | None = None
     imu: tuple[int, ...] | None = None
     attitude: tuple[int, ...] | None = None
+    payload: bool | None = None
     speed: float = 1.0
     bundle_ms: int = 50
     start_ns: int = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
@@ -87,7 +88,7 @@ def resolve(config: SimConfig) -> Scenario:
 
 
 def _fleet(fleet: FleetConfig, config: SimConfig) -> FleetConfig:
-    over = {name: getattr(config, name) for name in ("preset", "drive_mps", "gps", "imu", "attitude")}
+    over = {name: getattr(config, name) for name in ("preset", "drive_mps", "gps", "imu", "attitude", "payload")}
     kept = {name: value for name, value in over.items() if value is not None}
     return _replace(fleet, f"scenario {config.scenario}", **kept)
 

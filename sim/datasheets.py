@@ -133,6 +133,20 @@ class ArticulationNoise:
 
 
 @dataclass(frozen=True)
+class PayloadNoise:
+    """A weighing system: white noise, and an error of the scale (of 1) drawn once."""
+
+    rate_hz: int
+    white_kg: float
+    scale: float
+
+    def __post_init__(self) -> None:
+        _check_rate(self)
+        _check(self, _STD, "white_kg")
+        _check(self, (0, 0.5), "scale")
+
+
+@dataclass(frozen=True)
 class BodySpread:
     """How bodies differ from their nominal: mass, evenly up to this share; wheel radius, standard deviation (of 1)."""
 

@@ -1,4 +1,4 @@
-"""Sensors of the drive train: wheel encoders, drive torque, angle of the joint."""
+"""Sensors of the machine itself: wheel encoders, drive torque, angle of the joint, weight of what it carries."""
 
 from __future__ import annotations
 
@@ -64,3 +64,19 @@ class ArticulationBank(Bank):
         noise = self._zero_rad + self._white_rad * self._draws.take(len(steps))
         values: Floats = self.pick(states.articulation_rad, rows) + noise
         return values
+
+
+class PayloadBank(Bank):
+    """What the machine carries, as its weighing system states it: never less than nothing."""
+
+    def __init__(self, units: Sequence[Unit]) -> None:
+        super().__init__(units)
+        self._white_kg, scale = np.array([(u.rig.preset.payload.white_kg, u.rig.preset.payload.scale) for u in units]).T
+        self._scale = 1 + scale * self.per_unit(lambda unit: unit.rng.standard_normal())
+        self._draws = Draws([unit.rng for unit in units], 1)
+
+    def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
+        """Weight of the payload."""
+        noise = self._white_kg * self._draws.take(len(steps))
+        weighed: Floats = np.maximum(self._scale * self.pick(states.payload_kg, rows) + noise, 0.0)
+        return weighed

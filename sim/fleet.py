@@ -59,12 +59,14 @@ class Fleet:
         drive = drive_force_n(chassis, drive_n, rows[k.DRIVE], rows[k.GRIP])
         brake, machines, ground = np.ascontiguousarray(brake_n, float), self._machines, self._terrain.grid
         self._rows = k.advance(_CONSTANTS, _SOILS, machines, ground, rows, steering, drive, brake)
-        self._state = _state(self._rows, self._weight.mass_kg)
+        self._state = _state(self._rows, self._weight.mass_kg, self._payload_kg)
         return self._state
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
         """Change what one machine carries."""
-        self._payload_kg[machine] = payload_kg
+        carried = self._payload_kg.copy()  # past states keep theirs
+        carried[machine] = payload_kg
+        self._payload_kg = carried
         self._weigh()
 
     def set_terrain(self, terrain: Terrain) -> None:
@@ -91,7 +93,7 @@ class Fleet:
         self._machines = np.array(values, float)  # rows of `kernels.Machine`
 
 
-def _state(rows: Floats, mass_kg: Floats) -> FleetState:
+def _state(rows: Floats, mass_kg: Floats, payload_kg: Floats) -> FleetState:
     return FleetState(
         x_m=rows[k.X],
         y_m=rows[k.Y],
@@ -113,6 +115,7 @@ def _state(rows: Floats, mass_kg: Floats) -> FleetState:
         torque_nm=rows[k.TORQUE],
         load_n=rows[k.LOAD],
         mass_kg=mass_kg,
+        payload_kg=payload_kg,
         wheel_radps=rows[k.SPIN : k.SPIN + 2].T,
         wheel_rad=rows[k.TURNED : k.TURNED + 2].T,
         c_rr=rows[k.C_RR],

@@ -56,11 +56,13 @@ def machine_config(
     gps: tuple[int, ...],
     imu: tuple[int, ...],
     attitude: tuple[int, ...],
+    *,
+    payload: bool = False,
 ) -> MachineConfig:
     """Describe a machine of a kind as its agent knows it; sensors by the numbers that the model's URDF gives them.
 
-    attitude: IMUs that also say their orientation. Fast sensors stand first: readings of one stamp then have the same
-    order live, in bundles and in log folders.
+    attitude: IMUs that also say their orientation. payload: whether it weighs what it carries. Fast sensors stand
+    first: readings of one stamp then have the same order live, in bundles and in log folders.
     """
     ticks = preset.encoder.ticks_per_rev
     sensors = [_inertial("imu", number, model) for number in imu]
@@ -68,12 +70,19 @@ def machine_config(
     sensors += [SensorConfig("torque", "torque"), SensorConfig("wheels", "encoder", ticks_per_rev=ticks)]
     sensors += [SensorConfig("articulation", "articulation")]
     sensors += [_receiver(number, model, preset.gps) for number in gps]
+    sensors += [SensorConfig("payload", "payload")] if payload else []
+    payload_x_m, _, payload_z_m = np.round(model.payload_centre_m, 2).tolist()  # no finer than a data sheet
     return MachineConfig(
         name,
         mass_kg=model.mass_kg,
         wheel_radius_m=model.wheel_radius_m,
         load_centre_m=model.load_centre_m,
         rotating_mass_factor=model.rotating_mass_factor,
+        wheelbase_m=round(model.wheelbase_m, 3),
+        axle_stiffness_npm=2 * model.tyre_stiffness_npm,
+        cog_height_m=round(model.centre_height_m(), 2),
+        payload_x_m=payload_x_m,
+        payload_z_m=payload_z_m,
         sensors=tuple(sorted(sensors, key=lambda sensor: -preset.rate_hz(sensor.kind))),
     )
 

@@ -25,7 +25,15 @@ class Drive:
     wheel_rad: Floats
 
 
-def observe(before: Scene, now: Scene, load_n: Floats, mass_kg: Floats, drive: Drive) -> FleetState:
+@dataclass(frozen=True, slots=True)
+class Burden:
+    """What machines weigh with their payload, and the payload alone, both (n,)."""
+
+    mass_kg: Floats
+    payload_kg: Floats
+
+
+def observe(before: Scene, now: Scene, load_n: Floats, burden: Burden, drive: Drive) -> FleetState:
     """Read off the state of machines. load_n: of each wheel, (n, 4).
 
     Accelerations are differences over the step, as an accelerometer that averages over its interval has them.
@@ -58,7 +66,8 @@ def observe(before: Scene, now: Scene, load_n: Floats, mass_kg: Floats, drive: D
         drive_n=drive.drive_n,
         torque_nm=drive.torque_nm,
         load_n=load,
-        mass_kg=mass_kg,
+        mass_kg=burden.mass_kg,
+        payload_kg=burden.payload_kg,
         wheel_radps=drive.wheel_radps,
         wheel_rad=drive.wheel_rad,
         c_rr=(C_RR[now.ground.zone] * load_n).sum(axis=-1) / np.maximum(load, 1.0),

@@ -11,7 +11,16 @@ from typing import Any
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from protocol.site import NAME
-from sim.datasheets import ArticulationNoise, AttitudeNoise, BodySpread, EncoderNoise, GpsNoise, ImuNoise, TorqueNoise
+from sim.datasheets import (
+    ArticulationNoise,
+    AttitudeNoise,
+    BodySpread,
+    EncoderNoise,
+    GpsNoise,
+    ImuNoise,
+    PayloadNoise,
+    TorqueNoise,
+)
 
 LIBRARY = Path(__file__).parent / "presets.toml"
 
@@ -27,6 +36,7 @@ class Preset:
     encoder: EncoderNoise
     torque: TorqueNoise
     articulation: ArticulationNoise
+    payload: PayloadNoise
     body: BodySpread
 
     def __post_init__(self) -> None:

@@ -64,7 +64,8 @@ class FleetConfig:
     """Machines of one kind. name: of a single one; counted ones are numbered, name-1, name-2, ...
 
     routes: taken in turn; other_way: every second lap of turns the other way round. start: share of the cycle at which
-    the first begins. gps, imu, attitude: numbers of the sensors, as the machine's URDF has them.
+    the first begins. gps, imu, attitude: numbers of the sensors, as the machine's URDF has them. payload: whether they
+    weigh what they carry; None: if it changes on a route of theirs.
     """
 
     name: str
@@ -78,6 +79,7 @@ class FleetConfig:
     gps: tuple[int, ...] = (1, 2)
     imu: tuple[int, ...] = (3,)
     attitude: tuple[int, ...] = ()
+    payload: bool | None = None
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -174,7 +176,8 @@ class Scenario:
         faults = {f.machine: f for f in self.fault}
         for fleet, name in zip(self._fleets(), self.machine_names, strict=True):
             model, preset = load_model(fleet.model), self.preset(fleet.preset)
-            config = machine_config(name, model, preset, fleet.gps, fleet.imu, fleet.attitude)
+            payload = self._loads(fleet) if fleet.payload is None else fleet.payload
+            config = machine_config(name, model, preset, fleet.gps, fleet.imu, fleet.attitude, payload=payload)
             rigs.append(Rig(config, model, preset, faults.get(name, Faults())))
         return rigs
 
@@ -190,6 +193,11 @@ class Scenario:
                     route = route.reversed()
                 journeys.append((route, fleet.drive_mps, (fleet.start + lap * GOLDEN) % 1.0))
         return journeys
+
+    def _loads(self, fleet: FleetConfig) -> bool:
+        """Whether a route of this fleet changes what machines carry."""
+        legs = itertools.chain.from_iterable(route.leg for route in self.route if route.name in fleet.routes)
+        return any(leg.payload_kg is not None for leg in legs)
 
     def _fleets(self) -> list[FleetConfig]:
         """The fleet of every machine."""

@@ -9,7 +9,7 @@ from protocol.arrays import Ints
 from protocol.readings import Reading
 from protocol.site import Projection
 from sim.bank import Bank, Block, Unit
-from sim.drivetrain import ArticulationBank, EncoderBank, TorqueBank
+from sim.drivetrain import ArticulationBank, EncoderBank, PayloadBank, TorqueBank
 from sim.gps import GpsBank
 from sim.inertial import AttitudeBank, ImuBank
 from sim.machines import Rig
@@ -22,6 +22,7 @@ _BANKS: dict[str, type[Bank]] = {
     "torque": TorqueBank,
     "encoder": EncoderBank,
     "articulation": ArticulationBank,
+    "payload": PayloadBank,
 }
 
 

@@ -21,8 +21,8 @@ class FleetState:
     reverse. rates, rates_dot: angular rate and acceleration in `base_link` (3). force: specific force at `base_link`,
     in its axes, gravity included (3). articulation: angle of the front frame, its rate and acceleration; the frames are
     rigid, so these carry rates and force over to the front one. wheel_*: of the rear axle, left and right (2). torque:
-    at all wheels together. load: of all wheels on the ground. mass: with what is carried. c_rr, grade: of the ground
-    under the wheels, weighted by their loads, and as the plane through them.
+    at all wheels together. load: of all wheels on the ground. mass: with the payload. c_rr, grade: of the ground under
+    the wheels, weighted by their loads, and as the plane through them.
     """
 
     x_m: Floats
@@ -45,6 +45,7 @@ class FleetState:
     torque_nm: Floats
     load_n: Floats
     mass_kg: Floats
+    payload_kg: Floats
     wheel_radps: Floats
     wheel_rad: Floats
     c_rr: Floats

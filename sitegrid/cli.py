@@ -123,6 +123,7 @@ def _add_agent(nouns: Nouns, common: Parent, network: Parent) -> None:
     agent.add_argument("--name", help="name of the machine (over the config)")
     agent.add_argument("--spool", type=Path, required=True, help="file of the spool")
     agent.add_argument("--audit", type=Path, help="file that notes every recorded sample")
+    agent.add_argument("--calibration", type=Path, help="file that keeps the calibration (beside the spool)")
     agent.add_argument("--driver", choices=("zenoh", "replay"), default="zenoh", help="where readings come from")
     agent.add_argument("--log", type=Path, help="replay: manifest of the log")
     agent.add_argument("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
@@ -175,14 +176,12 @@ def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
         "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
     )
     table = asks.add_parser("localisation", help="the paper's table on recordings of its site", parents=[quiet])
-    _add_seeds(table, 12)
+    _add_recorded(table, 1200.0)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
-    table.add_argument("--seconds", type=_positive, default=1200.0, help="of each recording (default %(default)g)")
     table.add_argument("--plots", type=Path, help="folder to draw errors over time, tracks and the table into")
-    table.add_argument(
-        "--out", type=Path, default=Path("eval-output"), help="folder of recordings and results (default %(default)s)"
-    )
-    table.add_argument("--processes", type=_count, help="how many at a time (default: one per core)")
+    ground = asks.add_parser("ground", help="rolling resistance and gradient of loaders at work", parents=[quiet])
+    _add_recorded(ground, 600.0)
+    ground.add_argument("--plots", type=Path, help="folder to draw estimates along the way, errors by place into")
     log = asks.add_parser("log", help="a real log against fixes that were withheld, or its truth", parents=[quiet])
     log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
     log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
@@ -196,6 +195,16 @@ def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
     log.add_argument("--gps", type=_count, help="use the first receivers only")
     log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="default %(default)s")
     log.add_argument("--profile", choices=("default", "paper"), default="default", help="default %(default)s")
+
+
+def _add_recorded(ask: argparse.ArgumentParser, seconds: float) -> None:
+    """Options of what runs on recordings that are kept."""
+    _add_seeds(ask, 12)
+    ask.add_argument("--seconds", type=_positive, default=seconds, help="of each recording (default %(default)g)")
+    ask.add_argument(
+        "--out", type=Path, default=Path("eval-output"), help="folder of recordings and results (default %(default)s)"
+    )
+    ask.add_argument("--processes", type=_count, help="how many at a time (default: one per core)")
 
 
 def _add_seeds(ask: argparse.ArgumentParser, count: int) -> None:

@@ -1,56 +1,72 @@
-"""Rolling resistance and slope of the ground from torque, wheels and IMU.
+"""Rolling resistance and slope of the ground under one machine, with the calibration that it finds at work.
 
-c_rr = (F/m - f_x - (lambda - 1) dv/dt) / (g cos(theta)): the accelerometer's f_x already contains gravity's share, so
-the grade cancels (DESIGN, "Ground estimation"). A Kalman filter follows c_rr as a random walk; a jump test opens it up
-at the border of a zone.
+Readings become balances of force (`balance`), those that tell nothing are set aside with a reason (`plausibility`),
+and an estimator follows c_rr over the rest (`kalman`, `recursive`). What is asked for a stamp may be asked a little
+later, so that what came after it helps.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
+from collections import deque
 from dataclasses import dataclass, field
+from typing import Any
 
-from agents.estimation.attitude import AttitudeConfig, SlopeFilter
-from agents.physics import GRAVITY_MPS2
-from protocol.arrays import Floats
-from protocol.machine import BASE, MachineConfig, SensorConfig
-from protocol.readings import Imu, Reading, Torque
+from agents.estimation.attitude import AttitudeConfig
+from agents.estimation.balance import Balance, Balancer
+from agents.estimation.calibration import Calibration, CalibrationConfig, Calibrator, unknown
+from agents.estimation.kalman import KalmanConfig, KalmanResistance
+from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility, PlausibilityConfig
+from agents.estimation.recursive import RecursiveConfig, RecursiveGrade, RecursiveResistance
+from agents.estimation.resistance import Push, Resistance
+from agents.localisation.odometry import DeadReckoning
+from protocol.machine import MachineConfig, SensorConfig
+from protocol.readings import Reading
+
+ESTIMATORS = ("kalman", "rls")
+MASSES = ("message", "known", "estimated")
+KEPT = 400  # steps that are remembered: 20 s
+NEAR_NS = 200_000_000  # a slope this far from its stamp is none
+LOADING_S = 3.0  # a machine that stands so long may take or leave a load
 
 
 @dataclass(frozen=True)
 class EstimationConfig:
     """How the ground is estimated.
 
-    smooth_s: all signals are low-passed alike with this time. noise: of one raw c_rr, as a density [1/sqrt(Hz)].
-    walk: random walk of c_rr per sqrt(s). jump, jump_std: mean innovation that counts as a jump, and the standard
-    deviation that c_rr gets then. force_zero_mps2, force_share: standard deviations of the accelerometer's zero, and of
-    torque and mass as a share of the drive force. min_speed_mps: below it nothing is learnt of c_rr. stale_s: torque
-    older than this is missing.
+    estimator: "kalman", or "rls" (least squares with multiple forgetting, as the paper has it). mass: "message" (the
+    machine's, and what payload readings add), "known" (the machine's alone) or "estimated" (from forces). calibrate:
+    whether zero and scale of the force balance are found at work. step_s: of the balance. model_std: error of the
+    balance itself [-], which no calibration takes away.
     """
 
-    smooth_s: float = 0.15
-    noise: float = 0.004
-    walk: float = 0.003
-    jump: float = 0.016
-    jump_std: float = 0.05
-    force_zero_mps2: float = 0.03
-    force_share: float = 0.05
-    min_speed_mps: float = 0.4
-    stale_s: float = 0.5
+    estimator: str = "kalman"
+    mass: str = "message"
+    calibrate: bool = True
+    step_s: float = 0.05
+    model_std: float = 0.0015
+    kalman: KalmanConfig = field(default_factory=KalmanConfig)
+    recursive: RecursiveConfig = field(default_factory=RecursiveConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    plausibility: PlausibilityConfig = field(default_factory=PlausibilityConfig)
     attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
 
     def __post_init__(self) -> None:
-        for name in set(self.__dataclass_fields__) - {"attitude"}:
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: must be positive")
+        for name, known in (("estimator", ESTIMATORS), ("mass", MASSES)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: {getattr(self, name)!r} is none of {', '.join(known)}")
+        for name in ("step_s", "model_std"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: must be positive and finite")
 
 
 @dataclass(frozen=True)
 class GroundEstimate:
-    """What is known of the ground under the machine.
+    """What is known of the ground at a stamp.
 
-    c_rr, c_rr_var: NaN without torque or while standing. slope_x, slope_y: rise over run ahead and to the left, NaN
-    without IMU; slope_var of either. pitch_rate_radps: how fast the slope ahead changes.
+    c_rr, c_rr_var: NaN where `reason` says why nothing is known of it, "" else. slope_x, slope_y: rise over run ahead
+    and to the left, slope_var of either; NaN without accelerometer.
     """
 
     c_rr: float
@@ -58,101 +74,136 @@ class GroundEstimate:
     slope_x: float
     slope_y: float
     slope_var: float
-    pitch_rate_radps: float
+    reason: str
+
+    @property
+    def is_blurred(self) -> bool:
+        """Whether the slope is worth nothing either."""
+        return self.reason in SLOPE_TOO
 
 
-UNKNOWN = GroundEstimate(math.nan, math.nan, math.nan, math.nan, math.nan, 0.0)
+NOTHING_KNOWN = GroundEstimate(math.nan, math.nan, math.nan, math.nan, math.nan, "no_imu")
+
+
+@dataclass(frozen=True, slots=True)
+class _Moment:
+    """A balance as it was judged, and the slope ahead by the estimator in use [rad]."""
+
+    stamp_ns: int
+    balance: Balance
+    reason: str
+    slope_x: float
 
 
 class GroundEstimator:
     """Estimator of one machine; `update` takes readings in the order of their stamps."""
 
-    def __init__(self, machine: MachineConfig, config: EstimationConfig) -> None:
-        self._machine = machine
+    def __init__(self, machine: MachineConfig, config: EstimationConfig, known: Calibration | None = None) -> None:
+        """known: a calibration from before."""
         self._config = config
-        self._ahead = SlopeFilter(config.attitude)
-        self._left = SlopeFilter(config.attitude)
-        self._rotation: dict[str, Floats] = {}
-        self._sensor: str | None = None
-        self._imu_ns = 0
-        self._torque_ns = 0
-        self._drive_n = 0.0
-        self._smooth: tuple[float, float, float] | None = None  # drive force, f_x, wheel acceleration
-        self._pitch_rate = 0.0
-        self._c_rr, self._variance, self._mean_innovation = 0.03, 0.05**2, 0.0
-        self._load_n = machine.mass_kg * GRAVITY_MPS2
-        self._has_learnt = False
-
-    def update(self, reading: Reading, sensor: SensorConfig, speed_mps: float, accel_mps2: float) -> None:
-        """Take in a reading; speed and acceleration are the wheels'."""
-        if isinstance(reading, Torque):
-            self._drive_n = reading.torque_nm / self._machine.wheel_radius_m
-            self._torque_ns = reading.stamp_ns
-        elif isinstance(reading, Imu) and self._is_ours(sensor):
-            self._sensor = reading.sensor
-            if reading.sensor not in self._rotation:
-                self._rotation[reading.sensor] = sensor.mount.base_from_sensor()
-            dt_s = (reading.stamp_ns - self._imu_ns) * 1e-9 if self._imu_ns else 0.0
-            self._imu_ns = reading.stamp_ns
-            if 0 < dt_s < 1:
-                self._step(reading, self._rotation[reading.sensor], dt_s, speed_mps, accel_mps2)
-
-    def _is_ours(self, sensor: SensorConfig) -> bool:
-        """Whether it is the first IMU on the rear frame that has an accelerometer."""
-        return sensor.frame == BASE and sensor.says("force") and self._sensor in (None, sensor.name)
-
-    def now(self, speed_mps: float) -> GroundEstimate:
-        """The estimate of this moment."""
-        if self._smooth is None:
-            return UNKNOWN
-        slope_x, slope_y = math.tan(self._ahead.angle_rad), math.tan(self._left.angle_rad)
-        zero = self._config.force_zero_mps2 / GRAVITY_MPS2
-        slope_var = self._ahead.variance_rad2 + zero**2
-        knows = self._has_torque() and self._has_learnt and abs(speed_mps) >= self._config.min_speed_mps
-        c_rr, c_rr_var = (self._c_rr, self._c_rr_variance()) if knows else (math.nan, math.nan)
-        return GroundEstimate(c_rr, c_rr_var, slope_x, slope_y, slope_var, self._pitch_rate)
-
-    def _step(self, imu: Imu, rotation: Floats, dt_s: float, speed_mps: float, accel_mps2: float) -> None:
-        gyro = rotation @ (imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)
-        force = rotation @ (imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)
-        share = 1 - math.exp(-dt_s / self._config.smooth_s)
-        raw = (self._drive_n, float(force[0]), accel_mps2)
-        old = self._smooth or raw
-        self._smooth = (
-            old[0] + share * (raw[0] - old[0]),
-            old[1] + share * (raw[1] - old[1]),
-            old[2] + share * (raw[2] - old[2]),
+        self._balancer = Balancer(machine, config.step_s, config.attitude, weighs=config.mass != "known")
+        self._plausibility = Plausibility(config.plausibility)
+        self._calibrator = Calibrator(config.calibration, known)
+        self._applied = unknown(config.calibration)
+        estimates_mass = config.mass == "estimated"
+        self._resistance: Resistance = (
+            KalmanResistance(config.kalman, estimates_mass=estimates_mass)
+            if config.estimator == "kalman"
+            else RecursiveResistance(config.recursive, estimates_mass=estimates_mass)
         )
-        rate_up = -float(gyro[1])  # nose up is a negative turn about the y axis, which points to the left
-        self._pitch_rate += share * (rate_up - self._pitch_rate)
-        self._ahead.update(dt_s, rate_up, float(force[0]) - accel_mps2)
-        self._left.update(dt_s, float(gyro[0]), float(force[1]) - speed_mps * float(gyro[2]))
-        if self._has_torque() and abs(speed_mps) >= self._config.min_speed_mps:
-            self._learn(dt_s, math.copysign(1.0, speed_mps))
+        self._grade = RecursiveGrade(config.recursive) if config.estimator == "rls" else None
+        self._moments: deque[_Moment] = deque(maxlen=KEPT)
+        self._used_m = 0.0
+        self._stands_s = 0.0
 
-    def _learn(self, dt_s: float, direction: float) -> None:
-        """One step of the Kalman filter over c_rr; direction is +1 forwards, -1 in reverse."""
-        assert self._smooth is not None
-        c, m = self._config, self._machine
-        drive_n, force_x, accel = self._smooth
-        unbalanced = drive_n / m.mass_kg - force_x - (m.rotating_mass_factor - 1) * accel
-        raw = direction * unbalanced / (GRAVITY_MPS2 * math.cos(self._ahead.angle_rad))
-        self._variance += c.walk**2 * dt_s
-        innovation = raw - self._c_rr
-        gain = self._variance / (self._variance + c.noise**2 / dt_s)
-        self._mean_innovation += 5 * dt_s * (innovation - self._mean_innovation)
-        if abs(self._mean_innovation) > c.jump:
-            self._variance, self._mean_innovation = max(self._variance, c.jump_std**2), 0.0
-        self._c_rr += gain * innovation
-        self._variance *= 1 - gain
-        self._has_learnt = True
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest step; 0 before the first."""
+        return self._moments[-1].stamp_ns if self._moments else 0
 
-    def _c_rr_variance(self) -> float:
-        """Filter variance plus what does not average out: the accelerometer's zero, torque and mass scale."""
-        assert self._smooth is not None
-        zero = self._config.force_zero_mps2 / GRAVITY_MPS2
-        scale = self._config.force_share * self._smooth[0] / self._load_n
-        return self._variance + zero**2 + scale**2
+    @property
+    def fault(self) -> str:
+        """The sensor fault of this moment that keeps resistance from being known, "" if none does."""
+        reason = self._moments[-1].reason if self._moments else ""
+        return reason if reason in FAULTS else ""
 
-    def _has_torque(self) -> bool:
-        return self._torque_ns > 0 and self._imu_ns - self._torque_ns < self._config.stale_s * 1e9
+    @property
+    def calibration(self) -> Calibration:
+        """What was found at work."""
+        return self._calibrator.calibration
+
+    def health(self) -> dict[str, Any]:
+        """State in plain values."""
+        known = self._applied
+        age_s = (self.newest_ns - known.stamp_ns) * 1e-9 if known.stamp_ns else None
+        return {
+            "fault": self.fault,
+            "payload_kg": self._balancer.payload_kg,
+            "calibration": {
+                "zero": known.zero,
+                "zero_std": math.sqrt(known.covariance[0][0]),
+                "scale": known.scale,
+                "scale_std": math.sqrt(known.covariance[1][1]),
+                "age_s": age_s,
+                "passages": known.passages,
+                **self._calibrator.counters,
+            },
+        }
+
+    def update(
+        self, reading: Reading, sensor: SensorConfig, dead: DeadReckoning, known_c_rr: float | None = None
+    ) -> None:
+        """Take in a reading, after dead reckoning did. known_c_rr: of the ground here, where the site says it."""
+        if balance := self._balancer.update(reading, sensor, dead):
+            self._step(balance, dead, known_c_rr)
+
+    def at(self, stamp_ns: int) -> GroundEstimate:
+        """The estimate for a recent stamp, with what came after it."""
+        index = bisect_left(self._moments, stamp_ns, key=lambda moment: moment.stamp_ns)
+        near = [m for m in list(self._moments)[max(index - 1, 0) : index + 1] if abs(m.stamp_ns - stamp_ns) <= NEAR_NS]
+        if not near:
+            return NOTHING_KNOWN
+        moment = min(near, key=lambda m: abs(m.stamp_ns - stamp_ns))
+        balance, known = moment.balance, self._applied
+        found = None if moment.reason else self._resistance.at(stamp_ns)
+        c_rr, variance = math.nan, math.nan
+        if found:
+            cosine = math.cos(moment.slope_x)
+            c_rr = found[0]
+            variance = found[1] + known.variance(balance.share) / cosine**2 + self._config.model_std**2
+        reason = moment.reason or ("" if found else "settling")
+        slope_x = math.tan(moment.slope_x + known.zero)  # the zero is the accelerometer's, whose slope is off alike
+        slope_var = balance.slope_var + known.covariance[0][0]
+        return GroundEstimate(c_rr, variance, slope_x, math.tan(balance.slope_y), slope_var, reason)
+
+    def _step(self, balance: Balance, dead: DeadReckoning, known_c_rr: float | None) -> None:
+        if not self._moments:
+            self._apply(balance.stamp_ns)
+        cosine = math.cos(balance.slope_x)
+        raw = self._applied.corrected(balance)
+        reason = self._plausibility.judge(balance, balance.direction * raw / cosine)
+        slope_x = self._grade.update(balance.dt_s, balance.sine_x) if self._grade else balance.slope_x
+        self._moments.append(_Moment(balance.stamp_ns, balance, reason, slope_x))
+        if reason == "standstill":
+            self._rest(balance)
+        if reason:
+            self._calibrator.interrupt()
+            return
+        self._stands_s = 0.0
+        way_m, self._used_m = balance.way_m - self._used_m, balance.way_m
+        push = Push(balance.stamp_ns, balance.dt_s, way_m, raw, balance.direction * cosine, balance.share)
+        self._resistance.update(push)
+        if self._config.calibrate:
+            self._calibrator.update(balance, dead, known_c_rr)
+
+    def _rest(self, balance: Balance) -> None:
+        """A new calibration takes effect while the machine stands: the ground must not seem to change as it drives."""
+        self._stands_s += balance.dt_s
+        self._apply(balance.stamp_ns)
+        self._resistance.rest(changes_load=self._stands_s > LOADING_S)
+
+    def _apply(self, stamp_ns: int) -> None:
+        """Take up what was found out so far."""
+        if self._config.calibrate:
+            self._calibrator.age(stamp_ns)
+            self._applied = self._calibrator.calibration

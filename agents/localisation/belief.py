@@ -6,7 +6,7 @@ x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from protocol.arrays import Floats
@@ -14,11 +14,15 @@ from protocol.arrays import Floats
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """Mean and covariance of the state at a stamp."""
+    """Mean and covariance of the state at a stamp; neither is written to.
+
+    L: lower Cholesky factor of P, once it was needed; it is kept by `conditioning.root`, and no part of the value.
+    """
 
     stamp_ns: int
     x: Floats
     P: Floats
+    L: Floats | None = field(default=None, init=False, repr=False, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +45,8 @@ class Measurement:
 
     h: measurements (m, k) that states (m, n) would give. jacobian: dh/dx (k, n) at a state (n,). angles: components of
     z that are angles [rad]. gate_sigma: refused if the innovation is this many standard deviations off, 0 never.
-    relocks: believed again after too many refusals in a row; not so what is assumed rather than sensed.
+    relocks: believed again after too many refusals in a row; not so what is assumed rather than sensed. opens: states
+    (k,) that are made as unsure as it is off then; the others follow by themselves.
     """
 
     sensor: str
@@ -53,6 +58,7 @@ class Measurement:
     angles: tuple[int, ...] = ()
     gate_sigma: float = 0.0
     relocks: bool = True
+    opens: slice | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,12 @@
 """What EKF and UKF share: square roots of covariances that never fail, and the conditioning on a measurement.
 
 x: mean (n,), P = L L^T: its covariance (n, n) and lower Cholesky factor. z, R: measurement (k,) and covariance (k, k).
-y: innovation, S: its covariance (k, k), K: gain (n, k). Both filters describe what the state says of the measurement by
-D (n, k), with the covariance of state and measurement P H^T = L D, and by the rest M (k, k), with S = D^T D + M: noise,
-and for the UKF what no linear function explains.
+y: innovation, S: its covariance (k, k), K: gain (n, k). Both filters describe what they expect by m deviations from the
+mean, Z (k, m) of the measurement together with X (n, m) of the state; noise deviates the measurement alone. Then
+
+    P = X X^T      S = Z Z^T      K = X Z^T S^-1
+
+On matrices this small `dot` takes half the time of `@`, and LAPACK itself a tenth of that of numpy.linalg.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs  # a tenth of the cost of numpy.linalg on small matrices
+from scipy.linalg.lapack import dposv, dpotrf
 
 from agents.localisation.belief import Belief, Conditioned, Measurement
 from protocol.arrays import Floats
@@ -47,11 +50,23 @@ def factor(P: Floats) -> Floats:
     return _cholesky(_repaired(P))[0] if failed else L
 
 
-def definite(P: Floats) -> Floats:
-    """The covariance itself where it is positive definite by some margin, else one nearby that is."""
+def root(belief: Belief) -> Floats:
+    """Lower factor of the belief's covariance, computed once."""
+    if belief.L is None:
+        _keep(belief, factor(belief.P))
+    assert belief.L is not None
+    return belief.L
+
+
+def definite(stamp_ns: int, x: Floats, P: Floats) -> Belief:
+    """A belief of that covariance where it is positive definite by some margin, else of one nearby that is."""
     L, failed = _cholesky(P)
     pivots = L.diagonal()
-    return _repaired(P) if failed or P.diagonal() @ (1 / (pivots * pivots)) > MAX_INFLATION else P
+    if failed or P.diagonal().dot(np.reciprocal(pivots * pivots)) > MAX_INFLATION:
+        return Belief(stamp_ns, x, _repaired(P))
+    belief = Belief(stamp_ns, x, P)
+    _keep(belief, L)
+    return belief
 
 
 def bounded(P: Floats, angles: tuple[int, ...]) -> Floats:
@@ -70,10 +85,13 @@ def bounded(P: Floats, angles: tuple[int, ...]) -> Floats:
     return P * np.outer(scale, scale)
 
 
-def is_usable(measurement: Measurement) -> bool:
-    """Whether z and R are finite and R is positive definite; of R the lower triangle counts."""
-    z, R = measurement.z, measurement.R.ravel()
-    return math.isfinite(z @ z + R @ R) and not _cholesky(measurement.R)[1]  # half the cost of isfinite().all()
+def noise_root(measurement: Measurement) -> Floats | None:
+    """Lower factor of R, of which the lower triangle counts; None unless R is finite and definite."""
+    R = measurement.R.ravel()
+    if not math.isfinite(R.dot(R)):  # half the cost of isfinite().all()
+        return None
+    L, failed = _cholesky(measurement.R)
+    return None if failed else L
 
 
 def refused(belief: Belief, measurement: Measurement) -> Conditioned:
@@ -82,29 +100,40 @@ def refused(belief: Belief, measurement: Measurement) -> Conditioned:
     return Conditioned(belief, np.full(k, np.nan), np.full((k, k), np.nan), math.nan, accepted=False)
 
 
-def conclude(
-    belief: Belief, measurement: Measurement, predicted: Floats, L: Floats, D: Floats, M: Floats
-) -> Conditioned:
+def conclude(belief: Belief, measurement: Measurement, predicted: Floats, together: Floats) -> Conditioned:
     """Gate the innovation, and condition the belief on it.
 
-    predicted: (k,). With A = I - K H the covariance A P A^T + K M K^T (Joseph 1964) is a sum of squares, here of
-    A L = L - K D^T and of K times the factor of M: it stays symmetric, and definite but for rounding.
+    predicted: (k,). together: Z over X (k + n, m). The covariance is the square of what the measurement leaves of the
+    deviations, X - K Z: where the measurement is linear that is (I - K H) P (I - K H)^T + K R K^T (Joseph 1964). A sum
+    of squares stays symmetric, and definite but for rounding.
     """
     y = wrapped(measurement.z - predicted, measurement.angles)
-    S = D.T @ D + M
-    if not math.isfinite(y @ y):
+    if not math.isfinite(y.dot(y)):
         return refused(belief, measurement)
-    S_root = factor(S)
-    nis = float(y @ dpotrs(S_root, y, lower=1)[0])
+    k = len(y)
+    Z, X, rows = together[:k], together[k:], np.empty((len(together) + 1, k))
+    together.dot(Z.T, rows[:-1])
+    rows[-1] = y
+    S, quotients = rows[:k], _divided(rows[k:], rows[:k])
+    K, nis = quotients[:-1], float(quotients[-1].dot(y))
     if 0 < measurement.gate_sigma**2 < nis:
         return Conditioned(belief, y, S, nis, accepted=False)
-    K = dpotrs(S_root, (L @ D).T, lower=1)[0].T
-    n, k = D.shape
-    root = np.empty((n, n + k))
-    np.subtract(L, K @ D.T, out=root[:, :n])
-    np.matmul(K, factor(M), out=root[:, n:])
-    posterior = Belief(belief.stamp_ns, belief.x + K @ y, definite(root @ root.T))
+    left = X - K.dot(Z)
+    posterior = definite(belief.stamp_ns, belief.x + K.dot(y), left.dot(left.T))
     return Conditioned(posterior, y, S, nis, accepted=True)
+
+
+def _divided(rows: Floats, S: Floats) -> Floats:
+    """Rows (m, k) times S^-1, of S itself or of the nearest covariance that is positive definite."""
+    _, solved, failed = dposv(S, rows.T, lower=1)
+    if failed:
+        _, solved, _ = dposv(_repaired(S), rows.T, lower=1)
+    quotients: Floats = solved.T
+    return quotients
+
+
+def _keep(belief: Belief, L: Floats) -> None:
+    object.__setattr__(belief, "L", L)  # a belief is frozen, but this is no part of its value
 
 
 def _cholesky(P: Floats) -> tuple[Floats, bool]:

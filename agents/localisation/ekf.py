@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from agents.localisation.belief import Belief, Conditioned, Measurement, Motion
-from agents.localisation.conditioning import bounded, conclude, definite, factor, is_usable, refused, wrapped_state
+from agents.localisation.conditioning import bounded, conclude, definite, noise_root, refused, root, wrapped_state
 
 
 @dataclass(frozen=True)
@@ -15,13 +17,16 @@ class Ekf:
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
         """Move the belief: x <- f(x), P <- F P F^T + Q, as the square of F L so that it is symmetric."""
         x = wrapped_state(motion.f(belief.x[None])[0], motion.angles)
-        F_L = motion.jacobian(belief.x) @ factor(belief.P)
-        return Belief(stamp_ns, x, definite(bounded(F_L @ F_L.T + motion.Q, motion.angles)))
+        F_L = motion.jacobian(belief.x).dot(root(belief))
+        return definite(stamp_ns, x, bounded(F_L.dot(F_L.T) + motion.Q, motion.angles))
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
-        if not is_usable(measurement):
+        noise = noise_root(measurement)
+        if noise is None:
             return refused(belief, measurement)
-        L = factor(belief.P)
-        D = (measurement.jacobian(belief.x) @ L).T
-        return conclude(belief, measurement, measurement.h(belief.x[None])[0], L, D, measurement.R)
+        L, (n, k) = root(belief), (len(belief.x), len(noise))
+        together = np.zeros((k + n, n + k))
+        together[:k, :n], together[:k, n:] = measurement.jacobian(belief.x).dot(L), noise
+        together[k:, :n] = L
+        return conclude(belief, measurement, measurement.h(belief.x[None])[0], together)

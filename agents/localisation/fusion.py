@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from agents.localisation.belief import Belief, Conditioned, Filter, Measurement, Motion
-from agents.localisation.state import POSITION
 
 Motions = Callable[[Belief, float], Motion]  # how a belief moves on over so many seconds
 Change = Callable[[Belief], Belief]
@@ -132,7 +131,8 @@ class Fusion:
             if measurement.sensor in fresh:
                 self._judge(node, measurement, result)
             if not result.accepted and measurement.sensor in node.reopened:
-                result = self._engine.condition(_opened(belief, result), replace(measurement, gate_sigma=0.0))
+                opened = _opened(belief, result, measurement.opens)
+                result = self._engine.condition(opened, replace(measurement, gate_sigma=0.0))
             belief = result.belief
         return belief
 
@@ -166,12 +166,12 @@ def _changed(belief: Belief, changes: Iterable[Change]) -> Belief:
     return belief
 
 
-def _opened(belief: Belief, result: Conditioned) -> Belief:
-    """The belief with a position as unsure as a fix is off; what else is measured, the state follows by itself."""
-    if len(result.innovation) != 2:
+def _opened(belief: Belief, result: Conditioned, states: slice | None) -> Belief:
+    """The belief with states as unsure as a measurement of them is off."""
+    if states is None:
         return belief
-    P, at = belief.P.copy(), slice(POSITION.start, POSITION.start + 2)
-    P[at, at] += np.outer(result.innovation, result.innovation) + np.eye(2)
+    P = belief.P.copy()
+    P[states, states] += np.outer(result.innovation, result.innovation) + np.eye(len(result.innovation))
     return Belief(belief.stamp_ns, belief.x, P)
 
 

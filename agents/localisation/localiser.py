@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,24 +12,25 @@ from agents.localisation import sensing
 from agents.localisation.belief import Belief, Filter, Measurement, Motion, PoseBelief
 from agents.localisation.ekf import Ekf
 from agents.localisation.fusion import Fusion, FusionConfig
-from agents.localisation.kinematics import GpsError, MotionConfig, motion
-from agents.localisation.odometry import Alignment, Dead, DeadReckoning, align, mean_std
+from agents.localisation.kinematics import MotionConfig, motion
+from agents.localisation.odometry import Alignment, Dead, DeadReckoning, align, mean_std, turn_source
+from agents.localisation.receivers import Fix, Receivers, drifting
+from agents.localisation.references import UNKNOWN_STD, References, counted_from_start
 from agents.localisation.sensing import SensingConfig
 from agents.localisation.state import ACCELERATION, ATTITUDE, POSITION, RATE, SPEED, VELOCITY, YAW, Layout
 from agents.localisation.steps import Step, Steps
 from agents.localisation.unscented import Ukf
-from agents.localisation.watch import Consistency, Watch
+from agents.localisation.watch import Consistency
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
-from protocol.machine import MachineConfig, SensorConfig
+from protocol.machine import ABSOLUTE, MachineConfig, SensorConfig
 from protocol.readings import Gps, Reading
 from protocol.site import Projection
 
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
-MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
 START_MPS = 3.0  # how unsure the first speed is: the machine may drive already, and wheels take a moment to tell
 ROLLING_S = 0.5
-UNKNOWN_STD = 1e4  # of what a sensor does not give
+BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a wrong scale makes another in every bend
 TOLD_STD_M, TOLD_STD_RAD = 0.5, 0.02  # of a start that is told
 ENGINES = {"ekf": Ekf, "ukf": Ukf}
 PROFILES = ("default", "paper")
@@ -90,42 +90,31 @@ class LocalisationConfig:
             raise ValueError("start: must be x, y and heading, or empty")
 
 
-@dataclass(frozen=True)
-class _Fix:
-    """A fix in `map` with what the filter needs of it."""
-
-    stamp_ns: int
-    receiver: int
-    sensor: str
-    position_m: Floats
-    variance_m2: Floats
-    dead: Dead
-
-
 class Localiser:
     """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order."""
 
     def __init__(self, machine: MachineConfig, projection: Projection, config: LocalisationConfig) -> None:
         self.dead = DeadReckoning(machine, config.slip)
-        self._config, self._projection = config, projection
+        self._config = config
         self._own: Counter[str] = Counter()
         self._steps = Steps(machine, config.step_s, orients=config.profile == "paper")
         self._sensors = {s.name: s for s in machine.sensors if s.use}
-        self._receivers = [s for s in machine.sensors if s.kind == "gps" and s.use]
-        wheels = (s for s in self._sensors.values() if s.kind in ("encoder", "odometry"))
-        self._wheel_gate = next((s.gate_sigma for s in wheels), 0.0)  # of the one that dead reckoning uses, the first
+        wheels = [s for s in self._sensors.values() if s.kind in ("encoder", "odometry") and s.says("speed")]
+        self._wheels = wheels[0] if wheels else None  # the one that dead reckoning uses, the first
         self._imus = [s.name for s in machine.sensors if s.kind == "imu" and s.use]
+        self._turns = turn_source(machine)
         augmented = config.profile == "default"
-        self._layout = Layout(len(self._imus), True, len(self._receivers)) if augmented else Layout()
-        self._errors = [GpsError(MIN_DRIFT_M2, s.drift_time_s) for s in self._receivers] if augmented else []
-        self._heard: set[int] = set()
-        self._watches = {s.name: Watch() for s in self._receivers}
+        self._layout = _layout(machine, len(self._imus)) if augmented else Layout()
+        self._receivers = Receivers(machine.sensors, projection, self._layout, config.sensing, slow=augmented)
+        self._references = References(machine.sensors, self._layout, config.sensing)
+        is_flat = not any(_shows_tilt(s, config.profile) for s in machine.sensors)
+        self._moves = replace(config.motion, two_d=True) if is_flat else config.motion
         self._traction = 0.0
         self._rolling = 0.0  # resistance, low-passed
         self._engine: Filter = ENGINES[config.filter]()
         self._fusion: Fusion | None = None
         self._waiting: deque[Step] = deque(maxlen=COLLECTED)
-        self._fixes: deque[_Fix] = deque(maxlen=COLLECTED)
+        self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
         self._track: deque[Dead] = deque(maxlen=COLLECTED)
 
     @property
@@ -141,8 +130,7 @@ class Localiser:
     @property
     def consistency(self) -> dict[str, Consistency]:
         """How consistent the filter is with each GPS receiver, of those that were heard enough."""
-        found = {name: watch.consistency() for name, watch in self._watches.items()}
-        return {name: value for name, value in found.items() if value}
+        return self._receivers.consistency
 
     @property
     def belief(self) -> Belief | None:
@@ -152,7 +140,7 @@ class Localiser:
     def update(self, reading: Reading, sensor: SensorConfig) -> list[PoseBelief]:
         """Take in one reading; returns beliefs that it made possible or changed, oldest first."""
         if isinstance(reading, Gps):
-            return self._take_fix(self._fix(reading))
+            return self._take_fix(self._receivers.fix(reading, self.dead.now()))
         self.dead.update(reading, sensor)
         step = self._steps.take(reading, sensor, self.dead)
         if step is None:
@@ -167,39 +155,43 @@ class Localiser:
 
     def _take_step(self, fusion: Fusion, step: Step) -> list[PoseBelief]:
         self._traction = step.traction
+        beliefs = self._references.add(fusion, step)
         measurements = self._measurements(step)
-        return self._poses(fusion.add(measurements) if measurements else [])
+        return self._poses(beliefs + (fusion.add(measurements) if measurements else []))
 
     def _measurements(self, step: Step) -> list[Measurement]:
         found = [self._inertial(step, i, name) for i, name in enumerate(self._imus) if name in step.felt]
-        if self._config.profile == "paper":  # the default leaves headings aside: near steel they are wrong for minutes
-            found += [self._orientation(step, name) for name in step.orientations]
+        found += self._references.measurements(step) + self._of_turn(step)
         return found + self._of_wheels(step) if step.rolled else found  # silent ones are not at rest
 
     def _inertial(self, step: Step, imu: int, name: str) -> Measurement:
         c, felt, sensor = self._config.sensing, step.felt[name], self._sensors[name]
-        rate_std = c.rate_radps if sensor.says("rate") else UNKNOWN_STD
-        force_std = c.force_mps2 if sensor.says("force") else UNKNOWN_STD
+        rate_std = sensor.std.get("rate", c.rate_radps) if sensor.says("rate") else UNKNOWN_STD
+        force_std = sensor.std.get("force", c.force_mps2) if sensor.says("force") else UNKNOWN_STD
         R = np.diag([rate_std**2] * 3 + [force_std**2] * 3)
         bias = self._layout.gyro_bias(imu) if self._layout.imus else None
         lever, gate = np.array(sensor.mount.xyz_m), sensor.gate_sigma or c.gate_sigma
         return sensing.inertial(step.stamp_ns, name, felt.rates_radps, felt.force_mps2, R, lever, bias, gate)
 
-    def _orientation(self, step: Step, name: str) -> Measurement:
-        (rpy, variances), sensor = step.orientations[name], self._sensors[name]
-        said = [sensor.says("tilt"), sensor.says("tilt"), sensor.says("heading")]
-        R = np.diag(np.where(said, variances, UNKNOWN_STD**2))
-        gate = sensor.gate_sigma or self._config.sensing.gate_sigma
-        return sensing.orientation(step.stamp_ns, name, rpy, R, gate)
+    def _of_turn(self, step: Step) -> list[Measurement]:
+        """The turn rate where no IMU tells it. Where nothing does, it shows only in the fixes and is very unsure."""
+        if self._turns is None:
+            self._own["turn_unknown"] += 1
+        if self._turns is None or step.turn is None:
+            return []
+        std, told = _turn_std(self._turns, self._config.sensing), step.turn
+        error = self._layout.gyro_bias(len(self._imus)) if self._layout.imus else None
+        gate = self._turns.gate_sigma or self._config.sensing.gate_sigma
+        return [sensing.turn(step.stamp_ns, told.rate_radps, std, error, told.per_error, gate)]
 
     def _of_wheels(self, step: Step) -> list[Measurement]:
         c, stamp = self._config.sensing, step.stamp_ns
+        assert self._wheels is not None  # as step.rolled
         speed = step.speed_mps * (1 - self._slip(step) * math.copysign(1.0, step.speed_mps))
-        R = np.diag([c.speed_mps**2, c.side_mps**2, c.side_mps**2])
+        R = np.diag([self._wheels.std.get("speed", c.speed_mps) ** 2, c.side_mps**2, c.side_mps**2])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
-        found = [
-            sensing.wheels(stamp, "wheels", np.array([speed, 0.0, 0.0]), R, scale, self._wheel_gate or c.gate_sigma)
-        ]
+        gate = self._wheels.gate_sigma or c.gate_sigma
+        found = [sensing.wheels(stamp, "wheels", np.array([speed, 0.0, 0.0]), R, scale, gate)]
         if step.still_s >= self._config.standstill_s:
             found.append(sensing.standstill(stamp, c))
         return found
@@ -215,51 +207,24 @@ class Localiser:
         """Specific forces (3,) of the IMUs that measure them."""
         return [felt.force_mps2 for name, felt in step.felt.items() if self._sensors[name].says("force")]
 
-    def _take_fix(self, fix: _Fix) -> list[PoseBelief]:
+    def _take_fix(self, fix: Fix) -> list[PoseBelief]:
         if self._fusion is None:
             self._fixes.append(fix)
             return self._try_align()
-        return self._poses(self._add_fix(self._fusion, fix))
-
-    def _add_fix(self, fusion: Fusion, fix: _Fix) -> list[Belief]:
-        sensor, c = self._receivers[fix.receiver], self._config.sensing
-        error, change = None, None
-        variance = np.maximum(fix.variance_m2, c.min_fix_std_m**2)
-        if self._layout.receivers:
-            drift_m2 = max(sensor.drift_share * float(fix.variance_m2.mean()), MIN_DRIFT_M2)
-            variance = np.maximum(fix.variance_m2 * (1 - sensor.drift_share), c.min_fix_std_m**2)
-            self._errors[fix.receiver] = GpsError(drift_m2, sensor.drift_time_s)
-            error = self._layout.gps_error(fix.receiver)
-            if fix.receiver not in self._heard:  # a receiver that comes late brings its own unknown error
-                change = partial(_renewed, states=error, variance=drift_m2)
-        lever = np.array(sensor.mount.xyz_m)
-        measurement = sensing.fix(
-            fix.stamp_ns,
-            fix.sensor,
-            fix.position_m,
-            np.diag(variance),
-            lever,
-            error,
-            sensor.gate_sigma or c.gps_gate_sigma,
-        )
-        beliefs = fusion.add([measurement], change)
-        if beliefs:
-            self._heard.add(fix.receiver)
-            self._watches[fix.sensor].note(fusion.last[fix.sensor])
-        return beliefs
-
-    def _fix(self, gps: Gps) -> _Fix:
-        x, y, _ = self._projection.to_map(gps.lat_deg, gps.lon_deg, gps.height_m)
-        receiver = next(i for i, s in enumerate(self._receivers) if s.name == gps.sensor)
-        variance = np.array([gps.var_e_m2, gps.var_n_m2])
-        return _Fix(gps.stamp_ns, receiver, gps.sensor, np.array([x, y]), variance, self.dead.now())
+        return self._poses(self._receivers.add(self._fusion, fix))
 
     # --- beliefs -----------------------------------------------------------------------------------------------------
 
     def _motion(self, belief: Belief, dt_s: float) -> Motion:
         c = self._config
         slip_m2 = c.slip_std**2 * 2 * c.slip_time_s * (self._traction * float(belief.x[SPEED])) ** 2 * dt_s
-        return motion(self._layout, c.motion, belief, dt_s, self._errors, slip_m2)
+        found = motion(self._layout, self._moves, belief, dt_s, self._receivers.errors, slip_m2)
+        wander = self._layout.heading_errors  # as our own heading does
+        found.Q[wander, wander] = np.eye(self._layout.references) * (c.motion.heading_walk**2 * dt_s)
+        if self._layout.imus and self._turns and self._turns.kind == "odometry":
+            error = self._layout.gyro_bias(len(self._imus))
+            found.Q[error, error] += 2 * _turn_std(self._turns, c.sensing) ** 2 * dt_s / BEND_S
+        return found
 
     def _poses(self, beliefs: list[Belief]) -> list[PoseBelief]:
         speed = self.dead.wheels.speed_mps
@@ -275,17 +240,15 @@ class Localiser:
         c = self._config
         if self.dead.way_m < c.align_way_m or len(self._fixes) < 4 or not self._track:
             return []
-        antennas = np.array([self._dead_antenna(fix) for fix in self._fixes])
+        fixes = [fix for fix in self._fixes if fix.is_absolute]
+        if len(fixes) < 4:
+            return []
+        antennas = np.array([_dead_antenna(fix) for fix in fixes])
         if float(np.sqrt(((antennas - antennas.mean(axis=0)) ** 2).sum(axis=1).mean())) < c.align_spread_m:
             return []
-        std = mean_std([float(fix.variance_m2.mean()) for fix in self._fixes])
-        found = align(antennas, np.array([fix.position_m for fix in self._fixes]), std)
+        std = mean_std([float(fix.variance_m2.mean()) for fix in fixes])
+        found = align(antennas, np.array([fix.position_m for fix in fixes]), std)
         return self._start(found, std) if found else []
-
-    def _dead_antenna(self, fix: _Fix) -> tuple[float, float]:
-        lever = self._receivers[fix.receiver].mount.xyz_m
-        c, s = math.cos(fix.dead.angle_rad), math.sin(fix.dead.angle_rad)
-        return fix.dead.x_m + c * lever[0] - s * lever[1], fix.dead.y_m + s * lever[0] + c * lever[1]
 
     def _start_as_told(self) -> list[PoseBelief]:
         x, y, heading = self._config.start
@@ -296,13 +259,13 @@ class Localiser:
     def _start(self, found: Alignment, fix_std_m: float) -> list[PoseBelief]:
         start = self._start_belief(found, fix_std_m)
         self._fusion = Fusion(self._engine, self._motion, start, self._config.fusion)
-        events: list[Step | _Fix] = [*list(self._waiting)[1:], *self._fixes]
+        events: list[Step | Fix] = [*list(self._waiting)[1:], *self._fixes]
         poses = self._poses([start])
         for event in sorted(events, key=lambda e: e.stamp_ns):
             if isinstance(event, Step):
                 poses += self._take_step(self._fusion, event)
             else:
-                poses += self._poses(self._add_fix(self._fusion, event))
+                poses += self._poses(self._receivers.add(self._fusion, event))
         for collected in (self._waiting, self._fixes, self._track):
             collected.clear()
         return poses
@@ -325,18 +288,34 @@ class Localiser:
         variance[ATTITUDE] = 0.1**2
         variance[YAW] = min(0.5, 2 * found.std_rad + 0.05) ** 2
         variance[VELOCITY], variance[RATE], variance[ACCELERATION] = START_MPS**2, 0.1**2, 1.0
-        if self._layout.imus:
-            variance[self._layout.gyro_biases] = self._config.gyro_bias_radps**2
-            variance[self._layout.wheel_scales] = self._config.wheel_scale**2
+        variance[self._layout.gyro_biases] = self._config.gyro_bias_radps**2
+        variance[self._layout.wheel_scales] = self._config.wheel_scale**2
+        if self._turns and self._layout.imus > len(self._imus):
+            variance[self._layout.gyro_bias(len(self._imus))] = _turn_std(self._turns, self._config.sensing) ** 2
         return Belief(step.stamp_ns, x, np.diag(variance))
 
 
-def _renewed(belief: Belief, states: slice, variance: float) -> Belief:
-    """The belief with states that nothing is known of."""
-    x, P = belief.x.copy(), belief.P.copy()
-    x[states], P[states, :], P[:, states] = 0.0, 0.0, 0.0
-    P[states, states] = np.eye(states.stop - states.start) * variance
-    return Belief(belief.stamp_ns, x, P)
+def _layout(machine: MachineConfig, imus: int) -> Layout:
+    """States for the slow errors of a machine's sensors."""
+    source = turn_source(machine)
+    rates = imus + (source is not None and source.kind != "imu")
+    return Layout(rates, True, len(drifting(machine.sensors)), len(counted_from_start(machine.sensors)))
+
+
+def _shows_tilt(sensor: SensorConfig, profile: str) -> bool:
+    """Whether a sensor tells roll and pitch, or how they change; a machine without any is taken to be on a plane."""
+    oriented = sensor.kind == "attitude" and sensor.says("tilt") and (profile == "paper" or sensor.mode != ABSOLUTE)
+    return sensor.use and (sensor.kind == "imu" or oriented)
+
+
+def _turn_std(source: SensorConfig, config: SensingConfig) -> float:
+    return source.std.get("rate", config.turn_radps)
+
+
+def _dead_antenna(fix: Fix) -> tuple[float, float]:
+    lever = fix.sensor.mount.xyz_m
+    c, s = math.cos(fix.dead.angle_rad), math.sin(fix.dead.angle_rad)
+    return fix.dead.x_m + c * lever[0] - s * lever[1], fix.dead.y_m + s * lever[0] + c * lever[1]
 
 
 def _wrapped(angle_rad: float) -> float:

@@ -11,9 +11,17 @@ import numpy as np
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import BASE, MachineConfig, SensorConfig
-from protocol.readings import Encoder, Imu, Odometry, Reading, Torque
+from protocol.readings import Encoder, Imu, Odometry, Reading, Steering, Torque
 
+TURNS = ("imu", "odometry", "steering")  # what tells the turn, the best first
+STALE_S = 2.0  # a steering angle, or a speed to go with it, says nothing later
 MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
+
+
+def turn_source(machine: MachineConfig) -> SensorConfig | None:
+    """What the turn is taken from: IMUs, where one in use gives rates, else odometry, else steering."""
+    able = [s for kind in TURNS for s in machine.sensors if s.kind == kind and s.use and s.says("rate")]
+    return able[0] if able else None
 
 
 class WheelTracker:
@@ -78,16 +86,26 @@ class DeadReckoning:
         self._rolled_m = 0.0
         self._rotation: dict[str, Floats] = {}
         self._imu: Imu | None = None
+        source = turn_source(machine)
+        self._turns = source.name if source else ""
+        self._turned_ns = 0  # by odometry or steering
+        self._curvature = 0.0  # [1/m], by steering
         self._wheel_reading: Encoder | Odometry | None = None
         self._x_m = 0.0
         self._y_m = 0.0
 
     def update(self, reading: Reading, sensor: SensorConfig) -> None:
-        """Take in a reading of the gyro or the wheels; others change nothing."""
+        """Take in a reading of what tells the turn, or of the wheels; others change nothing."""
         if isinstance(reading, Imu) and sensor.frame == BASE and sensor.says("rate"):
             self._turn(reading, sensor)
         elif isinstance(reading, Encoder | Odometry):
-            self._roll(reading, sensor)
+            if isinstance(reading, Odometry) and sensor.name == self._turns:
+                self._turn_on(reading)
+            if sensor.says("speed"):
+                self._roll(reading, sensor)
+        elif isinstance(reading, Steering) and sensor.name == self._turns:
+            self._curvature = math.tan(reading.angle_rad) / self._machine.wheelbase_m
+            self._turned_ns = reading.stamp_ns
         elif isinstance(reading, Torque):
             weight_n = self._machine.mass_kg * GRAVITY_MPS2
             self.traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
@@ -109,6 +127,13 @@ class DeadReckoning:
             self.angle_rad += rate * min(dt, 1.0)
         self._imu = imu
         self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
+
+    def _turn_on(self, odometry: Odometry) -> None:
+        """Turn by what odometry says of it."""
+        if self._turned_ns:
+            dt_s = (odometry.stamp_ns - self._turned_ns) * 1e-9
+            self.angle_rad += odometry.rate_z_radps * min(dt_s, 1.0)
+        self._turned_ns = odometry.stamp_ns
 
     def _roll(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
         """Advance by what the first wheel sensor in use says (the others serve later issues)."""
@@ -132,8 +157,11 @@ class DeadReckoning:
         travel_m = rolled_m * (1 - self._slip * self.traction * math.copysign(1.0, rolled_m))
         self.travel_m += travel_m
         self.way_m += abs(travel_m)
-        self._x_m += travel_m * math.cos(self.angle_rad)
-        self._y_m += travel_m * math.sin(self.angle_rad)
+        steered_rad = travel_m * self._curvature if stamp_ns - self._turned_ns < STALE_S * 1e9 else 0.0
+        middle_rad = self.angle_rad + steered_rad / 2
+        self._x_m += travel_m * math.cos(middle_rad)
+        self._y_m += travel_m * math.sin(middle_rad)
+        self.angle_rad += steered_rad
         self.stamp_ns = max(self.stamp_ns, stamp_ns)
 
 

@@ -12,11 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.localisation.belief import Measurement
-from agents.localisation.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY
+from agents.localisation.kinematics import map_from_base
+from agents.localisation.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 
 ROLL, PITCH, YAW = range(ATTITUDE.start, ATTITUDE.stop)
+PLACE = slice(POSITION.start, POSITION.start + 2)
 
 
 @dataclass(frozen=True)
@@ -24,13 +26,16 @@ class SensingConfig:
     """Standard deviations of what sensors say, where readings do not state their own, and gates.
 
     rate_radps, force_mps2: of an IMU, of the mean over one filter step; the force's has to cover its zero and mounting
-    error, which do not average out. speed_mps: of wheels; side_mps: how fast a machine slides aside. still_mps: of a
-    machine at rest. gate_sigma: of all but GPS. min_fix_std_m: no fix is taken for better than this. gps_gate_sigma:
-    fixes further off are refused.
+    error, which do not average out. turn_radps: of the turn rate that odometry or steering tell where there is no IMU,
+    and of its lasting error at first (per m/s for steering, whose error is one of the angle). speed_mps: of wheels;
+    side_mps: how fast a machine slides aside. still_mps: of a machine at rest. gate_sigma: of all but GPS.
+    min_fix_std_m: no receiver is believed to be better than this, if it says so itself. gps_gate_sigma: fixes further
+    off are refused.
     """
 
     rate_radps: float = 0.005
     force_mps2: float = 2.0
+    turn_radps: float = 0.02
     speed_mps: float = 0.04
     side_mps: float = 0.04
     still_mps: float = 0.005
@@ -50,7 +55,7 @@ def fix(
     """A GPS fix (2,) in `map`; error: states of the receiver's slow error, if the filter has them."""
 
     def h(x: Floats) -> Floats:
-        at = x[:, POSITION][:, :2] + _turned(x, lever_m)[:, :2]
+        at = x[:, PLACE] + _turned(x, lever_m)[:, :2]
         return at if error is None else at + x[:, error]
 
     def jacobian(x: Floats) -> Floats:
@@ -61,7 +66,27 @@ def fix(
             H[:, error] = np.eye(2)
         return H
 
-    return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate)
+    return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=PLACE)
+
+
+def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_m: Floats, gate: float) -> Measurement:
+    """Velocity (2,) of an antenna in `map`: that of base_link and w x r, turned."""
+
+    def h(x: Floats) -> Floats:
+        return _turned(x, _of_antenna(x).T)[:, :2]
+
+    def jacobian(x: Floats) -> Floats:
+        H, turn = np.zeros((2, len(x))), map_from_base(x[ATTITUDE])[:2]
+        H[:, ATTITUDE] = _turned_jacobian(x, _of_antenna(x))[:2]
+        H[:, VELOCITY] = turn
+        H[:, RATE] = -turn @ _matrix(lever_m)
+        return H
+
+    def _of_antenna(x: Floats) -> Floats:
+        moving: Floats = x[..., VELOCITY] + _cross(x[..., RATE], lever_m)
+        return moving
+
+    return Measurement(sensor, stamp_ns, velocity_mps, R, h, jacobian, gate_sigma=gate)
 
 
 def inertial(
@@ -123,18 +148,60 @@ def wheels(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, scale: i
     return Measurement(sensor, stamp_ns, velocity_mps, R, h, jacobian, gate_sigma=gate)
 
 
-def orientation(stamp_ns: int, sensor: str, rpy_rad: Floats, R: Floats, gate: float) -> Measurement:
-    """Roll, pitch and yaw (3,) of `base_link` in `map`."""
+def turn(
+    stamp_ns: int, rate_radps: float, std_radps: float, error: int | None, per_error: float, gate: float
+) -> Measurement:
+    """Turn rate (1,) about the vertical of `base_link`; error: state of its lasting error, each worth per_error."""
 
     def h(x: Floats) -> Floats:
-        return x[:, ATTITUDE]
+        rate = x[:, YAW_RATE] if error is None else x[:, YAW_RATE] + per_error * x[:, error]
+        return rate[:, None]
+
+    def jacobian(x: Floats) -> Floats:
+        H = np.zeros((1, len(x)))
+        H[0, YAW_RATE] = 1.0
+        if error is not None:
+            H[0, error] = per_error
+        return H
+
+    R = np.array([[std_radps**2]])
+    return Measurement("turn", stamp_ns, np.array([rate_radps]), R, h, jacobian, gate_sigma=gate)
+
+
+def orientation(
+    stamp_ns: int, sensor: str, rpy_rad: Floats, R: Floats, gate: float, error: int | None = None
+) -> Measurement:
+    """Roll, pitch and yaw (3,) of `base_link` in `map`; error: state of the yaw's, if the filter has one."""
+
+    def h(x: Floats) -> Floats:
+        if error is None:
+            return x[:, ATTITUDE]
+        z = x[:, ATTITUDE].copy()
+        z[:, 2] += x[:, error]
+        return z
 
     def jacobian(x: Floats) -> Floats:
         H = np.zeros((3, len(x)))
         H[:, ATTITUDE] = np.eye(3)
+        if error is not None:
+            H[2, error] = 1.0
         return H
 
     return Measurement(sensor, stamp_ns, rpy_rad, R, h, jacobian, angles=(0, 1, 2), gate_sigma=gate)
+
+
+def rotation(stamp_ns: int, sensor: str, rates_radps: Floats, R: Floats, gate: float) -> Measurement:
+    """Angular rate (3,) of `base_link`, free of bias."""
+
+    def h(x: Floats) -> Floats:
+        return x[:, RATE]
+
+    def jacobian(x: Floats) -> Floats:
+        H = np.zeros((3, len(x)))
+        H[:, RATE] = np.eye(3)
+        return H
+
+    return Measurement(sensor, stamp_ns, rates_radps, R, h, jacobian, gate_sigma=gate)
 
 
 def standstill(stamp_ns: int, config: SensingConfig) -> Measurement:
@@ -159,7 +226,7 @@ def standstill(stamp_ns: int, config: SensingConfig) -> Measurement:
 
 
 def _turned(x: Floats, arm: Floats) -> Floats:
-    """A vector (3,) of `base_link` in `map`, for states (m, n): Rz(yaw) Ry(pitch) Rx(roll) arm."""
+    """A vector (3,), or one each (3, m), of `base_link` in `map`, for states (m, n): Rz(yaw) Ry(pitch) Rx(roll) arm."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(x[:, ATTITUDE].T), np.cos(x[:, ATTITUDE].T)
     left, up = cr * arm[1] - sr * arm[2], sr * arm[1] + cr * arm[2]
     ahead, z = cp * arm[0] + sp * up, cp * up - sp * arm[0]

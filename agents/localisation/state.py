@@ -23,24 +23,27 @@ OFF_PLANE = [Z, ROLL, PITCH, 8, 9, 10, 14]
 
 @dataclass(frozen=True)
 class Layout:
-    """Where in the state each error stands: gyro biases, then the wheel scale, then the GPS errors.
+    """Where in the state each error stands: of the turn rate, then of wheels, GPS receivers and heading references.
 
-    imus: with a yaw gyro bias each [rad/s]. wheel_scale: whether there is one [-]: the wheels turn 1 + scale times the
-    way. receivers: GPS receivers with an error east and north each [m]. Without any, the 15 states of the paper.
+    imus: with a yaw gyro bias each [rad/s]; without any, what tells the turn instead counts as one. wheel_scale:
+    whether there is one [-]: the wheels turn 1 + scale times the way. receivers: GPS receivers with an error east and
+    north each [m]. references: headings [rad] that count from a believed one, which may be off. Without any, the 15
+    states of the paper.
     """
 
     imus: int = 0
     wheel_scale: bool = False
     receivers: int = 0
+    references: int = 0
 
     def __post_init__(self) -> None:
-        if self.imus < 0 or self.receivers < 0:
-            raise ValueError("imus and receivers must not be negative")
+        if min(self.imus, self.receivers, self.references) < 0:
+            raise ValueError("imus, receivers and references must not be negative")
 
     @property
     def n(self) -> int:
         """Number of states."""
-        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers
+        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references
 
     @property
     def angles(self) -> tuple[int, ...]:
@@ -63,6 +66,11 @@ class Layout:
         """Two per receiver [m]."""
         first = self.wheel_scales.stop
         return slice(first, first + 2 * self.receivers)
+
+    @property
+    def heading_errors(self) -> slice:
+        """One per reference [rad]."""
+        return slice(self.gps_errors.stop, self.n)
 
     def gyro_bias(self, imu: int) -> int:
         """State of the bias of one yaw gyro."""

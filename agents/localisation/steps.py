@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.localisation.odometry import DeadReckoning, WheelTracker
+from agents.localisation.modes import Told
+from agents.localisation.odometry import STALE_S, DeadReckoning, WheelTracker, turn_source
 from protocol.arrays import Floats
-from protocol.machine import FRONT, MachineConfig, SensorConfig
-from protocol.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading
+from protocol.machine import ABSOLUTE, FRONT, MachineConfig, SensorConfig
+from protocol.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
 
 NOTHING = (0.0,) * 7  # count and sums
 MIN_NORM = 0.5  # a reference that has not found itself yet sends a quaternion of zeros
@@ -26,25 +27,41 @@ class Felt:
 
 
 @dataclass(frozen=True)
+class Turn:
+    """Mean turn rate [rad/s] over a step, of odometry or steering.
+
+    per_error: what the sensor's lasting error makes of it: of odometry, whose error is a rate, 1; of steering, whose
+    error is a curvature [1/m], the speed.
+    """
+
+    rate_radps: float
+    per_error: float
+
+
+@dataclass(frozen=True)
 class Step:
     """What fast sensors said up to a stamp.
 
-    orientations: the last roll, pitch, yaw (3,) of each attitude reference and their variances (3,). rolled: whether
-    the wheels spoke in this step, else their speed is an old one. traction: drive force over weight; still_s: how long
-    without travel.
+    orientations: the last roll, pitch, yaw (3,) of each attitude reference. rolled: whether the wheels spoke in this
+    step, else their speed is an old one. traction: drive force over weight; still_s: how long without travel. turn: of
+    a machine without IMU.
     """
 
     stamp_ns: int
     felt: dict[str, Felt]
-    orientations: dict[str, tuple[Floats, Floats]]
+    orientations: dict[str, Told]
     speed_mps: float
     rolled: bool
     traction: float
     still_s: float
+    turn: Turn | None = None
 
 
 class Steps:
-    """Gathers readings; `take` returns a step whenever step_s have passed. orients: whether orientations are wanted."""
+    """Gathers readings; `take` returns a step whenever step_s have passed.
+
+    orients: whether absolute orientations are wanted; those of another mode always are.
+    """
 
     def __init__(self, machine: MachineConfig, step_s: float, *, orients: bool = True) -> None:
         self.counters: Counter[str] = Counter()
@@ -53,7 +70,13 @@ class Steps:
         self._front = {s.name for s in machine.sensors if s.frame == FRONT}
         self._sums: dict[str, tuple[float, ...]] = {}
         self._orients = orients
-        self._orientations: dict[str, tuple[Floats, Floats]] = {}
+        self._orientations: dict[str, Told] = {}
+        source = turn_source(machine)
+        self._turns = source.name if source else ""
+        self._steers = source is not None and source.kind == "steering"
+        self._wheelbase_m = machine.wheelbase_m
+        self._told: list[float] = []  # rates of odometry, or curvatures of steering
+        self._rolled_ns = 0
         self._begin_ns = 0
         self._joint = WheelTracker()  # the angle of articulation, smoothed alike
         self._knows_joint = False
@@ -67,14 +90,22 @@ class Steps:
             self._knows_joint = True
         elif isinstance(reading, Imu):
             self._gather(reading, sensor)
-        elif isinstance(reading, Attitude) and self._orients:
+        elif isinstance(reading, Attitude) and (self._orients or sensor.mode != ABSOLUTE):
             self._orient(reading, sensor)
+        elif isinstance(reading, Steering) and sensor.name == self._turns:
+            self._told.append(math.tan(reading.angle_rad) / self._wheelbase_m)
         elif isinstance(reading, Encoder | Odometry):
-            self._rolled = True
+            self._roll(reading, sensor)
         self._begin_ns = self._begin_ns or reading.stamp_ns
         if reading.stamp_ns - self._begin_ns < self._step_ns:
             return None
         return self._finish(reading.stamp_ns, dead)
+
+    def _roll(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
+        if sensor.says("speed"):
+            self._rolled, self._rolled_ns = True, reading.stamp_ns
+        if isinstance(reading, Odometry) and sensor.name == self._turns:
+            self._told.append(reading.rate_z_radps)
 
     def _gather(self, imu: Imu, sensor: SensorConfig) -> None:
         """Add up what an IMU says in its own axes: they are turned once per step, as turning is linear."""
@@ -109,7 +140,7 @@ class Steps:
             return
         rotation = _rotation(attitude) @ self._rotations[attitude.sensor].T
         variances = np.array([attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2])
-        self._orientations[attitude.sensor] = (_angles(rotation), variances)
+        self._orientations[attitude.sensor] = Told(attitude.stamp_ns, _angles(rotation), variances)
 
     def _to_rear(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
         """Turn by the articulation in the middle of the step, and take its rate off."""
@@ -129,7 +160,15 @@ class Steps:
             self._still_since = (stamp_ns, dead.travel_m)
         still_s = (stamp_ns - self._still_since[0]) * 1e-9
         rolled, self._rolled = self._rolled, False
-        return Step(stamp_ns, felt, orientations, dead.wheels.speed_mps, rolled, dead.traction, still_s)
+        turn = self._turn(stamp_ns, dead.wheels.speed_mps) if self._told else None
+        return Step(stamp_ns, felt, orientations, dead.wheels.speed_mps, rolled, dead.traction, still_s, turn)
+
+    def _turn(self, stamp_ns: int, speed_mps: float) -> Turn | None:
+        """Of the readings of this step; steering tells no turn without a speed."""
+        mean, self._told = sum(self._told) / len(self._told), []
+        if not self._steers:
+            return Turn(mean, 1.0)
+        return Turn(speed_mps * mean, speed_mps) if stamp_ns - self._rolled_ns < STALE_S * 1e9 else None
 
 
 def _rotation(attitude: Attitude) -> Floats:

@@ -3,18 +3,18 @@
 EVIDENCE: with filterpy 2.0 several `update()` after one `predict()` reuse stale sigma points, and the covariance goes
 negative. Here each step draws its own. x, P = L L^T: belief, L_i: column of the factor, Q, R: noise.
 
-The scaled unscented transform (van der Merwe 2004) takes a function g at x and at x +- gamma L_i, with
-gamma^2 = alpha^2 (n + kappa). Of each pair the odd and the even part are
+The scaled unscented transform (van der Merwe 2004) takes a function g at x and at the sigma points x +- gamma L_i, with
+gamma^2 = alpha^2 (n + kappa). Put into the usual sums, the weights (W = 1 / (2 gamma^2), and large ones of either sign
+at the centre) cancel on paper: with d_j = g(x_j) - g(x), of the 2 n points around the centre,
 
-    d_i = (g+ - g-) / (2 gamma)      e_i = (g+ + g- - 2 g(x)) / (2 gamma)
-
-Put into the usual sums, the weights (W_i = 1 / (2 gamma^2), and large ones of either sign at the centre) cancel to
-
-    mean = g(x) + m,  m = sum(e_i) / gamma       covariance = sum(d_i d_i^T + e_i e_i^T) + (beta - alpha^2) m m^T
+    mean = g(x) + m,  m = W sum(d_j)       covariance = W sum(d_j d_j^T) + (beta - alpha^2) m m^T
 
 which is a sum of squares if beta >= alpha^2, whatever the sign of the centre's weight: the paper's lambda = 3 - n, and
 alpha = 0.001, are safe in this form. The default is the paper's gamma^2 = 3, which is right to the fourth moment along
 each axis, with beta = alpha^2, where the last term, which grows with n, vanishes.
+
+The d_j are columns of d. That of the centre, which does not deviate from itself, takes sqrt((beta - alpha^2) / W) m, so
+that the covariance is W d d^T.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from agents.localisation.conditioning import (
     bounded,
     conclude,
     definite,
-    factor,
-    is_usable,
+    noise_root,
     refused,
+    root,
     wrapped,
     wrapped_state,
 )
@@ -62,81 +62,58 @@ class Ukf:
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
         """Move the belief through the motion."""
-        ukf = self._at(belief)
-        ukf.predict_with(motion)
-        return Belief(stamp_ns, ukf.x, ukf.P)
+        ukf = self._filter(len(belief.x), 0)
+        _, d, mean = ukf.deviations(belief, motion.f, ())
+        P = ukf.W * d.dot(d.T) + motion.Q
+        return definite(stamp_ns, wrapped_state(mean, motion.angles), bounded(P, motion.angles))
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
-        if not is_usable(measurement):
+        noise = noise_root(measurement)
+        if noise is None:
             return refused(belief, measurement)
-        L, D, predicted, excess = self._at(belief).measured_with(measurement)
-        return conclude(belief, measurement, predicted, L, D, measurement.R + excess)
+        k = len(noise)
+        ukf = self._filter(len(belief.x), k)
+        of_x, d, mean = ukf.deviations(belief, measurement.h, measurement.angles)
+        together = ukf.root_W * np.concatenate([d, of_x])
+        together[:k, -k:] = noise
+        return conclude(belief, measurement, mean, together)
 
-    def _at(self, belief: Belief) -> VectorisedUkf:
-        """A filter of filterpy's at the belief."""
-        n = len(belief.x)
-        return _template(n, self.alpha, self.beta, 3.0 - n if self.kappa is None else self.kappa).at(belief)
+    def _filter(self, n: int, k: int) -> VectorisedUkf:
+        """A filter of filterpy's for n states and a measurement of k."""
+        return _made(n, k, self.alpha, self.beta, 3.0 - n if self.kappa is None else self.kappa)
 
 
 class VectorisedUkf(UnscentedKalmanFilter):  # type: ignore[misc]
-    """filterpy's filter without its loops over sigma points."""
+    """filterpy's filter without its loops over sigma points. It holds no belief, so one serves every step."""
 
-    def __init__(self, n: int, alpha: float, beta: float, kappa: float) -> None:
+    def __init__(self, n: int, k: int, alpha: float, beta: float, kappa: float) -> None:
         if n + kappa <= 0:
             raise ValueError(f"kappa: {kappa} is too small for {n} states")
         points = MerweScaledSigmaPoints(n, alpha=alpha, beta=beta, kappa=kappa)
-        super().__init__(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=None, points=points)
-        self.x: Floats
-        self.P: Floats
+        super().__init__(dim_x=n, dim_z=k, dt=1.0, hx=None, fx=None, points=points)
         self.gamma = alpha * math.sqrt(n + kappa)
+        self.W, self.root_W = 0.5 / self.gamma**2, math.sqrt(0.5) / self.gamma
         self.surplus = beta - alpha**2
-        self.ones = np.ones(n)
+        # Of x, in units of L: the centre, the pairs around it, and k times the centre, where noise deviates.
+        directions = np.concatenate([np.zeros((n, 1)), np.eye(n), -np.eye(n), np.zeros((n, k))], axis=1)
+        self.directions = self.gamma * directions
+        self.weights = np.full(2 * n + 1 + k, self.W)
 
-    def at(self, belief: Belief) -> VectorisedUkf:
-        """The same filter elsewhere; a copy, so that nothing is kept from step to step."""
-        other = object.__new__(VectorisedUkf)  # a third of the cost of copy.copy
-        other.__dict__ = {**self.__dict__, "x": belief.x, "P": belief.P}
-        return other
-
-    def predict_with(self, motion: Motion) -> None:
-        """Set x and P to those after the motion."""
-        parts, m, centre = self._parts(factor(self.P), motion.f, ())
-        self.x = wrapped_state(centre + m, motion.angles)
-        self.P = definite(bounded(self._square(parts, m) + motion.Q, motion.angles))
-
-    def measured_with(self, measurement: Measurement) -> tuple[Floats, Floats, Floats, Floats]:
-        """L (n, n), D (n, k), the measurement predicted (k,), and its covariance beyond D^T D (k, k)."""
-        L = factor(self.P)
-        parts, m, centre = self._parts(L, measurement.h, measurement.angles)
-        n = len(L)
-        return L, parts[:n], centre + m, self._square(parts[n:], m)
-
-    def _parts(
-        self, L: Floats, g: Callable[[Floats], Floats], angles: tuple[int, ...]
+    def deviations(
+        self, belief: Belief, g: Callable[[Floats], Floats], angles: tuple[int, ...]
     ) -> tuple[Floats, Floats, Floats]:
-        """d_i above e_i (2n, k), m (k,), g(x) (k,); differences of angles are wrapped."""
-        n = len(L)
-        spread = self.gamma * L.T
-        points = np.empty((2 * n + 1, n))
-        points[0] = self.x
-        np.add(self.x, spread, out=points[1 : n + 1])
-        np.subtract(self.x, spread, out=points[n + 1 :])
-        values = g(points)
+        """Those of x (n, 2 n + 1 + k) and d of g (j, 2 n + 1 + k) at the points, and the mean (j,) of g."""
+        of_x = root(belief).dot(self.directions)
+        values = g((of_x + belief.x[:, None]).T)
         centre = values[0]
-        off = wrapped(values[1:] - centre, angles)
-        parts = np.empty(off.shape)
-        np.subtract(off[:n], off[n:], out=parts[:n])
-        np.add(off[:n], off[n:], out=parts[n:])
-        parts *= 0.5 / self.gamma
-        return parts, self.ones @ parts[n:] / self.gamma, centre
-
-    def _square(self, parts: Floats, m: Floats) -> Floats:
-        """Sum of the squares of the parts (k, k), and the surplus of m."""
-        square: Floats = parts.T @ parts
-        return square + self.surplus * np.outer(m, m) if self.surplus else square
+        d = wrapped(values - centre, angles).T
+        m = d.dot(self.weights)
+        if self.surplus:
+            d[:, 0] = math.sqrt(self.surplus / self.W) * m
+        return of_x, d, centre + m
 
 
 @lru_cache
-def _template(n: int, alpha: float, beta: float, kappa: float) -> VectorisedUkf:
-    return VectorisedUkf(n, alpha, beta, kappa)
+def _made(n: int, k: int, alpha: float, beta: float, kappa: float) -> VectorisedUkf:
+    return VectorisedUkf(n, k, alpha, beta, kappa)

@@ -27,7 +27,7 @@ def run(arguments: Namespace) -> int:
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
     site, machine, config = _configure(arguments, log)
     session = open_session(SessionConfig(arguments.endpoint, wait_s=-1))
-    agent = Agent(session, site, machine, config, Places(arguments.spool, arguments.audit), withhold=arguments.withhold)
+    agent = Agent(session, site, machine, config, _places(arguments), withhold=arguments.withhold)
     say({"ready": "agent", "machine": machine.name, "site": site.name})
     try:
         report = agent.run(_driver(arguments, log, session, site, machine), stop.is_set, wait=stop.wait)
@@ -36,6 +36,12 @@ def run(arguments: Namespace) -> int:
         session.close()  # type: ignore[no-untyped-call]
     say({"ended": plain(report)}) if arguments.json else note(_summary(machine, report))
     return 0 if report["delivered"] or stop.is_set() else 1
+
+
+def _places(arguments: Namespace) -> Places:
+    """Files of the agent; the calibration lies beside the spool, if nothing else is asked for."""
+    calibration = arguments.calibration or arguments.spool.with_suffix(".calibration.json")
+    return Places(arguments.spool, arguments.audit, calibration)
 
 
 def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig, MachineConfig, AgentConfig]:

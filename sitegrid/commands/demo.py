@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.audit import AuditResult, audit_store
+from evaluation.ground_truth import read_way
 from evaluation.localisation import position_rmse
-from evaluation.mapscore import MapScore, score
+from evaluation.mapscore import DrivenScore, MapScore, score, score_driven
 from mapserver.config import ServerConfig
 from mapserver.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
@@ -22,6 +23,7 @@ from protocol.queries import Region
 from protocol.session import free_endpoint
 from protocol.site import load_site
 from sim.config import SimConfig, resolve
+from sim.recorder import TRACKS_FOLDER
 from sim.scenario import Scenario
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
@@ -129,8 +131,12 @@ def _drive(plan: Plan, children: Children, stop: threading.Event, display: Displ
     server.stop()
     audits = {name: plan.work / f"{name}.audit" for name in agents}
     audit = audit_store(audits, plan.work / "store", load_site(plan.site_file()), ServerConfig())
-    found = score(region, truth_layers(TruthMap.load(_truth_file(plan)), region))
-    return _result(plan, (audit, found, rmse), reports, pictures, log_report)
+    truth = truth_layers(TruthMap.load(_truth_file(plan)), region)
+    machines = [rig.machine for rig in plan.scenario.rigs()]
+    tracks_folder = plan.work / "truth" / TRACKS_FOLDER
+    ways_m = [read_way(tracks_folder / f"{m.name}.csv", m.load_centre_m).place_m for m in machines]
+    scores = score(region, truth), score_driven(region, truth, ways_m)
+    return _result(plan, (audit, scores, rmse), reports, pictures, log_report)
 
 
 def _start_server(plan: Plan, children: Children, name: str, site_file: Path) -> Child:
@@ -249,12 +255,12 @@ class _LogRun:
 
 def _result(
     plan: Plan,
-    judged: tuple[AuditResult, MapScore, dict[str, float]],
+    judged: tuple[AuditResult, tuple[MapScore, DrivenScore], dict[str, float]],
     reports: dict[str, Any],
     pictures: list[str],
     log: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    audit, found, rmse = judged
+    audit, (found, driven), rmse = judged
     log_lost, log_double = (log["lost"], log["double"]) if log else (0, 0)
     return {
         "machines": len(reports),
@@ -268,6 +274,13 @@ def _result(
         "cells": found.cells,
         "wrong_resistance_pct": round(found.wrong_resistance_pct, 2),
         "wrong_grade_pct": round(found.wrong_grade_pct, 2),
+        "driven": {
+            "cells": driven.cells,
+            "known_pct": round(driven.known_pct, 2),
+            "wrong_resistance_pct": round(driven.wrong_resistance_pct, 2),
+            "wrong_grade_pct": round(driven.wrong_grade_pct, 2),
+            "by_border": driven.by_border,
+        },
         "position_rmse_m": {name: round(value, 2) for name, value in rmse.items()},
         "pictures": [*pictures, *([log["picture"]] if log else [])],
         "log": log,
@@ -283,6 +296,11 @@ def _print(result: dict[str, Any]) -> None:
         f"resistance class wrong in {result['wrong_resistance_pct']} %, slope class in {result['wrong_grade_pct']} %"
     )
     print(f"  {result['cells']} cells are known: {wrong}")
+    driven = result["driven"]
+    print(
+        f"  {driven['cells']} cells were truly driven: {driven['known_pct']} % are known, of these "
+        f"{driven['wrong_resistance_pct']} % wrong by resistance, {driven['wrong_grade_pct']} % by slope"
+    )
     rmse = ", ".join(f"{name} {value} m" for name, value in result["position_rmse_m"].items())
     print(f"  position error (rms): {rmse}")
     if log := result["log"]:

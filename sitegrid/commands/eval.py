@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Sequence
 from typing import Any
 
 from benchmarks.measure import table
@@ -10,12 +11,13 @@ from sitegrid.process import note, plain, say
 from sitegrid.progress import Display
 
 Tables = dict[str, Any]
+MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side
 SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
 
 def run(arguments: Namespace) -> int:
     """Run one evaluation and print what it found."""
-    asks = {"physics": _physics, "localisation": _localisation, "log": _log, "parity": _parity}
+    asks = {"physics": _physics, "localisation": _localisation, "ground": _ground, "log": _log, "parity": _parity}
     result = asks[arguments.what](arguments)
     if arguments.json:
         say(plain(result))
@@ -51,6 +53,25 @@ def _localisation(arguments: Namespace) -> Tables:
     return result
 
 
+def _ground(arguments: Namespace) -> Tables:
+    from evaluation import ground
+    from evaluation.workers import cores
+
+    plan = ground.Plan(
+        seeds=tuple(_seeds(arguments)),
+        seconds=arguments.seconds,
+        cache=arguments.out,
+        processes=arguments.processes or cores(),
+    )
+    with Display("loaders work, estimators follow", headless=arguments.json) as display:
+        result, outcomes = ground.run(plan, display.show)
+    if arguments.plots:
+        from evaluation import ground_plots  # imported here: only pictures need matplotlib
+
+        result["plots"] = [str(path) for path in ground_plots.draw(outcomes, arguments.plots)]
+    return result
+
+
 def _log(arguments: Namespace) -> Tables:
     from evaluation import reallog
     from evaluation.configurations import Configuration, select
@@ -76,7 +97,14 @@ def _lines(result: Tables) -> list[str]:
     lines = []
     for name, value in result.items():
         if isinstance(value, list) and value and isinstance(value[0], dict):
-            lines.append(table([{k: v for k, v in row.items() if not isinstance(v, SHOWN)} for row in value]))
+            rows = [{k: v for k, v in row.items() if not isinstance(v, SHOWN)} for row in value]
+            lines.append(table(_turned(rows) if len(rows[0]) > MOST_COLUMNS else rows))
         elif value not in ([], {}):
             lines.append(f"{name}: {value}")
     return lines
+
+
+def _turned(rows: Sequence[Tables]) -> list[Tables]:
+    """Rows as columns, under their first values."""
+    named = {f"{next(iter(row.values()))} {list(row.values())[1]}": row for row in rows}
+    return [{"": name, **{title: row[name] for title, row in named.items()}} for name in list(rows[0])[2:]]

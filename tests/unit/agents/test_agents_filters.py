@@ -9,7 +9,7 @@ import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from agents.localisation.belief import Belief, Filter, Measurement, Motion
-from agents.localisation.conditioning import definite, factor, wrapped
+from agents.localisation.conditioning import definite, factor, root, wrapped
 from agents.localisation.ekf import Ekf
 from agents.localisation.kinematics import GpsError, MotionConfig, map_from_base, motion
 from agents.localisation.state import ATTITUDE, PITCH, POSITION, RATE, ROLL, VELOCITY, YAW, Layout
@@ -224,7 +224,7 @@ def _felt(truth: Floats, rng: np.random.Generator) -> list[Measurement]:
 @pytest.mark.parametrize("kind", ALL[1:], ids=name)
 @pytest.mark.parametrize("n", [2, 15, 21])
 def test_scaled_weights_sum_to_one(kind: Ukf, n: int) -> None:
-    ukf = kind._at(believed(np.zeros(n), np.eye(n)))
+    ukf = kind._filter(n, 2)
     assert ukf.Wm.sum() == pytest.approx(1.0)
     assert ukf.Wc.sum() == pytest.approx(1.0 + 1.0 - kind.alpha**2 + kind.beta)
     assert ukf.Wm[1] == pytest.approx(1 / (2 * ukf.gamma**2))
@@ -424,10 +424,31 @@ def test_a_belief_that_is_not_positive_definite_is_repaired(kind: Filter) -> Non
 def test_repair_changes_little_and_minds_the_units() -> None:
     P = np.diag([1e6, 1e-10, 1.0])
     P[0, 2] = P[2, 0] = 1e3 * (1 + 1e-9)
-    repaired = definite(P)
+    repaired = definite(0, np.zeros(3), P).P
     np.testing.assert_allclose(repaired, P, rtol=1e-6)
     root = factor(P)
     np.testing.assert_allclose(root @ root.T, P, rtol=1e-6, atol=1e-18)
+
+
+@pytest.mark.parametrize("kind", ALL, ids=name)
+def test_a_belief_keeps_the_factor_of_its_own_covariance(kind: Filter) -> None:
+    belief, moves, measurements = small(0.3)
+    assert belief.L is None
+    predicted = kind.predict(belief, moves, 1)
+    heard = kind.condition(predicted, measurements[0]).belief
+    for each in (belief, predicted, heard):
+        assert each.L is root(each)
+        np.testing.assert_array_equal(each.L, factor(each.P))
+    other = replace(heard, P=heard.P * 4.0)
+    np.testing.assert_allclose(root(other), 2.0 * root(heard), rtol=1e-15)
+
+
+def test_the_kept_factor_is_no_part_of_a_belief() -> None:
+    x, P = frozen(np.zeros(3)), frozen(np.eye(3))
+    one, other = Belief(1, x, P), Belief(1, x, P)
+    root(one)
+    assert one == other
+    assert repr(one) == repr(other)
 
 
 def test_a_covariance_of_nan_is_an_error() -> None:

@@ -79,6 +79,19 @@ def plainly(engine: Filter, groups: list[list[Measurement]], belief: Belief) -> 
     return belief
 
 
+def test_only_a_fix_makes_the_place_unsure_when_it_is_believed_again() -> None:
+    """A velocity (2,) of a differential receiver says nothing of the place."""
+    velocity = sensing.velocity(START_NS + 50 * MS, "gps-1", np.array([90.0, 0.0]), np.eye(2), np.zeros(3), 4.0)
+    variances = []
+    for measurement in (velocity, fix(50, 90.0, gate=4.0)):
+        found = fusion(relock=1)
+        found.add([measurement])
+        assert found.counters["gps-1_relocked"] == 1
+        variances.append(found.belief.P[0, 0])
+    assert variances[0] < 0.02
+    assert variances[1] > 0.9
+
+
 # --- order -----------------------------------------------------------------------------------------------------------
 
 

@@ -267,7 +267,7 @@ VALUES: dict[str, Any] = {
     "sampling.max_pitch_rate_radps": 0.002,
 }
 # Tested on their own below.
-ELSEWHERE = {"sampling.history_s"}
+ELSEWHERE = {"sampling.history_s", "localisation.sensing.turn_radps"}  # the latter in test_agents_turns.py
 
 
 def options_of(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -353,6 +353,12 @@ SENSOR = [
     ("imu-3", {"frame": FRONT}),
     ("imu-3", {"gives": ("rate",)}),
     ("torque", {"use": False}),
+    ("gps-1", {"std": {"position": 5.0}}),
+    ("imu-3", {"std": {"rate": 0.05}}),
+    ("imu-3", {"std": {"force": 9.0}}),
+    ("wheels", {"std": {"speed": 0.5}}),
+    ("gps-2", {"mode": "differential"}),
+    ("gps-2", {"mode": "relative"}),
 ]
 
 

@@ -25,7 +25,7 @@ from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import Mount
 
-PAPER, FULL = Layout(), Layout(imus=2, wheel_scale=True, receivers=2)
+PAPER, FULL = Layout(), Layout(imus=2, wheel_scale=True, receivers=2, references=1)
 LEVER_M = np.array([0.8, -0.3, 3.0])
 CONFIG = SensingConfig()
 
@@ -41,6 +41,10 @@ def every_kind(layout: Layout) -> list[Measurement]:
         sensing.wheels(0, "wheels", np.zeros(3), np.eye(3), layout.wheel_scales.start if augmented else None, 6.0),
         sensing.orientation(0, "ahrs", np.zeros(3), np.eye(3), 6.0),
         sensing.standstill(0, CONFIG),
+        sensing.velocity(0, "gps-2", np.zeros(2), np.eye(2), LEVER_M, 4.0),
+        sensing.rotation(0, "ahrs", np.zeros(3), np.eye(3), 6.0),
+        sensing.turn(0, 0.0, 0.02, layout.gyro_bias(1) if augmented else None, 3.0, 6.0),
+        sensing.orientation(0, "ahrs", np.zeros(3), np.eye(3), 6.0, layout.heading_errors.start if augmented else None),
     ]
 
 
@@ -54,7 +58,7 @@ def told(measurement: Measurement, x: Floats) -> Floats:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("layout", [PAPER, FULL], ids=["paper", "full"])
-@pytest.mark.parametrize("kind", range(5), ids=["fix", "inertial", "wheels", "orientation", "standstill"])
+@pytest.mark.parametrize("kind", range(9))
 def test_jacobian_equals_finite_differences(kind: int, layout: Layout, seed: int) -> None:
     measurement, x, step = every_kind(layout)[kind], somewhere(seed, layout), 1e-6
     moved = step * np.eye(layout.n)

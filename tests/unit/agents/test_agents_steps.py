@@ -144,9 +144,10 @@ def test_an_attitude_is_told_as_roll_pitch_yaw_at_any_mount(
 ) -> None:
     mount = Mount((0.0, 0.0, 1.0), rpy_deg)
     step = one(of_ahrs(mount), [attitude(rpy, mount), attitude(rpy, mount, 100, scale=-1.0005)])
-    told, variances = step.orientations["ahrs"]
-    assert told == pytest.approx(rpy, abs=1e-9)
-    assert variances.tolist() == [0.01, 0.02, 0.03]
+    told = step.orientations["ahrs"]
+    assert told.values == pytest.approx(rpy, abs=1e-9)
+    assert told.variances.tolist() == [0.01, 0.02, 0.03]
+    assert told.stamp_ns == step.stamp_ns
 
 
 def test_the_last_attitude_of_a_step_is_told_and_once_only() -> None:
@@ -154,7 +155,7 @@ def test_the_last_attitude_of_a_step_is_told_and_once_only() -> None:
     readings: list[Reading] = [attitude((0, 0, t / 100), Mount(), t) for t in (0, 50, 100)]
     readings.append(Encoder("wheels", START_NS + 200 * MS, 0.0, 0.0))
     first, second = gather(Steps(of, 0.1), of, readings)
-    assert first.orientations["ahrs"][0][2] == pytest.approx(1.0)
+    assert first.orientations["ahrs"].values[2] == pytest.approx(1.0)
     assert second.orientations == {}
 
 

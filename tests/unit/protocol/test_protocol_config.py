@@ -1,3 +1,4 @@
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import pytest
@@ -22,6 +23,7 @@ class Outer:
     many: tuple[int, ...] = ()
     inner: Inner = field(default_factory=Inner)
     inners: tuple[Inner, ...] = ()
+    named: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.count < 0:
@@ -30,8 +32,15 @@ class Outer:
 
 def test_values_and_defaults():
     table = {"name": "a", "ratio": 2, "maybe": 3, "triple": [1, 2.5, 3], "many": [4, 5], "inner": {"depth_m": 7}}
-    assert from_table(Outer, {**table, "inners": [{}, {"depth_m": 2}]}, "x.toml") == Outer(
-        "a", ratio=2.0, maybe=3.0, triple=(1.0, 2.5, 3.0), many=(4, 5), inner=Inner(7.0), inners=(Inner(), Inner(2.0))
+    assert from_table(Outer, {**table, "inners": [{}, {"depth_m": 2}], "named": {"b": 1}}, "x.toml") == Outer(
+        "a",
+        ratio=2.0,
+        maybe=3.0,
+        triple=(1.0, 2.5, 3.0),
+        many=(4, 5),
+        inner=Inner(7.0),
+        inners=(Inner(), Inner(2.0)),
+        named={"b": 1.0},
     )
 
 
@@ -55,6 +64,8 @@ def test_values_and_defaults():
         ({"name": "a", "inner": 1}, ["inner", "a table is expected"]),
         ({"name": "a", "inner": {"deep": 1}}, ["x.toml inner", "unknown key `deep`"]),
         ({"name": "a", "inners": [{}, {"deep": 1}]}, ["inners[1]", "unknown key `deep`"]),
+        ({"name": "a", "named": [1]}, ["x.toml named", "a table is expected, not list"]),
+        ({"name": "a", "named": {"b": "c"}}, ["x.toml named.b", "float is expected, not str"]),
         ({"name": "a", "count": -1}, ["x.toml", "count: -1 is negative"]),
     ],
 )

@@ -1,5 +1,6 @@
 """The pages say what the code does: names, limits, and an example that works."""
 
+import itertools
 import re
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from protocol import codec
 from protocol.errors import Refusal
 from protocol.geometry import MAX_CELLS
 from protocol.logfolder import open_log
+from protocol.machine import GIVES, MODES
 from protocol.messages import Pose
 from protocol.readings import KINDS, MAX_STAMP_NS, columns
 from protocol.samples import COLUMNS
@@ -36,6 +38,19 @@ def test_limits_are_the_documented_ones():
     for number in (codec.MAX_BATCH_SAMPLES, MAX_STAMP_NS, f"{MAX_CELLS:,}", "2^62", "2^64 - 1"):
         assert str(number) in WIRE
     assert codec.MAX_SEQ == 2**62
+
+
+@pytest.mark.parametrize("kind", GIVES)
+def test_every_part_of_a_sensor_is_documented(kind):
+    table = LOGS[LOGS.index("## What a sensor says") : LOGS.index("## Modes")]
+    rows = table[table.index(f"| `{kind}` |") :].splitlines()
+    own = [rows[0], *itertools.takewhile(lambda row: row.startswith("| |"), rows[1:])]
+    assert [row.split("|")[2].split("`")[1] for row in own] == [*GIVES[kind]]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_is_documented(mode):
+    assert f"`{mode}`" in LOGS
 
 
 @pytest.mark.parametrize("unit", [*_UNITS, *_NS])

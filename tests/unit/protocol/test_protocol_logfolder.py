@@ -178,7 +178,7 @@ def test_two_sensors_of_one_name_are_refused(tmp_path):
 SITE = SiteConfig("paper", 49.1, 8.4, 110.5)
 MOUNT = Mount((0.1, -0.2, 3.0), (0.0, 90.0, -90.0))
 SENSORS = tuple(SensorConfig(f"{kind}-1", kind, MOUNT, drift_time_s=60.0) for kind in KINDS)
-MACHINE = MachineConfig("loader-1", mass_kg=17_000.5, sensors=SENSORS)
+MACHINE = MachineConfig("loader-1", mass_kg=17_000.5, wheelbase_m=2.5, sensors=SENSORS)
 
 
 @st.composite

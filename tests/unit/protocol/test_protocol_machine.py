@@ -7,7 +7,8 @@ import pytest
 
 from protocol.config import from_table
 from protocol.errors import ConfigError
-from protocol.machine import MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
+from protocol.machine import GIVES, MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
+from protocol.readings import KINDS
 
 GPS = SensorConfig("gps-1", "gps", Mount((1.5, -0.5, 3.25), (0.0, 0.0, 180.0)), drift_share=0.5, use=False)
 MACHINE = MachineConfig("loader-1", mass_kg=16_000.0, sensors=(GPS, SensorConfig("imu-1", "imu")))
@@ -60,6 +61,8 @@ def test_impossible_machine_is_refused(change):
         {"ticks_per_rev": 0},
         {"frame": "bucket_link"},
         {"gives": ("force",)},
+        {"std": {"force": 1.0}},
+        {"mode": "total"},
         {"delay_s": -0.1},
         {"delay_s": float("nan")},
         {"gate_sigma": -1.0},
@@ -74,14 +77,72 @@ def test_a_sensor_may_give_a_part_of_what_its_kind_does():
     imu = SensorConfig("imu", "imu", gives=("rate",))
     assert (imu.says("rate"), imu.says("force")) == (True, False)
     assert SensorConfig("imu", "imu").says("force")
-    with pytest.raises(ValueError, match="gives: imu has no 'tilt', but rate, force"):
+    with pytest.raises(ValueError, match="gives: imu: imu has no 'tilt', but rate, force"):
         SensorConfig("imu", "imu", gives=("tilt",))
 
 
+def test_every_option_of_a_machine_is_written_and_read_back():
+    body = {
+        f.name: 1.25 + i for i, f in enumerate(dataclasses.fields(MachineConfig)) if f.name not in ("name", "sensors")
+    }
+    machine = MachineConfig("a", **body)
+    assert parse_machine(tomllib.loads(machine_toml(machine))["machine"], (), "x") == machine
+
+
+@pytest.mark.parametrize("name", ["wheelbase_m", "axle_stiffness_npm", "cog_height_m", "payload_z_m"])
+def test_what_a_maker_may_not_tell_is_0_or_positive(name):
+    assert getattr(MACHINE, name) == 0.0
+    for bad in (-0.1, math.nan, math.inf):
+        with pytest.raises(ValueError, match=name):
+            dataclasses.replace(MACHINE, **{name: bad})
+
+
 def test_every_option_of_a_sensor_is_written_and_read_back():
-    imu = SensorConfig("imu", "imu", use=False, gives=("rate",), delay_s=0.2, gate_sigma=5.0, frame="front_link")
-    table = tomllib.loads(machine_toml(MachineConfig("a", sensors=(imu,))))
-    assert from_table(SensorConfig, table["sensor"][0], "x") == imu
+    std = {"rate": 1e-5, "force": 1.5}
+    imu = SensorConfig(
+        "imu", "imu", use=False, gives=("rate",), delay_s=0.2, gate_sigma=5.0, frame="front_link", std=std
+    )
+    gps = dataclasses.replace(GPS, mode="relative")
+    table = tomllib.loads(machine_toml(MachineConfig("a", sensors=(imu, gps))))
+    assert tuple(from_table(SensorConfig, t, "x") for t in table["sensor"]) == (imu, gps)
+    assert len({imu, gps, dataclasses.replace(imu)}) == 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_standard_deviation_goes_by_what_the_kind_gives(kind):
+    for name in GIVES.get(kind, ()):
+        assert SensorConfig("a", kind, std={name: 0.5}).std[name] == 0.5
+        for bad in (0.0, -1.0, math.nan, math.inf):
+            with pytest.raises(ValueError, match=f"std: a: {name} must be positive and finite"):
+                SensorConfig("a", kind, std={name: bad})
+    with pytest.raises(ValueError, match=f"std: a: {kind} has no 'ticks', but "):
+        SensorConfig("a", kind, std={"ticks": 1.0})
+
+
+def test_a_bad_standard_deviation_of_a_file_is_refused_with_its_place():
+    with pytest.raises(ConfigError, match=r"x \[\[sensor\]\] 2: std: gyro: imu has no 'rte', but rate, force"):
+        from_table(SensorConfig, {"name": "gyro", "kind": "imu", "std": {"rte": 0.1}}, "x [[sensor]] 2")
+    with pytest.raises(ConfigError, match=r"x \[\[sensor\]\] 2 std.rate: float is expected"):
+        from_table(SensorConfig, {"name": "gyro", "kind": "imu", "std": {"rate": "a"}}, "x [[sensor]] 2")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("mode", ["differential", "relative"])
+def test_only_gps_and_attitude_have_another_mode(kind, mode):
+    assert SensorConfig("a", kind).mode == "absolute"
+    if kind in ("gps", "attitude"):
+        assert SensorConfig("a", kind, mode=mode).mode == mode
+        return
+    with pytest.raises(ValueError, match=f"mode: a: {kind} has no '{mode}', but absolute$"):
+        SensorConfig("a", kind, mode=mode)
+
+
+def test_steering_in_use_needs_the_wheelbase():
+    steering = SensorConfig("wheel-angle", "steering")
+    with pytest.raises(ValueError, match="wheelbase_m: wheel-angle: steering is of no use without it"):
+        MachineConfig("truck", sensors=(steering,))
+    assert MachineConfig("truck", sensors=(dataclasses.replace(steering, use=False),))
+    assert MachineConfig("truck", wheelbase_m=2.5, sensors=(steering,))
 
 
 def test_errors_of_a_machine_name_the_file():

@@ -19,6 +19,8 @@ from protocol.units import _UNITS, factor, stamp_ns, stamp_scale
         ("kNm", "torque_nm", 1000.0),
         ("mm", "height_m", 0.001),
         ("ticks", "left_ticks", 1.0),
+        ("t", "payload_kg", 1000.0),
+        ("kg", "payload_kg", 1.0),
     ],
 )
 def test_factor(unit, field, expected):

@@ -49,10 +49,12 @@ def rig(
     imu: Sequence[int] = (3,),
     attitude: Sequence[int] = (),
     only: str | None = None,
+    *,
+    payload: bool = False,
     faults: Faults = Faults(),  # noqa: B008 - frozen
 ) -> Rig:
     """A loader with these sensors. only: leave all other kinds aside."""
-    machine = machine_config("loader", LOADER, preset, tuple(gps), tuple(imu), tuple(attitude))
+    machine = machine_config("loader", LOADER, preset, tuple(gps), tuple(imu), tuple(attitude), payload=payload)
     kept = tuple(s for s in machine.sensors if only in (None, s.kind))
     return Rig(replace(machine, sensors=kept), LOADER, preset, faults)
 

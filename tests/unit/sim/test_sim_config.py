@@ -83,6 +83,7 @@ def test_options_go_over_the_scenario() -> None:
             gps=(3,),
             imu=(1, 4),
             attitude=(4,),
+            payload=True,
         )
     )
     assert (scenario.site.name, scenario.world, scenario.seed, scenario.seconds) == ("pit", "fast", 9, 5.0)
@@ -90,7 +91,7 @@ def test_options_go_over_the_scenario() -> None:
     assert {rig.preset.name for rig in scenario.rigs()} == {"rtk"}
     assert {speed for _, speed, _ in scenario.journeys()} == {2.0}
     sensors = {s.name for s in scenario.rigs()[0].machine.sensors}
-    assert sensors == {"gps-3", "imu-1", "imu-4", "attitude-4", "torque", "wheels", "articulation"}
+    assert sensors == {"gps-3", "imu-1", "imu-4", "attitude-4", "torque", "wheels", "articulation", "payload"}
 
 
 def test_without_options_everything_is_as_the_scenario_says() -> None:

@@ -26,6 +26,12 @@ def quarry() -> Driven:
     return drive(SimConfig(scenario="haul_road", world="fast", seed=1), 480.0)
 
 
+@pytest.fixture(scope="module")
+def loading() -> Driven:
+    """Four loaders at work together for more than two cycles."""
+    return drive(SimConfig(scenario="loading", world="fast", seed=1), 450.0)
+
+
 @pytest.mark.parametrize("steer", [0.1, -0.4, 0.6])
 @pytest.mark.parametrize(("rear", "front"), [(1.65, 1.65), (3.0, 1.2)])
 def test_bend_is_the_articulation_of_the_joints_circle(steer: float, rear: float, front: float) -> None:
@@ -97,6 +103,42 @@ def test_work_cycles_load_reverse_dump_and_wait(quarry: Driven) -> None:
     cycles = (np.diff((payload[:, loader] > 2000).astype(int)) == 1).sum()
     assert cycles >= 4
     assert still > (cycles - 1) * 10.0  # 6 s at the pile and 4 s at the hopper
+
+
+def test_loaders_at_work_get_round_in_each_others_company(loading: Driven) -> None:
+    speed, payload = loading.states.speed_mps, loading.payload_kg
+    assert ((np.diff((payload > 2000).astype(int), axis=0) == 1).sum(axis=0) >= 2).all()  # two cycles, each of them
+    assert (payload.min(axis=0) == 0).all()
+    assert payload.max(axis=0) == pytest.approx([4000.0] * 4)
+    pairs = itertools.combinations(range(4), 2)
+    joints = loading.joint_m
+    assert min(np.hypot(*(joints[:, i] - joints[:, j]).T).min() for i, j in pairs) > 6.0
+    ramp = abs(loading.states.grade_e) > 0.2
+    for machine in range(4):
+        backwards = speed[:, machine] < -1.0
+        assert (backwards & ramp[:, machine]).sum() > 50
+        assert (backwards & (payload[:, machine] > 2000)).sum() > 50
+        assert (backwards & ~ramp[:, machine]).sum() > 50
+
+
+def test_loaders_at_work_cover_all_soils_and_keep_to_their_ways(loading: Driven) -> None:
+    x, y, metres = loading.states.x_m, loading.states.y_m, abs(loading.states.speed_mps) * 0.1
+    zones = lay(loading.scenario.ground, 1).zone(x, y)
+    assert np.bincount(zones.ravel(), metres.ravel(), minlength=5).min() > 150
+    assert loading.off_m.max() < 0.6
+
+
+@pytest.mark.parametrize("route", ["west", "east", "middle", "yard"])
+def test_each_of_the_loaders_routes_can_be_driven_alone(tmp_path: Path, route: str) -> None:
+    path = tmp_path / "alone.toml"
+    path.write_text(f'base = "loading"\nworld = "fast"\n[[fleet]]\nname = "loader"\nroutes = ["{route}"]\n')
+    alone = drive(SimConfig(scenario=str(path), seed=2), 270.0)
+    loaded = (alone.payload_kg[:, 0] > 2000).astype(int)
+    assert (np.diff(loaded) == 1).any()
+    assert (np.diff(loaded) == -1).any()
+    starts = alone.joint_m[:50, 0].mean(axis=0)
+    back = np.hypot(*(alone.joint_m[1400:, 0] - starts).T) < 3.0
+    assert back.any()  # it has come round
 
 
 def test_reversing_machines_keep_to_their_way(quarry: Driven) -> None:

@@ -10,10 +10,10 @@ from sim_sensor_rigs import DGPS, LOADER, noisy, perfect, rig
 from protocol.config import load_toml
 from protocol.errors import ConfigError
 from protocol.machine import BASE, FRONT
-from protocol.readings import KINDS
-from sim.datasheets import EncoderNoise, GpsNoise, TorqueNoise
+from sim.datasheets import EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise
 from sim.machines import Rig, draw_bodies, machine_config
 from sim.presets import LIBRARY, load_preset, parse_preset
+from sim.sensors import _BANKS
 
 NAMES = tuple(load_toml(LIBRARY))
 HARDER = ("dgps", "harsh")
@@ -23,7 +23,7 @@ HARDER = ("dgps", "harsh")
 def test_every_preset_of_the_library_loads(name: str) -> None:
     preset = load_preset(name)
     assert preset.name == name
-    assert all(preset.rate_hz(kind) > 0 for kind in KINDS if kind != "odometry")
+    assert all(preset.rate_hz(kind) > 0 for kind in ("gps", *_BANKS))
 
 
 def test_the_library_has_the_presets_that_documents_name() -> None:
@@ -49,10 +49,15 @@ def test_paper_receivers_are_2_m_off_before_their_scale_and_mostly_slowly() -> N
 
 def test_harsh_is_nowhere_better_than_dgps() -> None:
     better, worse = map(load_preset, HARDER)
-    for kind in ("imu", "attitude", "torque", "articulation"):
+    for kind in ("imu", "attitude", "torque", "articulation", "payload"):
         for field in fields(getattr(better, kind)):
             assert getattr(getattr(worse, kind), field.name) >= getattr(getattr(better, kind), field.name), field.name
     assert worse.gps.outage_s > better.gps.outage_s
+
+
+def test_weighing_systems_are_as_good_as_their_makers_state_and_worse_on_a_bad_day() -> None:
+    assert load_preset("dgps").payload == load_preset("paper").payload == PayloadNoise(1, 50.0, 0.02)
+    assert load_preset("harsh").payload == PayloadNoise(1, 150.0, 0.05)
 
 
 def test_a_scenario_changes_single_values_of_a_base() -> None:
@@ -125,6 +130,8 @@ def test_machine_has_the_sensors_asked_for_fast_ones_first() -> None:
     assert machine.sensors[1].mount == LOADER.imu_mounts()[0][1]
     assert machine.sensors[2].mount == LOADER.imu_mounts()[2][1]
     assert [sensor.mount for sensor in machine.sensors[-2:]] == list(LOADER.gps_mounts()[:2])
+    weighed = machine_config("a", LOADER, DGPS, (1,), (3,), (), payload=True)
+    assert (weighed.sensors[-1].name, weighed.sensors[-1].kind) == ("payload", "payload")
     bare = machine_config("a", LOADER, noisy("torque", rate_hz=5), (), (), ())
     assert [sensor.name for sensor in bare.sensors] == ["wheels", "articulation", "torque"]
 
@@ -133,6 +140,9 @@ def test_agents_know_the_nominal_body_and_what_a_data_sheet_says() -> None:
     machine = machine_config("a", LOADER, load_preset("paper"), (3,), (), ())
     for name in ("mass_kg", "wheel_radius_m", "load_centre_m", "rotating_mass_factor"):
         assert getattr(machine, name) == getattr(LOADER, name)
+    known = (machine.wheelbase_m, machine.axle_stiffness_npm, machine.cog_height_m)
+    assert known == pytest.approx((3.3, 1.8e6, 1.05))
+    assert (machine.payload_x_m, machine.payload_z_m) == pytest.approx((4.7, 0.85))  # ahead of the front axle
     receiver = machine.sensors[-1]
     assert (receiver.name, receiver.drift_share, receiver.drift_time_s) == ("gps-3", 0.9, 45.0)
     assert machine_config("a", LOADER, DGPS, (1,), (), ()).sensors[-1].drift_share == 0.75

@@ -3,7 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from protocol.config import load_toml
 from protocol.errors import ConfigError
+from protocol.ground import ZONES
 from sim.driver import bend
 from sim.ground import lay
 from sim.machine_model import load_model
@@ -20,7 +22,7 @@ def write(folder: Path, text: str, base: str = "paper_site") -> str:
 
 
 def test_library_has_the_scenarios_of_the_project() -> None:
-    assert set(LIBRARY) >= {"paper_site", "haul_road", "repaved", "busy_site", "bad_machine"}
+    assert set(LIBRARY) >= {"paper_site", "haul_road", "repaved", "busy_site", "bad_machine", "loading"}
 
 
 @pytest.mark.parametrize("name", LIBRARY)
@@ -86,6 +88,50 @@ def test_busy_site_has_a_hundred_machines_in_the_fast_world_both_ways_round() ->
     assert min(turns.count(1), turns.count(-1)) > 30
     shares = np.sort([share for _, _, share in scenario.journeys()][::3])
     assert np.diff(shares).max() < 0.06  # spread over the lap
+
+
+def test_loaders_reverse_over_the_ground_they_came_and_carry_a_load_once_a_tour() -> None:
+    scenario = load_scenario("loading")
+    (ramp,) = scenario.ground.ramp
+    terrain = lay(scenario.ground, 0)
+    assert [route.name for route in scenario.route] == ["west", "east", "middle", "yard"]
+    for route, _, _ in scenario.journeys():
+        changes = [leg.payload_kg for leg in route.legs if leg.payload_kg is not None]
+        assert sorted(changes) == [0.0, 4000.0]
+        carried, soils, loaded, climbed_m = max(changes[-1:]), set[str](), 0, 0.0
+        for before, leg in zip([route.legs[-1], *route.legs[:-1]], route.legs, strict=True):
+            if leg.reverse:
+                assert 20 <= leg.length_m <= 30
+                off = np.hypot(*(leg.points[:, None] - before.points).transpose(2, 0, 1)).min(axis=1)
+                assert off.max() < 0.3  # there are points every half a metre
+                on_ramp = (leg.points[:, 0] > ramp.foot_m[0]) & (leg.points[:, 0] < ramp.top_m[0])
+                climbed_m = max(climbed_m, on_ramp.sum() * leg.spacing_m)
+                soils |= (
+                    {ZONES[i].name for i in set(terrain.zone(*leg.points.T).tolist())} if not on_ramp.any() else set()
+                )
+                loaded += carried > 0
+            carried = carried if leg.payload_kg is None else leg.payload_kg
+        assert sum(leg.reverse for leg in route.legs) >= 2
+        assert soils & {"dry concrete", "gravel"}
+        assert climbed_m > 10
+        assert loaded >= 1
+
+
+def test_machines_weigh_their_payload_where_a_route_changes_it_or_as_the_fleet_says(tmp_path: Path) -> None:
+    def weigh(name: str) -> list[bool]:
+        return ["payload" in {s.kind for s in rig.machine.sensors} for rig in load_scenario(name).rigs()]
+
+    assert weigh("paper_site") == [False] * 3
+    assert weigh("haul_road") == [True] * 5
+    assert weigh("loading") == [True] * 4
+    fleet = '[[fleet]]\nname = "{}"\nroutes = ["{}"]\n{}'
+    assert weigh(write(tmp_path, fleet.format("a", "west", "payload = true\n"))) == [True]
+    own = fleet.format("a", "haul", "payload = false\n") + fleet.format("b", "haul", "")
+    lap = '[[route]]\nname = "lap"\ncorners = [[30, 30], [90, 30], [90, 90], [30, 90]]\n'
+    haul = load_toml(FOLDER / "haul_road.toml")["route"][0]["leg"]
+    legs = "".join(f"[[route.leg]]\ncorners = {leg['corners']}\npayload_kg = {leg['payload_kg']}\n" for leg in haul)
+    text = own + fleet.format("c", "lap", "") + f'[[route]]\nname = "haul"\n{legs}' + lap
+    assert weigh(write(tmp_path, text.replace("22000", "2000"), "haul_road")) == [False, True, False]
 
 
 def test_bad_machine_and_repaved_say_what_is_wrong_and_when() -> None:

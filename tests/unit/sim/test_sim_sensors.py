@@ -28,7 +28,7 @@ from sim.world import FleetState
 
 N = 500
 STEPS = 600
-FULL = rig(DGPS, gps=(1, 2), imu=(1, 3), attitude=(3,))
+FULL = rig(DGPS, gps=(1, 2), imu=(1, 3), attitude=(3,), payload=True)
 
 
 def moving(k: int, n: int) -> FleetState:
@@ -77,10 +77,10 @@ def test_readings_do_not_depend_on_other_machines(count: int) -> None:
 
 def test_readings_do_not_depend_on_other_sensors() -> None:
     without = replace(DGPS, gps=replace(DGPS.gps, outage_s=0.0))  # receivers are lost in turn: their number matters
-    many = run([rig(without, gps=(1, 2, 3), imu=(1, 2, 3, 4), attitude=(1, 2, 3))])[0]
-    few = run([rig(without, gps=(2,), imu=(3,), attitude=(2,))])[0]
+    many = run([rig(without, gps=(1, 2, 3), imu=(1, 2, 3, 4), attitude=(1, 2, 3), payload=True)])[0]
+    few = run([rig(without, gps=(2,), imu=(3,), attitude=(2,), payload=True)])[0]
     names = {reading.sensor for reading in few}
-    assert names == {"gps-2", "imu-3", "attitude-2", "torque", "wheels", "articulation"}
+    assert names == {"gps-2", "imu-3", "attitude-2", "torque", "wheels", "articulation", "payload"}
     assert [reading for reading in many if reading.sensor in names] == few
 
 
@@ -181,6 +181,31 @@ def test_articulation_has_white_noise_and_a_zero(rate_hz: int) -> None:
     zero = values(rig(preset, only="articulation"), "articulation", 0.2, 2 * N, articulation_rad=0.4) - 0.4
     np.testing.assert_allclose(zero, np.broadcast_to(zero[0], zero.shape))
     check_deviation(zero[0], math.radians(0.3), 2 * N)
+
+
+@pytest.mark.parametrize("rate_hz", [1, 5])
+def test_payload_has_white_noise(rate_hz: int) -> None:
+    one = rig(noisy("payload", rate_hz=rate_hz, white_kg=50.0), only="payload", payload=True)
+    white = values(one, "payload", 4.0, N, payload_kg=4000.0) - 4000.0
+    assert len(white) == 4 * rate_hz
+    check_deviation(white, 50.0, white.size)
+    check_correlation(white, 1, 0.0, white.size)
+
+
+def test_payload_has_a_scale_error_drawn_once() -> None:
+    one = rig(noisy("payload", scale=0.02), only="payload", payload=True)
+    scales = values(one, "payload", 3.0, 2 * N, payload_kg=4000.0) / 4000.0 - 1
+    np.testing.assert_allclose(scales, np.broadcast_to(scales[0], scales.shape))
+    check_deviation(scales[0], 0.02, 2 * N)
+
+
+def test_payload_follows_what_is_carried_and_is_never_negative() -> None:
+    carried = np.repeat([0.0, 1500.0, 4000.0], 100)[:, None]
+    quiet, loud = (rig(noisy("payload", white_kg=kg), only="payload", payload=True) for kg in (0.0, 50.0))
+    assert blocks([quiet], still(300, payload_kg=carried))["payload"].values.ravel().tolist() == [0.0, 1500.0, 4000.0]
+    empty = values(loud, "payload", 2.0, N)
+    assert empty.min() == 0.0
+    assert 0.4 < (empty > 0).mean() < 0.6
 
 
 # --- faults ----------------------------------------------------------------------------------------------------------

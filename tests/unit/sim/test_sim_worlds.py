@@ -179,6 +179,16 @@ def test_steering_stays_within_its_limits(kind: type, model: MachineModel) -> No
 
 
 @EACH
+def test_state_says_what_is_carried(kind: type) -> None:
+    with placed(kind, plane(0), LOADER, LOADER, starts=[(500, 500, 0), (500, 520, 0)]) as world:
+        assert world.state.payload_kg.tolist() == [0.0, 0.0]
+        world.set_payload(1, 3000.0)
+        state = idle(world, 0.01)
+        assert state.payload_kg.tolist() == [0.0, 3000.0]
+        assert state.mass_kg.tolist() == [17_500.0, 20_500.0]
+
+
+@EACH
 @BOTH
 def test_a_load_weighs_on_the_wheels(kind: type, model: MachineModel) -> None:
     with placed(kind, plane(2, 0.1), model, model, starts=[(500, 500, 0), (500, 520, 0)]) as world:

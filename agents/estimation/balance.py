@@ -1,0 +1,164 @@
+"""From readings to balances of force along the machine: what drives it, over its weight, less what its motion takes.
+
+With F the drive force, f the specific force ahead at `base_link` (the accelerometer's, gravity's share included), a the
+wheels' acceleration, m the mass and lambda the rotating mass factor,
+
+    F / (m g) - (f - g squat) / g - (lambda - 1) a / g  =  direction c_rr cos(slope)
+
+The accelerometer feels gravity's share as well, so the grade cancels (DESIGN, "Ground estimation").
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from agents.estimation.attitude import AttitudeConfig, LeanFilter
+from agents.estimation.squat import squat_rad
+from agents.localisation.odometry import DeadReckoning
+from agents.physics import GRAVITY_MPS2
+from protocol.arrays import Floats
+from protocol.machine import BASE, MachineConfig, SensorConfig
+from protocol.readings import Articulation, Encoder, Imu, Odometry, Payload, Reading, Torque
+
+NOTHING = (0.0,) * 4
+
+
+@dataclass(frozen=True, slots=True)
+class Balance:
+    """One step of the force balance.
+
+    speed_mps, accel_mps2, way_m: of the wheels; way_m counts up in reverse too. unbalanced: the left side above, share:
+    F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad] with their variance, as
+    the body has them, squat taken off; sine_x: of the one ahead, by the accelerometer alone. pitch_radps: how fast it
+    changes. norm_mps2: of the specific force.
+    body_mps2: acceleration ahead as the accelerometer has it. torque_s, wheels_s: how old their newest reading is.
+    """
+
+    stamp_ns: int
+    dt_s: float
+    speed_mps: float
+    accel_mps2: float
+    way_m: float
+    unbalanced: float
+    share: float
+    slope_x: float
+    slope_y: float
+    slope_var: float
+    sine_x: float
+    pitch_radps: float
+    norm_mps2: float
+    body_mps2: float
+    torque_s: float
+    wheels_s: float
+
+    @property
+    def direction(self) -> float:
+        """+1 forwards, -1 in reverse."""
+        return math.copysign(1.0, self.speed_mps)
+
+
+class Balancer:
+    """Gathers readings into balances of step_s.
+
+    mass: "known" (the machine's own) or "message": that and what payload readings say.
+    """
+
+    def __init__(self, machine: MachineConfig, step_s: float, attitude: AttitudeConfig, *, weighs: bool) -> None:
+        self.payload_kg = 0.0
+        self._machine = machine
+        self._weighs = weighs
+        self._step_ns = round(step_s * 1e9)
+        self._lean = LeanFilter(attitude)
+        self._bend_rad = 0.0
+        self._rotation: dict[str, Floats] = {}
+        self._sensor: str | None = None
+        self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = 0
+        self._force_sums = NOTHING  # count; force ahead at base_link, norm, rate of nose up, a negative turn about y
+        self._torque_nm, self._torque_sums = 0.0, (0, 0.0)
+
+    def update(self, reading: Reading, sensor: SensorConfig, dead: DeadReckoning) -> Balance | None:
+        """Take in a reading, after dead reckoning did; returns the balance of the step that it ends."""
+        if isinstance(reading, Torque):
+            self._torque_ns, self._torque_nm = reading.stamp_ns, reading.torque_nm
+            count, total = self._torque_sums
+            self._torque_sums = count + 1, total + reading.torque_nm
+        elif isinstance(reading, Encoder | Odometry):
+            self._wheels_ns = reading.stamp_ns
+        elif isinstance(reading, Articulation):
+            self._bend_rad = reading.angle_rad
+        elif isinstance(reading, Payload) and self._weighs:
+            self.payload_kg = reading.payload_kg
+        elif isinstance(reading, Imu) and self._is_ours(sensor):
+            return self._feel(reading, sensor, dead)
+        return None
+
+    def _is_ours(self, sensor: SensorConfig) -> bool:
+        """Whether it is the first IMU on the rear frame that has an accelerometer."""
+        return sensor.frame == BASE and sensor.says("force") and self._sensor in (None, sensor.name)
+
+    def _feel(self, imu: Imu, sensor: SensorConfig, dead: DeadReckoning) -> Balance | None:
+        if imu.sensor not in self._rotation:
+            self._sensor, self._rotation[imu.sensor] = imu.sensor, sensor.mount.base_from_sensor()
+            self._imu_ns = self._begin_ns = imu.stamp_ns
+            return None
+        dt_s, self._imu_ns = (imu.stamp_ns - self._imu_ns) * 1e-9, imu.stamp_ns
+        if not 0 < dt_s < 1:  # a pause: start from here
+            self._begin_ns, self._force_sums, self._torque_sums = imu.stamp_ns, NOTHING, (0, 0.0)
+            return None
+        rotation = self._rotation[imu.sensor]
+        gyro = (rotation @ (imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)).tolist()
+        ahead, left, up = (rotation @ (imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)).tolist()
+        ahead += (gyro[1] ** 2 + gyro[2] ** 2) * sensor.mount.xyz_m[0]  # what turning adds at the sensor's place
+        accel, speed = (dead.wheels.accel_mps2, dead.wheels.speed_mps) if self._wheels_s() < 1 else (0.0, 0.0)
+        self._lean.update(dt_s, (gyro[0], gyro[1], gyro[2]), (ahead - accel, left - speed * gyro[2]))
+        n, force, norm, rate = self._force_sums
+        self._force_sums = n + 1, force + ahead, norm + math.hypot(ahead, left, up), rate - gyro[1]
+        if imu.stamp_ns - self._begin_ns < self._step_ns:
+            return None
+        return self._balance(dead, speed, accel)
+
+    def _balance(self, dead: DeadReckoning, speed: float, accel: float) -> Balance:
+        machine, g = self._machine, GRAVITY_MPS2
+        (n, *sums), (torques, torque_nm) = self._force_sums, self._torque_sums
+        force, norm, rate = (value / n for value in sums)
+        drive_n = (torque_nm / torques if torques else self._torque_nm) / machine.wheel_radius_m
+        share = drive_n / ((machine.mass_kg + self.payload_kg) * g)
+        squat = squat_rad(machine, self.payload_kg, force)
+        dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
+        self._force_sums, self._torque_sums = NOTHING, (0, 0.0)
+        return Balance(
+            stamp_ns=self._imu_ns,
+            dt_s=dt_s,
+            speed_mps=speed,
+            accel_mps2=accel,
+            way_m=dead.way_m,
+            unbalanced=share - force / g + squat - self._bent() - (machine.rotating_mass_factor - 1) * accel / g,
+            share=share,
+            slope_x=self._lean.ahead.angle_rad - squat,
+            slope_y=self._lean.left.angle_rad,
+            slope_var=self._lean.ahead.variance,
+            sine_x=(force - accel) / g - squat,
+            pitch_radps=rate,
+            norm_mps2=norm,
+            body_mps2=force - g * self._lean.ahead.sine,
+            torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
+            wheels_s=self._wheels_s(),
+        )
+
+    def _bent(self) -> float:
+        """What the front frame of a bent machine climbs more than the rear one, over the way [-].
+
+        Gravity works on each axle's load along that axle's own way, and the accelerometer feels the rear one's.
+        """
+        machine = self._machine
+        if not self._bend_rad or not machine.wheelbase_m:
+            return 0.0
+        mass = machine.mass_kg + self.payload_kg
+        ahead = machine.mass_kg * machine.load_centre_m + self.payload_kg * machine.payload_x_m
+        on_front = ahead / (mass * machine.wheelbase_m)
+        c, s = math.cos(self._bend_rad), math.sin(self._bend_rad)
+        return on_front * (self._lean.ahead.sine * (c - 1) + self._lean.left.sine * s)
+
+    def _wheels_s(self) -> float:
+        return (self._imu_ns - self._wheels_ns) * 1e-9 if self._wheels_ns else math.inf

@@ -1,0 +1,56 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agents.calibration_file import load, save
+from agents.estimation.calibration import Calibration
+from protocol.errors import StoreError
+
+KNOWN = Calibration(0.0031, -0.02, ((1e-6, -2e-7), (-2e-7, 1e-4)), 1_767_225_600_000_000_000, 41)
+
+
+def test_what_was_saved_is_loaded_exactly(tmp_path: Path) -> None:
+    save(tmp_path / "c.json", "loader-1", KNOWN)
+    assert load(tmp_path / "c.json", "loader-1") == KNOWN
+    assert [path.name for path in tmp_path.iterdir()] == ["c.json"]
+
+
+def test_no_file_is_no_calibration(tmp_path: Path) -> None:
+    assert load(tmp_path / "c.json", "loader-1") is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"version": 2}', "\x00\xff", "[" * 100_000])
+def test_anything_else_is_refused_with_its_path(tmp_path: Path, text: str) -> None:
+    (tmp_path / "c.json").write_text(text, encoding="latin-1")
+    with pytest.raises(StoreError, match=r"c\.json"):
+        load(tmp_path / "c.json", "loader-1")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"machine": "loader-2"},
+        {"zero": "a"},
+        {"zero": float("nan")},
+        {"zero": 3.0},
+        {"scale": -2.0},
+        {"covariance": [[1e-6, 1.0], [1.0, 1e-4]]},
+        {"covariance": [[-1e-6, 0.0], [0.0, 1e-4]]},
+        {"covariance": [[1e-6, 0.0]]},
+        {"stamp_ns": -1},
+        {"passages": None},
+    ],
+)
+def test_senseless_numbers_are_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    path = tmp_path / "c.json"
+    save(path, "loader-1", KNOWN)
+    path.write_text(json.dumps({**json.loads(path.read_text()), **wrong}))
+    with pytest.raises(StoreError, match=r"c\.json"):
+        load(path, "loader-1")
+
+
+def test_a_folder_that_is_not_there_is_an_error_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="cannot be written"):
+        save(tmp_path / "none" / "c.json", "loader-1", KNOWN)
