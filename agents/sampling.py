@@ -34,7 +34,7 @@ class SamplingConfig:
     """
 
     every_m: float = 0.5
-    lag_s: float = 1.5
+    lag_s: float = 2.0
     max_std_m: float = 20.0
     history_s: float = 30.0
 

@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 
 from agents.estimation.attitude import AttitudeConfig, LeanFilter
-from agents.estimation.squat import squat_rad
+from agents.estimation.squat import front_share, squat_rad
 from agents.localisation.odometry import DeadReckoning
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
@@ -32,7 +32,8 @@ class Balance:
     F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad] with their variance, as
     the body has them, squat taken off; sine_x: of the one ahead, by the accelerometer alone. pitch_radps: how fast it
     changes. norm_mps2: of the specific force.
-    body_mps2: acceleration ahead as the accelerometer has it. torque_s, wheels_s: how old their newest reading is.
+    on_front: share of the load on the front axle, 0 if not known. body_mps2: acceleration ahead as the accelerometer
+    has it. torque_s, wheels_s: how old their newest reading is.
     """
 
     stamp_ns: int
@@ -48,6 +49,7 @@ class Balance:
     sine_x: float
     pitch_radps: float
     norm_mps2: float
+    on_front: float
     body_mps2: float
     torque_s: float
     wheels_s: float
@@ -61,7 +63,7 @@ class Balance:
 class Balancer:
     """Gathers readings into balances of step_s.
 
-    mass: "known" (the machine's own) or "message": that and what payload readings say.
+    weighs: whether payload readings are believed; else the machine is as heavy as it says.
     """
 
     def __init__(self, machine: MachineConfig, step_s: float, attitude: AttitudeConfig, *, weighs: bool) -> None:
@@ -124,6 +126,7 @@ class Balancer:
         force, norm, rate = (value / n for value in sums)
         drive_n = (torque_nm / torques if torques else self._torque_nm) / machine.wheel_radius_m
         share = drive_n / ((machine.mass_kg + self.payload_kg) * g)
+        on_front = front_share(machine, self.payload_kg, force)
         squat = squat_rad(machine, self.payload_kg, force)
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
         self._force_sums, self._torque_sums = NOTHING, (0, 0.0)
@@ -133,7 +136,11 @@ class Balancer:
             speed_mps=speed,
             accel_mps2=accel,
             way_m=dead.way_m,
-            unbalanced=share - force / g + squat - self._bent() - (machine.rotating_mass_factor - 1) * accel / g,
+            unbalanced=share
+            - force / g
+            + squat
+            - self._bent(on_front)
+            - (machine.rotating_mass_factor - 1) * accel / g,
             share=share,
             slope_x=self._lean.ahead.angle_rad - squat,
             slope_y=self._lean.left.angle_rad,
@@ -141,22 +148,17 @@ class Balancer:
             sine_x=(force - accel) / g - squat,
             pitch_radps=rate,
             norm_mps2=norm,
+            on_front=on_front,
             body_mps2=force - g * self._lean.ahead.sine,
             torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
             wheels_s=self._wheels_s(),
         )
 
-    def _bent(self) -> float:
+    def _bent(self, on_front: float) -> float:
         """What the front frame of a bent machine climbs more than the rear one, over the way [-].
 
         Gravity works on each axle's load along that axle's own way, and the accelerometer feels the rear one's.
         """
-        machine = self._machine
-        if not self._bend_rad or not machine.wheelbase_m:
-            return 0.0
-        mass = machine.mass_kg + self.payload_kg
-        ahead = machine.mass_kg * machine.load_centre_m + self.payload_kg * machine.payload_x_m
-        on_front = ahead / (mass * machine.wheelbase_m)
         c, s = math.cos(self._bend_rad), math.sin(self._bend_rad)
         return on_front * (self._lean.ahead.sine * (c - 1) + self._lean.left.sine * s)
 

@@ -20,6 +20,7 @@ from agents.localisation.odometry import DeadReckoning
 from protocol.arrays import Floats
 
 REMEMBERED = 400  # stretches: 200 m of way
+RELOCK = 12  # so many that were off in a row are right, and what was known is wrong: a sensor worse than its class
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Calibrator:
         self._aged_ns = start.stamp_ns
         self._past: deque[_Stretch] = deque(maxlen=REMEMBERED)
         self._open: list[Balance] = []
+        self._off: list[float] = []
 
     @property
     def calibration(self) -> Calibration:
@@ -182,7 +184,13 @@ class Calibrator:
         off = measured - float(h @ self._x)
         if off**2 > c.gate_sigma**2 * S:
             self.counters["off"] += 1
+            self._off.append(off)
+            if len(self._off) == RELOCK:
+                self._P[0, 0] += float(np.mean(np.square(self._off)))
+                self._off.clear()
+                self.counters["relocked"] += 1
             return
+        self._off.clear()
         self._x = self._x + Ph / S * off
         self._P = self._P - np.outer(Ph, Ph) / S
         self._stamp_ns = stretch.stamp_ns

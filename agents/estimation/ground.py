@@ -100,8 +100,8 @@ class GroundEstimator:
 
     def __init__(self, machine: MachineConfig, config: EstimationConfig, known: Calibration | None = None) -> None:
         """known: a calibration from before."""
-        self._config = config
-        self._balancer = Balancer(machine, config.step_s, config.attitude, weighs=config.mass != "known")
+        self._machine, self._config = machine, config
+        self._balancer = Balancer(machine, config.step_s, config.attitude, weighs=config.mass == "message")
         self._plausibility = Plausibility(config.plausibility)
         self._calibrator = Calibrator(config.calibration, known)
         self._applied = unknown(config.calibration)
@@ -173,7 +173,8 @@ class GroundEstimator:
             variance = found[1] + known.variance(balance.share) / cosine**2 + self._config.model_std**2
         reason = moment.reason or ("" if found else "settling")
         slope_x = math.tan(moment.slope_x + known.zero)  # the zero is the accelerometer's, whose slope is off alike
-        slope_var = balance.slope_var + known.covariance[0][0]
+        # Of both directions: work shows the zero ahead, nothing that of the one across.
+        slope_var = balance.slope_var + (known.covariance[0][0] + self._config.calibration.zero**2) / 2
         return GroundEstimate(c_rr, variance, slope_x, math.tan(balance.slope_y), slope_var, reason)
 
     def _step(self, balance: Balance, dead: DeadReckoning, known_c_rr: float | None) -> None:
@@ -191,10 +192,18 @@ class GroundEstimator:
             return
         self._stands_s = 0.0
         way_m, self._used_m = balance.way_m - self._used_m, balance.way_m
-        push = Push(balance.stamp_ns, balance.dt_s, way_m, raw, balance.direction * cosine, balance.share)
-        self._resistance.update(push)
+        self._resistance.update(self._push(balance, way_m, raw, balance.direction * cosine))
         if self._config.calibrate:
             self._calibrator.update(balance, dead, known_c_rr)
+
+    def _push(self, balance: Balance, way_m: float, raw: float, regressor: float) -> Push:
+        machine, forwards = self._machine, balance.direction > 0
+        axles = (1.0, 0.0, 0.0)
+        if machine.wheelbase_m:
+            lead_share = balance.on_front if forwards else 1 - balance.on_front
+            lead_m = machine.wheelbase_m - machine.load_centre_m if forwards else machine.load_centre_m
+            axles = (lead_share, machine.wheelbase_m, lead_m)
+        return Push(balance.stamp_ns, balance.dt_s, way_m, raw, regressor, balance.share, *axles)
 
     def _rest(self, balance: Balance) -> None:
         """A new calibration takes effect while the machine stands: the ground must not seem to change as it drives."""

@@ -19,6 +19,7 @@ SLOPE_TOO = frozenset({"pitch_transient", "accelerometer"})
 FAULTS = frozenset({"accelerometer", "no_torque", "no_wheels", "torque_frozen", "torque_implausible"})
 FORCE_NORMS_MPS2 = (5.0, 15.0)  # of a specific force in m/s2: neither in g, nor in mm/s2, nor a sensor that is dead
 MEAN_S = 0.3  # over which wheels are compared with the body
+SMOOTH_S = 1.0  # of the forces that are compared for their unit
 FORGET_S = 120.0  # of the proof that torque moves the machine
 
 
@@ -139,11 +140,16 @@ class _Gain:
 
     def __init__(self) -> None:
         self._weight = self._x = self._y = self._xx = self._xy = 0.0
+        self._means = (0.0, 0.0)
 
     def update(self, balance: Balance) -> None:
         """Take in a balance of a machine that drives."""
         fade = math.exp(-balance.dt_s / FORGET_S)
-        y, x = balance.share, balance.share - balance.unbalanced  # what drives, what the motion takes
+        # What the motion takes, what drives, both smooth: noise of the first would make the slope look flat.
+        news_xy = (balance.share - balance.unbalanced, balance.share)
+        share = min(balance.dt_s / SMOOTH_S, 1.0)
+        x, y = (mean + share * (new - mean) for mean, new in zip(self._means, news_xy, strict=True))
+        self._means = (x, y)
         sums = (self._weight, self._x, self._y, self._xx, self._xy)
         news = (1.0, x, y, x * x, x * y)
         self._weight, self._x, self._y, self._xx, self._xy = (

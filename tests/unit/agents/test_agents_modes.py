@@ -178,6 +178,28 @@ def test_differential_receiver_has_no_slow_error_and_a_relative_one_has() -> Non
         assert len(beliefs[-1].x) == Layout(1, True, receivers).n
 
 
+@pytest.mark.parametrize(("time_s", "slow"), [(1e-3, 1.0), (1e9, 0.0)])
+def test_slow_errors_cancel_in_a_velocity_but_for_what_they_change_meanwhile(time_s: float, slow: float) -> None:
+    """Two fixes 0.5 s apart, of 4 m2 each: a quarter of it is white."""
+    of = changed_sensor(of_gps("differential"), "gps-1", drift_time_s=time_s)
+    found = localiser(of, start=START)
+    gps = fix(SensorConfig("gps-1", "gps"), START_NS, 3.0, 4.0, 0.0, 4.0)
+    fixes = [found._receivers.fix(r, found.dead.now()) for r in (gps, replace(gps, stamp_ns=START_NS + SECOND // 2))]
+    first, second = (found._receivers._velocity(f) for f in fixes)
+    assert first is None
+    assert second
+    assert np.diag(second.R).tolist() == pytest.approx([2 * (1.0 + 3.0 * slow) / 0.5**2] * 2)
+
+
+def test_error_of_a_relative_receiver_is_that_of_two_fixes_and_of_the_belief_then() -> None:
+    of = of_gps("relative")
+    found = localiser(of, start=START)
+    made = drive([Leg(2)], of)
+    believed = next(b for b in run(found, of, made.readings) if b.stamp_ns > START_NS + SECOND // 5)
+    expected = 2 * 0.75 * 2.0 + float(np.trace(believed.P[:2, :2])) / 2
+    assert found._receivers.errors[0].variance_m2 == pytest.approx(expected, rel=0.15)
+
+
 def test_fixes_far_apart_make_no_velocity() -> None:
     of = of_gps("differential")
     made = drive(S_BEND, of)

@@ -139,6 +139,13 @@ def test_odometry_that_gives_no_speed_rolls_no_wheel() -> None:
     assert (dead.travel_m, dead.angle_rad) == (0.0, pytest.approx(0.1))
 
 
+def test_odometry_that_gives_no_speed_says_nothing_of_standing_still() -> None:
+    of = truck(replace(ODOMETRY, gives=("rate",)))
+    found = steps_of(of, [Odometry("odom", START_NS + i * 50_000_000, 3.0, 0.0, 0.1) for i in range(9)])
+    assert [step.rolled for step in found] == [False] * 4
+    assert all(step.turn for step in found)
+
+
 def test_old_steering_angle_turns_nothing() -> None:
     of = truck(ENCODER, STEERING)
     readings: list[Reading] = [Steering("steer", START_NS, 0.2)]
@@ -208,6 +215,17 @@ def test_the_offset_of_steering_is_learnt_and_standing_still_does_not_unlearn_it
     made = driven(of, Wrong(math.radians(1), fixes=False), [*EIGHT, Leg(3, -1.0), Leg(20)])
     _, beliefs = run(of, made.readings)
     assert beliefs[-1].x[ERROR] == pytest.approx(math.tan(math.radians(1)) / WHEELBASE_M, abs=1e-3)
+
+
+@pytest.mark.parametrize(("sensors", "per_s"), [((ENCODER, STEERING), 0.0), ((ODOMETRY,), 2 * 0.02**2 / 60)])
+def test_the_error_of_a_turn_is_unsure_at_first_and_that_of_odometry_changes(
+    sensors: tuple[SensorConfig, ...], per_s: float
+) -> None:
+    """A wrong scale makes another error in every bend; an offset of the steering stays."""
+    of = truck(*sensors)
+    found, beliefs = run(of, driven(of, Wrong(), [Leg(1)]).readings, start=(10.0, 20.0, 0.7))
+    assert beliefs[0].P[ERROR, ERROR] == pytest.approx(0.02**2, rel=0.01)
+    assert found._motion(beliefs[0], 2.0).Q[ERROR, ERROR] == pytest.approx(2 * (per_s + 5e-5**2))
 
 
 def test_the_paper_s_profile_has_no_state_for_the_error_of_the_turn() -> None:
