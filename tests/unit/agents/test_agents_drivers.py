@@ -1,5 +1,6 @@
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,15 +8,17 @@ import pytest
 from agents_drives import SITE, START_NS, Leg, drive, machine
 
 from agents.agent import Agent, Places
+from agents.calibration_file import load
 from agents.config import AgentConfig
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
+from agents.physics import GRAVITY_MPS2
 from agents.uplink import UplinkConfig
 from protocol import keys
 from protocol.codec import encode_bundle
 from protocol.logfolder import open_log, write_log
 from protocol.messages import SensorBundle
-from protocol.readings import Articulation, Reading
+from protocol.readings import Articulation, Imu, Reading
 from protocol.session import SessionConfig, free_endpoint, open_session
 
 OF = machine()
@@ -255,6 +258,44 @@ def test_agent_that_is_stopped_does_not_linger(sessions: tuple[Any, Any], tmp_pa
     report, time_ = run_agent(sessions[1], tmp_path, AgentConfig(), driver, stopped=True)
     assert report["delivered"] is False
     assert time_.waits == []
+
+
+OUT_AND_BACK = (Leg(4, 0.5), Leg(14), Leg(4, -0.5), Leg(2), Leg(4, -0.5), Leg(14), Leg(4, 0.5), Leg(3))
+
+
+def test_calibration_is_kept_across_restarts(sessions: tuple[Any, Any], tmp_path: Path) -> None:
+    """Whoever drives out and back learns the accelerometer's zero, and the next agent starts with it."""
+    zero_mps2, made = 0.05, drive(OUT_AND_BACK, OF)
+    readings = [replace(r, force_x_mps2=r.force_x_mps2 + zero_mps2) if isinstance(r, Imu) else r for r in made.readings]
+    found = []
+    for spans in ([readings], [readings[:500]]):
+        time_, places = Time(), Places(tmp_path / "spool.db", calibration=tmp_path / "c.json")
+        agent = Agent(sessions[1], SITE, OF, AgentConfig(linger_s=0.0), places)
+        try:
+            found.append(agent.run(Given(*spans), lambda: False, time_.clock, time_.wait))
+        finally:
+            agent.close()
+    before, after = (report["pipeline"]["ground"]["calibration"] for report in found)
+    assert before["passages"] > 20
+    assert after["passages"] == before["passages"]
+    assert after["zero"] == pytest.approx(-zero_mps2 / GRAVITY_MPS2, abs=5e-4)
+    assert found[0]["calibration_problem"] == ""
+
+
+def test_calibration_file_that_makes_no_sense_is_reported_and_replaced(
+    sessions: tuple[Any, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "c.json").write_text("not a calibration")
+    time_, places = Time(), Places(tmp_path / "spool.db", calibration=tmp_path / "c.json")
+    agent = Agent(sessions[1], SITE, OF, AgentConfig(linger_s=0.0), places)
+    driver = Given([])
+    try:
+        assert "c.json" in agent.report(driver)["calibration_problem"]
+        driver = Given(drive(OUT_AND_BACK, OF).readings)
+        assert agent.run(driver, lambda: False, time_.clock, time_.wait)["calibration_problem"] == ""
+    finally:
+        agent.close()
+    assert load(tmp_path / "c.json", OF.name)
 
 
 def test_uplink_waits_timeout_s_for_an_acknowledgement(sessions: tuple[Any, Any], tmp_path: Path) -> None:

@@ -4,18 +4,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.estimation.ground import GroundEstimate
+from agents.estimation.ground import NOTHING_KNOWN, GroundEstimate
 from agents.localisation.belief import PoseBelief
-from agents.sampling import PoseHistory, Sampler, SamplingConfig
+from agents.sampling import PoseHistory, Sampler, SamplingConfig, Way
 from protocol.arrays import Table
+from protocol.readings import Encoder, Imu, Odometry, Reading
 from protocol.samples import check_samples
 
 S = 10**9
-ESTIMATE = GroundEstimate(0.05, 1e-4, 0.2, 0.1, 1e-3, 0.0)
+ESTIMATE = GroundEstimate(0.05, 1e-4, 0.2, 0.1, 1e-3, "")
+
+
+def ns(seconds: float) -> int:
+    return round((100 + seconds) * S)
 
 
 def pose(seconds: float, x_m: float = 0.0, heading_rad: float = 0.0, variance_m2: float = 1.0) -> PoseBelief:
-    return PoseBelief(round((100 + seconds) * S), x_m, 5.0, heading_rad, 2.0, np.diag([variance_m2, 2 * variance_m2]))
+    return PoseBelief(ns(seconds), x_m, 5.0, heading_rad, 2.0, np.diag([variance_m2, 2 * variance_m2]))
+
+
+class Asked:
+    """An estimator that notes what it is asked for."""
+
+    def __init__(self, estimate: GroundEstimate) -> None:
+        self.stamps_ns: list[int] = []
+        self._estimate = estimate
+
+    def __call__(self, stamp_ns: int) -> GroundEstimate:
+        self.stamps_ns.append(stamp_ns)
+        return self._estimate
 
 
 def drive(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, metres: float = 10.0, speed: float = 2.0) -> Table:
@@ -25,9 +42,16 @@ def drive(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, metres: float =
         t = i * 0.05
         sampler.poses.append(pose(t, speed * t))
         if sampler.is_due(speed * t):
-            sampler.mark(round((100 + t) * S), speed * t, estimate)
-        rows.append(sampler.take())
+            sampler.mark(ns(t), speed * t)
+        rows.append(sampler.take(ns(t), Asked(estimate)))
     return np.concatenate(rows)
+
+
+def sampled(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, now_s: float = 0.0, *, waits: bool = True) -> Table:
+    return sampler.take(ns(now_s), Asked(estimate), waits=waits)
+
+
+# --- one per stretch, where the machine was --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("every_m", [0.5, 2.0])
@@ -35,36 +59,23 @@ def test_one_sample_per_stretch_that_says_how_long_it_is(every_m: float) -> None
     rows = drive(Sampler(1.5, SamplingConfig(every_m=every_m, lag_s=0.0)))
     assert len(rows) == 10 / every_m
     assert rows["distance_m"] == pytest.approx(every_m)
+    assert rows["x_m"] == pytest.approx(1.5 + every_m * np.arange(1, len(rows) + 1))
     check_samples(rows, 1e4)
 
 
 def test_distance_of_a_stretch_is_at_most_twice_every_m() -> None:
     sampler = Sampler(0.0, SamplingConfig(every_m=0.5, lag_s=0.0))
     sampler.poses.append(pose(0))
-    sampler.mark(100 * S, 30.0, ESTIMATE)
-    assert sampler.take()["distance_m"].tolist() == [1.0]
-
-
-def test_lag_places_the_sample_where_the_machine_was() -> None:
-    now, lagged = (drive(Sampler(0.0, SamplingConfig(lag_s=lag_s))) for lag_s in (0.0, 1.0))
-    assert now["x_m"] == pytest.approx(np.arange(1, 21) * 0.5)
-    assert lagged["x_m"] == pytest.approx(np.arange(17) * 0.5)  # marks at 2.0, 2.5 ... 10.0 m, 1 s is 2 m
-    assert lagged["stamp_ns"][0] == 100 * S
-
-
-def test_marks_before_the_first_pose_are_counted() -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=1.0))
-    rows = drive(sampler)
-    assert sampler.withheld == {"no_pose": 3}
-    assert len(rows) == 20 - 3
+    sampler.mark(ns(0), 30.0)
+    assert sampled(sampler)["distance_m"].tolist() == [1.0]
 
 
 def test_load_centre_lies_ahead() -> None:
     for heading, place in ((0.0, (1.5, 5.0)), (math.pi / 2, (0.0, 6.5)), (math.pi, (-1.5, 5.0))):
         sampler = Sampler(1.5, SamplingConfig(lag_s=0.0))
         sampler.poses.append(pose(0, heading_rad=heading))
-        sampler.mark(100 * S, 0.5, ESTIMATE)
-        (row,) = sampler.take()
+        sampler.mark(ns(0), 0.5)
+        (row,) = sampled(sampler)
         assert (row["x_m"], row["y_m"]) == pytest.approx(place)
 
 
@@ -72,8 +83,8 @@ def test_load_centre_lies_ahead() -> None:
 def test_gradient_is_turned_into_the_map(heading: float) -> None:
     sampler = Sampler(1.5, SamplingConfig(lag_s=0.0))
     sampler.poses.append(pose(0, heading_rad=heading))
-    sampler.mark(100 * S, 0.5, ESTIMATE)
-    (row,) = sampler.take()
+    sampler.mark(ns(0), 0.5)
+    (row,) = sampled(sampler)
     ahead, left = complex(math.cos(heading), math.sin(heading)), complex(-math.sin(heading), math.cos(heading))
     expected = 0.2 * ahead + 0.1 * left
     assert complex(row["grade_e"], row["grade_n"]) == pytest.approx(expected, abs=1e-6)
@@ -81,11 +92,108 @@ def test_gradient_is_turned_into_the_map(heading: float) -> None:
     assert (row["cov_xx_m2"], row["cov_xy_m2"], row["cov_yy_m2"]) == (1.0, 0.0, 2.0)
 
 
-@pytest.mark.parametrize("rate", [0.03, -0.03])
-def test_samples_on_a_change_of_slope_are_withheld_and_counted(rate: float) -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0, max_pitch_rate_radps=0.026))
-    assert not len(drive(sampler, replace(ESTIMATE, pitch_rate_radps=rate)))
-    assert sampler.withheld == {"pitch_transient": 20}
+# --- later than the machine was there --------------------------------------------------------------------------------
+
+
+def test_lag_delays_samples_and_moves_none() -> None:
+    """The estimator looks ahead for lag_s; sample, stamp and pose are those of the mark."""
+    now, lagged = (drive(Sampler(0.0, SamplingConfig(lag_s=lag_s))) for lag_s in (0.0, 1.0))
+    assert now["x_m"] == pytest.approx(np.arange(1, 21) * 0.5)
+    assert len(lagged) == 16  # the last second, 2 m, still waits
+    assert lagged.tobytes() == now[:16].tobytes()
+
+
+def test_estimator_is_asked_for_the_stamp_of_the_mark_once_it_is_lag_s_old() -> None:
+    sampler, asked = Sampler(0.0, SamplingConfig(lag_s=1.0)), Asked(ESTIMATE)
+    for t in (0.0, 0.5, 0.999, 1.0, 1.2):
+        sampler.poses.append(pose(t))
+        if t == 0.0:
+            sampler.mark(ns(0), 0.5)
+        rows = sampler.take(ns(t), asked)
+        assert (len(rows), sampler.waiting) == ((1, 0) if t == 1.0 else (0, int(t < 1)))
+    assert asked.stamps_ns == [ns(0)]
+
+
+def test_an_estimate_is_asked_in_time_even_if_no_pose_is_known_yet() -> None:
+    """An estimator remembers seconds, a late alignment takes minutes."""
+    sampler, asked = Sampler(0.0, SamplingConfig(lag_s=1.0)), Asked(ESTIMATE)
+    for i in range(1, 400):
+        sampler.mark(ns(i * 0.25), i * 0.5)
+        assert not len(sampler.take(ns(i * 0.25), asked))
+    assert asked.stamps_ns == [ns(i * 0.25) for i in range(1, 396)]
+
+
+def test_samples_come_in_the_order_of_their_stamps() -> None:
+    sampler = Sampler(0.0, SamplingConfig(lag_s=0.3))
+    rows = drive(sampler)
+    rest = sampled(sampler, now_s=99)
+    stamps = np.concatenate([rows, rest])["stamp_ns"]
+    assert (np.diff(stamps) > 0).all()
+    assert len(stamps) == 20
+
+
+def test_what_still_waits_is_taken_without_waiting() -> None:
+    sampler = Sampler(0.0, SamplingConfig(lag_s=1.0))
+    rows = drive(sampler)
+    rest = sampled(sampler, now_s=5.0, waits=False)
+    assert len(rows) + len(rest) == 20
+    assert sampler.waiting == 0
+    assert not sampler.withheld
+
+
+def test_nothing_is_lost_while_no_pose_is_known() -> None:
+    """The heading is found late: the poses then come all at once, from the beginning of the drive on."""
+    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    for i in range(1, 21):
+        sampler.mark(ns(i * 0.25), i * 0.5)
+        assert not len(sampled(sampler, now_s=i * 0.25))
+    for i in range(201):
+        sampler.poses.append(pose(i * 0.05, i * 0.1))
+    rows = sampled(sampler, now_s=10.0)
+    assert rows["x_m"] == pytest.approx(np.arange(1, 21) * 0.5)
+    assert not sampler.withheld
+
+
+# --- what is withheld ------------------------------------------------------------------------------------------------
+
+
+def test_marks_before_the_first_pose_are_counted() -> None:
+    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    for t in (-1.0, -0.5, 0.5):
+        sampler.mark(ns(t), 0.5 * (t + 2))
+    sampler.poses.append(pose(0))
+    sampler.poses.append(pose(1))
+    assert len(sampled(sampler, now_s=1.0)) == 1
+    assert sampler.withheld == {"no_pose": 2}
+
+
+@pytest.mark.parametrize("reason", ["pitch_transient", "accelerometer"])
+def test_samples_whose_slope_is_blurred_are_withheld_and_counted(reason: str) -> None:
+    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    assert not len(drive(sampler, replace(ESTIMATE, c_rr=math.nan, c_rr_var=math.nan, reason=reason)))
+    assert sampler.withheld == {reason: 20}
+    assert not sampler.without_resistance
+
+
+@pytest.mark.parametrize("reason", ["braking", "no_torque", "torque_frozen", "standstill", "settling"])
+def test_position_and_slope_are_sampled_without_resistance_and_counted(reason: str) -> None:
+    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    rows = drive(sampler, replace(ESTIMATE, c_rr=math.nan, c_rr_var=math.nan, reason=reason))
+    assert len(rows) == 20
+    assert np.isnan(rows["c_rr"]).all()
+    assert np.isnan(rows["c_rr_var"]).all()
+    assert rows["grade_e"] == pytest.approx(0.2)
+    assert sampler.without_resistance == {reason: 20}
+    assert not sampler.withheld
+    check_samples(rows, 1e4)
+
+
+def test_where_nothing_is_known_of_the_ground_the_place_is_sampled() -> None:
+    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    rows = drive(sampler, NOTHING_KNOWN)
+    assert len(rows) == 20
+    assert np.isnan(rows["grade_e"]).all()
+    assert sampler.without_resistance == {"no_imu": 20}
 
 
 def test_samples_of_an_unsure_place_are_withheld_and_counted() -> None:
@@ -94,17 +202,66 @@ def test_samples_of_an_unsure_place_are_withheld_and_counted() -> None:
     assert sampler.withheld == {"unsure_position": 20}
 
 
-def test_nothing_is_lost_while_no_pose_is_known() -> None:
-    """The heading is found late: the poses then come all at once, from the beginning of the drive on."""
+def test_good_samples_are_counted_nowhere() -> None:
     sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
-    for i in range(1, 21):
-        sampler.mark(round((100 + i * 0.25) * S), i * 0.5, ESTIMATE)
-        assert not len(sampler.take())
-    for i in range(201):
-        sampler.poses.append(pose(i * 0.05, i * 0.1))
-    rows = sampler.take()
-    assert rows["x_m"] == pytest.approx(np.arange(1, 21) * 0.5)
+    drive(sampler)
     assert not sampler.withheld
+    assert not sampler.without_resistance
+
+
+# --- the way ---------------------------------------------------------------------------------------------------------
+
+
+def imu(seconds: float) -> Reading:
+    return Imu("imu", ns(seconds), 0.0, 0.0, 0.0, 0.0, 0.0, 9.81)
+
+
+def wheels(seconds: float) -> Reading:
+    return Encoder("wheels", ns(seconds), 0.0, 0.0)
+
+
+def test_way_is_that_of_the_wheels_while_they_speak() -> None:
+    way = Way()
+    for i in range(100):
+        reading = wheels(i * 0.05) if i % 2 else Odometry("wheels", ns(i * 0.05), 0.0, 0.0, 0.0)
+        assert way.update(reading, 0.1 * i, 7.0) == pytest.approx(0.1 * i)  # the filter's speed is not asked
+
+
+@pytest.mark.parametrize("speed_mps", [2.0, -2.0], ids=["forwards", "reverse"])
+def test_way_goes_on_by_the_filter_s_speed_when_wheels_fall_silent(speed_mps: float) -> None:
+    """From when they fell silent, which is noticed half a second later; up in reverse too."""
+    way = Way()
+    way.update(wheels(0.0), 5.0, speed_mps)
+    found = [way.update(imu(i * 0.01), 5.0, speed_mps) for i in range(1, 1001)]
+    assert found[49] == 5.0
+    assert found[-1] == pytest.approx(5.0 + 2.0 * 10.0, abs=1.1)
+    assert (np.diff(found) >= 0).all()
+
+
+def test_wheels_that_speak_again_count_on_and_nothing_twice() -> None:
+    way = Way()
+    way.update(wheels(0.0), 5.0, 2.0)
+    for i in range(1, 301):
+        before = way.update(imu(i * 0.01), 5.0, 2.0)
+    assert way.update(wheels(3.01), 5.0, 2.0) == pytest.approx(before)  # counted from where they were
+    for i in range(302, 400):
+        after = way.update(imu(i * 0.01) if i % 5 else wheels(i * 0.01), 5.0 + 0.02 * (i - 301), 2.0)
+    assert after == pytest.approx(before + 0.02 * 98, abs=0.05)
+
+
+def test_a_machine_without_wheels_has_a_way() -> None:
+    way = Way()
+    found = [way.update(imu(i * 0.01), 0.0, 2.0) for i in range(101)]
+    assert found[-1] - found[0] == pytest.approx(2.0)
+
+
+def test_noise_of_the_filter_s_speed_at_a_standstill_is_no_way() -> None:
+    way = Way()
+    start = way.update(imu(0.0), 0.0, 0.0)
+    assert [way.update(imu(i * 0.01), 0.0, 0.29 * (-1) ** i) for i in range(1, 1000)] == [start] * 999
+
+
+# --- where the machine was -------------------------------------------------------------------------------------------
 
 
 def test_interpolation_takes_the_short_way_across_the_back_heading() -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,13 @@ import pytest
 from protocol import codec
 from protocol.errors import Refusal
 from protocol.geometry import MAX_CELLS
+from protocol.config import from_table
 from protocol.logfolder import open_log
 from protocol.machine import GIVES, MODES
 from protocol.messages import Pose
 from protocol.readings import KINDS, MAX_STAMP_NS, columns
 from protocol.samples import COLUMNS
+from protocol.site import KnownGround
 from protocol.units import _NS, _UNITS
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -64,3 +67,9 @@ def test_example_of_a_manifest_is_read(tmp_path):
     log = open_log(tmp_path)
     assert [source.file for source in log.sources] == ["gps.csv.gz", "wheels.csv"]
     assert [s.use for s in log.machine.sensors] == [True, False]
+
+
+def test_example_of_known_ground_is_read():
+    example = re.search(r"`known_ground` \|.*?`(\{.*?\})`", LOGS)[1]
+    area = from_table(KnownGround, tomllib.loads(f"area = {example}")["area"], "example")
+    assert area.inside_m(15.0, 5.0) > 0

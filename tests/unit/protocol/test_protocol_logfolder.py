@@ -1,3 +1,4 @@
+import dataclasses
 import gzip
 import math
 
@@ -10,7 +11,7 @@ from protocol.errors import ConfigError, LogFolderError, Refusal
 from protocol.logfolder import open_log, write_log
 from protocol.machine import MachineConfig, Mount, SensorConfig
 from protocol.readings import KINDS, Articulation, Encoder, Gps, Imu, Torque
-from protocol.site import SiteConfig
+from protocol.site import KnownGround, SiteConfig
 
 T0 = 1_750_000_000_000_000_000
 MANIFEST = f"""
@@ -201,6 +202,17 @@ def test_written_log_reads_back_exactly(tmp_path_factory, readings):
     assert [r.stamp_ns for r in got] == [r.stamp_ns for r in readings]
     assert sorted(map(repr, got)) == sorted(map(repr, readings))
     assert not log.refused
+
+
+def test_known_ground_of_the_site_reads_back_exactly(tmp_path):
+    areas = (
+        KnownGround('the "pad"', 0.012, ((0.0, 0.1), (10.0, 0.0), (10.5, 1e-3))),
+        KnownGround("näher", 1 / 3, ((-5.0, 0.0), (-1.0, 0.0), (-1.0, 4.0), (-5.0, 4.0))),
+        KnownGround("whole numbers", 0, ((0, 0), (10, 0), (10, 10))),
+    )
+    site = dataclasses.replace(SITE, known_ground=areas)
+    write_log(tmp_path, "pad", site, MACHINE, [])
+    assert open_log(tmp_path).site == site
 
 
 def test_numbers_of_numpy_read_back(tmp_path):

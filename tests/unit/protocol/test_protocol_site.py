@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
-from protocol.site import Projection, SiteConfig, load_site
+from protocol.site import KnownGround, Projection, SiteConfig, load_site
 
 PAPER = SiteConfig("paper", 49.0, 8.4, 110.0)
 
@@ -89,3 +89,70 @@ def test_site_file(tmp_path):
     path.write_text('name = "paper"\norigin_lat_deg = 149\norigin_lon_deg = 8.4\n')
     with pytest.raises(ConfigError, match=r"site\.toml: origin_lat_deg"):
         load_site(path)
+
+
+# --- known ground ----------------------------------------------------------------------------------------------------
+
+SQUARE = KnownGround("pad", 0.012, ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)))
+HOOK = KnownGround("hook", 0.012, ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (6.0, 9.0), (6.0, 3.0), (0.0, 3.0)))
+
+
+@pytest.mark.parametrize(
+    ("area", "place", "metres"),
+    [
+        (SQUARE, (5.0, 5.0), 5.0),
+        (SQUARE, (2.0, 6.0), 2.0),
+        (SQUARE, (12.0, 5.0), -2.0),
+        (SQUARE, (13.0, 14.0), -5.0),  # off a corner
+        (SQUARE, (-1.0, 5.0), -1.0),
+        (HOOK, (7.5, 6.0), 1.5),
+        (HOOK, (3.0, 1.0), 1.0),
+        (HOOK, (3.0, 6.0), -3.0),  # in its crook
+        (HOOK, (7.0, 2.0), math.hypot(1.0, 1.0)),  # off the inner corner
+    ],
+)
+def test_how_far_inside_of_known_ground_a_place_is(area, place, metres):
+    assert area.inside_m(*place) == pytest.approx(metres)
+    backwards = dataclasses.replace(area, outline=area.outline[::-1])
+    assert backwards.inside_m(*place) == pytest.approx(metres)
+
+
+@given(st.floats(-20, 30), st.floats(-20, 30))
+def test_known_ground_has_the_same_inside_as_its_parts(x, y):
+    """The hook is made of two rectangles."""
+    inside = (0 < x < 9 and 0 < y < 3) or (6 < x < 9 and 0 < y < 9)
+    if abs(HOOK.inside_m(x, y)) > 1e-6:
+        assert (HOOK.inside_m(x, y) > 0) == inside
+
+
+def test_outline_that_repeats_its_first_corner_is_the_same():
+    closed = dataclasses.replace(SQUARE, outline=(*SQUARE.outline, SQUARE.outline[0]))
+    for place in ((5.0, 4.0), (12.0, 5.0), (-3.0, -3.0)):
+        assert closed.inside_m(*place) == pytest.approx(SQUARE.inside_m(*place))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [({"c_rr": -0.1}, "c_rr"), ({"c_rr": math.nan}, "c_rr"), ({"outline": SQUARE.outline[:2]}, "outline")],
+)
+def test_known_ground_out_of_range_is_named(change, named):
+    with pytest.raises(ValueError, match=named):
+        dataclasses.replace(SQUARE, **change)
+
+
+def test_known_ground_of_a_site_file(tmp_path):
+    path = tmp_path / "site.toml"
+    head = 'name = "paper"\norigin_lat_deg = 49\norigin_lon_deg = 8.4\norigin_height_m = 110\n'
+    area = '{ name = "pad", c_rr = 0.012, outline = [[0, 0], [10, 0.0], [10, 10], [0, 10]] }'
+    path.write_text(f"{head}known_ground = [{area}]\n")
+    assert load_site(path) == dataclasses.replace(PAPER, known_ground=(SQUARE,))
+    path.write_text(f"{head}known_ground = [{area.replace('0.012', '1.2')}]\n")
+    with pytest.raises(ConfigError, match=r"site\.toml.*known_ground\[0\].*c_rr"):
+        load_site(path)
+    path.write_text(f"{head}known_ground = [{area.replace('c_rr', 'crr')}]\n")
+    with pytest.raises(ConfigError, match="crr"):
+        load_site(path)
+
+
+def test_frame_does_not_depend_on_known_ground():
+    assert dataclasses.replace(PAPER, known_ground=(SQUARE,)).frame == PAPER.frame

@@ -106,3 +106,9 @@ def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch: pytes
 def test_the_demo_keeps_off_the_seeds_that_reports_are_made_on():
     assert build_parser().parse_args(["demo"]).seed is None
     assert all(load_scenario(path.stem).seed < 1000 for path in FOLDER.glob("*.toml"))
+
+
+@pytest.mark.parametrize(("words", "expected"), [([], "a.calibration.json"), (["--calibration", "b.json"], "b.json")])
+def test_agent_keeps_its_calibration_beside_the_spool_or_where_it_is_told(words: list[str], expected: str) -> None:
+    arguments = build_parser().parse_args(["agent", "--spool", "a.db", *words])
+    assert agent._places(arguments).calibration == Path(expected)
