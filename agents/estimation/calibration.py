@@ -165,12 +165,10 @@ class Calibrator:
         for other in reversed(self._past):
             if (stretch.stamp_ns - other.stamp_ns) * 1e-9 > c.pair_s:
                 break
+            if other.direction == stretch.direction:
+                continue
             off_m = math.hypot(stretch.x_m - other.x_m, stretch.y_m - other.y_m)
-            if (
-                off_m < nearest_m
-                and other.direction != stretch.direction
-                and abs(math.remainder(stretch.angle_rad - other.angle_rad, math.tau)) < c.pair_rad
-            ):
+            if off_m < nearest_m and abs(math.remainder(stretch.angle_rad - other.angle_rad, math.tau)) < c.pair_rad:
                 found, nearest_m = other, off_m
         return found
 

@@ -87,6 +87,11 @@ class _Step:
     x: Floats = field(default_factory=lambda: EYE[0])
     P: Floats = field(default_factory=lambda: EYE)
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether both axles stood on the same ground, and still do."""
+        return self.A is EYE and math.isnan(self.begun_m)
+
 
 class KalmanResistance:
     """The default estimator. estimates_mass: whether the scale error is a state."""
@@ -219,6 +224,11 @@ class KalmanResistance:
         x, P = newest.x, newest.P
         for i in range(len(self._steps) - 2, index - 1, -1):
             here, after = self._steps[i], self._steps[i + 1]
+            if after.is_plain and not self._estimates_mass:  # both axles on one ground: a number, most of the time
+                g = float(here.P[0, 0]) / float(after.P0[0, 0])
+                x = here.x + g * (x - after.x0)
+                P = here.P + g**2 * (P - after.P0)
+                continue
             G = np.linalg.solve(after.P0 + TINY, after.A @ here.P).T
             x, P = here.x + G @ (x - after.x0), here.P + G @ (P - after.P0) @ G.T
         return x, P

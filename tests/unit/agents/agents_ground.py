@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -9,8 +10,8 @@ from typing import Any
 import numpy as np
 from agents_drives import START_NS
 
-from agents.estimation.balance import Balance, Balancer
 from agents.estimation.attitude import AttitudeConfig
+from agents.estimation.balance import Balance, Balancer
 from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEstimator
 from agents.estimation.resistance import Push, Resistance
 from agents.localisation.odometry import DeadReckoning
@@ -48,7 +49,9 @@ def after(steps: int, **options: Any) -> Balance:
     return replace(STEADY, stamp_ns=START_NS + steps * round(STEP_S * 1e9), way_m=0.1 * steps, **options)
 
 
-def balances(of: MachineConfig, readings: Iterable[Reading], *, weighs: bool = True, step_s: float = 0.05) -> list[Balance]:
+def balances(
+    of: MachineConfig, readings: Iterable[Reading], *, weighs: bool = True, step_s: float = 0.05
+) -> list[Balance]:
     """What readings make."""
     balancer, dead = Balancer(of, step_s, AttitudeConfig(), weighs=weighs), DeadReckoning(of, 0.0)
     found = []
@@ -118,4 +121,4 @@ def pushed(of: Resistance, steps: Iterable[Push]) -> None:
 
 def noise_of(density: float, n: int, rng: np.random.Generator) -> Floats:
     """White noise of n steps."""
-    return density / np.sqrt(STEP_S) * rng.standard_normal(n)
+    return density / math.sqrt(STEP_S) * np.asarray(rng.standard_normal(n))

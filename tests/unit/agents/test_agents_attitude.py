@@ -95,6 +95,17 @@ def test_normalised_error_is_one_where_the_slope_wanders_as_assumed() -> None:
     assert 0.6 < rms < 1.5, f"{seed=} {rms=}"
 
 
+@pytest.mark.parametrize("dt", [0.01, 0.04])
+def test_first_correction_by_hand(dt: float) -> None:
+    """Variance 0.05^2 at first; noise of 0.35 m/s2 over 20 ms, less over longer ones."""
+    lean = standing(0.0, 0.0)
+    lean.update(dt, (0.0, 0.0, 0.0), (0.5, 0.0))
+    before = 0.05**2 + (2e-3 * dt) ** 2 + 1.5e-3**2 * dt
+    noise = (0.35 / GRAVITY_MPS2) ** 2 * 0.02 / dt
+    assert lean.ahead.sine == pytest.approx(before / (before + noise) * 0.5 / GRAVITY_MPS2)
+    assert lean.ahead.variance == pytest.approx(before * noise / (before + noise))
+
+
 def test_force_beyond_any_slope_is_survived() -> None:
     lean = LeanFilter(AttitudeConfig())
     for _ in range(100):

@@ -23,9 +23,9 @@ BODY = {
 }
 
 
-def loader(mount: Mount | None = None, **options: object) -> MachineConfig:
+def loader(mount: Mount | None = None, **options: float) -> MachineConfig:
     """A machine that bends, weighs what it carries, and sits on tyres."""
-    of = machine(mount, **{**BODY, **options})
+    of = machine(mount, **{**BODY, **options})  # type: ignore[arg-type]
     more = SensorConfig("joint", "articulation"), SensorConfig("scale", "payload")
     return replace(of, sensors=(*of.sensors, *more))
 
@@ -126,7 +126,9 @@ def test_bent_machine_uphill_climbs_less() -> None:
     of = loader(axle_stiffness_npm=0.0, cog_height_m=0.0)
     legs = [Leg(2), Leg(4, 0.5, bend_rad=0.6), Leg(6, bend_rad=0.6)]
     last = balances(of, drive(legs, of, ground=Ground(0.04, 0.2)).readings)[-1]
-    assert last.share == pytest.approx(0.04 * math.cos(0.2) + math.sin(0.2) * (1 - 1.5 / 3.3 * (1 - math.cos(0.6))), abs=1e-4)
+    assert last.share == pytest.approx(
+        0.04 * math.cos(0.2) + math.sin(0.2) * (1 - 1.5 / 3.3 * (1 - math.cos(0.6))), abs=1e-4
+    )
     assert last.unbalanced == pytest.approx(0.04 * math.cos(0.2), abs=1e-3)
 
 

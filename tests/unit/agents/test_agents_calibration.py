@@ -115,9 +115,7 @@ def test_flat_ground_there_and_back_shows_the_zero(zero: float, c_rr: float) -> 
 @pytest.mark.parametrize("scale", [0.05, -0.05])
 def test_a_slope_shows_the_scale_too(scale: float) -> None:
     """40 m of flat ground, then a ramp of 12 degrees."""
-    on = course(
-        zero=0.004, scale=scale, slope=lambda x: math.radians(12) if x > 20 else 0.0, noise=NOISE, seed=2
-    )
+    on = course(zero=0.004, scale=scale, slope=lambda x: math.radians(12) if x > 20 else 0.0, noise=NOISE, seed=2)
     on.there_and_back(40, 8)
     found = on.calibrator.calibration
     assert found.zero == pytest.approx(0.004, abs=0.0015)
@@ -157,6 +155,18 @@ def test_a_passage_counts_once() -> None:
     on.wait(1)
     on.drive(20, -1.0)
     assert 2 * pairs - 6 <= on.calibrator.counters["pairs"] <= 2 * pairs + 6
+
+
+def test_one_way_there_pairs_with_one_way_back() -> None:
+    on = course(zero=0.004)
+    on.drive(20)
+    on.wait(1)
+    on.drive(20, -1.0)
+    pairs = on.calibrator.counters["pairs"]
+    on.wait(1)
+    on.place.x_m = 20.0  # back again, and never there
+    on.drive(20, -1.0)
+    assert on.calibrator.counters["pairs"] <= pairs + 4
 
 
 @pytest.mark.parametrize(
@@ -310,9 +320,7 @@ def normalised(seeds: Iterable[int], error: Callable[[Calibration, float, float]
     for seed in seeds:
         rng = np.random.default_rng(1000 + seed)
         zero, scale = config.zero * rng.standard_normal(), config.scale * rng.standard_normal()
-        on = course(
-            config, zero=zero, scale=scale, slope=lambda x: 0.2 if x > 10 else 0.0, noise=NOISE, seed=seed
-        )
+        on = course(config, zero=zero, scale=scale, slope=lambda x: 0.2 if x > 10 else 0.0, noise=NOISE, seed=seed)
         on.there_and_back(20, 2)
         found.append(error(on.calibrator.calibration, zero, scale))
     return float(np.sqrt(np.mean(np.square(found))))
@@ -341,6 +349,19 @@ def test_no_number_of_pairs_gets_below_the_floor() -> None:
     (zz, _), (_, ss) = on.calibrator.calibration.covariance
     assert 0.002 < math.sqrt(zz) < 0.0025
     assert 0.02 < math.sqrt(ss) < 0.025
+
+
+def test_known_stretch_counts_as_one_and_a_pair_as_two() -> None:
+    config = CalibrationConfig(zero=1.0, scale=1e-9, floor=1e-12, zero_walk=1e-12)
+    on, known = course(config), course(config)
+    on.there_and_back(20)
+    known.drive(20, known_c_rr=0.04)
+    for course_, stretches in (
+        (on, 2 * on.calibrator.counters["pairs"]),
+        (known, known.calibrator.counters["known_ground"]),
+    ):
+        zz = course_.calibrator.calibration.covariance[0][0]
+        assert zz == pytest.approx(config.noise**2 / stretches, rel=1e-3)
 
 
 def test_variance_of_a_balance_is_that_of_zero_and_scale_together() -> None:

@@ -1,3 +1,4 @@
+import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
@@ -6,6 +7,8 @@ from typing import Any
 import pytest
 
 from agents.config import AgentConfig, load_agent
+from agents.estimation.ground import NOTHING_KNOWN
+from agents.estimation.plausibility import FAULTS
 from protocol.errors import ConfigError
 from protocol.machine import MachineConfig, Mount, SensorConfig
 from protocol.site import SiteConfig, load_site
@@ -105,3 +108,15 @@ def test_bad_option_is_refused_by_name_and_file(tmp_path: Path, text: str, probl
 def test_missing_file_is_a_config_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
         load_agent(tmp_path / "none.toml")
+
+
+def test_page_of_ground_estimation_names_every_reason_and_none_else() -> None:
+    page = (CONFIG.parent / "docs" / "ground-estimation.md").read_text(encoding="utf-8")
+    modules = [*(CONFIG.parent / "agents" / "estimation").glob("*.py")]
+    said = set(re.findall(r"^\| ((?:`\w+`[ *,]*)+)\|", page[page.index("## Reasons") :], re.MULTILINE))
+    reasons = {name for names in said for name in re.findall(r"`(\w+)`", names)} - {"reason"}
+    source = "".join(path.read_text(encoding="utf-8") for path in modules)
+    assert not {reason for reason in reasons if f'"{reason}"' not in source}
+    judged = (CONFIG.parent / "agents" / "estimation" / "plausibility.py").read_text(encoding="utf-8")
+    given = set(re.findall(r'return "(\w+)"', judged)) | set(re.findall(r'_hold = "(\w+)"', judged))
+    assert given | FAULTS | {NOTHING_KNOWN.reason, "settling"} == reasons

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from agents_drives import START_NS, Drive, Ground, Leg, drive, machine, noisy
-from agents_ground import Run
+from agents_ground import STEADY, Run
 
 from agents.estimation.calibration import Calibration, CalibrationConfig
 from agents.estimation.ground import (
@@ -146,7 +146,9 @@ def test_mass_that_nobody_weighs_is_estimated_from_forces() -> None:
     legs = [STAND, START, *[Leg(2, 0.7), Leg(2, -0.7)] * 12]
     made = drive(legs, loaded, ground=Ground(0.05))
     found = {
-        mass: np.nanmean([abs(e.c_rr - 0.05) for e in Run(of, EstimationConfig(mass=mass)).feed(made.readings).between(40, 55)])
+        mass: np.nanmean(
+            [abs(e.c_rr - 0.05) for e in Run(of, EstimationConfig(mass=mass)).feed(made.readings).between(40, 55)]
+        )
         for mass in ("known", "estimated")
     }
     assert found["estimated"] < 0.006
@@ -206,7 +208,8 @@ def test_slope_s_normalised_errors_are_about_one() -> None:
         rng = np.random.default_rng(200 + seed)
         zero = CalibrationConfig().zero * GRAVITY_MPS2 * rng.standard_normal()
         for found in Run(of).feed(noisy(made, seed, force_mps2=zero)).between(8, 15)[::20]:
-            errors.append((found.slope_x - math.tan(0.1)) / math.sqrt(found.slope_var))
+            error = found.slope_x - math.tan(0.1)
+            errors += [error / math.sqrt(found.slope_var)]
     rms = float(np.sqrt(np.mean(np.square(errors))))
     assert 0.5 < rms < 1.5, rms
 
@@ -275,7 +278,9 @@ def test_torque_in_a_wrong_unit_is_noticed(factor: float) -> None:
 def test_torque_that_is_stuck_is_noticed() -> None:
     of = machine()
     made = drive([STAND, START, Leg(3), *[Leg(3, 0.6), Leg(3, -0.6)] * 4], of).readings
-    stuck = [replace(r, torque_nm=9000.0) if isinstance(r, Torque) and r.stamp_ns > START_NS + 8 * 10**9 else r for r in made]
+    stuck = [
+        replace(r, torque_nm=9000.0) if isinstance(r, Torque) and r.stamp_ns > START_NS + 8 * 10**9 else r for r in made
+    ]
     run = Run(of).feed(stuck)
     assert "torque_frozen" in {e.reason for e in run.between(10, 30)}
     assert "torque_frozen" not in {e.reason for e in Run(of).feed(made).between(0, 40)}
@@ -323,6 +328,16 @@ def test_change_of_slope_blurs_slope_and_resistance() -> None:
     assert all(e.is_blurred for e in found)
 
 
+@pytest.mark.parametrize(("speed_mps", "axles"), [(2.0, (0.4, 3.3, 2.1)), (-2.0, (0.6, 3.3, 1.2))])
+def test_estimator_is_told_which_axle_leads(speed_mps: float, axles: tuple[float, float, float]) -> None:
+    """Its share of the load, how far the other one is behind, and the load centre."""
+    estimator = GroundEstimator(machine(wheelbase_m=3.3, load_centre_m=1.2), EstimationConfig())
+    push = estimator._push(replace(STEADY, speed_mps=speed_mps, on_front=0.4), 0.1, 0.04, 1.0)
+    assert (push.lead_share, push.wheelbase_m, push.lead_m) == pytest.approx(axles)
+    bare = GroundEstimator(machine(), EstimationConfig())._push(STEADY, 0.1, 0.04, 1.0)
+    assert (bare.lead_share, bare.wheelbase_m) == (1.0, 0.0)
+
+
 # --- calibration -----------------------------------------------------------------------------------------------------
 
 CYCLE = [Leg(4, 0.5), Leg(6), Leg(4, -0.5), Leg(4), Leg(4, -0.5), Leg(6), Leg(4, 0.5), Leg(4)]  # there and back
@@ -350,9 +365,7 @@ def test_zero_is_found_by_the_work_cycle() -> None:
     readings = off(cycles(of, 5), 0.06)
     run, without = (Run(of, EstimationConfig(calibrate=c)).feed(readings) for c in (True, False))
     for direction in ((151.5, 155.5), (169.5, 173.5)):  # of the last cycle
-        found, uncalibrated = (
-            [e.c_rr for e in r.between(*direction) if not e.reason] for r in (run, without)
-        )
+        found, uncalibrated = ([e.c_rr for e in r.between(*direction) if not e.reason] for r in (run, without))
         assert len(found) > 20
         assert np.mean(found) == pytest.approx(0.04, abs=0.0015)
         assert abs(np.mean(uncalibrated) - 0.04) == pytest.approx(0.06 / GRAVITY_MPS2, abs=0.001)

@@ -169,7 +169,9 @@ def test_noise_is_measured_where_it_is_more_than_the_option_says(density: float)
 def test_borders_pauses_and_turns_back_are_not_taken_for_noise() -> None:
     steps = pushes(np.full(600, 0.05))
     steps = [replace(s, raw=s.raw + 0.1 * (i // 100 % 2)) for i, s in enumerate(steps)]  # borders
-    steps = [replace(s, raw=-s.raw, regressor=-1.0) if i // 50 % 2 else s for i, s in enumerate(steps)]  # there and back
+    steps = [
+        replace(s, raw=-s.raw, regressor=-1.0) if i // 50 % 2 else s for i, s in enumerate(steps)
+    ]  # there and back
     of = KalmanResistance(STILL)
     pushed(of, steps)
     assert of._density < 1.2 * 0.004**2
@@ -259,7 +261,7 @@ AXLES = {"wheelbase_m": 3.3, "lead_m": 1.8, "lead_share": 0.45}
 
 def crossing(before: float, behind: float, at_m: float, metres: float = 20.0) -> list[Push]:
     """A machine whose front axle is at way 0 first drives over a border; no noise."""
-    found = []
+    found: list[Push] = []
     for push in pushes(np.zeros(round(metres / 0.1))):
         lead_m = 0.1 * (len(found) + 1)
         lead, trail = (behind if m > at_m else before for m in (lead_m, lead_m - 3.3))
@@ -274,7 +276,9 @@ def test_border_that_two_axles_cross_is_one(before: float, behind: float) -> Non
     assert min(abs(i - 100) for i in borders(of)) <= 2
     for index in range(200):  # the load centre is 1.8 m behind the front axle
         if abs(index - 118) > 4 and index >= 100:
-            assert at_step(of, index)[0] == pytest.approx(before if index < 118 else behind, abs=max(5e-3, 0.1 * behind))
+            assert at_step(of, index)[0] == pytest.approx(
+                before if index < 118 else behind, abs=max(5e-3, 0.1 * behind)
+            )
 
 
 def test_without_axles_the_border_is_smeared_over_the_wheelbase() -> None:
@@ -291,14 +295,14 @@ def test_without_axles_the_border_is_smeared_over_the_wheelbase() -> None:
 def test_back_across_a_border_half_crossed() -> None:
     """The front axle 1 m on the new ground, then home: the old ground is found again behind."""
     of = KalmanResistance(KalmanConfig())
-    there = [s for s in crossing(0.03, 0.12, 9.0, 10.0)]
+    there = crossing(0.03, 0.12, 9.0, 10.0)
     pushed(of, there)
     home = []
     for i, push in enumerate(pushes(np.zeros(60))):
         front_m = 10.0 - 0.1 * (i + 1)
         raw = -(0.45 * (0.12 if front_m > 9.0 else 0.03) + 0.55 * 0.03)
         lead = {**AXLES, "lead_m": 1.5, "lead_share": 0.55}
-        push = replace(push, stamp_ns=there[-1].stamp_ns + (i + 20) * STEP_NS, raw=raw, regressor=-1.0, **lead)  # type: ignore[arg-type]
+        push = replace(push, stamp_ns=there[-1].stamp_ns + (i + 20) * STEP_NS, raw=raw, regressor=-1.0, **lead)
         home.append(push)
     pushed(of, home)
     found = of.at(home[-1].stamp_ns)
@@ -376,9 +380,8 @@ def test_wrong_mass_is_found_where_forces_vary(scale: float) -> None:
     pushed(of, steps)
     pushed(blind, steps)
     assert scale_of(of)[0] == pytest.approx(scale / (1 + scale), abs=0.02)
-    errors, blinds = (
-        [abs(e.at(s.stamp_ns)[0] - 0.05) for s in steps[-90:]] for e in (of, blind)  # type: ignore[index]
-    )
+    first = len(steps) - 90
+    errors, blinds = ([abs(at_step(e, i)[0] - 0.05) for i in range(first, len(steps))] for e in (of, blind))
     assert np.mean(errors) < 4e-3
     assert np.mean(blinds) > 1.3 * np.mean(errors)
 

@@ -14,9 +14,10 @@ from agents_drives import S_BEND, SITE, START_NS, Drive, Ground, Leg, changed_se
 import agents
 import protocol
 from agents.estimation.calibration import Calibration
-from agents.estimation.ground import EstimationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.localisation.belief import PoseBelief
+from agents.localisation.localiser import LocalisationConfig
 from agents.physics import GRAVITY_MPS2
+from agents.pipeline import Pipeline, PipelineConfig
 from protocol.logfolder import open_log
 from protocol.machine import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.readings import KINDS, Encoder, Gps, Imu, Reading, Torque, columns
@@ -160,6 +161,7 @@ def test_long_pause_starts_localisation_anew_and_keeps_the_counts() -> None:
     used = pipeline.health()["counters"]["gps-1_used"]
     first = pipeline.step([r for r in readings if r.stamp_ns >= silent[1]][:50])
     assert pipeline.pose is None
+    assert len(first) > 3
     assert (first["stamp_ns"] < silent[1]).all()  # what still waited
     after = pipeline.step([r for r in readings if r.stamp_ns >= silent[1]][50:])
     assert len(before) > 80
@@ -227,7 +229,6 @@ FAULTS: dict[str, tuple[Callable[[Reading], Reading | None], str]] = {
     "torque silent": (without(Torque), "no_torque"),
     "wheels silent": (without(Encoder), "no_wheels"),
     "torque stuck": (torque_stuck, "torque_frozen"),
-    "torque in mNm": (torque_times(1000.0), "torque_implausible"),
 }
 
 
@@ -248,11 +249,32 @@ def test_sensor_that_fails_costs_the_resistance_and_nothing_else(name: str) -> N
     slope = np.hypot(failed["grade_e"], failed["grade_n"])
     assert slope == pytest.approx(math.tan(0.1), abs=0.08 if reason == "no_wheels" else 0.02)
     assert pipeline.health()["without_resistance"][reason] >= len(failed) - 2
-    if name != "torque in mNm":  # whose proof takes minutes to fade
-        back = rows[at_s > HEAL_S + 5]
-        assert np.isfinite(back["c_rr"]).sum() > 20
-        assert np.nanmedian(back["c_rr"]) == pytest.approx(0.05, abs=0.006)
-        assert pipeline.health()["ground"]["fault"] == ""
+    back = rows[at_s > HEAL_S + 5]
+    assert np.isfinite(back["c_rr"]).sum() > 20
+    assert np.nanmedian(back["c_rr"]) == pytest.approx(0.05, abs=0.006)
+    assert pipeline.health()["ground"]["fault"] == ""
+
+
+def test_torque_in_a_wrong_unit_costs_the_resistance_and_nothing_else() -> None:
+    """In kNm where Nm are meant: known for sure once the machine has driven 20 s."""
+    legs = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.6), Leg(3, -0.6)] * 7]
+    readings = [torque_times(0.001)(r) for r in drive(legs, machine(), ground=Ground(0.05, 0.1)).readings]
+    pipeline = Pipeline(SITE, machine(), PipelineConfig())
+    rows = pipeline.step([r for r in readings if r])
+    assert pipeline.health()["ground"]["fault"] == "torque_implausible"
+    late = rows[rows["stamp_ns"] > START_NS + 30 * SECOND]
+    assert np.isnan(late["c_rr"]).all()
+    assert np.hypot(late["grade_e"], late["grade_n"]) == pytest.approx(math.tan(0.1), abs=0.02)
+    assert pipeline.health()["without_resistance"]["torque_implausible"] >= len(late)
+
+
+@pytest.mark.xfail(reason="slip is taken off by traction, however implausible that is", strict=True)
+def test_torque_a_thousand_times_too_large_moves_no_position() -> None:
+    made = long_drive()
+    rows = Pipeline(SITE, machine(), PipelineConfig()).step(failing(torque_times(1000.0)))
+    for row in rows:
+        x, y, heading = made.at(int(row["stamp_ns"]))
+        assert math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y)) < 3
 
 
 def test_accelerometer_in_g_withholds_samples_and_is_told() -> None:
@@ -311,17 +333,31 @@ def test_calibration_is_handed_over_a_pause_and_to_the_next_pipeline() -> None:
 @pytest.mark.parametrize(("half_m", "known"), [(60.0, True), (8.0, False)])
 def test_known_ground_counts_well_inside_of_it_only(half_m: float, known: bool) -> None:
     """3 m and twice the position's deviation from its edge; the drive leads 60 m away from its middle."""
-    corners = ((10 - half_m, 20 - half_m), (10 + half_m, 20 - half_m), (10 + half_m, 20 + half_m), (10 - half_m, 20 + half_m))
+    corners = (
+        (10 - half_m, 20 - half_m),
+        (10 + half_m, 20 - half_m),
+        (10 + half_m, 20 + half_m),
+        (10 - half_m, 20 + half_m),
+    )
     site: SiteConfig = replace(SITE, known_ground=(KnownGround("pad", 0.04, corners),))
     of = machine()
     pipeline = Pipeline(site, of, PipelineConfig())
-    pipeline.step([r for r in drive([Leg(2), Leg(4, 0.5), Leg(10), Leg(8)], of).readings])
+    pipeline.step(drive([Leg(2), Leg(4, 0.5), Leg(10), Leg(8)], of).readings)
     found = pipeline.health()["ground"]["calibration"].get("known_ground", 0)
     assert (found > 15) is known
     config = changed(PipelineConfig(), "estimation.calibration.edge_m", 50.0)
     strict = Pipeline(site, of, config)
     strict.step(drive([Leg(2), Leg(4, 0.5), Leg(10), Leg(8)], of).readings)
     assert strict.health()["ground"]["calibration"].get("known_ground", 0) < max(found, 1)
+
+
+@pytest.mark.parametrize(("std_m", "c_rr"), [(1.0, 0.04), (3.0, None)])
+def test_known_ground_has_to_be_all_around_an_unsure_position(std_m: float, c_rr: float | None) -> None:
+    """8 m from its edge: 3 m, and twice the standard deviation."""
+    pad = KnownGround("pad", 0.04, ((0.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0)))
+    pipeline = Pipeline(replace(SITE, known_ground=(pad,)), machine(), PipelineConfig())
+    pipeline._sampler.poses.append(PoseBelief(START_NS, 8.0, 20.0, 0.0, 2.0, std_m**2 * np.eye(2)))
+    assert pipeline._known_c_rr() == c_rr
 
 
 # --- never sees the truth --------------------------------------------------------------------------------------------
@@ -442,9 +478,13 @@ def changed(config: Any, dotted: str, value: Any) -> Any:
 OPTIONS = options_of(PipelineConfig())
 
 
+# Positions matter little for the options of estimation: the cheaper filter saves time.
+CHEAP = PipelineConfig(localisation=LocalisationConfig(filter="ekf", step_s=0.1))
+
+
 def config_for(name: str) -> PipelineConfig:
-    """The defaults, with what this option needs."""
-    config = PipelineConfig()
+    """What an option is tried on: with what it needs."""
+    config = CHEAP
     for prefix, needed in WITH.items():
         if name.startswith(prefix):
             for option, value in needed.items():
@@ -459,9 +499,7 @@ PAD = KnownGround("pad", 0.03, ((-30.0, -30.0), (20.0, -30.0), (20.0, 70.0), (-3
 
 
 def worker() -> MachineConfig:
-    of = machine(
-        wheelbase_m=3.3, axle_stiffness_npm=1.8e6, cog_height_m=1.05, payload_x_m=4.7, payload_z_m=0.85
-    )
+    of = machine(wheelbase_m=3.3, axle_stiffness_npm=1.8e6, cog_height_m=1.05, payload_x_m=4.7, payload_z_m=0.85)
     return replace(of, sensors=(*of.sensors, SensorConfig("scale", "payload")))
 
 
@@ -469,14 +507,14 @@ def worker() -> MachineConfig:
 def work() -> tuple[Reading, ...]:
     """40 s: there and back on two grounds, empty and loaded, with every trouble for a moment.
 
-    Half of the IMU's readings are enough here, and save time.
+    Half of the readings of IMU and torque are enough here, and save time.
     """
     of = worker()
     cycle = (Leg(2, 1.0), Leg(5), Leg(1, -2.0), Leg(3.5), Leg(2, -1.0), Leg(4), Leg(2, 1.0))
     legs = [Leg(1), *cycle, Leg(0.5), *(replace(leg, payload_kg=3000) for leg in cycle)]
     firm, soft = (drive(legs, of, ground=Ground(c_rr, 0.02)) for c_rr in (0.03, 0.09))
     mixed = [a if seconds(a) % 20 < 5 else b for a, b in zip(firm.readings, soft.readings, strict=True)]
-    heard = [r for r in mixed if not (isinstance(r, Imu) and r.stamp_ns % 20_000_000)]
+    heard = [r for r in mixed if not (isinstance(r, Imu | Torque) and r.stamp_ns % 20_000_000)]
     return tuple(troubled(r, of) for r in noisy(heard, 1) if not (isinstance(r, Torque) and 6.2 < seconds(r) < 6.9))
 
 
@@ -517,7 +555,7 @@ def work_as_it_is(name: str) -> tuple[bytes, Any]:
 
 
 def test_work_has_every_reason_to_withhold_resistance() -> None:
-    _, health = run_work(PipelineConfig())
+    _, health = work_as_it_is("")
     found = {*health["without_resistance"], *health["withheld"]}
     assert found >= {"torque_implausible", "digging", "slip", "pitch_transient", "no_torque", "torque_frozen"}
     assert health["ground"]["calibration"]["known_ground"] > 0
@@ -625,7 +663,7 @@ def test_every_field_of_machine_and_sensor_is_covered() -> None:
 
 @pytest.mark.parametrize("name", sorted(BODY))
 def test_option_of_the_body_changes_the_samples(name: str) -> None:
-    assert run_work(PipelineConfig(), replace(worker(), **{name: BODY[name]}))[0] != work_as_it_is("")[0]
+    assert run_work(CHEAP, replace(worker(), **{name: BODY[name]}))[0] != work_as_it_is("")[0]
 
 
 @pytest.mark.parametrize(("sensor", "options"), SENSOR)

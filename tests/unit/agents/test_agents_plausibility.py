@@ -44,8 +44,8 @@ def test_a_loader_at_work_is_believed() -> None:
 
 
 def test_which_reasons_are_faults_and_which_leave_no_slope() -> None:
-    assert SLOPE_TOO == {"pitch_transient", "accelerometer"}
-    assert FAULTS == {"accelerometer", "no_torque", "no_wheels", "torque_frozen", "torque_implausible"}
+    assert {"pitch_transient", "accelerometer"} == SLOPE_TOO
+    assert {"accelerometer", "no_torque", "no_wheels", "torque_frozen", "torque_implausible"} == FAULTS
 
 
 # --- one balance is enough -------------------------------------------------------------------------------------------
@@ -197,6 +197,12 @@ def test_scales_and_zeros_as_sensors_have_them_are_believed(gain: float, offset:
     assert set(verdicts(at_work(120, gain, offset))) == {""}
 
 
+def test_forces_of_a_machine_that_stands_prove_nothing() -> None:
+    standing = [replace(b, speed_mps=0.0) for b in at_work(60, 5.0)]
+    found = verdicts([*standing, *(replace(b, stamp_ns=b.stamp_ns + 60 * 10**9) for b in at_work(60))])
+    assert set(found) <= {"", "standstill"}
+
+
 def test_resistance_alone_does_not_look_like_a_wrong_unit() -> None:
     """Sand and asphalt in turn: the drive force changes, and what the motion takes does not."""
     steps = [after(i, share=c, unbalanced=c) for i in range(4000) for c in [0.25 if i // 200 % 2 else 0.01]]
@@ -226,7 +232,9 @@ def test_noise_of_the_torque_does_not_look_like_a_wrong_unit() -> None:
     seed = 4
     rng = np.random.default_rng(seed)
     noise = 0.03 * rng.standard_normal(6000)
-    steps = [replace(b, share=b.share + e, unbalanced=b.unbalanced + e) for b, e in zip(at_work(300), noise, strict=True)]
+    steps = [
+        replace(b, share=b.share + e, unbalanced=b.unbalanced + e) for b, e in zip(at_work(300), noise, strict=True)
+    ]
     assert set(verdicts(steps)) == {""}, f"{seed=}"
 
 

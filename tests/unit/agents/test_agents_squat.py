@@ -67,7 +67,7 @@ def test_on_a_slope_less_weight_presses_the_tyres() -> None:
 
 @pytest.mark.parametrize("unknown", ["wheelbase_m", "axle_stiffness_npm"])
 def test_without_data_there_is_no_squat(unknown: str) -> None:
-    assert squat_rad(replace(LOADER, **{unknown: 0.0}), 4000, 2.0) == 0.0
+    assert squat_rad(replace(LOADER, **{unknown: 0.0}), 4000, 2.0) == 0.0  # type: ignore[arg-type]
     assert squat_rad(MachineConfig("loader-1"), 4000, 2.0) == 0.0
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from protocol import codec
+from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.geometry import MAX_CELLS
-from protocol.config import from_table
 from protocol.logfolder import open_log
 from protocol.machine import GIVES, MODES
 from protocol.messages import Pose
