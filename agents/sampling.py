@@ -98,9 +98,8 @@ class Way:
             self._wheels_ns = now_ns
         self._way_m += wheels_m - self._wheels_m
         self._wheels_m = wheels_m
-        if now_ns - self._wheels_ns > SILENT_NS and abs(speed_mps) > MIN_SPEED_MPS:
-            since_ns = max(self._wheels_ns, self._counted_ns)
-            self._way_m += abs(speed_mps) * max(now_ns - since_ns, 0) * 1e-9
+        if now_ns - self._wheels_ns > SILENT_NS and abs(speed_mps) > MIN_SPEED_MPS and self._counted_ns:
+            self._way_m += abs(speed_mps) * max(now_ns - self._counted_ns, 0) * 1e-9
         self._counted_ns = max(self._counted_ns, now_ns)
         return self._way_m
 

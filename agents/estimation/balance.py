@@ -139,7 +139,7 @@ class Balancer:
             unbalanced=share
             - force / g
             + squat
-            - self._bent(on_front)
+            - self._bent(on_front, squat)
             - (machine.rotating_mass_factor - 1) * accel / g,
             share=share,
             slope_x=self._lean.ahead.angle_rad - squat,
@@ -154,13 +154,13 @@ class Balancer:
             wheels_s=self._wheels_s(),
         )
 
-    def _bent(self, on_front: float) -> float:
+    def _bent(self, on_front: float, squat: float) -> float:
         """What the front frame of a bent machine climbs more than the rear one, over the way [-].
 
         Gravity works on each axle's load along that axle's own way, and the accelerometer feels the rear one's.
         """
         c, s = math.cos(self._bend_rad), math.sin(self._bend_rad)
-        return on_front * (self._lean.ahead.sine * (c - 1) + self._lean.left.sine * s)
+        return on_front * ((self._lean.ahead.sine - squat) * (c - 1) + self._lean.left.sine * s)
 
     def _wheels_s(self) -> float:
         return (self._imu_ns - self._wheels_ns) * 1e-9 if self._wheels_ns else math.inf

@@ -110,8 +110,9 @@ class Calibrator:
     @property
     def calibration(self) -> Calibration:
         """What is known now."""
-        P = self._P + np.diag([1.0, 100.0]) * self._config.floor**2 * (self._passages > 0)
-        (zz, zs), (_, ss) = P.tolist()
+        (zz, zs), (_, ss) = self._P.tolist()
+        least = self._config.floor
+        zz, ss = max(zz, least**2), max(ss, (10 * least) ** 2)  # raised variances keep a covariance definite
         zero, scale = self._x.tolist()
         return Calibration(zero, scale, ((zz, zs), (zs, ss)), self._stamp_ns, self._passages)
 

@@ -28,6 +28,7 @@ ESTIMATORS = ("kalman", "rls")
 MASSES = ("message", "known", "estimated")
 KEPT = 400  # steps that are remembered: 20 s
 NEAR_NS = 200_000_000  # a slope this far from its stamp is none
+SILENT_NS = 1_000_000_000  # other sensors speak, but no step was made for so long
 LOADING_S = 3.0  # a machine that stands so long may take or leave a load
 
 
@@ -115,6 +116,7 @@ class GroundEstimator:
         self._moments: deque[_Moment] = deque(maxlen=KEPT)
         self._used_m = 0.0
         self._stands_s = 0.0
+        self._heard_ns = 0  # of any sensor
 
     @property
     def newest_ns(self) -> int:
@@ -124,6 +126,8 @@ class GroundEstimator:
     @property
     def fault(self) -> str:
         """The sensor fault of this moment that keeps resistance from being known, "" if none does."""
+        if self._heard_ns - self.newest_ns > SILENT_NS:
+            return NOTHING_KNOWN.reason
         reason = self._moments[-1].reason if self._moments else ""
         return reason if reason in FAULTS else ""
 
@@ -154,6 +158,7 @@ class GroundEstimator:
         self, reading: Reading, sensor: SensorConfig, dead: DeadReckoning, known_c_rr: float | None = None
     ) -> None:
         """Take in a reading, after dead reckoning did. known_c_rr: of the ground here, where the site says it."""
+        self._heard_ns = max(self._heard_ns, reading.stamp_ns)
         if balance := self._balancer.update(reading, sensor, dead):
             self._step(balance, dead, known_c_rr)
 

@@ -191,6 +191,7 @@ class KalmanResistance:
         c, n = self._config, len(self._steps)
         least, most = c.border_steps
         first = max(n - most, 0)
+        self._doubt(n - 2 * least)
         for i in range(n - 1, first - 1, -1):
             if self._steps[i].border or not math.isnan(self._steps[i].begun_m):  # one border at a time
                 first = i + 1
@@ -218,6 +219,13 @@ class KalmanResistance:
         if likely[best] > c.jump_sigma:
             self._steps[first + best].border = True
             self._filter(first + best)
+
+    def _doubt(self, since: int) -> None:
+        """Take back a border that is younger than this step: with more behind it, it may lie elsewhere."""
+        for i in range(len(self._steps) - 1, max(since, 0) - 1, -1):
+            if self._steps[i].border:
+                self._steps[i].border = False
+                self._filter(i)
 
     def _smoothed(self, index: int) -> tuple[Floats, Floats]:
         newest = self._steps[-1]

@@ -19,6 +19,7 @@ SLOPE_TOO = frozenset({"pitch_transient", "accelerometer"})
 FAULTS = frozenset({"accelerometer", "no_torque", "no_wheels", "torque_frozen", "torque_implausible"})
 FORCE_NORMS_MPS2 = (5.0, 15.0)  # of a specific force in m/s2: neither in g, nor in mm/s2, nor a sensor that is dead
 MEAN_S = 0.3  # over which wheels are compared with the body
+MIN_C_RR = -0.08  # ground that pushes: the torque that does it is missing, and no accelerometer's zero is so far off
 SMOOTH_S = 1.0  # of the forces that are compared for their unit
 FORGET_S = 120.0  # of the proof that torque moves the machine
 
@@ -66,12 +67,13 @@ class Plausibility:
         self._hold = ("", 0.0)  # reason, and for how long still
         self._frozen = _Frozen()
         self._gain = _Gain()
+        self._resisted = 0.0  # resistance, low-passed
 
     def judge(self, balance: Balance, resistance: float) -> str:
         """Why this balance tells nothing of the resistance; "" if it does. resistance: what it would say."""
         if not FORCE_NORMS_MPS2[0] <= balance.norm_mps2 <= FORCE_NORMS_MPS2[1]:
             return "accelerometer"
-        if fault := self._fault(balance):
+        if fault := self._fault(balance, resistance):
             return fault
         if abs(balance.speed_mps) < self._config.min_speed_mps:
             return "standstill"
@@ -79,7 +81,7 @@ class Plausibility:
             return "pitch_transient"
         return self._unsteady(balance, resistance)
 
-    def _fault(self, balance: Balance) -> str:
+    def _fault(self, balance: Balance, resistance: float) -> str:
         c = self._config
         if balance.wheels_s > c.stale_s:
             return "no_wheels"
@@ -88,9 +90,12 @@ class Plausibility:
         drives = abs(balance.speed_mps) >= c.min_speed_mps
         if self._frozen.update(balance, drives=drives) >= c.frozen_share and self._frozen.same_s >= c.frozen_s:
             return "torque_frozen"
+        if abs(balance.share) > c.max_share:
+            return "torque_implausible"
         if drives:
             self._gain.update(balance)
-        if abs(balance.share) > c.max_share or not c.min_gain <= self._gain.value <= c.max_gain:
+            self._resisted += min(balance.dt_s / SMOOTH_S, 1.0) * (resistance - self._resisted)
+        if self._resisted < MIN_C_RR or not c.min_gain <= self._gain.value <= c.max_gain:
             return "torque_implausible"
         return ""
 

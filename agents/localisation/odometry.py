@@ -15,6 +15,7 @@ from protocol.readings import Encoder, Imu, Odometry, Reading, Steering, Torque
 
 TURNS = ("imu", "odometry", "steering")  # what tells the turn, the best first
 STALE_S = 2.0  # a steering angle, or a speed to go with it, says nothing later
+MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine
 MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
 
 
@@ -108,7 +109,8 @@ class DeadReckoning:
             self._turned_ns = reading.stamp_ns
         elif isinstance(reading, Torque):
             weight_n = self._machine.mass_kg * GRAVITY_MPS2
-            self.traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
+            traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
+            self.traction = traction if abs(traction) <= MAX_TRACTION else 0.0
 
     def now(self) -> Dead:
         """The dead-reckoned pose of this moment."""
