@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,13 +19,12 @@ import numpy as np
 
 from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline, PipelineConfig
+from evaluation.campaign import Progress, carry_out, check_name, loaded
 from evaluation.ground_score import Judged, by_border, c_rr_bias, figures, judge, pool, soils
 from evaluation.ground_truth import Ground, Way, lay_ground, read_way
-from evaluation.recordings import Drive, Recording, Setup, code_version, digest, load, make, track_file
+from evaluation.recordings import Drive, Recording, Setup, code_version, digest, track_file
 from evaluation.summary import half_width, rounded
-from evaluation.workers import each
 from protocol.arrays import Floats, Table
-from protocol.errors import SitegridError
 
 LOADING = Setup("loading", ("west", "east", "middle", "yard"), gps=(1, 2), imu=(3,))
 ESTIMATORS = ("kalman", "rls")
@@ -47,7 +46,6 @@ GOALS = (
     ("wrong_slope_cells_pct", "<=", 0.2),
 )
 DIGITS = 3
-Progress = Callable[[float, float, str], None]  # simulated seconds done, all of them, what was done last
 
 
 @dataclass(frozen=True)
@@ -202,16 +200,7 @@ def _outcomes(plan: Plan, on_progress: Progress) -> list[Outcome]:
     """Outcomes of all tasks by seeds and rows, from the cache where they are there."""
     tasks = [plan.task(seed, row) for seed in plan.seeds for row in plan.rows]
     tasks.sort(key=lambda task: (task.drive.seed, task.drive.preset))  # a worker loads each recording once
-    waiting = [task for task in tasks if not run_file(task).exists()]
-    drives = [d for d in dict.fromkeys(task.drive for task in waiting) if not d.folder(plan.cache).exists()]
-    total_s = (len(drives) + len(tasks)) * plan.seconds
-    done_s = (len(tasks) - len(waiting)) * plan.seconds
-    for (drive, _), _ in each(_record, [(drive, plan.cache) for drive in drives], plan.processes):
-        done_s += plan.seconds
-        on_progress(done_s, total_s, f"recorded seed {drive.seed} {drive.preset}")
-    for (task, _), _ in each(_estimate, [(task, run_file(task)) for task in waiting], plan.processes):
-        done_s += plan.seconds
-        on_progress(done_s, total_s, f"seed {task.drive.seed} {task.row.name}")
+    carry_out(tasks, run_file, _estimate, plan.processes, on_progress)
     return [judge_task(task) for task in tasks]
 
 
@@ -245,16 +234,11 @@ def _truth(drive: Drive, cache: Path) -> tuple[Way, Ground]:
 # --- in the worker processes -----------------------------------------------------------------------------------------
 
 
-def _record(job: tuple[Drive, Path]) -> None:
-    make(*job)
-
-
 def _estimate(job: tuple[Task, Path]) -> None:
     """Run one row on one recording, and keep its samples, whole or not at all."""
     task, file = job
-    if file != run_file(task):  # this process read its code later than the one that named the file
-        raise SitegridError("the sources changed during the run: start it again, it goes on where it was")
-    recording = _loaded(task.folder)
+    check_name(file, run_file(task))
+    recording = loaded(task.drive, task.cache)
     pipeline = Pipeline(recording.site, recording.machine, task.row.options)
     samples, cpu_s = sample(pipeline, recording)
     seconds = (recording.readings[-1].stamp_ns - recording.readings[0].stamp_ns) * 1e-9
@@ -275,8 +259,3 @@ def sample(pipeline: Pipeline, recording: Recording) -> tuple[Table, float]:
     readings = recording.readings
     made = [pipeline.step(readings[i : i + CHUNK]) for i in range(0, len(readings), CHUNK)]
     return np.concatenate(made), time.process_time() - began_s
-
-
-@lru_cache(maxsize=1)
-def _loaded(folder: Path) -> Recording:
-    return load(folder)

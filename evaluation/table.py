@@ -8,26 +8,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents.pipeline import Pipeline
+from evaluation.campaign import Progress, carry_out, check_name, loaded
 from evaluation.configurations import Configuration, UnsupportedError, configure, started_at
-from evaluation.recordings import Drive, Recording, code_version, digest, gps_error, load, make
+from evaluation.recordings import Drive, code_version, digest, gps_error
 from evaluation.replay import Score, Trace, Truth, errors, replay, score
 from evaluation.summary import ratios, summarise
-from evaluation.workers import each
 from protocol.arrays import Floats
-from protocol.errors import SitegridError
 
 TRACE_S = 1.0  # between two points of the curves that plots draw
 RESULT_SOURCES = ("agents", "protocol", "evaluation/replay.py", "evaluation/consistency.py")
-Progress = Callable[[float, float, str], None]  # simulated seconds done, all of them, what was done last
 
 
 @dataclass(frozen=True)
@@ -115,16 +112,7 @@ def _sort_out(plan: Plan) -> tuple[list[Configuration], list[dict[str, Any]]]:
 def _outcomes(plan: Plan, rows: Sequence[Configuration], on_progress: Progress) -> list[Outcome]:
     """Outcomes of all tasks, in the order of rows and seeds, from the cache where they are there."""
     tasks = [Task(drive, row, plan.cache) for drive in plan.drives for row in rows]
-    waiting = [task for task in tasks if not result_file(task).exists()]
-    drives = [d for d in dict.fromkeys(task.drive for task in waiting) if not d.folder(plan.cache).exists()]
-    total_s = (len(drives) + len(tasks)) * plan.seconds
-    done_s = (len(tasks) - len(waiting)) * plan.seconds
-    for drive, _ in each(_record, [(drive, plan.cache) for drive in drives], plan.processes):
-        done_s += plan.seconds
-        on_progress(done_s, total_s, f"recorded seed {drive[0].seed}")
-    for (task, _), _ in each(_replay, [(task, result_file(task)) for task in waiting], plan.processes):
-        done_s += plan.seconds
-        on_progress(done_s, total_s, f"seed {task.drive.seed} {task.row.name}")
+    carry_out(tasks, result_file, _replay, plan.processes, on_progress)
     return [read_outcome(task) for task in tasks]
 
 
@@ -144,16 +132,11 @@ def read_outcome(task: Task) -> Outcome:
 # --- in the worker processes -----------------------------------------------------------------------------------------
 
 
-def _record(job: tuple[Drive, Path]) -> None:
-    make(*job)
-
-
 def _replay(job: tuple[Task, Path]) -> None:
     """Run one configuration on one recording, and write its outcome, whole or not at all."""
     task, file = job
-    if file != result_file(task):  # this process read its code later than the one that named the file
-        raise SitegridError("the sources changed during the run: start it again, it goes on where it was")
-    recording = _loaded(task.drive.folder(task.cache))
+    check_name(file, result_file(task))
+    recording = loaded(task.drive, task.cache)
     machine, options = configure(recording.machine, task.row)
     if not task.row.gps:
         options = started_at(options, recording.start)
@@ -165,11 +148,6 @@ def _replay(job: tuple[Task, Path]) -> None:
     part = file.with_suffix(".part")
     part.write_text(json.dumps(_without_nan(outcome), allow_nan=False), encoding="utf-8")
     part.rename(file)
-
-
-@lru_cache(maxsize=1)  # tasks come recording by recording
-def _loaded(folder: Path) -> Recording:
-    return load(folder)
 
 
 def _thin(trace: Trace, truth: Truth) -> dict[str, Any]:

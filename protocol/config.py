@@ -7,7 +7,7 @@ import math
 import tomllib
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -88,3 +88,10 @@ def _convert_tuple(value: Any, args: tuple[Any, ...], where: str) -> tuple[Any, 
     if len(value) != len(args):
         raise ConfigError(where, f"{len(args)} values are expected, not {len(value)}")
     return tuple(_convert(v, a, f"{where}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True)))
+
+
+def require_positive(config: Any, names: Iterable[str]) -> None:
+    """Raise ValueError, by name, on the first of these numbers of a dataclass that is not positive and finite."""
+    for name in names:
+        if not 0 < getattr(config, name) < math.inf:  # also false for NaN
+            raise ValueError(f"{name}: must be positive and finite")

@@ -18,6 +18,7 @@ import numpy as np
 from agents.estimation.balance import Balance
 from agents.localisation.odometry import DeadReckoning
 from protocol.arrays import Floats
+from protocol.config import require_positive
 
 REMEMBERED = 400  # stretches: 200 m of way
 RELOCK = 12  # so many that were off in a row are right, and what was known is wrong: a sensor worse than its class
@@ -46,9 +47,7 @@ class CalibrationConfig:
     edge_m: float = 3.0
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be positive and finite")
+        require_positive(self, self.__dataclass_fields__)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility, Plau
 from agents.estimation.recursive import RecursiveConfig, RecursiveGrade, RecursiveResistance
 from agents.estimation.resistance import Push, Resistance
 from agents.localisation.odometry import DeadReckoning
+from protocol.config import require_positive
 from protocol.machine import MachineConfig, SensorConfig
 from protocol.readings import Reading
 
@@ -57,9 +58,7 @@ class EstimationConfig:
         for name, known in (("estimator", ESTIMATORS), ("mass", MASSES)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}: {getattr(self, name)!r} is none of {', '.join(known)}")
-        for name in ("step_s", "model_std"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be positive and finite")
+        require_positive(self, ("step_s", "model_std"))
 
 
 @dataclass(frozen=True)

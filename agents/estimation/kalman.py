@@ -22,6 +22,7 @@ import numpy as np
 
 from agents.estimation.resistance import Push
 from protocol.arrays import Floats
+from protocol.config import require_positive
 
 KEPT = 100  # steps: 5 s
 FIRST_C_RR, FIRST_STD = 0.03, 0.1
@@ -29,10 +30,9 @@ NOISE_S = 20.0  # over which noise is measured
 OUTLIER = 16.0  # squares beyond so many times the mean are something else
 NEAR_NS = 150_000_000  # an estimate this far from a step that was usable is none
 EYE = np.eye(3)
-MERGED = np.array(
-    [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-)  # the trailing axle stands where the leading does
-FREED = np.diag([0.0, 1.0, 1.0])  # nothing is known of what lies under the leading axle
+# What of the state survives: both axles stand where the leading one does; or nothing is known under the leading one.
+MERGED = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+FREED = np.diag([0.0, 1.0, 1.0])
 TINY = 1e-14 * EYE  # both axles on the same ground: a covariance without inverse
 
 
@@ -57,9 +57,7 @@ class KalmanConfig:
     scale_std: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in set(self.__dataclass_fields__) - {"border_steps"}:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be positive and finite")
+        require_positive(self, set(self.__dataclass_fields__) - {"border_steps"})
         least, most = self.border_steps
         if not 2 <= least < most <= KEPT:
             raise ValueError(f"border_steps: {least}, {most} are not from 2 to {KEPT} and rising")
@@ -81,11 +79,11 @@ class _Step:
     scale_var: float
     border: bool = False
     begun_m: float = math.nan
-    A: Floats = field(default_factory=lambda: EYE)
-    x0: Floats = field(default_factory=lambda: EYE[0])
-    P0: Floats = field(default_factory=lambda: EYE)
-    x: Floats = field(default_factory=lambda: EYE[0])
-    P: Floats = field(default_factory=lambda: EYE)
+    A: Floats = field(init=False)
+    x0: Floats = field(init=False)
+    P0: Floats = field(init=False)
+    x: Floats = field(init=False)
+    P: Floats = field(init=False)
 
     @property
     def is_plain(self) -> bool:
@@ -103,8 +101,8 @@ class KalmanResistance:
         first = Push(0, 0.0, 0.0, 0.0, 1.0, 0.0)
         P = _tied(FIRST_STD**2)
         P[2, 2] = scale_var
-        x = np.array([FIRST_C_RR, FIRST_C_RR, 0.0])
-        self._first = _Step(first, 0.0, np.zeros(3), 1.0, 0.0, x=x, P=P)
+        self._first = _Step(first, 0.0, np.zeros(3), 1.0, 0.0)
+        self._first.x, self._first.P = np.array([FIRST_C_RR, FIRST_C_RR, 0.0]), P
         self._steps: list[_Step] = []
         self._density = config.noise**2  # of the noise [1/Hz]
         self._last: Push | None = None

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from agents.estimation.balance import Balance
 from agents.physics import GRAVITY_MPS2
+from protocol.config import require_positive
 
 # Reasons that leave the slope as it is; the others withhold the whole sample.
 SLOPE_TOO = frozenset({"pitch_transient", "accelerometer"})
@@ -51,9 +52,7 @@ class PlausibilityConfig:
     max_gain: float = 2.5
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be positive and finite")
+        require_positive(self, self.__dataclass_fields__)
         if self.min_gain >= self.max_gain:
             raise ValueError("min_gain: not below max_gain")
 

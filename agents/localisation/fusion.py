@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from agents.localisation.belief import Belief, Conditioned, Filter, Measurement, Motion
+from protocol.config import require_positive
 
 Motions = Callable[[Belief, float], Motion]  # how a belief moves on over so many seconds
 Change = Callable[[Belief], Belief]
@@ -29,9 +30,7 @@ class FusionConfig:
     relock: int = 15
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be positive and finite")
+        require_positive(self, self.__dataclass_fields__)
 
 
 @dataclass

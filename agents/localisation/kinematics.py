@@ -33,6 +33,7 @@ from agents.localisation.state import (
     Z,
 )
 from protocol.arrays import Floats
+from protocol.config import require_positive
 
 OFF_PLANE_VARIANCE = 1e-6  # of states that are zero on a plane, as robot_localization measures them
 EYE = np.eye(3)
@@ -63,9 +64,7 @@ class MotionConfig:
     wheel_scale_walk: float = 2e-4
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if name != "two_d" and not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be positive and finite")
+        require_positive(self, (name for name in self.__dataclass_fields__ if name != "two_d"))
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from agents.localisation.unscented import Ukf
 from agents.localisation.watch import Consistency
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
+from protocol.config import require_positive
 from protocol.machine import ABSOLUTE, MachineConfig, SensorConfig
 from protocol.readings import Gps, Reading
 from protocol.site import Projection
@@ -81,9 +82,7 @@ class LocalisationConfig:
             raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(ENGINES)}")
         if self.profile not in PROFILES:
             raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
-        for name in POSITIVE:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be positive and finite")
+        require_positive(self, POSITIVE)
         if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
             raise ValueError("slip: must be from 0 to below 1, slip_soft not negative")
         if len(self.start) not in (0, 3) or not np.isfinite(self.start).all():

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from agents.estimation.squat import front_share, squat_rad
+from agents.localisation.belief import Belief
+from agents.localisation.localiser import Localiser
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats, Table
 from protocol.machine import MachineConfig, Mount, SensorConfig
@@ -222,3 +224,15 @@ def made_up_samples(n: int, seed: int = 0) -> Table:
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0
     rows["distance_m"] = 0.5
     return rows
+
+
+def beliefs_of(found: Localiser, of: MachineConfig, readings: Iterable[Reading]) -> list[Belief]:
+    """Run a localiser; its newest beliefs, as they were known."""
+    beliefs: list[Belief] = []
+    for reading in readings:
+        sensor = of.sensor(reading.sensor)
+        assert sensor
+        found.update(reading, sensor)
+        if found.belief and (not beliefs or found.belief.stamp_ns > beliefs[-1].stamp_ns):
+            beliefs.append(found.belief)
+    return beliefs

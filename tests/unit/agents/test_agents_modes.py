@@ -6,7 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agents_drives import PROJECTION, S_BEND, SITE, START_NS, Drive, Leg, changed_sensor, drive, fix, machine
+from agents_drives import (
+    PROJECTION,
+    S_BEND,
+    SITE,
+    START_NS,
+    Drive,
+    Leg,
+    beliefs_of,
+    changed_sensor,
+    drive,
+    fix,
+    machine,
+)
 
 from agents.localisation.belief import Belief
 from agents.localisation.kinematics import MotionConfig, map_from_base
@@ -27,18 +39,6 @@ BOTH = pytest.mark.parametrize("engine", ["ekf", "ukf"])
 
 def localiser(of: MachineConfig, **options: Any) -> Localiser:
     return Localiser(of, PROJECTION, LocalisationConfig(slip=0.0, slip_soft=0.0, **options))
-
-
-def run(found: Localiser, of: MachineConfig, readings: list[Reading]) -> list[Belief]:
-    """The newest beliefs, as they were known."""
-    beliefs: list[Belief] = []
-    for reading in readings:
-        sensor = of.sensor(reading.sensor)
-        assert sensor
-        found.update(reading, sensor)
-        if found.belief and (not beliefs or found.belief.stamp_ns > beliefs[-1].stamp_ns):
-            beliefs.append(found.belief)
-    return beliefs
 
 
 def errors(made: Drive, beliefs: list[Belief], east_m: float = 0.0, north_m: float = 0.0) -> list[float]:
@@ -121,9 +121,9 @@ def test_a_machine_with_such_a_receiver_alone_never_aligns_but_runs_from_a_start
     readings = moved(made.readings, 1000.0)
     assert not localiser(of, profile=profile).is_aligned
     lost = localiser(of, profile=profile, filter=engine)
-    assert run(lost, of, readings) == []
+    assert beliefs_of(lost, of, readings) == []
     found = localiser(of, profile=profile, filter=engine, start=START)
-    assert max(errors(made, run(found, of, readings))) < 0.6
+    assert max(errors(made, beliefs_of(found, of, readings))) < 0.6
     assert found.counters["gps-1_used"] > 100
     assert found.counters["gps-1_gated"] == 0
 
@@ -133,8 +133,8 @@ def test_the_start_heading_comes_from_absolute_receivers_alone(mode: str) -> Non
     of = of_gps(mode, receivers=2)
     made = drive(S_BEND, of)
     straight, off = localiser(of), localiser(of)
-    expected = run(straight, of, made.readings)[0]
-    assert run(off, of, moved(made.readings, 300.0, "gps-2"))[0].x[:2] == pytest.approx(expected.x[:2], abs=0.3)
+    expected = beliefs_of(straight, of, made.readings)[0]
+    assert beliefs_of(off, of, moved(made.readings, 300.0, "gps-2"))[0].x[:2] == pytest.approx(expected.x[:2], abs=0.3)
     assert off.counters["gps-2_used"] > 100
 
 
@@ -151,7 +151,7 @@ def test_differential_receiver_shows_speed_and_heading_where_wheels_are_wrong() 
             for r in moved(made.readings, 200.0)
             if mode or not isinstance(r, Gps)
         ]
-        drifts[mode] = errors(made, run(localiser(of, start=START, profile="paper"), of, readings))[-1]
+        drifts[mode] = errors(made, beliefs_of(localiser(of, start=START, profile="paper"), of, readings))[-1]
     assert drifts["differential"] < 0.5 * drifts[None], drifts
 
 
@@ -165,7 +165,7 @@ def test_velocity_of_an_antenna_far_off_the_axle_is_free_of_bias_in_a_bend(hz: i
     fixes = [r for r in made.readings if isinstance(r, Gps)][:: 5 // hz]
     readings = sorted([*(r for r in made.readings if not isinstance(r, Gps)), *fixes], key=lambda r: r.stamp_ns)
     found = localiser(of, start=START, filter=engine)
-    last = run(found, of, readings)[-1]
+    last = beliefs_of(found, of, readings)[-1]
     assert abs(math.remainder(last.x[YAW] - made.at(last.stamp_ns)[2], math.tau)) < 0.01
     assert last.x[6] == pytest.approx(2.0, abs=0.03)
     assert found.counters["gps-1_used"] >= len(fixes) - 2
@@ -174,7 +174,7 @@ def test_velocity_of_an_antenna_far_off_the_axle_is_free_of_bias_in_a_bend(hz: i
 def test_differential_receiver_has_no_slow_error_and_a_relative_one_has() -> None:
     for mode, receivers in (("differential", 0), ("relative", 1), ("absolute", 1)):
         of = of_gps(mode)
-        beliefs = run(localiser(of, start=START), of, drive([Leg(2, 0.5)], of).readings)
+        beliefs = beliefs_of(localiser(of, start=START), of, drive([Leg(2, 0.5)], of).readings)
         assert len(beliefs[-1].x) == Layout(1, True, receivers).n
 
 
@@ -195,7 +195,7 @@ def test_error_of_a_relative_receiver_is_that_of_two_fixes_and_of_the_belief_the
     of = of_gps("relative")
     found = localiser(of, start=START)
     made = drive([Leg(2)], of)
-    believed = next(b for b in run(found, of, made.readings) if b.stamp_ns > START_NS + SECOND // 5)
+    believed = next(b for b in beliefs_of(found, of, made.readings) if b.stamp_ns > START_NS + SECOND // 5)
     expected = 2 * 0.75 * 2.0 + float(np.trace(believed.P[:2, :2])) / 2
     assert found._receivers.errors[0].variance_m2 == pytest.approx(expected, rel=0.15)
 
@@ -205,7 +205,9 @@ def test_fixes_far_apart_make_no_velocity() -> None:
     made = drive(S_BEND, of)
     fixes = [r for r in made.readings if isinstance(r, Gps)][::6]  # every 1.2 s
     found = localiser(of, start=START)
-    run(found, of, sorted([*(r for r in made.readings if not isinstance(r, Gps)), *fixes], key=lambda r: r.stamp_ns))
+    beliefs_of(
+        found, of, sorted([*(r for r in made.readings if not isinstance(r, Gps)), *fixes], key=lambda r: r.stamp_ns)
+    )
     assert found.counters["gps-1_used"] == 0
 
 
@@ -215,7 +217,7 @@ def test_relative_receivers_are_shifted_each_by_its_own_first_fix() -> None:
     made = drive(S_BEND, of)
     readings = moved(moved(made.readings, 70.0, "gps-2"), -4000.0, "gps-3")
     found = localiser(of)
-    assert max(errors(made, run(found, of, readings))) < 0.5
+    assert max(errors(made, beliefs_of(found, of, readings))) < 0.5
     assert min(found.counters["gps-2_used"], found.counters["gps-3_used"]) > 100
     assert found.counters["gps-2_gated"] == found.counters["gps-3_gated"] == 0
 
@@ -227,7 +229,7 @@ def test_a_relative_receiver_that_comes_late_counts_from_the_belief_at_its_first
     readings = moved([r for r in made.readings if not isinstance(r, Gps) or after(r, 15)], 500.0)
     late = sorted(readings, key=lambda r: r.stamp_ns + (400_000_000 if isinstance(r, Gps) else 0))
     found = localiser(of, start=START, profile="paper")
-    assert max(errors(made, run(found, of, late))) < 0.6
+    assert max(errors(made, beliefs_of(found, of, late))) < 0.6
     assert found.counters["gps-1_used"] > 100
 
 
@@ -240,7 +242,7 @@ def test_a_first_fix_that_is_too_late_is_no_reference() -> None:
     old = moved(fixes[40:41], 900.0)  # of second 8, and elsewhere
     readings = [*others[:cut], *old, *sorted([*others[cut:], *fixes[100:]], key=lambda r: r.stamp_ns)]
     found = localiser(of, start=START)
-    assert max(errors(made, run(found, of, readings))) < 0.6
+    assert max(errors(made, beliefs_of(found, of, readings))) < 0.6
     assert (found.counters["too_late"], found.counters["gps-1_gated"]) == (1, 0)
 
 
@@ -248,7 +250,7 @@ def test_a_relative_receiver_does_not_make_a_wrong_start_sure() -> None:
     """What its first fix says of the place it takes from the belief: that is no news."""
     of = of_gps("relative")
     made = drive([Leg(5), Leg(4, 0.5), Leg(20)], of)
-    stds = [math.sqrt(np.trace(b.P[:2, :2])) for b in run(localiser(of, start=START), of, made.readings)]
+    stds = [math.sqrt(np.trace(b.P[:2, :2])) for b in beliefs_of(localiser(of, start=START), of, made.readings)]
     assert stds[-1] > 0.7 * stds[0]
 
 
@@ -275,7 +277,7 @@ def test_relative_fixes_are_those_of_the_paper_s_transform_seen_from_the_shared_
     rng, sensor = np.random.default_rng(11), SensorConfig("gps-1", "gps", mode="relative")
     of = replace(machine(receivers=0), sensors=(*machine(receivers=0).sensors, sensor))
     found = localiser(of, start=START)
-    run(found, of, drive([Leg(1)], of, without=("gps-1",)).readings)
+    beliefs_of(found, of, drive([Leg(1)], of, without=("gps-1",)).readings)
     assert found.belief
     fusion = found._fusion
     assert fusion
@@ -326,7 +328,7 @@ def test_an_attitude_that_is_far_off_is_used_in_its_mode_in_both_profiles(mode: 
     of = of_ahrs(mode=mode)
     made = drive(S_BEND, of)
     found = localiser(of, profile=profile, filter=engine, start=START)
-    beliefs = run(found, of, with_ahrs(made, 2.0))
+    beliefs = beliefs_of(found, of, with_ahrs(made, 2.0))
     assert found.counters["ahrs_used"] > 500
     assert found.counters["ahrs_gated"] == 0
     assert max(yaw_error(made, b) for b in beliefs) < 0.06
@@ -345,7 +347,7 @@ def test_an_attitude_in_its_mode_holds_the_heading_where_the_gyro_is_wrong(mode:
             for r in with_ahrs(made, 1.0)
             if not isinstance(r, Gps)
         ]
-        wrong[chosen] = yaw_error(made, run(localiser(of, start=START), of, readings)[-1])
+        wrong[chosen] = yaw_error(made, beliefs_of(localiser(of, start=START), of, readings)[-1])
     assert wrong[mode] < 0.3 * wrong["absolute"], wrong
 
 
@@ -357,7 +359,7 @@ def test_a_relative_heading_that_comes_late_counts_from_the_belief_then(profile:
         with_ahrs(made, 1.5, from_s=18.5), key=lambda r: r.stamp_ns + (400_000_000 if r.sensor == "ahrs" else 0)
     )  # it turns by 0.1 rad while a reading is on its way
     found = localiser(of, profile=profile, start=START)
-    beliefs = run(found, of, readings)
+    beliefs = beliefs_of(found, of, readings)
     assert found.counters["ahrs_used"] > 100
     assert max(yaw_error(made, b) for b in beliefs) < 0.05
 
@@ -370,14 +372,14 @@ def test_tilt_of_a_relative_attitude_stays_absolute() -> None:
         replace(r, qx=math.sin(half), qz=0.0, qw=math.cos(half)) if isinstance(r, Attitude) else r
         for r in with_ahrs(made)
     ]
-    assert run(localiser(of, start=START), of, tilted)[-1].x[3] == pytest.approx(0.1, abs=0.02)
+    assert beliefs_of(localiser(of, start=START), of, tilted)[-1].x[3] == pytest.approx(0.1, abs=0.02)
 
 
 def test_a_relative_heading_leaves_a_wrong_start_to_be_corrected_by_fixes() -> None:
     """Told 0.1 rad off: the reference is as wrong, and known to be unsure; GPS turns both."""
     of = of_ahrs(mode="relative")
     made = drive([*S_BEND, Leg(40)], of)
-    beliefs = run(localiser(of, start=(10.0, 20.0, 0.76)), of, with_ahrs(made, 1.0))
+    beliefs = beliefs_of(localiser(of, start=(10.0, 20.0, 0.76)), of, with_ahrs(made, 1.0))
     assert yaw_error(made, beliefs[20]) > 0.04
     assert yaw_error(made, beliefs[-1]) < 0.02
 
@@ -385,7 +387,7 @@ def test_a_relative_heading_leaves_a_wrong_start_to_be_corrected_by_fixes() -> N
 def test_heading_of_a_reference_wanders_as_the_machine_s_own() -> None:
     of = of_ahrs(mode="relative", gives=("heading",))
     found = localiser(of, start=START, motion=MotionConfig(heading_walk=0.01))
-    run(found, of, drive([Leg(1)], of).readings)
+    beliefs_of(found, of, drive([Leg(1)], of).readings)
     assert found.belief
     error = found._layout.heading_errors.start
     assert error == len(found.belief.x) - 1
@@ -405,7 +407,7 @@ STD = [
 
 
 def final(of: MachineConfig, made: Drive) -> Floats:
-    belief = run(localiser(of, start=START), of, with_ahrs(made))[-1]
+    belief = beliefs_of(localiser(of, start=START), of, with_ahrs(made))[-1]
     return np.concatenate([belief.x, belief.P.ravel()])
 
 
@@ -423,8 +425,8 @@ def test_a_configured_position_replaces_what_fixes_state() -> None:
     made = drive(S_BEND, of)
     known = changed_sensor(of, "gps-1", std={"position": math.sqrt(2.0)})
     boasting = [replace(r, var_e_m2=1e-4, var_n_m2=1e3) if isinstance(r, Gps) else r for r in made.readings]
-    expected = run(localiser(of), of, made.readings)[-1]
-    found = run(localiser(known), known, boasting)[-1]
+    expected = beliefs_of(localiser(of), of, made.readings)[-1]
+    found = beliefs_of(localiser(known), known, boasting)[-1]
     assert found.x == pytest.approx(expected.x, abs=1e-9)
     assert np.abs(found.P - expected.P).max() < 1e-9
 
@@ -433,7 +435,7 @@ def test_a_configured_position_may_be_better_than_receivers_are_believed_to_be()
     of, stds = machine(), []
     for std in (0.02, 0.3):  # min_fix_std_m is 0.3
         known = changed_sensor(of, "gps-1", std={"position": std}, drift_share=0.0)
-        stds.append(math.sqrt(np.trace(run(localiser(known), known, drive(S_BEND, of).readings)[-1].P[:2, :2])))
+        stds.append(math.sqrt(np.trace(beliefs_of(localiser(known), known, drive(S_BEND, of).readings)[-1].P[:2, :2])))
     assert stds[0] < 0.6 * stds[1]
 
 
@@ -441,8 +443,10 @@ def test_a_configured_heading_replaces_what_an_attitude_states() -> None:
     of = of_ahrs(mode="relative", std={"heading": 0.01, "tilt": 0.01})
     plain = of_ahrs(mode="relative")
     made = drive(S_BEND, of)
-    boasting = run(localiser(of, start=START), of, with_ahrs(made, variance=1.0))[-1]
-    assert boasting.x == pytest.approx(run(localiser(plain, start=START), plain, with_ahrs(made))[-1].x, abs=1e-9)
+    boasting = beliefs_of(localiser(of, start=START), of, with_ahrs(made, variance=1.0))[-1]
+    assert boasting.x == pytest.approx(
+        beliefs_of(localiser(plain, start=START), plain, with_ahrs(made))[-1].x, abs=1e-9
+    )
 
 
 def test_a_made_up_fix_lies_where_it_should() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agents_drives import LEVER_M, PROJECTION, START_NS, Drive, Leg, drive
+from agents_drives import LEVER_M, PROJECTION, START_NS, Drive, Leg, beliefs_of, drive
 
 from agents.localisation.belief import Belief
 from agents.localisation.localiser import LocalisationConfig, Localiser
@@ -61,14 +61,7 @@ def driven(of: MachineConfig, wrong: Wrong, legs: list[Leg] | None = None, gps_h
 def run(of: MachineConfig, readings: list[Reading], **options: Any) -> tuple[Localiser, list[Belief]]:
     """The localiser, and its newest beliefs as they were known."""
     found = Localiser(of, PROJECTION, LocalisationConfig(slip=0.0, slip_soft=0.0, **options))
-    beliefs: list[Belief] = []
-    for reading in readings:
-        sensor = of.sensor(reading.sensor)
-        assert sensor
-        found.update(reading, sensor)
-        if found.belief and (not beliefs or found.belief.stamp_ns > beliefs[-1].stamp_ns):
-            beliefs.append(found.belief)
-    return found, beliefs
+    return found, beliefs_of(found, of, readings)
 
 
 def seconds(stamp_ns: int) -> float:

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation import ground, recordings
+from evaluation import campaign, ground, recordings
 from evaluation.recordings import Setup
+from protocol.errors import SitegridError
 from sitegrid import cli
 
 FAST = Setup("paper_site", ("west", "east"), gps=(1, 2), imu=(3,), world="fast")
@@ -51,7 +52,7 @@ def test_an_interrupted_run_goes_on_where_it_was(plan: ground.Plan, monkeypatch:
     done: list[str] = []
     work = ground._estimate
     monkeypatch.setattr(ground, "_estimate", lambda job: (done.append(job[0].row.name), work(job)))
-    monkeypatch.setattr(ground, "make", lambda *_: pytest.fail("recorded again"))
+    monkeypatch.setattr(campaign, "make", lambda *_: pytest.fail("recorded again"))
     again, _ = ground.run(plan)
     assert done == [outcomes[1].task.row.name]
     for rows in (first["rows"], again["rows"]):
@@ -72,7 +73,7 @@ def test_other_code_or_rows_never_meet_old_samples(plan: ground.Plan, monkeypatc
 
 
 def test_sources_that_change_during_a_run_end_it(plan: ground.Plan):
-    with pytest.raises(ground.SitegridError, match="start it again"):
+    with pytest.raises(SitegridError, match="start it again"):
         ground._estimate((plan.task(4, CALIBRATED), Path("named-by-other-code.npz")))
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from evaluation import recordings, table
+from evaluation import campaign, recordings, table
 from evaluation.configurations import Configuration, UnsupportedError
 from evaluation.workers import each
 from protocol.errors import ConfigError, SitegridError
@@ -53,7 +53,7 @@ def test_an_interrupted_run_goes_on_where_it_was(plan: table.Plan, monkeypatch: 
     done: list[str] = []
     work = table._replay
     monkeypatch.setattr(table, "_replay", lambda job: (done.append(job[0].row.name), work(job)))
-    monkeypatch.setattr(table, "make", lambda *_: pytest.fail("recorded again"))
+    monkeypatch.setattr(campaign, "make", lambda *_: pytest.fail("recorded again"))
     again, _ = table.run(plan)
     assert done == [TWO.name]
     timeless = [[{k: v for k, v in row.items() if k != "us_per_second"} for row in r["rows"]] for r in (first, again)]
