@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.pipeline import Pipeline
+from agents.pipeline import Locates
 from protocol.machine import MachineConfig
 from protocol.readings import Gps, Reading
 from protocol.site import Projection, SiteConfig
@@ -43,7 +43,7 @@ class Holdout:
         """Return what the pipeline may see."""
         return [r for r in readings if not self._is_withheld(r)]
 
-    def compare(self, pipeline: Pipeline) -> None:
+    def compare(self, pipeline: Locates) -> None:
         """Compare withheld fixes with the poses that are known by now."""
         pose = pipeline.pose
         while pose and self._waiting and self._waiting[0].stamp_ns <= pose.stamp_ns:

@@ -1,11 +1,14 @@
-"""The machine's pure heart: readings in, samples out. No clock, no files, no network."""
+"""The machine's pure heart: readings in, samples out. No clock, no files, no network.
+
+`Positioning` is the half of it that says where the machine is; `Pipeline` adds the ground there, and samples of it.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,9 +18,9 @@ from agents.localisation.belief import PoseBelief
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.localisation.state import SPEED
 from agents.order import Order, Verdict
-from agents.sampling import NOTHING, Sampler, SamplingConfig, Way
+from agents.sampling import NOTHING, PoseHistory, Sampler, SamplingConfig, Way
 from protocol.arrays import Table
-from protocol.machine import MachineConfig
+from protocol.machine import MachineConfig, SensorConfig
 from protocol.readings import Reading
 from protocol.site import Projection, SiteConfig
 
@@ -41,6 +44,90 @@ class PipelineConfig:
             raise ValueError("gap_s must be positive and late_s not negative")
 
 
+class Locates(Protocol):
+    """What finds out where a machine is: a `Pipeline`, or its half that does nothing else."""
+
+    @property
+    def pose(self) -> PoseBelief | None:
+        """The newest pose, None until the start heading is known."""
+        ...
+
+    def pose_at(self, stamp_ns: int) -> PoseBelief | None:
+        """Pose at a recent stamp, None where it is not known."""
+        ...
+
+    def step(self, readings: Sequence[Reading]) -> object:
+        """Take in readings in the order of their stamps."""
+        ...
+
+
+class Taken(NamedTuple):
+    """A reading that counts, at the stamp of what it measured; a tuple, as there are hundreds a second.
+
+    poses: what it made possible or changed, oldest first. restarts: nothing before it counts any more.
+    """
+
+    reading: Reading
+    sensor: SensorConfig
+    poses: list[PoseBelief]
+    restarts: bool
+
+
+class Positioning:
+    """Localisation of one machine: readings are judged by their order, and recent poses remembered."""
+
+    def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
+        self._machine, self._config = machine, config
+        self._projection = Projection(site)
+        self._sensors = {s.name: s for s in machine.sensors if s.use}
+        self._order = Order(config.gap_s, config.late_s)
+        self._counters: Counter[str] = Counter()
+        self._start()
+
+    @property
+    def pose(self) -> PoseBelief | None:
+        """The newest pose, None until the start heading is known."""
+        return self._poses.newest
+
+    def pose_at(self, stamp_ns: int) -> PoseBelief | None:
+        """Pose at a recent stamp, None where it is not known."""
+        return self._poses.at(stamp_ns)
+
+    @property
+    def counters(self) -> Counter[str]:
+        """What was used and refused, before restarts too."""
+        return self._counters + self._order.counters + self.localiser.counters
+
+    def step(self, readings: Sequence[Reading]) -> None:
+        """Take in readings in the order of their stamps."""
+        for reading in readings:
+            self.take(reading)
+
+    def take(self, reading: Reading) -> Taken | None:
+        """Take in one reading; None where it is refused."""
+        sensor = self._sensors.get(reading.sensor)
+        if sensor is None or sensor.kind != reading.kind:
+            self._counters["reading_unknown_sensor"] += 1
+            return None
+        if sensor.delay_s:
+            reading = replace(reading, stamp_ns=reading.stamp_ns - round(sensor.delay_s * 1e9))
+        verdict = self._order.judge(reading)
+        if verdict is Verdict.REFUSE:
+            return None
+        if verdict is Verdict.RESTART:
+            self._counters.update(self.localiser.counters)
+            self._start()
+        poses = self.localiser.update(reading, sensor)
+        for pose in poses:
+            self._poses.append(pose)
+        return Taken(reading, sensor, poses, verdict is Verdict.RESTART)
+
+    def _start(self) -> None:
+        """Start with nothing known, as after power-up or a jump of the clock."""
+        self.localiser = Localiser(self._machine, self._projection, self._config.localisation)
+        self._poses = PoseHistory(self._config.sampling.history_s)
+
+
 class Pipeline:
     """Localisation, ground estimation and sampling of one machine."""
 
@@ -50,9 +137,7 @@ class Pipeline:
         """calibration: of the ground estimator, from before."""
         self._site, self._machine = site, machine
         self._config = config
-        self._projection = Projection(site)
-        self._sensors = {s.name: s for s in machine.sensors if s.use}
-        self._order = Order(config.gap_s, config.late_s)
+        self._positioning = Positioning(site, machine, config)
         self._counters: Counter[str] = Counter()
         self._newest_ns = 0
         self._start(calibration)
@@ -60,11 +145,11 @@ class Pipeline:
     @property
     def pose(self) -> PoseBelief | None:
         """The newest pose, None until the start heading is known."""
-        return self._sampler.poses.newest
+        return self._positioning.pose
 
     def pose_at(self, stamp_ns: int) -> PoseBelief | None:
         """Pose at a recent stamp, None where it is not known."""
-        return self._sampler.poses.at(stamp_ns)
+        return self._positioning.pose_at(stamp_ns)
 
     def step(self, readings: Sequence[Reading]) -> Table:
         """Take in readings in the order of their stamps; returns the samples (n,) that they made possible."""
@@ -84,43 +169,37 @@ class Pipeline:
 
     def health(self) -> dict[str, Any]:
         """State of the stages in plain values."""
-        pose = self.pose
+        pose, localiser = self.pose, self._positioning.localiser
         std_m = float(np.sqrt(np.linalg.eigvalsh(pose.covariance_m2)[-1])) if pose else None
         return {
-            "aligned": self._localiser.is_aligned,
+            "aligned": localiser.is_aligned,
             "position_std_m": std_m,
-            "counters": dict(self._counters + self._order.counters + self._localiser.counters),
+            "counters": dict(self._counters + self._positioning.counters),
             "withheld": dict(self._sampler.withheld),
             "without_resistance": dict(self._sampler.without_resistance),
             "ground": self._estimator.health(),
             "consistency": {
-                name: {**asdict(found), "good": found.is_good} for name, found in self._localiser.consistency.items()
+                name: {**asdict(found), "good": found.is_good} for name, found in localiser.consistency.items()
             },
         }
 
     def _step_one(self, reading: Reading) -> list[Table]:
-        sensor = self._sensors.get(reading.sensor)
-        if sensor is None or sensor.kind != reading.kind:
-            self._counters["reading_unknown_sensor"] += 1
+        taken = self._positioning.take(reading)
+        if taken is None:
             return []
-        if sensor.delay_s:
-            reading = replace(reading, stamp_ns=reading.stamp_ns - round(sensor.delay_s * 1e9))
-        verdict = self._order.judge(reading)
-        if verdict is Verdict.REFUSE:
-            return []
+        reading, sensor, poses, restarts = taken
         made: list[Table] = []
-        if verdict is Verdict.RESTART:
+        if restarts:
             made.append(self.finish())
-            self._counters.update(self._localiser.counters)
             self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
             self._start(self._estimator.calibration)
-        for pose in self._localiser.update(reading, sensor):  # after a late alignment more than the history holds
+        for pose in poses:  # after a late alignment more than the history holds
             self._sampler.poses.append(pose)
             made.append(self._take())
         self._newest_ns = max(self._newest_ns, reading.stamp_ns)
-        dead = self._localiser.dead
+        localiser = self._positioning.localiser
+        dead, belief = localiser.dead, localiser.belief
         self._estimator.update(reading, sensor, dead, self._known_c_rr())
-        belief = self._localiser.belief
         way_m = self._way.update(reading, dead.way_m, float(belief.x[SPEED]) if belief else 0.0)
         if self._sampler.is_due(way_m):
             self._sampler.mark(reading.stamp_ns, way_m)
@@ -141,7 +220,6 @@ class Pipeline:
     def _start(self, known: Calibration | None) -> None:
         """Start with nothing known but the calibration, as after power-up or a jump of the clock."""
         config, machine = self._config, self._machine
-        self._localiser = Localiser(machine, self._projection, config.localisation)
         self._estimator = GroundEstimator(machine, config.estimation, known)
         self._sampler = Sampler(machine.load_centre_m, config.sampling)
         self._way = Way()

@@ -1,4 +1,4 @@
-"""Run the pure pipeline over readings, and compare what it believed with the truth.
+"""Run the pure pipeline, or its half that localises, over readings, and compare what it believed with the truth.
 
 A belief is compared at its own stamp, as it was known after the readings of that 100 ms: nothing that came later
 helps it.
@@ -16,7 +16,7 @@ import numpy as np
 
 from agents.holdout import Holdout
 from agents.localisation.belief import PoseBelief
-from agents.pipeline import Pipeline
+from agents.pipeline import Locates
 from evaluation.consistency import normalised_square, summarise
 from protocol.arrays import Floats, Ints
 from protocol.readings import Reading
@@ -40,10 +40,10 @@ class Truth:
 
 @dataclass(frozen=True)
 class Trace:
-    """What a pipeline believed, once per STEP_NS from its first pose on.
+    """What was believed, once per STEP_NS from the first pose on.
 
     stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2) in `map`. first_ns, last_ns: of the readings. cpu_s:
-    processor time that the pipeline took.
+    processor time of whatever was run: the whole pipeline, or localisation alone.
     """
 
     stamp_ns: Ints
@@ -85,18 +85,18 @@ class Score:
     us_per_second: float
 
 
-def replay(pipeline: Pipeline, readings: Sequence[Reading], holdout: Holdout | None = None) -> Trace:
-    """Give readings to a pipeline, in the order of their stamps; holdout keeps its fixes back."""
+def replay(core: Locates, readings: Sequence[Reading], holdout: Holdout | None = None) -> Trace:
+    """Give readings to a pipeline or to its localising half, in the order of their stamps; holdout keeps fixes back."""
     poses: list[PoseBelief] = []
     cpu_s = 0.0
     for span in _spans(readings):
         seen = holdout.split(span) if holdout else span
         began_s = time.process_time()
-        pipeline.step(seen)
-        pose = pipeline.pose
+        core.step(seen)
+        pose = core.pose
         cpu_s += time.process_time() - began_s
         if holdout:
-            holdout.compare(pipeline)
+            holdout.compare(core)
         if pose and (not poses or pose.stamp_ns > poses[-1].stamp_ns):
             poses.append(pose)
     return Trace(

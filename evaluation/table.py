@@ -1,5 +1,8 @@
 """The paper's table: every configuration on the same recordings of the paper's site, against the truth.
 
+Poses are all it compares, so only the localising half of the pipeline runs, without ground estimation and sampling;
+`us_per_second` is what localisation costs, which is the paper's argument for cheap sensors on a small computer.
+
 A result is one small JSON file beside its recording, named by everything that it depends on: an interrupted run goes on
 where it was, and other code or options never meet old results.
 """
@@ -15,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.pipeline import Pipeline
+from agents.pipeline import Positioning
 from evaluation.campaign import Progress, carry_out, check_name, loaded
 from evaluation.configurations import Configuration, UnsupportedError, configure, started_at
 from evaluation.recordings import Drive, code_version, digest, gps_error
@@ -142,7 +145,7 @@ def _replay(job: tuple[Task, Path]) -> None:
         options = started_at(options, recording.start)
     in_use = {sensor.name for sensor in machine.sensors if sensor.use}
     readings = [reading for reading in recording.readings if reading.sensor in in_use]
-    trace = replay(Pipeline(recording.site, machine, options), readings)
+    trace = replay(Positioning(recording.site, machine, options), readings)
     outcome = {"score": asdict(score(trace, recording.truth)), "curves": _thin(trace, recording.truth)}
     file.parent.mkdir(exist_ok=True)
     part = file.with_suffix(".part")

@@ -121,6 +121,19 @@ def map_from_base(attitude: Floats) -> Floats:
     return np.array(_axes(attitude.tolist())).T
 
 
+def turned_jacobian(attitude: Floats, arm: Floats) -> tuple[tuple[float, float, float], ...]:
+    """Derivative (3, 3) of map_from_base(attitude) arm by roll, pitch, yaw, of an arm (3,)."""
+    (cr, cp, cy), (sr, sp, sy) = _trigonometry(attitude.tolist())
+    forward, left, up = arm.tolist()
+    left, up = cr * left - sr * up, sr * left + cr * up
+    ahead, above = cp * forward + sp * up, cp * up - sp * forward
+    return (
+        (cy * sp * left + sy * up, cy * above, -sy * ahead - cy * left),
+        (sy * sp * left - cy * up, sy * above, cy * ahead - sy * left),
+        (cp * left, -ahead, 0.0),
+    )
+
+
 def _axes(attitude: Sequence[float]) -> tuple[tuple[float, float, float], ...]:
     """Forward, left and up of the body in map: the columns of map_from_base."""
     (cr, cp, cy), (sr, sp, sy) = _trigonometry(attitude)
@@ -173,18 +186,14 @@ def _secant(cosine: Floats) -> Floats:
 
 def _jacobian(x: Floats, dt_s: float) -> Floats:
     """Derivative (n, n) of `_moved` at a state (n,)."""
-    (cr, cp, cy), (sr, sp, sy) = _trigonometry(x[ATTITUDE].tolist())
-    forward, left, up = (x[VELOCITY] * dt_s + x[ACCELERATION] * (dt_s**2 / 2)).tolist()
-    left, up = cr * left - sr * up, sr * left + cr * up
-    ahead, above = cp * forward + sp * up, cp * up - sp * forward
+    attitude = x[ATTITUDE]
+    (cr, cp, _), (sr, sp, _) = _trigonometry(attitude.tolist())
     _, q, r = (x[RATE] * dt_s).tolist()
     secant = cp / max(cp * cp, MIN_COS_PITCH**2)
     turn, climb, tan = sr * q + cr * r, cr * q - sr * r, sp * secant
     F = np.eye(len(x))
-    F[: ATTITUDE.stop, ATTITUDE] = (  # of position and attitude
-        (cy * sp * left + sy * up, cy * above, -sy * ahead - cy * left),
-        (sy * sp * left - cy * up, sy * above, cy * ahead - sy * left),
-        (cp * left, -ahead, 0.0),
+    F[POSITION, ATTITUDE] = turned_jacobian(attitude, x[VELOCITY] * dt_s + x[ACCELERATION] * (dt_s**2 / 2))
+    F[ATTITUDE, ATTITUDE] = (
         (1.0 + climb * tan, turn * secant**2, 0.0),
         (-turn, 1.0, 0.0),
         (climb * secant, turn * tan * secant, 1.0),
@@ -194,7 +203,7 @@ def _jacobian(x: Floats, dt_s: float) -> Floats:
         (0.0, cr * dt_s, -sr * dt_s),
         (0.0, sr * secant * dt_s, cr * secant * dt_s),
     )
-    R = map_from_base(x[ATTITUDE])
+    R = map_from_base(attitude)
     F[POSITION, VELOCITY] = R * dt_s
     F[POSITION, ACCELERATION] = R * (dt_s**2 / 2)
     F[VELOCITY, ACCELERATION] = EYE * dt_s

@@ -51,10 +51,12 @@ class References:
         beliefs: list[Belief] = []
         for name, raw in step.orientations.items():
             sensor = self._sensors[name]
+            if sensor.mode == ABSOLUTE:
+                continue
             told = self._judged(sensor, raw)
             if sensor.mode == RELATIVE:
                 beliefs += self._add_relative(fusion, sensor, told)
-            elif sensor.mode != ABSOLUTE and (rotation := self._rotation(sensor, told)):
+            elif rotation := self._rotation(sensor, told):
                 beliefs += fusion.add([rotation])
         return beliefs
 

@@ -1,18 +1,21 @@
 """What sensors say of the state: each reading, or the mean of several, as a `Measurement` with its model and Jacobian.
 
 Specific force: an accelerometer on a rigid body feels dv/dt + w x v + g up, all in the body's axes, and at a lever arm
-r also w x (w x r); so gravity is removed in the frame of the sensor's body, at any mounting. The lever arms of antennas
-turn with roll, pitch and yaw.
+r also w x (w x r), together dv/dt + w x (v + w x r) + g up; so gravity is removed in the frame of the sensor's body, at
+any mounting. The lever arms of antennas turn with roll, pitch and yaw.
+
+States (m, n) come as rows; where a model takes more than a few operations it works on columns, whose values adjoin.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from agents.localisation.belief import Measurement
-from agents.localisation.kinematics import map_from_base
+from agents.localisation.kinematics import EYE, map_from_base, turned_jacobian
 from agents.localisation.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
@@ -55,15 +58,19 @@ def fix(
     """A GPS fix (2,) in `map`; error: states of the receiver's slow error, if the filter has them."""
 
     def h(x: Floats) -> Floats:
-        at = x[:, PLACE] + _turned(x, lever_m)[:, :2]
-        return at if error is None else at + x[:, error]
+        columns = x.T
+        at = _turned(columns, lever_m)
+        at += columns[PLACE]
+        if error is not None:
+            at += columns[error]
+        return at.T
 
     def jacobian(x: Floats) -> Floats:
         H = np.zeros((2, len(x)))
         H[0, POSITION.start] = H[1, POSITION.start + 1] = 1.0
-        H[:, ATTITUDE] = _turned_jacobian(x, lever_m)[:2]
+        H[:, ATTITUDE] = turned_jacobian(x[ATTITUDE], lever_m)[:2]
         if error is not None:
-            H[:, error] = np.eye(2)
+            H[:, error] = EYE[:2, :2]
         return H
 
     return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=PLACE)
@@ -71,20 +78,18 @@ def fix(
 
 def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_m: Floats, gate: float) -> Measurement:
     """Velocity (2,) of an antenna in `map`: that of base_link and w x r, turned."""
+    by_rate = -_matrix(lever_m)  # w x r = -[r]x w
 
     def h(x: Floats) -> Floats:
-        return _turned(x, _of_antenna(x).T)[:, :2]
+        columns = x.T
+        return _turned(columns, columns[VELOCITY] + by_rate.dot(columns[RATE])).T
 
     def jacobian(x: Floats) -> Floats:
         H, turn = np.zeros((2, len(x))), map_from_base(x[ATTITUDE])[:2]
-        H[:, ATTITUDE] = _turned_jacobian(x, _of_antenna(x))[:2]
+        H[:, ATTITUDE] = turned_jacobian(x[ATTITUDE], x[VELOCITY] + by_rate.dot(x[RATE]))[:2]
         H[:, VELOCITY] = turn
-        H[:, RATE] = -turn @ _matrix(lever_m)
+        H[:, RATE] = turn.dot(by_rate)
         return H
-
-    def _of_antenna(x: Floats) -> Floats:
-        moving: Floats = x[..., VELOCITY] + _cross(x[..., RATE], lever_m)
-        return moving
 
     return Measurement(sensor, stamp_ns, velocity_mps, R, h, jacobian, gate_sigma=gate)
 
@@ -100,29 +105,36 @@ def inertial(
     gate: float,
 ) -> Measurement:
     """Angular rate (3,) and specific force (3,) of an IMU, turned into `base_link`; bias: state of its yaw rate's."""
+    by_rate = -_matrix(lever_m)  # w x r = -[r]x w
 
     def h(x: Floats) -> Floats:
-        w, v = x[:, RATE], x[:, VELOCITY]
-        z = np.empty((len(x), 6))
-        z[:, :3] = w
+        columns = x.T
+        w, tilt = columns[RATE], columns[ROLL:YAW]
+        p, q, r = w
+        ahead, left, up = columns[VELOCITY] + by_rate.dot(w)
+        (sr, sp), (cr, cp) = np.sin(tilt), np.cos(tilt)
+        level = GRAVITY_MPS2 * cp
+        z = np.empty((6, len(x)))
+        z[:3] = w
         if bias is not None:
-            z[:, 2] += x[:, bias]
-        z[:, 3:] = x[:, ACCELERATION] + _cross(w, v) + _cross(w, _cross(w, lever_m)) + GRAVITY_MPS2 * _up(x)
-        return z
+            z[2] += columns[bias]
+        z[3] = q * up - r * left - GRAVITY_MPS2 * sp
+        z[4] = r * ahead - p * up + level * sr
+        z[5] = p * left - q * ahead + level * cr
+        z[3:] += columns[ACCELERATION]
+        return z.T
 
     def jacobian(x: Floats) -> Floats:
-        w, v = x[RATE], x[VELOCITY]
+        w, moving = x[RATE], x[VELOCITY] + by_rate.dot(x[RATE])
+        tilt = x[ROLL:YAW].tolist()
+        (sr, sp), (cr, cp) = map(math.sin, tilt), map(math.cos, tilt)
         H = np.zeros((6, len(x)))
-        H[:3, RATE] = np.eye(3)
+        H[:3, RATE] = H[3:, ACCELERATION] = EYE
         if bias is not None:
             H[2, bias] = 1.0
-        H[3:, ACCELERATION] = np.eye(3)
-        H[3:, VELOCITY] = _matrix(w)
-        # d/dw of w x v + w x (w x r)
-        H[3:, RATE] = -_matrix(v) - _matrix(_cross(w, lever_m)) - _matrix(w) @ _matrix(lever_m)
-        (sr, cr), (sp, cp) = ((np.sin(a), np.cos(a)) for a in (x[ROLL], x[PITCH]))
-        H[3:, ROLL] = GRAVITY_MPS2 * np.array([0.0, cp * cr, -cp * sr])
-        H[3:, PITCH] = GRAVITY_MPS2 * np.array([-cp, -sp * sr, -sp * cr])
+        H[3:, VELOCITY] = across = _matrix(w)
+        H[3:, RATE] = across.dot(by_rate) - _matrix(moving)  # d/dw of w x (v + w x r)
+        H[3:, ROLL:YAW] = GRAVITY_MPS2 * np.array([(0.0, -cp), (cp * cr, -sp * sr), (-cp * sr, -sp * cr)])
         return H
 
     return Measurement(sensor, stamp_ns, np.concatenate([rates_radps, force_mps2]), R, h, jacobian, gate_sigma=gate)
@@ -139,7 +151,7 @@ def wheels(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, scale: i
 
     def jacobian(x: Floats) -> Floats:
         H = np.zeros((3, len(x)))
-        H[:, VELOCITY] = np.eye(3)
+        H[:, VELOCITY] = EYE
         if scale is not None:
             H[0, VELOCITY.start] = 1 + x[scale]
             H[0, scale] = x[VELOCITY.start]
@@ -182,7 +194,7 @@ def orientation(
 
     def jacobian(x: Floats) -> Floats:
         H = np.zeros((3, len(x)))
-        H[:, ATTITUDE] = np.eye(3)
+        H[:, ATTITUDE] = EYE
         if error is not None:
             H[2, error] = 1.0
         return H
@@ -198,7 +210,7 @@ def rotation(stamp_ns: int, sensor: str, rates_radps: Floats, R: Floats, gate: f
 
     def jacobian(x: Floats) -> Floats:
         H = np.zeros((3, len(x)))
-        H[:, RATE] = np.eye(3)
+        H[:, RATE] = EYE
         return H
 
     return Measurement(sensor, stamp_ns, rates_radps, R, h, jacobian, gate_sigma=gate)
@@ -216,7 +228,7 @@ def standstill(stamp_ns: int, config: SensingConfig) -> Measurement:
 
     def jacobian(x: Floats) -> Floats:
         H = np.zeros((6, len(x)))
-        H[:3, VELOCITY] = H[3:, RATE] = np.eye(3)
+        H[:3, VELOCITY] = H[3:, RATE] = EYE
         return H
 
     return Measurement("standstill", stamp_ns, np.zeros(6), R, h, jacobian, gate_sigma=config.gate_sigma, relocks=False)
@@ -225,41 +237,21 @@ def standstill(stamp_ns: int, config: SensingConfig) -> Measurement:
 # --- rotations of many states ----------------------------------------------------------------------------------------
 
 
-def _turned(x: Floats, arm: Floats) -> Floats:
-    """A vector (3,), or one each (3, m), of `base_link` in `map`, for states (m, n): Rz(yaw) Ry(pitch) Rx(roll) arm."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin(x[:, ATTITUDE].T), np.cos(x[:, ATTITUDE].T)
-    left, up = cr * arm[1] - sr * arm[2], sr * arm[1] + cr * arm[2]
-    ahead, z = cp * arm[0] + sp * up, cp * up - sp * arm[0]
-    return np.stack([cy * ahead - sy * left, sy * ahead + cy * left, z], axis=1)
+def _turned(columns: Floats, arm: Floats) -> Floats:
+    """East and north (2, m) of a vector (3,), or one each (3, m), of `base_link`, for states (n, m).
 
-
-def _turned_jacobian(x: Floats, arm: Floats) -> Floats:
-    """Its derivative (3, 3) by roll, pitch and yaw at a state (n,)."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin(x[ATTITUDE]), np.cos(x[ATTITUDE])
-    left, up = cr * arm[1] - sr * arm[2], sr * arm[1] + cr * arm[2]
-    ahead, z = cp * arm[0] + sp * up, cp * up - sp * arm[0]
-    by_roll = np.array([sp * left, -up, cp * left])  # d(ahead), d(left), d(z); d(up) = left, d(left) = -up
-    by_pitch = np.array([z, 0.0, -ahead])
-    turn = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    by_yaw = np.array([-sy * ahead - cy * left, cy * ahead - sy * left, 0.0])
-    return np.stack([turn @ by_roll, turn @ by_pitch, by_yaw], axis=1)
-
-
-def _up(x: Floats) -> Floats:
-    """The vertical in `base_link`, for states (m, n)."""
-    (sr, cr), (sp, cp) = ((np.sin(a), np.cos(a)) for a in (x[:, ROLL], x[:, PITCH]))
-    return np.stack([-sp, cp * sr, cp * cr], axis=1)
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Cross product along the last axis; numpy's costs ten times as much on a few rows."""
-    product = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    product[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    product[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    product[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
+    The first two rows of Rz(yaw) Ry(pitch) Rx(roll) arm.
+    """
+    attitude = columns[ATTITUDE]
+    (sr, sp, sy), (cr, cp, cy) = np.sin(attitude), np.cos(attitude)
+    ahead, left, up = arm
+    ahead, left = cp * ahead + sp * (sr * left + cr * up), cr * left - sr * up
+    turned = np.empty((2, columns.shape[1]))
+    turned[0], turned[1] = cy * ahead - sy * left, sy * ahead + cy * left
+    return turned
 
 
 def _matrix(v: Floats) -> Floats:
     """[v]x, so that [v]x u is the cross product of v and u."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    x, y, z = v.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -70,7 +70,7 @@ class Steps:
         self._front = {s.name for s in machine.sensors if s.frame == FRONT}
         self._sums: dict[str, tuple[float, ...]] = {}
         self._orients = orients
-        self._orientations: dict[str, Told] = {}
+        self._attitudes: dict[str, Attitude] = {}  # the last of each: only that is made into angles
         source = turn_source(machine)
         self._turns = source.name if source else ""
         self._steers = source is not None and source.kind == "steering"
@@ -126,21 +126,23 @@ class Steps:
     def _mean(self, name: str) -> Felt:
         """Mean of an IMU over the step, in `base_link`."""
         n, *total = self._sums[name]
-        mean = np.array(total) / n
-        rates, force = self._rotations[name] @ mean[:3], self._rotations[name] @ mean[3:]
+        rates, force = (np.array(total).reshape(2, 3) / n).dot(self._rotations[name].T)
         return Felt(*(self._to_rear(rates, force) if name in self._front else (rates, force)))
 
     def _orient(self, attitude: Attitude, sensor: SensorConfig) -> None:
-        """Orientation of `base_link`: map_from_sensor times sensor_from_base. One on the front frame is left aside."""
+        """Keep an orientation that can be used. One on the front frame is left aside."""
         if sensor.frame == FRONT:
             self.counters["front_attitude_unused"] += 1
-            return
-        if math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw) < MIN_NORM:
+        elif math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw) < MIN_NORM:
             self.counters["attitude_without_direction"] += 1
-            return
-        rotation = _rotation(attitude) @ self._rotations[attitude.sensor].T
+        else:
+            self._attitudes[attitude.sensor] = attitude
+
+    def _told_by(self, attitude: Attitude) -> Told:
+        """Orientation of `base_link`: map_from_sensor times sensor_from_base."""
+        rotation = _rotation(attitude).dot(self._rotations[attitude.sensor].T)
         variances = np.array([attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2])
-        self._orientations[attitude.sensor] = Told(attitude.stamp_ns, _angles(rotation), variances)
+        return Told(attitude.stamp_ns, _angles(rotation), variances)
 
     def _to_rear(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
         """Turn by the articulation in the middle of the step, and take its rate off."""
@@ -153,7 +155,8 @@ class Steps:
 
     def _finish(self, stamp_ns: int, dead: DeadReckoning) -> Step:
         felt = {name: self._mean(name) for name in self._sums}
-        orientations, self._orientations = self._orientations, {}
+        orientations = {name: self._told_by(attitude) for name, attitude in self._attitudes.items()}
+        self._attitudes.clear()
         self._sums.clear()
         self._begin_ns = stamp_ns
         if dead.travel_m != self._still_since[1]:
@@ -173,9 +176,8 @@ class Steps:
 
 def _rotation(attitude: Attitude) -> Floats:
     """Matrix (3, 3) of the quaternion."""
-    x, y, z, w = np.array([attitude.qx, attitude.qy, attitude.qz, attitude.qw]) / math.sqrt(
-        attitude.qx**2 + attitude.qy**2 + attitude.qz**2 + attitude.qw**2
-    )
+    norm = math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw)
+    x, y, z, w = attitude.qx / norm, attitude.qy / norm, attitude.qz / norm, attitude.qw / norm
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -187,5 +189,5 @@ def _rotation(attitude: Attitude) -> Floats:
 
 def _angles(rotation: Floats) -> Floats:
     """Roll, pitch and yaw (3,) of map_from_base."""
-    roll = math.atan2(rotation[2, 1], rotation[2, 2])
-    return np.array([roll, -math.asin(max(-1.0, min(1.0, rotation[2, 0]))), math.atan2(rotation[1, 0], rotation[0, 0])])
+    (ahead, _, _), (aside, _, _), (down, left, up) = rotation.tolist()
+    return np.array([math.atan2(left, up), -math.asin(max(-1.0, min(1.0, down))), math.atan2(aside, ahead)])

@@ -17,7 +17,7 @@ from agents.estimation.calibration import Calibration
 from agents.localisation.belief import PoseBelief
 from agents.localisation.localiser import LocalisationConfig
 from agents.physics import GRAVITY_MPS2
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline, PipelineConfig, Positioning
 from protocol.logfolder import open_log
 from protocol.machine import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.readings import KINDS, Encoder, Gps, Imu, Reading, Torque, columns
@@ -122,6 +122,34 @@ def test_any_cutting_of_the_stream_gives_the_same_samples(
     cuts = sorted(rng.choice(len(recorded), size=rng.integers(1, 2000)).tolist())
     made = [pipeline.step(recorded[a:b]) for a, b in zip([0, *cuts], [*cuts, len(recorded)], strict=True)]
     assert (np.concatenate(made).tobytes(), pipeline.health()) == base, f"seed={seed}"
+
+
+def test_positioning_alone_finds_the_very_poses_of_the_whole_pipeline(
+    of: MachineConfig, recorded: list[Reading]
+) -> None:
+    """To the last bit, and after a restart too: the ground and samples of it have no part in localisation."""
+    after_gap = [replace(r, stamp_ns=r.stamp_ns + 100 * SECOND) for r in recorded]
+    delayed = changed_sensor(of, "wheels", delay_s=0.02)
+    site = simulated(3, 40.0)[0]
+    whole, half = Pipeline(site, delayed, PipelineConfig()), Positioning(site, delayed, PipelineConfig())
+    stream, found = [*recorded, *after_gap], 0
+    for i in range(0, len(stream), 20):
+        whole.step(stream[i : i + 20])
+        half.step(stream[i : i + 20])
+        assert same(whole.pose, half.pose)
+        assert same(*(each.pose_at(stream[i].stamp_ns - SECOND) for each in (whole, half)))
+        found += half.pose is not None
+    assert found > 100
+    counted = whole.health()["counters"]
+    assert counted["gap_restarts"] == 1
+    assert counted.items() >= half.counters.items()
+
+
+def same(a: PoseBelief | None, b: PoseBelief | None) -> bool:
+    """Whether two poses are bit for bit the same."""
+    if a is None or b is None:
+        return a is b
+    return repr(a) == repr(b) and a.covariance_m2.tobytes() == b.covariance_m2.tobytes()
 
 
 def test_readings_of_unknown_sensors_are_counted_and_change_nothing(
@@ -355,7 +383,7 @@ def test_known_ground_has_to_be_all_around_an_unsure_position(std_m: float, c_rr
     """8 m from its edge: 3 m, and twice the standard deviation."""
     pad = KnownGround("pad", 0.04, ((0.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0)))
     pipeline = Pipeline(replace(SITE, known_ground=(pad,)), machine(), PipelineConfig())
-    pipeline._sampler.poses.append(PoseBelief(START_NS, 8.0, 20.0, 0.0, 2.0, std_m**2 * np.eye(2)))
+    pipeline._positioning._poses.append(PoseBelief(START_NS, 8.0, 20.0, 0.0, 2.0, std_m**2 * np.eye(2)))
     assert pipeline._known_c_rr() == c_rr
 
 

@@ -107,6 +107,14 @@ def test_antenna_is_where_the_rotation_of_the_attitude_puts_it(seed: int) -> Non
     assert fix_at(tuple(attitude), tuple(lever)) == pytest.approx(expected[:2]), f"seed={seed}"
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_velocity_of_an_antenna_is_that_of_the_body_and_of_its_turn(seed: int) -> None:
+    x = somewhere(seed, PAPER)
+    expected = map_from_base(x[ATTITUDE]) @ (x[VELOCITY] + np.cross(x[RATE], LEVER_M))
+    measurement = sensing.velocity(0, "gps-1", np.zeros(2), np.eye(2), LEVER_M, 0.0)
+    assert told(measurement, x) == pytest.approx(expected[:2]), f"seed={seed}"
+
+
 def test_a_receivers_own_error_is_added_to_its_fix_and_to_no_other() -> None:
     x = np.zeros(FULL.n)
     x[FULL.gps_error(0)], x[FULL.gps_error(1)] = (100.0, 200.0), (3.0, 4.0)

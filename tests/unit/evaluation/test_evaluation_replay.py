@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.belief import PoseBelief
+from agents.pipeline import Locates, Pipeline, PipelineConfig, Positioning
 from evaluation.replay import STEP_NS, Trace, Truth, read_track, replay, score
 from protocol.readings import Articulation, Reading
+from sim.config import SimConfig
+from sim.simulator import Simulator
 
 START_NS = 1_767_225_600_000_000_000
 
@@ -87,6 +91,24 @@ def test_a_belief_is_taken_once_per_step_with_nothing_that_came_later():
     assert trace.stamp_ns.tolist() == [readings[7].stamp_ns, readings[11].stamp_ns]
     assert trace.covariance_m2.shape == (2, 2, 2)
     assert trace.seconds == pytest.approx(0.275)
+
+
+def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipeline():
+    simulator = Simulator(SimConfig(world="fast", machines=1, seed=3, seconds=30.0, bundle_ms=1000))
+    readings = [r for _ in range(simulator.bundles or 0) for r in simulator.advance()["loader-1"]]
+    site, machine = simulator.site, simulator.machines[0]
+    traces, judged = [], []
+    for kind in (Pipeline, Positioning):
+        core: Locates = kind(site, machine, PipelineConfig())
+        holdout = Holdout(site, machine, HoldoutConfig(settle_s=5.0))
+        traces.append(replay(core, readings, holdout))
+        judged.append(holdout.report())
+    whole, half = traces
+    assert len(whole.stamp_ns) > 100
+    assert judged[0] == judged[1]
+    assert judged[0]["fixes"]
+    for name in ("stamp_ns", "position_m", "covariance_m2"):
+        assert getattr(whole, name).tobytes() == getattr(half, name).tobytes()
 
 
 def test_replay_of_nothing_is_empty():

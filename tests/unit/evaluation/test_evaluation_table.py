@@ -47,6 +47,14 @@ def test_rows_are_scored_on_one_recording_and_what_cannot_run_is_named(plan: tab
     assert len(outcomes[0].curves.time_s) > 8
 
 
+def test_poses_are_found_without_the_ground(plan: table.Plan, monkeypatch: pytest.MonkeyPatch):
+    """What it costs is what localisation costs."""
+    monkeypatch.setattr("agents.pipeline.GroundEstimator", lambda *_: pytest.fail("estimates the ground"))
+    monkeypatch.setattr(table, "code_version", lambda *_: "never run before")
+    report, _ = table.run(replace(plan, rows=(ONE,)))
+    assert report["rows"][0]["covered"] > 0.3
+
+
 def test_an_interrupted_run_goes_on_where_it_was(plan: table.Plan, monkeypatch: pytest.MonkeyPatch):
     first, outcomes = table.run(plan)
     table.result_file(outcomes[1].task).unlink()
