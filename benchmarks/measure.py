@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +20,7 @@ from protocol.samples import empty
 
 Result = dict[str, Any]
 START_NS = 1_767_225_600_000_000_000
-SIDE_M = 300.0  # of the site: its evidence takes 40 MB
+SIDE_M = 1024.0  # of the site; three sums for each of its cells of 1 m take 25 MB, more than a cache holds
 
 
 def track(n: int, seed: int = 0) -> Table:
@@ -35,7 +39,7 @@ def scattered(n: int, seed: int = 0) -> Table:
 
 
 def _fill(n: int, draw: np.random.Generator, x: Any, y: Any, heading: Any) -> Table:
-    """1.3 m of position error per axis, correlated; 10 ms apart, so that the default run lies in one time bucket."""
+    """1.3 m of position error per axis, correlated; 10 ms apart, as from a fleet of 16 machines."""
     rows = empty(n)
     rows["stamp_ns"] = START_NS + np.arange(n) * 10**7
     rows["x_m"], rows["y_m"], rows["heading_rad"] = x, y, (heading + np.pi) % (2 * np.pi) - np.pi
@@ -68,6 +72,20 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = [list(rows[0]), *(["-" if value is None else str(value) for value in row.values()] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(w.rjust(width) for w, width in zip(line, widths, strict=True)) for line in lines)
+
+
+def memory_mb(name: str = "VmRSS") -> float:
+    """Memory of this process: resident now, or with VmHWM the most that ever was (getrusage counts a parent's too)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name)) / 1024
+
+
+def in_child(module: str, *words: str) -> Result:
+    """What a module prints as one JSON object when it runs in a process of its own."""
+    command = [sys.executable, "-m", module, *words]
+    root = Path(__file__).parent.parent
+    found: Result = json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603
+    return found
 
 
 def machine() -> dict[str, Any]:

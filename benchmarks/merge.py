@@ -1,80 +1,120 @@
-"""Samples per second of the fold: both kernels, and as a yardstick np.add.at of three plain sums per cell."""
+"""Samples per second of the fold: the server's own, and plain sums per cell by several libraries as yardsticks.
+
+Every variant takes the same structured rows; what its library wants made of them first is part of its time. All fold
+into what they already have, as a server does that is at work: soft votes also pack, now and then, what they unpacked.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import numpy as np
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 
 from benchmarks.measure import SIDE_M, Result, machine, medians, scattered, timed, track
+from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, Polars, Sums
 from mapserver.grid import Grid
 from mapserver.votes import FoldConfig
 from protocol.arrays import Table
 
 PATTERNS = {"track": track, "random": scattered}
 BATCH = 100  # what a machine sends every few seconds
-# Whole runs in pieces of one large batch; the numpy fallback holds every stencil cell of a piece in memory.
-PIECE = 5000
-NUMPY_SHARE = 10  # the fallback is so much slower that it is measured on a tenth of the samples
+PIECE = 5000  # whole runs in pieces of this size; the numpy fallback holds all stencil cells of a piece in memory
+BATCHED_SHARE = 10  # calls cost so much more than rows that batches are measured on a tenth of the samples
+YARDSTICK = "np.add.at"
+Fold = Callable[[Table], None]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to merge samples.
+
+    make: gives a fold, or ImportError where its library is missing; install: what to install then. shares: of each
+    pattern one in so many samples is folded, where that is not all: the slow ones need not take minutes.
+    """
+
+    make: Callable[[], Fold]
+    install: str = ""
+    shares: Mapping[str, int] = field(default_factory=dict)
+
+
+def _soft(kernel: str) -> Fold:
+    return partial(Grid(1.0, FoldConfig(kernel=kernel)).fold, machine="loader-1")
+
+
+def _plain(kind: Callable[[int], Sums]) -> Fold:
+    return kind(int(SIDE_M)).fold
+
+
+NUMBA, BENCH = "pip install 'sitegrid[server]'", "pip install 'sitegrid[bench]'"
+VARIANTS = {
+    "soft_votes": Variant(partial(_soft, "numba"), NUMBA, {"track": 10, "random": 100}),
+    "soft_votes numpy": Variant(partial(_soft, "numpy"), shares={"track": 100, "random": 200}),
+    "hard_votes": Variant(partial(_plain, HardVotes), NUMBA),
+    YARDSTICK: Variant(partial(_plain, AddAt)),
+    "boost_histogram": Variant(partial(_plain, BoostHistogram), BENCH),
+    "polars group-by": Variant(partial(_plain, Polars), BENCH),
+    "duckdb group-by": Variant(partial(_plain, DuckDb), BENCH),
+}
 
 
 def run(samples: int, runs: int) -> Result:
-    """Measure every variant on every pattern."""
-    rows = []
-    for pattern, make in PATTERNS.items():
-        variants = _variants(make(samples))
-        for _, work in variants.values():
-            work(BATCH)  # compiled, and every block allocated
-        whole = medians({name: _timer(work, PIECE) for name, (_, work) in variants.items()}, runs)
-        batches = medians({name: _timer(work, BATCH) for name, (_, work) in variants.items()}, runs)
-        for name, (n, _) in variants.items():
-            rows.append(
-                {
-                    "variant": name,
-                    "pattern": pattern,
-                    "msamples_per_s": float(f"{n / whole[name] / 1e6:.3g}"),
-                    "us_per_batch_of_100": round(batches[name] / (n / BATCH) * 1e6, 1),
-                }
-            )
-    return {"benchmark": "merge", "samples": samples, "runs": runs, **machine(), "rows": rows}
+    """Measure every variant whose library is there on every pattern.
+
+    Rows: variant, pattern, samples of a whole run, million samples per second of whole runs, that over the yardstick's,
+    and microseconds for a batch of 100. missing: variants that were not measured, and what to install for each.
+    """
+    rows: list[dict[str, str | float]] = []
+    missing: dict[str, str] = {}
+    for pattern, draw in PATTERNS.items():
+        folds, missing = _made()
+        drawn = draw(samples)
+        parts = {name: drawn[: _share(samples, VARIANTS[name].shares.get(pattern, 1))] for name in folds}
+        rows += _measured(pattern, folds, parts, runs)
+    return {"benchmark": "merge", "samples": samples, "runs": runs, **machine(), "rows": rows, "missing": missing}
 
 
-def _variants(rows: Table) -> dict[str, tuple[int, Callable[[int], None]]]:
-    """How many samples each variant folds, and how it folds them in pieces of a given size."""
-    few = rows[: max(BATCH, len(rows) // NUMPY_SHARE)]
-    return {
-        "soft_votes numba": (len(rows), _fold(rows, "numba")),
-        "soft_votes numpy": (len(few), _fold(few, "numpy")),
-        "np.add.at three sums": (len(rows), _three_sums(rows)),
-    }
+def _made() -> tuple[dict[str, Fold], dict[str, str]]:
+    """A new fold of each variant, and what to install for those whose library is missing."""
+    folds, missing = {}, {}
+    for name, variant in VARIANTS.items():
+        try:
+            folds[name] = variant.make()
+        except ImportError:
+            missing[name] = variant.install
+    return folds, missing
 
 
-def _timer(work: Callable[[int], None], piece: int) -> Callable[[], float]:
-    return lambda: timed(lambda: work(piece))
+def _measured(
+    pattern: str, folds: Mapping[str, Fold], parts: Mapping[str, Table], runs: int
+) -> list[dict[str, str | float]]:
+    """Rows of one pattern; all variants in turn."""
+    for name, fold in folds.items():
+        fold(parts[name])  # compiled, and every block allocated
+    few = {name: part[: _share(len(part), BATCHED_SHARE)] for name, part in parts.items()}
+    whole_s = medians({name: _timer(fold, parts[name], PIECE) for name, fold in folds.items()}, runs)
+    batched_s = medians({name: _timer(fold, few[name], BATCH) for name, fold in folds.items()}, runs)
+    pace = {name: len(parts[name]) / whole_s[name] for name in folds}
+    return [
+        {
+            "variant": name,
+            "pattern": pattern,
+            "samples": len(parts[name]),
+            "msamples_per_s": float(f"{pace[name] / 1e6:.3g}"),
+            "ratio_to_add_at": float(f"{pace[name] / pace[YARDSTICK]:.3g}"),
+            "us_per_batch_of_100": round(batched_s[name] / (len(few[name]) / BATCH) * 1e6, 1),
+        }
+        for name in folds
+    ]
 
 
-def _fold(rows: Table, kernel: str) -> Callable[[int], None]:
-    grid = Grid(1.0, FoldConfig(kernel=kernel))
+def _share(samples: int, share: int) -> int:
+    """One in so many samples, in whole batches."""
+    return min(samples, max(1, samples // share // BATCH) * BATCH)
 
-    def work(piece: int) -> None:
+
+def _timer(fold: Fold, rows: Table, piece: int) -> Callable[[], float]:
+    def work() -> None:
         for first in range(0, len(rows), piece):
-            grid.fold(rows[first : first + piece], "loader-1")
+            fold(rows[first : first + piece])
 
-    return work
-
-
-def _three_sums(rows: Table) -> Callable[[int], None]:
-    """Count, sum and sum of squares of the cell that a sample lies in: no evidence, no covariance."""
-    side = int(SIDE_M)
-    sums = np.zeros((3, side * side))
-
-    def work(piece: int) -> None:
-        for first in range(0, len(rows), piece):
-            part = rows[first : first + piece]
-            cell = part["y_m"].astype(np.int64) * side + part["x_m"].astype(np.int64)
-            value = part["c_rr"].astype(np.float64)
-            np.add.at(sums[0], cell, 1.0)
-            np.add.at(sums[1], cell, value)
-            np.add.at(sums[2], cell, value * value)
-
-    return work
+    return lambda: timed(work)

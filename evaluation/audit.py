@@ -15,11 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from agents.audit import read_audit
+from mapserver import evidence as ev
 from mapserver import snapshot
 from mapserver.config import ServerConfig
-from mapserver.grid import Grid, GridState
+from mapserver.grid import Grid, GridState, Placed
 from mapserver.journal import Journal, JournalRow
+from mapserver.pages import Page
 from mapserver.store import JOURNAL_FILE
+from protocol.arrays import Ints
 from protocol.samples import content_hash
 from protocol.site import SiteConfig
 
@@ -95,14 +98,25 @@ def grid_difference(expected: GridState, found: GridState) -> tuple[int, int]:
     Counts are compared cell by cell; their difference is turned into samples by the counts of a mean sample, rounded
     up.
     """
-    per_sample = max(1.0, float(expected.counts.sum()) / max(1, expected.folded))
-    slots = {int(code): i for i, code in enumerate(found.codes)}
+    per_sample = max(1.0, sum(map(_votes, expected.pages)) / max(1, expected.folded))
+    there = {(at.x, at.y, at.rung, at.index): at.page for at in found.pages}
     missing = surplus = 0
-    for i, code in enumerate(expected.codes):
-        j = slots.pop(int(code), None)
-        there = found.counts[j] if j is not None else np.zeros_like(expected.counts[i])
-        difference = expected.counts[i].astype(np.int64) - there
+    for at in expected.pages:
+        difference = _dense(at.page)
+        if page := there.pop((at.x, at.y, at.rung, at.index), None):
+            difference -= _dense(page)
         missing += int(difference[difference > 0].sum())
         surplus -= int(difference[difference < 0].sum())
-    surplus += sum(int(found.counts[j].sum()) for j in slots.values())
+    surplus += sum(int(page.votes["count"].sum(dtype=np.int64)) for page in there.values())
     return math.ceil(missing / per_sample), math.ceil(surplus / per_sample)
+
+
+def _votes(at: Placed) -> int:
+    return int(at.page.votes["count"].sum(dtype=np.int64))
+
+
+def _dense(page: Page) -> Ints:
+    """All counts of a page (COUNTS * 256,)."""
+    counts = np.zeros(ev.COUNTS * ev.CELLS, np.int64)
+    counts[page.votes["place"]] = page.votes["count"]
+    return counts

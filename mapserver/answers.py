@@ -1,104 +1,239 @@
-"""Map queries answered: the window's blocks are copied by the writer's thread, layers are derived here, outside it."""
+"""Map queries and commands answered: pages are copied by the writer's thread, layers are derived here, outside it."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
 from mapserver import layers
-from mapserver.grid import chunks
-from mapserver.store import Store
+from mapserver.config import ServerConfig
+from mapserver.filling import AREA_LAYERS
+from mapserver.journal import Wanted
+from mapserver.past import Moment
+from mapserver.views import Past, View, cropped, read_cells, view_now, widened
 from mapserver.writer import Writer
-from protocol.arrays import Floats32
-from protocol.geometry import BLOCK_CELLS, Bounds, CellWindow
+from protocol.admin import TrustCommand, parse_command
+from protocol.errors import QueryError, Refusal
+from protocol.geometry import Bounds, CellWindow
 from protocol.queries import (
-    InfoQuery,
+    MAX_SPANS,
+    ChangesQuery,
+    HistoryAnswer,
+    HistoryQuery,
+    MachinesQuery,
     MapQuery,
     PointAnswer,
     PointQuery,
     Region,
     RegionQuery,
+    Span,
+    When,
     check_size,
+    encode_changes,
+    encode_history,
     encode_info,
+    encode_machine,
+    encode_machines,
     encode_point,
     encode_region,
     parse_query,
 )
 from protocol.site import SiteConfig
 
+WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
+
+
+class Keeper(Protocol):
+    """What the server finds out about its machines and its ground; any thread may ask (docs/protocol.md)."""
+
+    def machines(self) -> list[dict[str, Any]]:
+        """What is known of every machine, as plain values."""
+        ...
+
+    def changes(self, after: int) -> list[dict[str, Any]]:
+        """Changes of the ground with a number beyond `after`, as plain values."""
+        ...
+
+    def trust(self, machine: str, trusted: bool | None, reason: str, wait_s: float) -> dict[str, Any]:  # noqa: FBT001
+        """Trust a machine or not, wait until the map is folded so; QueryError for an unknown machine."""
+        ...
+
+    def distrusted(self) -> frozenset[str]:
+        """Machines whose samples are left out of the map."""
+        ...
+
+
+class Nobody:
+    """A keeper where none watches."""
+
+    def machines(self) -> list[dict[str, Any]]:
+        """None."""
+        return []
+
+    def changes(self, after: int) -> list[dict[str, Any]]:  # noqa: ARG002
+        """None."""
+        return []
+
+    def trust(self, machine: str, trusted: bool | None, reason: str, wait_s: float) -> dict[str, Any]:  # noqa: ARG002, FBT001
+        """Refuse."""
+        raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine}` is not known: nobody watches machines here")
+
+    def distrusted(self) -> frozenset[str]:
+        """None."""
+        return frozenset()
+
 
 class Answers:
-    """Answers the queries of one map, from any thread."""
+    """Answers the queries of one map, from any thread.
 
-    def __init__(self, writer: Writer, site: SiteConfig, config: layers.ReadConfig) -> None:
+    journal: where the past is read; without it only the map as it is can be asked for.
+    """
+
+    def __init__(
+        self,
+        writer: Writer,
+        site: SiteConfig,
+        config: ServerConfig,
+        keeper: Keeper | None = None,
+        journal: Path | None = None,
+    ) -> None:
         self._writer = writer
         self._site = site
         self._config = config
+        self._keeper = keeper or Nobody()
+        self._past = Past(journal, site.cell_m, config) if journal else None
 
-    def answer(self, name: str, parameters: dict[str, str]) -> bytes:
+    def answer(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and answer one query; QueryError says what is wrong with it."""
         query = parse_query(name, parameters)
         self._writer.wait_merged(query.fresh.after, query.fresh.wait_s)
         return self._encode(query)
+
+    def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
+        """Parse and carry out one command; QueryError says what is wrong with it."""
+        return encode_machine(self.trust(parse_command(name, parameters)))
 
     def _encode(self, query: MapQuery) -> bytes:
         if isinstance(query, PointQuery):
             return encode_point(self.point(query))
         if isinstance(query, RegionQuery):
             return encode_region(self.region(query))
-        assert isinstance(query, InfoQuery)
+        if isinstance(query, HistoryQuery):
+            return encode_history(self.history(query))
+        if isinstance(query, MachinesQuery):
+            return encode_machines(self._keeper.machines())
+        if isinstance(query, ChangesQuery):
+            return encode_changes(self._keeper.changes(query.after))
         return encode_info(self.info())
 
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
-        return {**self._writer.info(), "layers": list(layers.LAYERS)}
+        return {**self._writer.info(), "layers": [*layers.LAYERS, *AREA_LAYERS]}
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
-        x, y = query.x_m, query.y_m
-        window = self._site.geometry.window(Bounds(x, y, np.nextafter(x, np.inf), np.nextafter(y, np.inf)))
-        region = self._read(CellWindow(window.column, window.row, 1, 1), query.layers)
+        region = self._read(self._cell(query.x_m, query.y_m), query.layers, query.when)
         values = {name: float(layer[0, 0]) for name, layer in region.layers.items()}
         return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.merged, region.stamp_ns)
 
     def region(self, query: RegionQuery) -> Region:
         """Layers of all cells that a rectangle touches."""
-        return self._read(self._site.geometry.window(query.bounds), query.layers)
+        return self._read(self._site.geometry.window(query.bounds), query.layers, query.when)
 
-    def _read(self, window: CellWindow, names: tuple[str, ...]) -> Region:
+    def history(self, query: HistoryQuery) -> HistoryAnswer:
+        """Layers of the cell that a position lies in, span by span."""
+        names = _of_cells(query.layers)
+        now_ns = self._writer.read(lambda store: store.newest_ns)
+        span_s = query.span_s or self._config.fold.bucket_s
+        from_ns, to_ns = _time_of(query, now_ns, span_s)
+        cell = self._cell(query.x_m, query.y_m)
+        wanted = Wanted(from_ns, to_ns, without=self._keeper.distrusted())
+        moments, merged = self._known_past().moments((cell.column, cell.row), wanted, span_s)
+        x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
+        return HistoryAnswer(x_m, y_m, tuple(self._span(moment, names) for moment in moments), merged, now_ns)
+
+    def trust(self, command: TrustCommand) -> dict[str, Any]:
+        """What is known of the machine once the command counts, and the journal row of the map that it counts in."""
+        row = self._keeper.trust(command.machine, command.trusted, command.reason, command.wait_s)
+        return {**row, "merged": self._writer.read(lambda store: store.merged)}
+
+    def _cell(self, x_m: float, y_m: float) -> CellWindow:
+        window = self._site.geometry.window(Bounds(x_m, y_m, np.nextafter(x_m, np.inf), np.nextafter(y_m, np.inf)))
+        return CellWindow(window.column, window.row, 1, 1)
+
+    def _read(self, window: CellWindow, names: tuple[str, ...], when: When) -> Region:
         check_size(window.columns, window.rows)
-        names = layers.select(names)
-        shape = (window.rows, window.columns)
-        out: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in names}
-        blocks, merged, stamp_ns = self._writer.read(lambda s: (s.grid.blocks_in(window), s.merged, s.newest_ns))
-        for some in chunks(blocks):
-            evidence = self._writer.read(_evidence_of(some))
-            for name, values in layers.read(evidence, names, self._config).items():
-                _place(out[name], window, some, values)
+        if when.minus_ns is None:
+            return self._map(window, layers.select(names), when.as_of_ns)
+        names = _with_difference(names)
+        newer, older = (self._map(window, names, as_of_ns) for as_of_ns in (when.as_of_ns, when.minus_ns))
+        differences = {name: newer[name] - older[name] for name in names}
+        return replace(newer, layers=differences, merged=min(newer.merged, older.merged))
+
+    def _map(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None) -> Region:
+        wide = widened(window, layers.margin_cells(names, self._site.cell_m, self._config.read))
+        view = self._view(wide, as_of_ns)
+        values = read_cells(view, wide, layers.required(names), self._site.cell_m, self._config)
+        areas = layers.derive_area(names, values, self._site.cell_m, self._config.read)
         geometry = self._site.geometry
         return Region(
             x_m=geometry.centres(window.column, window.columns),
             y_m=geometry.centres(window.row, window.rows),
             cell_m=self._site.cell_m,
-            layers=out,
-            merged=merged,
-            stamp_ns=stamp_ns,
+            layers={name: cropped(layer, wide, window) for name, layer in areas.items()},
+            merged=view.merged,
+            stamp_ns=view.stamp_ns,
         )
 
+    def _view(self, window: CellWindow, as_of_ns: int | None) -> View:
+        if as_of_ns is None:
+            return self._writer.read(lambda store: view_now(store, window))
+        return self._known_past().view(window, as_of_ns, self._keeper.distrusted())
 
-def _evidence_of(blocks: list[tuple[int, int]]) -> Any:
-    def copy(store: Store) -> Any:
-        return store.grid.evidence(blocks)
+    def _span(self, moment: Moment, names: tuple[str, ...]) -> Span:
+        values = layers.read(moment.evidence, names, self._config.read, moment.last_ns)
+        return Span(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
 
-    return copy
+    def _known_past(self) -> Past:
+        if self._past is None:
+            raise QueryError(Refusal.STORE, "this server keeps no journal; ask for the map as it is")
+        return self._past
 
 
-def _place(out: Floats32, window: CellWindow, blocks: list[tuple[int, int]], values: Floats32) -> None:
-    """Copy block values (blocks, 256) into the window."""
-    n = BLOCK_CELLS
-    for (x, y), block in zip(blocks, values.reshape(-1, n, n), strict=True):
-        column, row = x * n - window.column, y * n - window.row
-        left, top = max(0, -column), max(0, -row)
-        right, bottom = min(n, window.columns - column), min(n, window.rows - row)
-        out[row + top : row + bottom, column + left : column + right] = block[top:bottom, left:right]
+def reads_past(name: str, parameters: Mapping[str, str]) -> bool:
+    """Whether a query folds the journal, which takes a while."""
+    return name == HistoryQuery.name or not {"as_of", "minus"}.isdisjoint(parameters)
+
+
+def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:
+    names = layers.select(names)
+    if filled := [name for name in names if name in AREA_LAYERS]:
+        problem = (
+            f"layer `{filled[0]}` is made from neighbours; a history has layers of cells: {', '.join(layers.LAYERS)}"
+        )
+        raise QueryError(Refusal.UNKNOWN_LAYER, problem)
+    return names
+
+
+def _with_difference(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Check layers to be subtracted; none means all of which there is a difference."""
+    if refused := [name for name in names if name in WITHOUT_DIFFERENCE]:
+        problem = f"layer `{refused[0]}` has no difference; ask for it without `minus`, as of each time"
+        raise QueryError(Refusal.OUT_OF_RANGE, problem)
+    return tuple(name for name in layers.select(names) if name not in WITHOUT_DIFFERENCE)
+
+
+def _time_of(query: HistoryQuery, now_ns: int, span_s: float) -> tuple[int, int]:
+    """First and last stamp of a history; refuses too many spans before any is folded."""
+    span_ns = round(span_s * 1e9)
+    to_ns = query.to_ns or max(now_ns, query.from_ns or 1)
+    from_ns = query.from_ns or max(1, (to_ns // span_ns - MAX_SPANS + 1) * span_ns)
+    spans = to_ns // span_ns - from_ns // span_ns + 1
+    if spans > MAX_SPANS:
+        problem = f"{spans} spans of {span_s:g} s; at most {MAX_SPANS} are answered: a longer `span`, or less time"
+        raise QueryError(Refusal.TOO_LARGE, problem)
+    return from_ns, to_ns

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mapserver.change import ChangeConfig
 from mapserver.layers import ReadConfig
+from mapserver.trust import TrustConfig
 from mapserver.votes import FoldConfig
+from protocol.config import require_positive
 
 
 @dataclass(frozen=True)
@@ -27,12 +30,35 @@ class StoreConfig:
 
 
 @dataclass(frozen=True)
+class KeepConfig:
+    """What the keeper does beside the map.
+
+    turn_s: it looks for new rows and changes so often. judge_s: machines are judged so often. distrusts: whether
+    machines that contradict all others are left out of the map, or only named. archive_after_h: rows move to Parquet
+    files once they are so old, 0 for never.
+    """
+
+    turn_s: float = 1.0
+    judge_s: float = 30.0
+    distrusts: bool = True
+    archive_after_h: float = 24.0
+
+    def __post_init__(self) -> None:
+        require_positive(self, ("turn_s", "judge_s"))
+        if not self.archive_after_h >= 0:
+            raise ValueError("archive_after_h: negative")
+
+
+@dataclass(frozen=True)
 class ServerConfig:
     """All options, one table per component."""
 
     store: StoreConfig = field(default_factory=StoreConfig)
     fold: FoldConfig = field(default_factory=FoldConfig)
     read: ReadConfig = field(default_factory=ReadConfig)
+    change: ChangeConfig = field(default_factory=ChangeConfig)
+    trust: TrustConfig = field(default_factory=TrustConfig)
+    keep: KeepConfig = field(default_factory=KeepConfig)
     query_threads: int = 2
 
     def __post_init__(self) -> None:

@@ -1,19 +1,36 @@
-"""Votes into the grid. The integer weights of one sample sum exactly to its weight, with and without numba."""
+"""Votes into hot blocks. The integer weights of one sample sum exactly to its weight, with and without numba."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapserver import evidence as ev
-from mapserver.votes import TABLE, TABLE_MAX_D2, TABLE_PER_UNIT, Votes
-from protocol.arrays import Bools, Ints
+from mapserver.hot import FREE, Hot, code_of
+from mapserver.votes import TABLE, TABLE_LAST, TABLE_PER_UNIT, FoldConfig, Votes, is_foldable, prepare
+from protocol.arrays import Ints, Table
+from protocol.geometry import BLOCK_CELLS
 
-# A kernel adds votes into counts (slots, 256, COUNTS), bitmaps (slots, 256, 2), newest (slots, 256).
-# slots: (n, k, k) slot of each block that a stencil touches; corner: (n, 2) block column and row of slots[:, 0, 0].
-Kernel = Callable[[Votes, Ints, Ints, NDArray[np.uint32], NDArray[np.uint64], Ints], None]
+WEIGHT_SHIFT = 32  # shares of a weight are exact to 2**-32 before they are rounded down
+
+
+@dataclass(frozen=True)
+class Folded:
+    """What became of rows. missing: codes of blocks that have to be opened first, nothing was folded then."""
+
+    missing: list[int]
+    folded: int = 0
+
+
+class Kernel(Protocol):
+    """Adds samples of one machine to hot blocks, or says which blocks are missing."""
+
+    def __call__(self, rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> Folded:
+        """Fold the rows that know their place well enough, all or none."""
+        ...
 
 
 def kernel(name: str) -> Kernel:
@@ -29,61 +46,71 @@ def kernel(name: str) -> Kernel:
     return fold_numba
 
 
-def fold_numpy(
-    votes: Votes,
-    slots: Ints,
-    corner: Ints,
-    counts: NDArray[np.uint32],
-    bitmaps: NDArray[np.uint64],
-    newest: Ints,
-) -> None:
+def fold_numpy(rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> Folded:
     """Fold without numba: the same integers, one stencil cell at a time over all samples."""
+    votes = prepare(rows[is_foldable(rows, config)], machine, cell_m, config)
+    corner = (votes.middle - votes.reach[:, None]) // BLOCK_CELLS
+    codes = _codes(votes, corner)
+    unique, inverse = np.unique(codes, return_inverse=True)
+    found = hot.slots_of(unique.tolist())
+    if missing := unique[found == FREE].tolist():
+        return Folded(missing)
+    slots = found[inverse].reshape(codes.shape)
     for offset_y, offset_x, share in _stencils(votes):
         hit = np.flatnonzero(share)
-        column, row = votes.origin[hit, 0] + offset_x, votes.origin[hit, 1] + offset_y
-        block = slots[hit, (row >> 4) - corner[hit, 1], (column >> 4) - corner[hit, 0]]
-        cell = (row & 15) * 16 + (column & 15)
-        weight = share[hit]
-        for part, first in enumerate((ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start)):
-            voting = votes.bins[hit, part] >= 0
-            upper = weight * votes.shares[hit, part] // ev.SHARE_ONE
-            index = first + votes.bins[hit, part]
-            _add(counts, block, cell, index, weight - upper, voting)
-            _add(counts, block, cell, index + 1, upper, voting)
-        everyone = np.ones(len(hit), np.bool_)
-        _add(counts, block, cell, ev.HEADING.start + votes.sector[hit], weight, everyone)
-        _add(counts, block, cell, np.full(len(hit), ev.WEIGHT), weight, everyone)
-        np.bitwise_or.at(bitmaps, (block, cell), votes.bits[hit])
-        np.maximum.at(newest, (block, cell), votes.stamp_ns[hit])
+        column, row = votes.middle[hit, 0] + offset_x, votes.middle[hit, 1] + offset_y
+        slot = slots[hit, (row >> 4) - corner[hit, 1], (column >> 4) - corner[hit, 0]]
+        _add_votes(votes, hit, slot, (row & 15) * 16 + (column & 15), share[hit], hot)
+    return Folded([], len(votes.weight))
+
+
+def _codes(votes: Votes, corner: Ints) -> Ints:
+    """Codes (n, k, k) of all blocks that the stencils touch; where one touches fewer, its last block again."""
+    last = (votes.middle + votes.reach[:, None]) // BLOCK_CELLS
+    steps = np.arange(int((last - corner).max(initial=0)) + 1)
+    x = np.minimum(corner[:, 0, None, None] + steps[None, None, :], last[:, 0, None, None])
+    y = np.minimum(corner[:, 1, None, None] + steps[None, :, None], last[:, 1, None, None])
+    return code_of(votes.bucket[:, None, None], x, y)
 
 
 def _stencils(votes: Votes) -> list[tuple[int, int, Ints]]:
-    """Return offset_y, offset_x and every sample's integer share of its weight there."""
-    edge = int(votes.size.max(initial=0))
-    offsets = [(dy, dx) for dy in range(edge) for dx in range(edge)]
-    raw = np.stack([_raw_weight(votes, dy, dx) for dy, dx in offsets]) if offsets else np.zeros((0, 0), np.int64)
-    total = raw.sum(axis=0)
-    lost = total == 0  # the cell is much larger than the spread: all of it stays where the sample is
-    middle = (votes.size // 2) * edge + votes.size // 2
-    raw[middle[lost], np.flatnonzero(lost)] = 1
-    share = raw * votes.weight // np.maximum(total, 1)
-    share[raw.argmax(axis=0), np.arange(len(votes.weight))] += votes.weight - share.sum(axis=0)
+    """Return offset_y, offset_x from the middle, and every sample's integer share of its weight there.
+
+    What rounding down leaves over goes to the middle.
+    """
+    reach = int(votes.reach.max(initial=0))
+    offsets = [(dy, dx) for dy in range(-reach, reach + 1) for dx in range(-reach, reach + 1)]
+    raw = np.stack([_raw_weight(votes, dy, dx) for dy, dx in offsets])
+    factor = (votes.weight << WEIGHT_SHIFT) // np.maximum(raw.sum(axis=0), 1)
+    share = (raw * factor) >> WEIGHT_SHIFT
+    share[len(offsets) // 2] += votes.weight - share.sum(axis=0)
     return [(dy, dx, share[k]) for k, (dy, dx) in enumerate(offsets)]
 
 
 def _raw_weight(votes: Votes, dy: int, dx: int) -> Ints:
-    x = votes.origin[:, 0] + dx + 0.5 - votes.place[:, 0]
-    y = votes.origin[:, 1] + dy + 0.5 - votes.place[:, 1]
-    d2 = votes.inverse[:, 0] * x * x + votes.inverse[:, 1] * x * y + votes.inverse[:, 2] * y * y
-    inside = (d2 <= TABLE_MAX_D2) & (dx < votes.size) & (dy < votes.size)
-    return np.where(inside, TABLE[np.where(inside, d2 * TABLE_PER_UNIT, 0).astype(np.int64)], 0)
+    x = (votes.middle[:, 0] + dx + 0.5) - votes.place[:, 0]
+    y = (votes.middle[:, 1] + dy + 0.5) - votes.place[:, 1]
+    a, b, c = votes.inverse.T
+    d2 = (a * x + b * y) * x + c * y * y
+    inside = (abs(dx) <= votes.reach) & (abs(dy) <= votes.reach)
+    place = np.minimum(d2 * TABLE_PER_UNIT, TABLE_LAST).astype(np.int64)
+    return np.where(inside, TABLE[place], 0)
 
 
-def _add(counts: NDArray[np.uint32], block: Ints, cell: Ints, index: Ints, weight: Ints, which: Bools) -> None:
-    """Add with saturation: the exact sum of this batch and what is there, limited to COUNT_MAX."""
-    where = np.ravel_multi_index((block[which], cell[which], index[which]), counts.shape)
-    unique, inverse = np.unique(where, return_inverse=True)
-    total = np.zeros(len(unique), np.int64)
-    np.add.at(total, inverse, weight[which])
-    place = np.unravel_index(unique, counts.shape)
-    counts[place] = np.minimum(counts[place].astype(np.int64) + total, ev.COUNT_MAX).astype(np.uint32)
+def _add_votes(votes: Votes, hit: Ints, slot: Ints, cell: Ints, weight: Ints, hot: Hot) -> None:
+    """Add the weights of the samples `hit` to one cell each."""
+    counts = hot.counts.astype(np.uint32, copy=False)
+    for part, first in enumerate((ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start)):
+        votes_for = votes.bins[hit, part] >= 0
+        at, where, bins = slot[votes_for], cell[votes_for], first + votes.bins[hit, part][votes_for]
+        upper = weight[votes_for] * votes.shares[hit, part][votes_for] // ev.SHARE_ONE
+        _add(counts, at, bins, where, weight[votes_for] - upper)
+        _add(counts, at, bins + 1, where, upper)
+    _add(counts, slot, ev.HEADING.start + votes.sector[hit], cell, weight)
+    for which in (ev.VISITS, ev.MACHINES):
+        np.bitwise_or.at(hot.bitmaps, (slot, np.full_like(slot, which), cell), votes.bits[hit, which])
+    np.maximum.at(hot.newest, (slot, cell), votes.stamp_ns[hit])
+
+
+def _add(counts: NDArray[np.uint32], slot: Ints, plane: Ints, cell: Ints, weight: Ints) -> None:
+    np.add.at(counts, (slot, plane, cell), weight.astype(np.uint32))

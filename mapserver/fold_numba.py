@@ -1,4 +1,9 @@
-"""The fold kernel in numba. Imported only where numba is installed; `fold.fold_numpy` gives the same bits."""
+"""The fold kernel in numba. Imported only where numba is installed; `fold.fold_numpy` gives the same bits.
+
+Blocks lie in memory bin by bin, so that one sample adds whole rows of 16 neighbouring cells to each bin that it votes
+for: additions of 64 bytes, which the compiler turns into vector instructions. Shares are first laid out in such rows
+("lanes"), one block column after the other.
+"""
 
 from __future__ import annotations
 
@@ -6,100 +11,248 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from mapserver import evidence as ev
-from mapserver.votes import TABLE, TABLE_MAX_D2, TABLE_PER_UNIT, Votes
-from protocol.arrays import Ints
+from mapserver.fold import WEIGHT_SHIFT, Folded
+from mapserver.hot import CODE_BITS, CODE_HALF, FREE, Hot
+from mapserver.votes import (
+    GRADE_LOW,
+    GRADE_STEPS,
+    HASH,
+    RESISTANCE_STEPS,
+    TABLE,
+    TABLE_LAST,
+    TABLE_PER_UNIT,
+    VISIT_NS,
+    FoldConfig,
+    name_hash,
+)
+from protocol.arrays import Table
 
-_FIRST = np.array([ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start])
-_HEADING, _WEIGHT, _ONE, _MAX = ev.HEADING.start, ev.WEIGHT, ev.SHARE_ONE, int(ev.COUNT_MAX)
-
-
-def fold_numba(
-    votes: Votes,
-    slots: Ints,
-    corner: Ints,
-    counts: NDArray[np.uint32],
-    bitmaps: NDArray[np.uint64],
-    newest: Ints,
-) -> None:
-    """Fold votes; see `fold.Kernel`."""
-    edge = int(votes.size.max(initial=0))
-    raw = np.empty((edge, edge), np.int64)
-    v = votes
-    arrays = (v.place, v.inverse, v.origin, v.size, v.weight, v.bins, v.shares, v.sector, v.stamp_ns, v.bits)
-    _fold(*arrays, slots, corner, counts, bitmaps, newest, raw)
-
-
-@numba.njit(cache=True)
-def _add(counts: Any, block: int, cell: int, index: int, weight: int) -> None:
-    total = np.int64(counts[block, cell, index]) + weight
-    counts[block, cell, index] = min(total, _MAX)
+_RESISTANCE, _EAST, _NORTH = ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start
+_HEADING, _COUNTS, _CELLS = ev.HEADING.start, ev.COUNTS, ev.CELLS
+_R_LAST, _G_LAST = ev.RESISTANCE_BINS - 2, ev.GRADE_BINS - 2
+_R_PER_LOG = len(RESISTANCE_STEPS) / np.log(ev.RESISTANCE_CENTRES[-1] / ev.RESISTANCE_CENTRES[0])
+_R_OFFSET = 0.5 - np.log(ev.RESISTANCE_CENTRES[0]) * _R_PER_LOG
+_G_TOP = (ev.GRADE_BINS - 1) * ev.SHARE_ONE
+_SECTOR_RAD, _SECTORS = 2 * np.pi / ev.SECTORS, ev.SECTORS
+_UNITS, _ONE = ev.WEIGHT_UNITS_PER_M, ev.SHARE_ONE
+_HASH = np.uint64(HASH)
 
 
-@numba.njit(cache=True)
-def _stencil(place: Any, inverse: Any, origin: Any, size: int, raw: Any) -> tuple[int, int, int]:
-    """Fill raw[:size, :size] with table weights; return their sum and the first largest place."""
-    total, best, best_y, best_x = 0, -1, 0, 0
-    for dy in range(size):
-        y = origin[1] + dy + 0.5 - place[1]
-        for dx in range(size):
-            x = origin[0] + dx + 0.5 - place[0]
-            d2 = inverse[0] * x * x + inverse[1] * x * y + inverse[2] * y * y
-            weight = TABLE[int(d2 * TABLE_PER_UNIT)] if d2 <= TABLE_MAX_D2 else 0
-            raw[dy, dx] = weight
+def fold_numba(rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> Folded:
+    """Fold rows; see `fold.Kernel`."""
+    limits = (cell_m, config.std_floor_m**2, config.std_cap_m**2)
+    places, slots, folded, missing = _locate(rows, limits, config.bucket_ns, hot.keys, hot.places, hot.shift)
+    if len(missing):
+        return Folded(list(dict.fromkeys(missing.tolist())))
+    arrays = (hot.counts.reshape(-1), hot.bitmaps.reshape(-1), hot.newest.reshape(-1))
+    _fold(rows, places, slots, np.uint64(name_hash(machine)), *arrays)
+    return Folded([], folded)
+
+
+@numba.njit(cache=True, nogil=True)
+def _locate(
+    rows: Any, limits: tuple[float, float, float], bucket_ns: int, keys: Any, places: Any, shift: int
+) -> tuple[Any, Any, int, Any]:
+    """Where each row lies, and the slots of all blocks that its stencil touches, row by row.
+
+    place: (n, 6) position in cells, inverse covariance xx, 2 xy, yy, and reach, -1 where a row has no vote.
+    """
+    n = len(rows)
+    where = np.empty((n, 6))
+    slots = np.empty(4 * n, np.int64)
+    missing = np.empty(0, np.int64)
+    used, folded, gaps = 0, 0, 0
+    for k in range(n):
+        _place(rows[k], limits, where[k])
+        if where[k, 5] < 0:
+            continue
+        folded += 1
+        reach = int(where[k, 5])
+        column, row = int(np.floor(where[k, 0])), int(np.floor(where[k, 1]))
+        bucket = rows[k].stamp_ns // bucket_ns
+        for y in range((row - reach) >> 4, ((row + reach) >> 4) + 1):
+            for x in range((column - reach) >> 4, ((column + reach) >> 4) + 1):
+                code = (bucket << 2 * CODE_BITS) | ((x + CODE_HALF) << CODE_BITS) | (y + CODE_HALF)
+                slot = _find(keys, places, shift, code)
+                if slot == FREE:
+                    if gaps == len(missing):
+                        missing = _grown(missing)
+                    missing[gaps] = code
+                    gaps += 1
+                if used == len(slots):
+                    slots = _grown(slots)
+                slots[used] = slot
+                used += 1
+    return where, slots, folded, missing[:gaps]
+
+
+@numba.njit(cache=True, nogil=True)
+def _grown(values: Any) -> Any:
+    more = np.empty(max(16, 2 * len(values)), np.int64)
+    more[: len(values)] = values
+    return more
+
+
+@numba.njit(cache=True, nogil=True)
+def _find(keys: Any, places: Any, shift: int, code: int) -> int:
+    """Slot of a code in the hash table of Hot, FREE if it has none."""
+    mask = len(keys) - 1
+    entry = np.int64((np.uint64(code) * _HASH) >> np.uint64(shift))
+    while keys[entry] != FREE:
+        if keys[entry] == code:
+            return places[entry]  # type: ignore[no-any-return]
+        entry = (entry + 1) & mask
+    return FREE
+
+
+@numba.njit(cache=True, nogil=True)
+def _place(row: Any, limits: tuple[float, float, float], out: Any) -> None:
+    """As `votes.is_foldable` and `votes.prepare`, for one row."""
+    cell_m, floor_m2, cap_m2 = limits
+    cov_xx, cov_xy, cov_yy = np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2)
+    half = (cov_xx - cov_yy) / 2
+    if not (cov_xx + cov_yy) / 2 + np.sqrt(half * half + cov_xy * cov_xy) <= cap_m2:
+        out[5] = -1.0
+        return
+    per_m2 = 1 / (cell_m * cell_m)
+    xx, yy, xy = (cov_xx + floor_m2) * per_m2, (cov_yy + floor_m2) * per_m2, cov_xy * per_m2
+    scale = 1 / (xx * yy - xy * xy)
+    out[0], out[1] = row.x_m / cell_m, row.y_m / cell_m
+    out[2], out[3], out[4] = yy * scale, -2 * xy * scale, xx * scale
+    out[5] = np.ceil(2 * np.sqrt(max(xx, yy)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _fold(rows: Any, places: Any, slots: Any, name: Any, counts: Any, bitmaps: Any, newest: Any) -> None:
+    edge = 2 * int(max(0.0, places[:, 5].max())) + 1 if len(rows) else 1
+    raw = np.empty(edge * edge, np.int64)
+    lanes = np.empty((edge // 16 + 2) * edge * 16, np.uint32)
+    machine_bit = np.uint64(1) << (name >> np.uint64(58))
+    used = 0
+    for k in range(len(rows)):
+        reach = int(places[k, 5])
+        if reach < 0:
+            continue
+        row = rows[k]
+        n = 2 * reach + 1
+        first_x, first_y = int(np.floor(places[k, 0])) - reach, int(np.floor(places[k, 1])) - reach
+        across = ((first_x + n - 1) >> 4) - (first_x >> 4) + 1
+        weight = int(np.rint(np.float64(row.distance_m) * _UNITS))
+        total = _weigh(places[k], first_x, first_y, n, raw)
+        _lay_out(raw, n, total, weight, first_x & 15, lanes[: across * n * 16])
+        resistance, resistance_share = _split_resistance(np.float64(row.c_rr))
+        east, east_share = _split_grade(np.float64(row.grade_e))
+        north, north_share = _split_grade(np.float64(row.grade_n))
+        sector = np.int64(np.floor(np.float64(row.heading_rad) / _SECTOR_RAD + 0.5)) % _SECTORS
+        visit = (name + np.uint64(row.stamp_ns // VISIT_NS)) * _HASH
+        visit_bit = np.uint64(1) << (visit >> np.uint64(58))
+        for y in range(first_y >> 4, ((first_y + n - 1) >> 4) + 1):
+            top, end = max(first_y, y << 4), min(first_y + n, (y + 1) << 4)
+            offset, size = (top & 15) * 16, (end - top) * 16
+            for x in range(across):
+                lane = lanes[(x * n + top - first_y) * 16 :][:size]
+                at = slots[used] * (_COUNTS * _CELLS) + offset
+                if resistance >= 0:
+                    _vote(counts, at + (_RESISTANCE + resistance) * _CELLS, lane, resistance_share)
+                if east >= 0:
+                    _vote(counts, at + (_EAST + east) * _CELLS, lane, east_share)
+                if north >= 0:
+                    _vote(counts, at + (_NORTH + north) * _CELLS, lane, north_share)
+                _add(counts, at + (_HEADING + sector) * _CELLS, lane)
+                _mark(bitmaps, slots[used] * 2 * _CELLS + offset, lane, visit_bit, machine_bit)
+                _stamp(newest, slots[used] * _CELLS + offset, lane, row.stamp_ns)
+                used += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _weigh(place: Any, first_x: int, first_y: int, n: int, raw: Any) -> int:
+    """Fill raw[: n * n] with table weights; return their sum."""
+    total = 0
+    for dy in range(n):
+        y = (first_y + dy + 0.5) - place[1]
+        b, c = place[3] * y, place[4] * y * y
+        line = raw[dy * n : dy * n + n]
+        for dx in range(n):
+            x = (first_x + dx + 0.5) - place[0]
+            d2 = (place[2] * x + b) * x + c
+            weight = TABLE[int(min(d2 * TABLE_PER_UNIT, TABLE_LAST))]
+            line[dx] = weight
             total += weight
-            if weight > best:
-                best, best_y, best_x = weight, dy, dx
-    if total == 0:  # the cell is much larger than the spread: all of it stays where the sample is
-        best_y = best_x = size // 2
-    return total, best_y, best_x
+    return total
 
 
-@numba.njit(cache=True)
-def _fold(
-    place: Any,
-    inverse: Any,
-    origin: Any,
-    size: Any,
-    weight: Any,
-    bins: Any,
-    shares: Any,
-    sector: Any,
-    stamp_ns: Any,
-    bits: Any,
-    slots: Any,
-    corner: Any,
-    counts: Any,
-    bitmaps: Any,
-    newest: Any,
-    raw: Any,
-) -> None:
-    for k in range(len(weight)):
-        total, best_y, best_x = _stencil(place[k], inverse[k], origin[k], size[k], raw)
-        rest = weight[k]
-        for dy in range(size[k]):
-            for dx in range(size[k]):
-                raw[dy, dx] = raw[dy, dx] * weight[k] // max(total, 1)
-                rest -= raw[dy, dx]
-        raw[best_y, best_x] += rest
-        for dy in range(size[k]):
-            row = origin[k, 1] + dy
-            for dx in range(size[k]):
-                share = raw[dy, dx]
-                if share == 0:
-                    continue
-                column = origin[k, 0] + dx
-                block = slots[k, (row >> 4) - corner[k, 1], (column >> 4) - corner[k, 0]]
-                cell = (row & 15) * 16 + (column & 15)
-                for part in range(3):
-                    if bins[k, part] >= 0:
-                        upper = share * shares[k, part] // _ONE
-                        _add(counts, block, cell, _FIRST[part] + bins[k, part], share - upper)
-                        _add(counts, block, cell, _FIRST[part] + bins[k, part] + 1, upper)
-                _add(counts, block, cell, _HEADING + sector[k], share)
-                _add(counts, block, cell, _WEIGHT, share)
-                bitmaps[block, cell, 0] |= bits[k, 0]
-                bitmaps[block, cell, 1] |= bits[k, 1]
-                newest[block, cell] = max(newest[block, cell], stamp_ns[k])
+@numba.njit(cache=True, nogil=True)
+def _lay_out(raw: Any, n: int, total: int, weight: int, column: int, lanes: Any) -> None:
+    """Share a weight by raw[: n * n] into lanes (block columns, n, 16); what is left over goes to the middle."""
+    factor = (weight << WEIGHT_SHIFT) // max(total, 1)
+    rest = weight
+    lanes[:] = 0
+    for dy in range(n):
+        line = raw[dy * n : dy * n + n]
+        for dx in range(n):
+            share = (line[dx] * factor) >> WEIGHT_SHIFT
+            rest -= share
+            lanes[(((column + dx) >> 4) * n + dy) * 16 + ((column + dx) & 15)] = share
+    middle = column + n // 2
+    lanes[((middle >> 4) * n + n // 2) * 16 + (middle & 15)] += np.uint32(rest)
+
+
+@numba.njit(cache=True, nogil=True)
+def _split_resistance(c_rr: float) -> tuple[int, Any]:
+    """As `votes.split_resistance`."""
+    if np.isnan(c_rr):
+        return -1, np.uint32(0)
+    place = int(min(max(np.log(max(c_rr, 1e-9)) * _R_PER_LOG + _R_OFFSET, 0.0), len(RESISTANCE_STEPS)))  # nearly
+    while place < len(RESISTANCE_STEPS) and RESISTANCE_STEPS[place] <= c_rr:
+        place += 1
+    while place > 0 and RESISTANCE_STEPS[place - 1] > c_rr:
+        place -= 1
+    lower = min(place // _ONE, _R_LAST)
+    return lower, np.uint32(place - lower * _ONE)
+
+
+@numba.njit(cache=True, nogil=True)
+def _split_grade(grade: float) -> tuple[int, Any]:
+    """As `votes.split_grade`."""
+    if np.isnan(grade):
+        return -1, np.uint32(0)
+    place = int(min(max(np.rint((grade - GRADE_LOW) * GRADE_STEPS), 0), _G_TOP))
+    lower = min(place // _ONE, _G_LAST)
+    return lower, np.uint32(place - lower * _ONE)
+
+
+# The loops below run over slices from 0 on: the compiler sees that no index is negative, and vectorises.
+
+
+@numba.njit(cache=True, nogil=True)
+def _vote(counts: Any, at: int, lane: Any, share: Any) -> None:
+    lower, upper = counts[at:][: len(lane)], counts[at + _CELLS :][: len(lane)]
+    for i in range(len(lane)):
+        above = np.uint32(np.uint32(lane[i] * share) >> np.uint32(8))
+        lower[i] += np.uint32(lane[i] - above)
+        upper[i] += above
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(counts: Any, at: int, lane: Any) -> None:
+    cells = counts[at:][: len(lane)]
+    for i in range(len(lane)):
+        cells[i] += lane[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark(bitmaps: Any, at: int, lane: Any, visit_bit: Any, machine_bit: Any) -> None:
+    visits, machines = bitmaps[at:][: len(lane)], bitmaps[at + _CELLS :][: len(lane)]
+    nothing = np.uint64(0)
+    for i in range(len(lane)):
+        visits[i] |= visit_bit if lane[i] else nothing
+        machines[i] |= machine_bit if lane[i] else nothing
+
+
+@numba.njit(cache=True, nogil=True)
+def _stamp(newest: Any, at: int, lane: Any, stamp_ns: int) -> None:
+    cells = newest[at:][: len(lane)]
+    for i in range(len(lane)):
+        cells[i] = max(cells[i], stamp_ns if lane[i] else 0)

@@ -1,4 +1,4 @@
-"""The grid in memory: 16 x 16 cell blocks per time bucket, allocated where somebody drove. One thread owns it."""
+"""The grid in memory: 16 x 16 cell blocks, each with its pages by time, where somebody drove. One thread owns it."""
 
 from __future__ import annotations
 
@@ -6,41 +6,47 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapserver import evidence as ev
 from mapserver.fold import kernel
-from mapserver.votes import FoldConfig, Votes, is_foldable, prepare
-from protocol.arrays import Ints, Table
+from mapserver.hot import Hot, of_code
+from mapserver.ladder import Block, Ladder, TimedPage, rungs
+from mapserver.pages import Page
+from mapserver.reading import evidence
+from mapserver.votes import FoldConfig
+from protocol.arrays import Table
 from protocol.geometry import BLOCK_CELLS, CellWindow
 
-CELLS = BLOCK_CELLS * BLOCK_CELLS
-# Block columns and rows are packed as 18 bits each below the bucket, which has 27: enough for 5 cm cells 100 km away,
-# and for minutes until the year 2100.
-_BITS = 18
-_HALF = 1 << (_BITS - 1)
-READ_BLOCKS = 256  # summed at once: 60 MB
+PIECE = 4096  # samples that are folded at once; their weights together stay far below COUNT_MAX
+READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A page, and where it belongs: the block's column and row, the rung of its ladder and the index there."""
+
+    x: int
+    y: int
+    rung: int
+    index: int
+    page: Page
 
 
 @dataclass(frozen=True)
 class GridState:
-    """Everything that a snapshot keeps.
+    """Everything that a snapshot keeps; equal grids have equal states. newest_ns: of all samples, 0 for none."""
 
-    codes: (slots,) packed bucket, block column and block row; the arrays as in Evidence, per slot.
-    """
-
-    codes: Ints
-    counts: NDArray[np.uint32]
-    bitmaps: NDArray[np.uint64]
-    newest: Ints
+    pages: tuple[Placed, ...]
     folded: int
     skipped: int
+    newest_ns: int
 
 
 class Grid:
     """Evidence of one site.
 
-    folded, skipped: how many samples voted, and how many were too unsure of their place to vote.
+    folded, skipped: how many samples voted, and how many were too unsure of their place to vote. newest_ns: the newest
+    stamp of all of them.
     """
 
     def __init__(self, cell_m: float, config: FoldConfig) -> None:
@@ -48,115 +54,130 @@ class Grid:
         self.config = config
         self.folded = 0
         self.skipped = 0
+        self.newest_ns = 0
         self._kernel = kernel(config.kernel)
-        self._slots: dict[int, int] = {}
-        self._counts = np.zeros((0, CELLS, ev.COUNTS), np.uint32)
-        self._bitmaps = np.zeros((0, CELLS, 2), np.uint64)
-        self._newest = np.zeros((0, CELLS), np.int64)
+        self._rungs = rungs(config)
+        self._hot = Hot(config.hot_blocks)
+        self._ladders: dict[Block, Ladder] = {}
+        self._touched: set[Block] = set()
 
     def fold(self, rows: Table, machine: str) -> None:
         """Fold samples of one machine; commutative, not idempotent: exactly-once is decided at the journal."""
-        foldable = is_foldable(rows, self.config)
-        self.skipped += int((~foldable).sum())
-        rows = rows[foldable]
-        if not len(rows):
-            return
-        votes = prepare(rows, machine, self.cell_m, self.config)
-        corner = votes.origin // BLOCK_CELLS
-        slots = self._slots_of(votes, corner)
-        self._kernel(votes, slots, corner, self._counts, self._bitmaps, self._newest)
-        self.folded += len(rows)
+        if len(rows):
+            self.newest_ns = max(self.newest_ns, int(rows["stamp_ns"].max()))
+        for first in range(0, len(rows), PIECE):
+            self._fold_piece(rows[first : first + PIECE], machine)
 
-    def blocks_in(self, window: CellWindow) -> list[tuple[int, int]]:
+    def blocks_in(self, window: CellWindow) -> list[Block]:
         """Block columns and rows with evidence that the window touches."""
+        self._drain()
         first_x, last_x = window.column // BLOCK_CELLS, (window.column + window.columns - 1) // BLOCK_CELLS
         first_y, last_y = window.row // BLOCK_CELLS, (window.row + window.rows - 1) // BLOCK_CELLS
-        found = {(x, y) for _, x, y in map(_unpack, self._slots)}
-        return sorted((x, y) for x, y in found if first_x <= x <= last_x and first_y <= y <= last_y)
+        return sorted((x, y) for x, y in self._ladders if first_x <= x <= last_x and first_y <= y <= last_y)
 
-    def evidence(self, blocks: Iterable[tuple[int, int]]) -> ev.Evidence:
-        """Copy the evidence of these blocks, summed over time buckets."""
-        order = {block: i for i, block in enumerate(blocks)}
-        counts = np.zeros((len(order), CELLS, ev.COUNTS), np.uint64)
-        bitmaps = np.zeros((len(order), CELLS, 2), np.uint64)
-        newest = np.zeros((len(order), CELLS), np.int64)
-        for code, slot in self._slots.items():
-            _, x, y = _unpack(code)
-            if (i := order.get((x, y))) is not None:
-                counts[i] += self._counts[slot]
-                bitmaps[i] |= self._bitmaps[slot]
-                np.maximum(newest[i], self._newest[slot], out=newest[i])
-        return ev.Evidence(counts, bitmaps, newest)
+    def pages(self, blocks: Iterable[Block]) -> list[list[TimedPage]]:
+        """Pages of each of these blocks in the order of time, none for a block without evidence."""
+        self._drain()
+        return [self._ladders[block].timed() if block in self._ladders else [] for block in blocks]
+
+    def touch_all(self) -> None:
+        """Count all blocks as touched."""
+        self._drain()
+        self._touched |= set(self._ladders)
+
+    def take_touched(self, most: int) -> list[Block]:
+        """Some of the blocks that were folded into, each once until it is folded into again."""
+        self._drain()
+        return [self._touched.pop() for _ in range(min(most, len(self._touched)))]
+
+    def evidence(self, blocks: Iterable[Block]) -> ev.Evidence:
+        """Everything that was ever seen of these blocks, whether it still holds or not."""
+        return evidence(self.pages(blocks))
 
     def bounds(self) -> tuple[int, int, int, int] | None:
         """First column, first row, end column, end row of all blocks with evidence."""
-        places = [_unpack(code)[1:] for code in self._slots]
-        if not places:
+        self._drain()
+        if not self._ladders:
             return None
-        xs, ys = [x for x, _ in places], [y for _, y in places]
+        xs, ys = zip(*self._ladders, strict=True)
         n = BLOCK_CELLS
         return min(xs) * n, min(ys) * n, (max(xs) + 1) * n, (max(ys) + 1) * n
 
     def known_cells(self) -> int:
         """How many cells have any evidence."""
-        known: dict[tuple[int, int], NDArray[np.bool_]] = {}
-        for code, slot in self._slots.items():
-            place = _unpack(code)[1:]
-            seen = self._counts[slot, :, ev.WEIGHT] > 0
-            known[place] = known[place] | seen if place in known else seen
-        return int(sum(cells.sum() for cells in known.values()))
+        self._drain()
+        known = np.zeros(ev.CELLS, np.bool_)
+        total = 0
+        for ladder in self._ladders.values():
+            known[:] = False
+            for _, _, page in ladder.items():
+                known[page.cells["cell"]] = True
+            total += int(known.sum())
+        return total
+
+    def page_count(self) -> int:
+        """How many pages there are."""
+        return sum(1 for ladder in self._ladders.values() for _ in ladder.items())
 
     def state(self) -> GridState:
-        """Copy everything, in the order of the codes, so that equal grids have equal states."""
-        codes = np.array(sorted(self._slots), np.int64)
-        slots = np.array([self._slots[int(code)] for code in codes], np.int64)
-        arrays = (self._counts[slots], self._bitmaps[slots], self._newest[slots])
-        return GridState(codes, *arrays, self.folded, self.skipped)
+        """Everything, in the order of places, so that equal grids have equal states."""
+        self._drain()
+        pages = (
+            Placed(x, y, rung, index, page)
+            for x, y in sorted(self._ladders)
+            for rung, index, page in self._ladders[x, y].items()
+        )
+        return GridState(tuple(pages), self.folded, self.skipped, self.newest_ns)
 
     @classmethod
     def from_state(cls, cell_m: float, config: FoldConfig, state: GridState) -> Grid:
         """Undo `state`."""
         grid = cls(cell_m, config)
-        grid._counts, grid._bitmaps, grid._newest = state.counts, state.bitmaps, state.newest
-        grid._slots = {int(code): i for i, code in enumerate(state.codes)}
-        grid.folded, grid.skipped = state.folded, state.skipped
+        for at in state.pages:
+            grid._ladder((at.x, at.y)).put(at.rung, at.index, at.page)
+        grid.folded, grid.skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
         return grid
 
-    def _slots_of(self, votes: Votes, corner: Ints) -> Ints:
-        """Slots (n, k, k) of all blocks that the stencils touch, allocated where they are new."""
-        last = (votes.origin + votes.size[:, None] - 1) // BLOCK_CELLS
-        k = int((last - corner).max()) + 1
-        steps = np.arange(k)
-        x = np.minimum(corner[:, 0, None, None] + steps[None, None, :], last[:, 0, None, None])
-        y = np.minimum(corner[:, 1, None, None] + steps[None, :, None], last[:, 1, None, None])
-        codes = (votes.bucket[:, None, None] << 2 * _BITS) | ((x + _HALF) << _BITS) | (y + _HALF)
-        unique, inverse = np.unique(codes, return_inverse=True)
-        slots = np.fromiter((self._slot(code) for code in unique.tolist()), np.int64, len(unique))
-        return slots[inverse].reshape(codes.shape)
+    def _fold_piece(self, rows: Table, machine: str) -> None:
+        """Fold what the hot blocks have room for; cut the rest by place, until it fits."""
+        weight = int(rows["distance_m"].sum(dtype=np.float64) * ev.WEIGHT_UNITS_PER_M) + len(rows)
+        if self._hot.load + weight > ev.COUNT_MAX:
+            self._drain()
+        done = self._kernel(rows, machine, self.cell_m, self.config, self._hot)
+        if done.missing and len(done.missing) > self._hot.room:
+            self._drain()
+            done = self._kernel(rows, machine, self.cell_m, self.config, self._hot)
+        if len(done.missing) > self._hot.room:
+            if len(rows) == 1:  # one stencil is larger than all hot blocks
+                self._hot = Hot(len(done.missing))
+                self._fold_piece(rows, machine)
+                return
+            half, rows = len(rows) // 2, rows[np.lexsort((rows["x_m"], rows["y_m"]))]
+            self._fold_piece(rows[:half], machine)
+            self._fold_piece(rows[half:], machine)
+            return
+        if done.missing:
+            self._hot.open(done.missing)
+            done = self._kernel(rows, machine, self.cell_m, self.config, self._hot)
+        self._hot.load += weight
+        self.folded += done.folded
+        self.skipped += len(rows) - done.folded
 
-    def _slot(self, code: int) -> int:
-        slot = self._slots.get(code)
-        if slot is None:
-            slot = self._slots[code] = len(self._slots)
-            if slot >= len(self._counts):
-                self._allocate(max(8, 2 * slot))
-        return slot
+    def _drain(self) -> None:
+        """Pack what is hot."""
+        for code, page in self._hot.drain():
+            bucket, x, y = of_code(code)
+            self._ladder((x, y)).add(bucket, page)
+            self._touched.add((x, y))
 
-    def _allocate(self, slots: int) -> None:
-        """Make room; what is there is kept."""
-        more = [(0, slots - len(self._counts)), (0, 0)]
-        self._counts = np.pad(self._counts, [*more, (0, 0)])
-        self._bitmaps = np.pad(self._bitmaps, [*more, (0, 0)])
-        self._newest = np.pad(self._newest, more)
+    def _ladder(self, block: Block) -> Ladder:
+        ladder = self._ladders.get(block)
+        if ladder is None:
+            ladder = self._ladders[block] = Ladder(self._rungs)
+        return ladder
 
 
-def chunks(blocks: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
+def chunks(blocks: list[Block]) -> Iterator[list[Block]]:
     """Cut a list of blocks into pieces that are read at once."""
     for first in range(0, len(blocks), READ_BLOCKS):
         yield blocks[first : first + READ_BLOCKS]
-
-
-def _unpack(code: int) -> tuple[int, int, int]:
-    """Bucket, block column, block row."""
-    mask = (1 << _BITS) - 1
-    return code >> 2 * _BITS, (code >> _BITS & mask) - _HALF, (code & mask) - _HALF

@@ -2,16 +2,20 @@
 
 One journal row is one admitted batch. Row and watermark are written in one transaction, so that exactly-once is
 decided here. EVIDENCE: `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulated power cuts, FULL none.
+Rows up to `archived_row` have moved to Parquet files (archive.py); past.py reads both as one.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import sqlite3
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -19,10 +23,26 @@ import numpy as np
 from mapserver.ingest import Admission
 from protocol.arrays import Table
 from protocol.errors import StoreError
+from protocol.geometry import Bounds
+from protocol.readings import MAX_STAMP_NS
 from protocol.samples import SAMPLE_DTYPE
 
-SCHEMA = 1
-_TABLES = """
+SCHEMA = 2
+# When and where the samples of a row lie is a table of its own: 50 bytes a row, so that a read by time and place passes
+# over rows without touching the pages of their payloads. A box that is NULL is not known.
+_EXTENT = """
+CREATE TABLE extent (
+    row INTEGER PRIMARY KEY,
+    first_stamp_ns INTEGER NOT NULL,
+    last_stamp_ns INTEGER NOT NULL,
+    west_m REAL,
+    south_m REAL,
+    east_m REAL,
+    north_m REAL
+);
+CREATE TABLE events (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, stamp_ns INTEGER NOT NULL, body TEXT NOT NULL);
+"""
+_TABLES = f"""
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE journal (
     row INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -42,32 +62,165 @@ CREATE TABLE watermark (
     spool_id BLOB NOT NULL,
     seq INTEGER NOT NULL,
     lost INTEGER NOT NULL,
+    newest_ns INTEGER NOT NULL DEFAULT 0,
     PRIMARY KEY (machine, spool_id)
 ) WITHOUT ROWID;
+{_EXTENT}"""
+# ruff: noqa: S608 - statements are put together from constants, never from input
+_OLD_EXTENT = "SELECT row, first_stamp_ns, last_stamp_ns, NULL, NULL, NULL, NULL FROM journal"
+_FROM_SCHEMA_1 = f"""
+BEGIN IMMEDIATE;
+{_EXTENT}
+INSERT INTO extent {_OLD_EXTENT};
+ALTER TABLE watermark ADD COLUMN newest_ns INTEGER NOT NULL DEFAULT 0;
+UPDATE watermark SET newest_ns = newest FROM
+    (SELECT machine AS m, spool_id AS s, MAX(last_stamp_ns) AS newest FROM journal GROUP BY machine, spool_id)
+    WHERE m = machine AND s = spool_id;
+UPDATE meta SET value = '2' WHERE key = 'schema';
+COMMIT;
 """
+# What a reader, which may not write, puts over a journal of schema 1.
+_SEEN_FROM_SCHEMA_1 = f"""
+CREATE TEMP VIEW extent (row, first_stamp_ns, last_stamp_ns, west_m, south_m, east_m, north_m) AS {_OLD_EXTENT};
+CREATE TEMP VIEW watermark AS SELECT machine, spool_id, seq, lost,
+    (SELECT COALESCE(MAX(last_stamp_ns), 0) FROM main.journal) AS newest_ns FROM main.watermark;
+CREATE TEMP TABLE events (id INTEGER PRIMARY KEY, kind TEXT, stamp_ns INTEGER, body TEXT);
+"""
+_COLUMNS = "SELECT row, machine, spool_id, first_seq, received_ns, payload, crc32 FROM "
+_IN_ORDER = """
+    AND row > :after AND row <= :until AND machine NOT IN (SELECT value FROM json_each(:without))
+ORDER BY row LIMIT :most
+"""
+_READ_ALL = _COLUMNS + "journal WHERE TRUE" + _IN_ORDER
+# CROSS JOIN keeps SQLite from walking the journal first.
+_READ_SOME = f"""{_COLUMNS} extent CROSS JOIN journal USING (row)
+WHERE extent.last_stamp_ns >= :from_ns AND extent.first_stamp_ns <= :to_ns
+    AND (west_m IS NULL OR west_m <= :east_m AND east_m >= :west_m AND south_m <= :north_m AND north_m >= :south_m)
+{_IN_ORDER}"""
+_LAST_ROW = "SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'"  # also where all is archived
 _WAL_LIMIT = 64 * 2**20
+_AT_ONCE = 200  # rows that are read or removed in one transaction: short ones keep the write-ahead log small
+LAST = 2**63 - 1
+_EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
+SPARE = 0.25  # share of free pages above which a file is made smaller
+
+
+class ArchivedError(StoreError):
+    """Rows that are asked for have moved to the archive. archived_row: the last one that has."""
+
+    def __init__(self, path: Path, archived_row: int) -> None:
+        super().__init__(path, f"rows up to {archived_row} are in the archive; read them together (past.history_rows)")
+        self.archived_row = archived_row
 
 
 @dataclass(frozen=True)
 class JournalRow:
-    """One admitted batch as it lies on disk."""
+    """One admitted batch as it lies on disk. received_ns: the server's clock when it came in."""
 
     row: int
     machine: str
     spool_id: int
     first_seq: int
     rows: Table
+    received_ns: int = 0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which journal rows to read. A row that may hold a wanted sample is given whole.
+
+    from_ns, to_ns: rows with samples in from_ns <= stamp <= to_ns. bounds: rows whose samples' bounding box touches it.
+    without: machines that are left out.
+    """
+
+    from_ns: int = 0
+    to_ns: int = MAX_STAMP_NS
+    bounds: Bounds | None = None
+    without: frozenset[str] = frozenset()
+
+
+ALL = Wanted()
 
 
 @dataclass(frozen=True)
 class Mark:
-    """Progress of one spool: the last committed sample, and how many it declared lost."""
+    """Progress of one spool: the last committed sample, how many it declared lost, and its newest stamp."""
 
     seq: int = 0
     lost: int = 0
+    newest_ns: int = 0
 
 
-class Journal:
+@dataclass(frozen=True)
+class Event:
+    """Something that the server has to remember and that is no sample; body: plain values."""
+
+    id: int
+    kind: str
+    stamp_ns: int
+    body: Mapping[str, Any]
+
+
+class JournalReads:
+    """What can be read of a journal, on its owner's connection as on a reader's."""
+
+    path: Path
+    _db: sqlite3.Connection
+
+    def read(self, after: int = 0, until: int = LAST, wanted: Wanted = ALL) -> Iterator[JournalRow]:
+        """Rows after < row <= until in order, also those that are committed meanwhile.
+
+        StoreError where a row's checksum does not fit, ArchivedError as soon as one of these rows is archived.
+        """
+        while True:
+            rows = self._piece(after, until, wanted)
+            # Asked after the rows were read: none beyond this one had been removed then.
+            if after < min(archived := self.archived_row, until):
+                raise ArchivedError(self.path, archived)
+            yield from rows
+            if len(rows) < _AT_ONCE:
+                return
+            after = rows[-1].row
+
+    def newest_ns(self) -> int:
+        """The newest stamp of all samples, archived or not: the site's now."""
+        return int(self._db.execute("SELECT COALESCE(MAX(newest_ns), 0) FROM watermark").fetchone()[0])
+
+    @property
+    def archived_row(self) -> int:
+        """The last row that has moved to the archive."""
+        found = self._db.execute("SELECT value FROM meta WHERE key = 'archived_row'").fetchone()
+        return int(found[0]) if found else 0
+
+    def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
+        """Events beyond the number `after`, of one kind or of all, in the order in which they were written."""
+        query = "SELECT id, kind, stamp_ns, body FROM events WHERE id > ? AND kind = COALESCE(?, kind) ORDER BY id"
+        return [Event(i, k, ns, json.loads(body)) for i, k, ns, body in self._db.execute(query, (after, kind))]
+
+    def _piece(self, after: int, until: int, wanted: Wanted) -> list[JournalRow]:
+        everything = wanted == Wanted(without=wanted.without)
+        box = asdict(wanted.bounds) if wanted.bounds else _EVERYWHERE
+        span = {"after": after, "until": until, "from_ns": wanted.from_ns, "to_ns": wanted.to_ns, "most": _AT_ONCE}
+        try:
+            query = {**span, **box, "without": json.dumps(sorted(wanted.without))}
+            found = self._db.execute(_READ_ALL if everything else _READ_SOME, query).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(self.path, f"cannot be read: {error}") from None
+        return [self._row(*values) for values in found]
+
+    def _row(
+        self, row: int, machine: str, spool: bytes, first_seq: int, received_ns: int, payload: bytes, crc32: int
+    ) -> JournalRow:
+        if zlib.crc32(payload) != crc32:
+            raise StoreError(self.path, f"journal row {row} is damaged; restore the file from a backup")
+        return JournalRow(row, machine, int.from_bytes(spool, "big"), first_seq, _unpack(payload), received_ns)
+
+    def _load_marks(self) -> dict[tuple[str, int], Mark]:
+        rows = self._db.execute("SELECT machine, spool_id, seq, lost, newest_ns FROM watermark")
+        return {(machine, int.from_bytes(spool, "big")): Mark(*values) for machine, spool, *values in rows}
+
+
+class Journal(JournalReads):
     """One writer's connection to the journal of one site."""
 
     def __init__(self, path: Path, site: str, frame: str) -> None:
@@ -77,12 +230,12 @@ class Journal:
             try:
                 self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
                 opened.callback(self._db.close)
+                self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")  # only a new file takes it
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
                 self._create_or_check(site, frame)
-                self._marks = self._load_marks()
-                self.last_row = int(self._db.execute("SELECT COALESCE(MAX(row), 0) FROM journal").fetchone()[0])
+                self._return_to_disk()
             except sqlite3.Error as error:
                 raise StoreError(path, f"is no usable journal: {error}") from None
             opened.pop_all()
@@ -103,20 +256,28 @@ class Journal:
         """Write one row and its watermark into the open transaction; returns the row's number."""
         batch = admission.batch
         payload = _pack(batch.rows)
-        stamps = batch.rows["stamp_ns"]
-        spool = _spool_bytes(batch.spool_id)
-        values = (batch.machine, spool, batch.first_seq, len(batch.rows), received_ns)
+        x_m, y_m, stamps = (batch.rows[name] for name in ("x_m", "y_m", "stamp_ns"))
+        first_ns, last_ns = int(stamps.min()), int(stamps.max())
+        values = (batch.machine, _spool_bytes(batch.spool_id), batch.first_seq, len(batch.rows), received_ns)
         cursor = self._db.execute(
             "INSERT INTO journal (machine, spool_id, first_seq, n, received_ns, first_stamp_ns, last_stamp_ns, payload,"
             " crc32) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*values, int(stamps.min()), int(stamps.max()), payload, zlib.crc32(payload)),
+            (*values, first_ns, last_ns, payload, zlib.crc32(payload)),
         )
-        key = (batch.machine, batch.spool_id)
-        mark = Mark(admission.watermark, self.mark(*key).lost + admission.lost)
-        self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?)", (batch.machine, spool, mark.seq, mark.lost))
-        self._marks[key] = mark
-        self.last_row = int(cursor.lastrowid or 0)
-        return self.last_row
+        row = int(cursor.lastrowid or 0)
+        box = (float(x_m.min()), float(y_m.min()), float(x_m.max()), float(y_m.max()))
+        self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?)", (row, first_ns, last_ns, *box))
+        before = self.mark(batch.machine, batch.spool_id)
+        mark = Mark(admission.watermark, before.lost + admission.lost, max(before.newest_ns, last_ns))
+        self.put_mark(batch.machine, batch.spool_id, mark)
+        self.last_row = row
+        return row
+
+    def put_mark(self, machine: str, spool_id: int, mark: Mark) -> None:
+        """Write a watermark into the open transaction."""
+        values = (machine, _spool_bytes(spool_id), mark.seq, mark.lost, mark.newest_ns)
+        self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?)", values)
+        self._marks[machine, spool_id] = mark
 
     def commit(self) -> None:
         """Commit to disk; only then may anything be acknowledged."""
@@ -126,20 +287,49 @@ class Journal:
         """Give up the open transaction and return to what is on disk."""
         if self._db.in_transaction:
             self._db.execute("ROLLBACK")
-        self._marks = self._load_marks()
-        self.last_row = int(self._db.execute("SELECT COALESCE(MAX(row), 0) FROM journal").fetchone()[0])
+        self._return_to_disk()
 
-    def read(self, after: int = 0) -> Iterator[JournalRow]:
-        """All rows beyond `after`, in order; StoreError where a row's checksum does not fit."""
-        query = "SELECT row, machine, spool_id, first_seq, payload, crc32 FROM journal WHERE row > ? ORDER BY row"
-        for row, machine, spool, first_seq, payload, crc32 in self._db.execute(query, (after,)):
-            if zlib.crc32(payload) != crc32:
-                raise StoreError(self.path, f"journal row {row} is damaged; restore the file from a backup")
-            yield JournalRow(row, machine, int.from_bytes(spool, "big"), first_seq, _unpack(payload))
+    def append_event(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> int:
+        """Commit an event, outside of any other transaction; returns its number."""
+        text = json.dumps(body, allow_nan=False)
+        self.begin()
+        try:
+            query = "INSERT INTO events (kind, stamp_ns, body) VALUES (?, ?, ?)"
+            number = int(self._db.execute(query, (kind, stamp_ns, text)).lastrowid or 0)
+            self.commit()
+        except sqlite3.Error:
+            self.rollback()
+            raise
+        return number
 
-    def newest_ns(self) -> int:
-        """The newest stamp of all samples: the site's now."""
-        return int(self._db.execute("SELECT COALESCE(MAX(last_stamp_ns), 0) FROM journal").fetchone()[0])
+    def forget(self, until: int, most: int = _AT_ONCE) -> int:
+        """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.
+
+        most: how many at most, so that batches need not wait long; call it again until `until` is reached.
+        """
+        last = min(until, self.archived_row + most, self.last_row)
+        self.begin()
+        try:
+            for table in ("journal", "extent"):
+                self._db.execute(f"DELETE FROM {table} WHERE row <= ?", (last,))
+            self._db.execute("REPLACE INTO meta VALUES ('archived_row', ?)", (str(last),))
+            self.commit()
+        except sqlite3.Error:
+            self.rollback()
+            raise
+        return last
+
+    def shrink(self, most_pages: int = 100) -> int:
+        """Give free pages back to the disk where more than SPARE of the file is free; returns how many.
+
+        Fewer are kept for the rows to come. A journal that was made with schema 1 keeps all of them.
+        """
+        pages, free = (self._number(f"PRAGMA {name}") for name in ("page_count", "freelist_count"))
+        spare = min(most_pages, free - int(SPARE * pages))
+        if spare <= 0:
+            return 0
+        self._db.executescript(f"PRAGMA incremental_vacuum({spare})")  # `execute` would stop after the first page
+        return free - self._number("PRAGMA freelist_count")
 
     def close(self) -> None:
         """Fold the write-ahead log into the file and close."""
@@ -152,15 +342,68 @@ class Journal:
             self._db.executescript("BEGIN IMMEDIATE;" + _TABLES)
             self._db.executemany("INSERT INTO meta VALUES (?, ?)", expected.items())
             self._db.execute("COMMIT")
-        found = dict(self._db.execute("SELECT key, value FROM meta"))
+        found = _meta(self._db)
         for key, value in expected.items():
-            if found.get(key) != value:
+            if found.get(key) != value and not (key == "schema" and found.get(key) == "1"):
                 problem = f"the store has {key} {found.get(key)!r}, this server {value!r}; choose another --store"
                 raise StoreError(self.path, problem)
+        if found["schema"] == "1":
+            self._db.executescript(_FROM_SCHEMA_1)
 
-    def _load_marks(self) -> dict[tuple[str, int], Mark]:
-        rows = self._db.execute("SELECT machine, spool_id, seq, lost FROM watermark")
-        return {(machine, int.from_bytes(spool, "big")): Mark(seq, lost) for machine, spool, seq, lost in rows}
+    def _return_to_disk(self) -> None:
+        self._marks = self._load_marks()
+        self.last_row = self._number(_LAST_ROW)
+
+    def _number(self, query: str) -> int:
+        return int(self._db.execute(query).fetchone()[0])
+
+
+class JournalReader(JournalReads):
+    """A read-only connection for threads other than the owner's, also while a server writes; one thread at a time.
+
+    site, frame: whose journal it is.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with ExitStack() as opened:
+            try:
+                self._db = sqlite3.connect(
+                    f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None, check_same_thread=False
+                )
+                opened.callback(self._db.close)
+                found = _meta(self._db)
+                if found.get("schema") == "1":
+                    self._db.executescript(_SEEN_FROM_SCHEMA_1)
+                elif found.get("schema") != str(SCHEMA):
+                    raise StoreError(path, f"the journal has schema {found.get('schema')!r}, known is {SCHEMA}")
+            except sqlite3.Error as error:
+                raise StoreError(path, f"is no usable journal: {error}") from None
+            self.site, self.frame = found["site"], found["frame"]
+            opened.pop_all()
+
+    @property
+    def last_row(self) -> int:
+        """The last row on disk, archived or not."""
+        return int(self._db.execute(_LAST_ROW).fetchone()[0])
+
+    def marks(self) -> dict[tuple[str, int], Mark]:
+        """Progress of all spools."""
+        return self._load_marks()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._db.close()
+
+    def __enter__(self) -> JournalReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _meta(db: sqlite3.Connection) -> dict[str, str]:
+    return dict(db.execute("SELECT key, value FROM meta"))
 
 
 def _spool_bytes(spool_id: int) -> bytes:

@@ -1,132 +1,269 @@
-"""Read layers: from evidence to float32 values, NaN where unknown. A new layer is a function and a line in LAYERS."""
+"""Read layers: from evidence to float32 values, NaN where unknown (docs/layers.md).
+
+A new layer of a cell is a function and a line in LAYERS; one that looks at its neighbours, a function and a line in
+`filling.AREA_LAYERS`. What is debatable, such as the classes' boundaries, is applied here, without folding again.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from mapserver import evidence as ev
+from mapserver.estimators import linear_count, ratio, robust_centre, robust_spread
+from mapserver.filling import AREA_LAYERS, Area
+from protocol import ground
 from protocol.arrays import AnyArray, Bools, Floats, Floats32
+from protocol.config import require_positive
 from protocol.errors import QueryError, Refusal
-from protocol.ground import BOUNDARIES
+
+LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # between resistance bins
+GRADE_STEP = float(ev.GRADE_CENTRES[1] - ev.GRADE_CENTRES[0])
+MAX_REACH_M = 50.0  # every window is widened by it, and its kernel has its square of cells
+SURE_AXIS = 0.2  # least length of the mean axis, 0 to 1, that is a preferred one
 
 
 @dataclass(frozen=True)
 class ReadConfig:
-    """How evidence is read. min_weight_m: cells with fewer metres of evidence than this are unknown."""
+    """How evidence is read.
+
+    min_weight_m: cells with fewer metres of evidence than this are unknown. boundaries: of the classes of resistance,
+    increasing; n of them make n + 1 classes. fill_reach_m: so far from the next known cell gaps are filled.
+    """
 
     min_weight_m: float = 0.1
+    boundaries: tuple[float, ...] = ground.BOUNDARIES
+    fill_reach_m: float = 5.0
 
     def __post_init__(self) -> None:
-        if self.min_weight_m < 0:
+        if not self.min_weight_m >= 0:
             raise ValueError("min_weight_m: negative")
+        if not self.boundaries or not all(low < high for low, high in pairwise((0.0, *self.boundaries))):
+            raise ValueError(f"boundaries: {self.boundaries} are not positive and increasing")
+        require_positive(self, ["fill_reach_m"])
+        if self.fill_reach_m > MAX_REACH_M:
+            raise ValueError(f"fill_reach_m: {self.fill_reach_m:g} is over {MAX_REACH_M:g}")
 
 
-Layer = Callable[[ev.Evidence], Floats]
+@dataclass(frozen=True)
+class Reading:
+    """What the layers of cells are derived from.
+
+    evidence: of cells, arrays (cells, ...) as in Evidence. now_ns: the site's now, 0 where it is not known.
+    """
+
+    evidence: ev.Evidence
+    now_ns: int
+    config: ReadConfig
+
+    def votes(self, part: slice) -> Floats:
+        """Votes (cells, bins) of one histogram; exact as floating point, and several times faster."""
+        return self.evidence.counts[..., part].astype(np.float64)
+
+    # Centres on the bin axis; several layers ask for them.
+    @cached_property
+    def resistance_bin(self) -> Floats:
+        """Robust centre of the c_rr votes, in bins."""
+        return robust_centre(self.votes(ev.RESISTANCE), reach=2.5)
+
+    @cached_property
+    def gradient(self) -> tuple[Floats, Floats]:
+        """Robust centre of the votes for the gradient, east and north [m/m]."""
+        # nearer than for c_rr: gradients one and a half bins apart meet in a cell, and must not be averaged
+        east, north = (robust_centre(self.votes(part), reach=1.5) for part in (ev.GRADE_EAST, ev.GRADE_NORTH))
+        return ev.GRADE_CENTRES[0] + GRADE_STEP * east, ev.GRADE_CENTRES[0] + GRADE_STEP * north
 
 
-def resistance(evidence: ev.Evidence) -> Floats:
+# --- layers of a cell ------------------------------------------------------------------------------------------------
+
+Layer = Callable[[Reading], Floats]
+
+
+def resistance(reading: Reading) -> Floats:
     """Rolling resistance coefficient [-]: robust centre of the votes, in log(c_rr)."""
-    centres = np.log(ev.RESISTANCE_CENTRES)
-    return np.exp(_robust_centre(evidence.counts[..., ev.RESISTANCE], centres, reach=2))
+    centre: Floats = ev.RESISTANCE_CENTRES[0] * np.exp(LOG_STEP * reading.resistance_bin)
+    return centre
 
 
-def resistance_class(evidence: ev.Evidence) -> Floats:
-    """Index of the ground class with most votes (0 dry concrete ... 4 sand)."""
-    votes = _class_votes(evidence)
+def resistance_std(reading: Reading) -> Floats:
+    """Standard deviation of the votes for c_rr [-], without the spread that binning adds."""
+    return resistance(reading) * LOG_STEP * robust_spread(reading.votes(ev.RESISTANCE))
+
+
+def resistance_class(reading: Reading) -> Floats:
+    """Index of the ground class with most votes (by default 0 dry concrete ... 4 sand)."""
+    votes = _class_votes(reading)
     return np.where(votes.sum(axis=-1) > 0, votes.argmax(axis=-1), np.nan)
 
 
-def confidence(evidence: ev.Evidence) -> Floats:
+def confidence(reading: Reading) -> Floats:
     """Share of the votes that the leading ground class has."""
-    votes = _class_votes(evidence)
-    return _ratio(votes.max(axis=-1), votes.sum(axis=-1))
+    votes = _class_votes(reading)
+    return ratio(votes.max(axis=-1), votes.sum(axis=-1))
 
 
-def grade_east(evidence: ev.Evidence) -> Floats:
+def grade_east(reading: Reading) -> Floats:
     """Eastern component of the gradient [m/m], positive where the ground rises to the east."""
-    return _robust_centre(evidence.counts[..., ev.GRADE_EAST], ev.GRADE_CENTRES, reach=2)
+    return reading.gradient[0]
 
 
-def grade_north(evidence: ev.Evidence) -> Floats:
+def grade_north(reading: Reading) -> Floats:
     """Northern component of the gradient [m/m], positive where the ground rises to the north."""
-    return _robust_centre(evidence.counts[..., ev.GRADE_NORTH], ev.GRADE_CENTRES, reach=2)
+    return reading.gradient[1]
 
 
-def grade(evidence: ev.Evidence) -> Floats:
+def grade(reading: Reading) -> Floats:
     """Steepness: length of the gradient [m/m]."""
-    return np.hypot(grade_east(evidence), grade_north(evidence))
+    return np.hypot(*reading.gradient)
 
 
-def visits(evidence: ev.Evidence) -> Floats:
-    """How many visits a cell had: linear counting of a 64-bit bitmap (Whang et al. 1990); at most 266."""
-    bits = np.bitwise_count(evidence.bitmaps[..., ev.VISITS]).astype(np.float64)
-    return np.where(bits > 0, np.rint(-64 * np.log(1 - np.minimum(bits, 63) / 64)), np.nan)
+def grade_std(reading: Reading) -> Floats:
+    """Standard deviation of the votes for one component of the gradient [m/m]: root mean square of the two."""
+    east, north = (robust_spread(reading.votes(part)) for part in (ev.GRADE_EAST, ev.GRADE_NORTH))
+    return GRADE_STEP * np.hypot(east, north) / math.sqrt(2)
+
+
+def slope_class(reading: Reading) -> Floats:
+    """0 flat, 1 slope (the paper's: steeper than 7.5 degrees)."""
+    return _known_class(ground.slope_class(*reading.gradient))
+
+
+def heading(reading: Reading) -> Floats:
+    """Axis along which machines drive [rad], -pi/2 to pi/2 from east, both ways alike; NaN where none is preferred."""
+    # the axis, not the direction: a haul road is driven both ways, and doubled angles do not cancel then
+    votes = reading.votes(ev.HEADING)
+    doubled = np.exp(4j * np.pi / ev.SECTORS * np.arange(ev.SECTORS))
+    east, north = votes @ doubled.real, votes @ doubled.imag
+    sure = np.hypot(east, north) >= SURE_AXIS * np.maximum(votes.sum(axis=-1), 1)
+    return np.where(sure, np.arctan2(north, east) / 2, np.nan)
+
+
+def visits(reading: Reading) -> Floats:
+    """How many visits a cell had; at most 266."""
+    return linear_count(reading.evidence.bitmaps[..., ev.VISITS])
+
+
+def machines(reading: Reading) -> Floats:
+    """How many machines drove here; at most 266."""
+    return linear_count(reading.evidence.bitmaps[..., ev.MACHINES])
+
+
+def weight(reading: Reading) -> Floats:
+    """Metres of evidence."""
+    metres: Floats = reading.evidence.weight / float(ev.WEIGHT_UNITS_PER_M)
+    return metres
+
+
+def age_s(reading: Reading) -> Floats:
+    """Time from the newest sample to the site's now [s]; NaN where now is not known."""
+    return _seconds_ago(reading.evidence.newest_ns, reading.now_ns)
+
+
+def changed_s(reading: Reading) -> Floats:
+    """Time from the ground's last change to the site's now [s]; NaN where none was found or now is not known."""
+    return _seconds_ago(reading.evidence.changed_ns, reading.now_ns)
 
 
 LAYERS: dict[str, Layer] = {
     "resistance": resistance,
+    "resistance_std": resistance_std,
     "resistance_class": resistance_class,
     "confidence": confidence,
     "grade_east": grade_east,
     "grade_north": grade_north,
     "grade": grade,
+    "grade_std": grade_std,
+    "slope_class": slope_class,
+    "heading": heading,
     "visits": visits,
+    "machines": machines,
+    "weight": weight,
+    "age_s": age_s,
+    "changed_s": changed_s,
 }
 
 
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
 def select(names: Sequence[str]) -> tuple[str, ...]:
-    """Check layer names; none means all."""
-    if unknown := [name for name in names if name not in LAYERS]:
-        problem = f"layer `{unknown[0][:40]}` is not known; known: {', '.join(LAYERS)}"
+    """Check layer names; none means all layers of cells (filled ones are asked for by name)."""
+    known = [*LAYERS, *AREA_LAYERS]
+    if unknown := [name for name in names if name not in known]:
+        problem = f"layer `{unknown[0][:40]}` is not known; known: {', '.join(known)}"
         raise QueryError(Refusal.UNKNOWN_LAYER, problem)
     return tuple(names) or tuple(LAYERS)
 
 
-def read(evidence: ev.Evidence, names: Sequence[str], config: ReadConfig) -> dict[str, Floats32]:
-    """Derive layers, each (blocks, 256), NaN where the evidence is too thin."""
-    weight = evidence.counts[..., ev.WEIGHT].astype(np.float64)
-    unknown = (weight == 0) | (weight < config.min_weight_m * ev.WEIGHT_UNITS_PER_M)
-    return {name: np.where(unknown, np.nan, LAYERS[name](evidence)).astype(np.float32) for name in names}
+def read(evidence: ev.Evidence, names: Sequence[str], config: ReadConfig, now_ns: int = 0) -> dict[str, Floats32]:
+    """Derive layers of cells, each (blocks, 256), NaN where the evidence is too thin. now_ns: the site's now."""
+    metres = evidence.weight
+    known = (metres > 0) & (metres >= config.min_weight_m * ev.WEIGHT_UNITS_PER_M)
+    reading = Reading(_cells(evidence, known), now_ns, config)
+    out = {name: np.full(known.shape, np.nan, np.float32) for name in names}
+    for name, values in out.items():
+        values[known] = LAYERS[name](reading)
+    return out
 
 
-def _robust_centre(votes: AnyArray, centres: Floats, reach: int) -> Floats:
-    """Mean of the votes within `reach` bins of the median bin.
-
-    As robust as the median, and exact where all votes agree, because a vote is split linearly between two bins.
-    """
-    votes = votes.astype(np.float64)
-    total = votes.sum(axis=-1)
-    median = (votes.cumsum(axis=-1) >= total[..., None] / 2).argmax(axis=-1)
-    near: Bools = np.abs(np.arange(len(centres)) - median[..., None]) <= reach
-    kept = np.where(near, votes, 0.0)
-    weighted: Floats = np.matmul(kept, centres)
-    weight: Floats = kept.sum(axis=-1)
-    return _ratio(weighted, weight)
+def required(names: Sequence[str]) -> tuple[str, ...]:
+    """Layers of cells from which `derive_area` makes these layers, each once."""
+    cells: dict[str, None] = {}
+    for name in names:
+        needs = required(AREA_LAYERS[name].needs) if name in AREA_LAYERS else (name,)
+        cells |= dict.fromkeys(needs)
+    return tuple(cells)
 
 
-def _class_votes(evidence: ev.Evidence) -> Floats:
-    votes: Floats = np.matmul(evidence.counts[..., ev.RESISTANCE].astype(np.float64), _CLASS_OF_BIN)
+def margin_cells(names: Sequence[str], cell_m: float, config: ReadConfig) -> int:
+    """By how many cells on each side a window must be widened before `derive_area`, and cropped after it."""
+    return math.ceil(config.fill_reach_m / cell_m) if any(name in AREA_LAYERS for name in names) else 0
+
+
+def derive_area(
+    names: Sequence[str], cells: Mapping[str, Floats32], cell_m: float, config: ReadConfig
+) -> dict[str, Floats32]:
+    """Make these layers, of cells or areas, from the `required` layers of cells, all (rows, columns)."""
+    done: dict[str, Floats] = {name: values.astype(np.float64) for name, values in cells.items()}
+
+    def derive(name: str) -> Floats:
+        if name not in done:
+            for need in AREA_LAYERS[name].needs:
+                derive(need)
+            done[name] = AREA_LAYERS[name].derive(Area(done, cell_m, config.fill_reach_m, config.boundaries))
+        return done[name]
+
+    return {name: derive(name).astype(np.float32) for name in names}
+
+
+# --- shared by layers -------------------------------------------------------------------------------------------------
+
+
+def _class_votes(reading: Reading) -> Floats:
+    """Votes (cells, classes): each bin's, by the share of its width, in log(c_rr), that lies in each class."""
+    position = np.log(np.array(reading.config.boundaries) / ev.RESISTANCE_CENTRES[0]) / LOG_STEP
+    edges = np.concatenate([[-np.inf], position, [np.inf]])
+    bins = np.arange(ev.RESISTANCE_BINS)[:, None]
+    share = np.maximum(np.minimum(bins + 0.5, edges[1:]) - np.maximum(bins - 0.5, edges[:-1]), 0)
+    votes: Floats = reading.votes(ev.RESISTANCE) @ share
     return votes
 
 
-def _class_of_bin() -> Floats:
-    """Share (bins, classes) of each bin's width, in log(c_rr), that lies in each class."""
-    centres = np.log(ev.RESISTANCE_CENTRES)
-    half = (centres[1] - centres[0]) / 2
-    edges = np.concatenate([[-np.inf], np.log(BOUNDARIES), [np.inf]])
-    low = np.maximum(centres[:, None] - half, edges[None, :-1])
-    high = np.minimum(centres[:, None] + half, edges[None, 1:])
-    share: Floats = np.maximum(high - low, 0) / (2 * half)
-    return share
+def _seconds_ago(stamp_ns: AnyArray, now_ns: int) -> Floats:
+    """Time since stamps [s], not below 0; NaN where either is 0, which means not known."""
+    return np.where((stamp_ns > 0) & (now_ns > 0), np.maximum(now_ns - stamp_ns, 0) / 1e9, np.nan)
 
 
-_CLASS_OF_BIN = _class_of_bin()
+def _known_class(classes: AnyArray) -> Floats:
+    return np.where(classes == ground.UNKNOWN, np.nan, classes.astype(np.float64))
 
 
-def _ratio(numerator: Floats, denominator: Floats) -> Floats:
-    out: Floats = np.full(denominator.shape, np.nan)
-    np.divide(numerator, denominator, out=out, where=denominator > 0)
-    return out
+def _cells(evidence: ev.Evidence, which: Bools) -> ev.Evidence:
+    """Evidence (cells, ...) of some of the cells."""
+    return ev.Evidence(**{f.name: getattr(evidence, f.name)[which] for f in dataclasses.fields(evidence)})

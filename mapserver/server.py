@@ -1,6 +1,6 @@
-"""The map server's edge to Zenoh: a queryable for batches and one for map queries.
+"""The map server's edge to Zenoh: a queryable for batches, one for map queries, one for commands; events of changes.
 
-Callbacks only move bytes to the writer's queue or to the query threads (EVIDENCE: work in a callback stalls it).
+Callbacks only move bytes to the writer's queue or to other threads (EVIDENCE: work in a callback stalls it).
 """
 
 from __future__ import annotations
@@ -9,18 +9,21 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
-from mapserver.answers import Answers
+from mapserver.answers import Answers, reads_past
 from mapserver.config import ServerConfig
-from mapserver.store import Incoming
+from mapserver.keeper import Keeper
+from mapserver.store import JOURNAL_FILE, Incoming
 from mapserver.writer import Writer
 from protocol import keys
 from protocol.codec import encode_reply
 from protocol.errors import ConfigError, QueryError
 from protocol.messages import Ack, Refused
-from protocol.queries import encode_error
+from protocol.parameters import split_selector
+from protocol.queries import encode_change, encode_error
 from protocol.site import SiteConfig
 
 log = logging.getLogger("mapserver")
@@ -38,11 +41,19 @@ class Server:
         now_ns: Callable[[], int],
     ) -> None:
         self._writer = Writer(folder, site, config, now_ns)
-        self._answers = Answers(self._writer, site, config.read)
+        self._changed = session.declare_publisher(
+            keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._keeper = Keeper(self._writer, folder, site, config, self._publish, now_ns)
+        self._answers = Answers(self._writer, site, config, self._keeper, folder / JOURNAL_FILE)
         self._threads = ThreadPoolExecutor(config.query_threads, thread_name_prefix="query")
+        # One each: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
+        self._past_thread = ThreadPoolExecutor(1, thread_name_prefix="past")
+        self._command_thread = ThreadPoolExecutor(1, thread_name_prefix="command")
         self._queryables = [
             session.declare_queryable(keys.ingest_all(site.name), self._on_batch),
             session.declare_queryable(keys.map_queries_all(site.name), self._on_query),
+            session.declare_queryable(keys.admin_all(site.name), self._on_command),
         ]
 
     @property
@@ -59,7 +70,10 @@ class Server:
         """Stop listening, finish what has come in, commit, snapshot."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
-        self._threads.shutdown()
+        for threads in (self._threads, self._past_thread, self._command_thread):
+            threads.shutdown()
+        self._keeper.close()
+        self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()
 
     def _on_batch(self, query: zenoh.Query) -> None:
@@ -79,25 +93,30 @@ class Server:
         self._writer.submit(Incoming(machine, payload), reply)
 
     def _on_query(self, query: zenoh.Query) -> None:
-        self._threads.submit(self._answer, query)
+        name, parameters = _asked(query)
+        threads = self._past_thread if reads_past(name, parameters) else self._threads
+        threads.submit(self._reply, query, lambda: self._answers.answer(name, parameters))
 
-    def _answer(self, query: zenoh.Query) -> None:
-        name = keys.query_of(str(query.key_expr))
-        parameters = dict(_pairs(query))
+    def _on_command(self, query: zenoh.Query) -> None:
+        name, parameters = _asked(query)
+        self._command_thread.submit(self._reply, query, lambda: self._answers.obey(name, parameters))
+
+    def _reply(self, query: zenoh.Query, answer: Callable[[], bytes]) -> None:
         with query:
             try:
-                query.reply(query.key_expr, self._answers.answer(name, parameters))
+                query.reply(query.key_expr, answer())
             except QueryError as error:
                 self._writer.count_refusal(error.reason)
                 query.reply_err(encode_error(error))
             except zenoh.ZError as error:
-                log.info("reply failed query=%s error=%r", name, str(error))
+                log.info("reply failed query=%s error=%r", query.key_expr, str(error))
             except Exception as error:  # a bug must not leave the asker waiting, nor end the thread silently
-                log.exception("query failed query=%s", name)
+                log.exception("query failed query=%s", query.key_expr)
                 query.reply_err(encode_error(QueryError("internal", f"the server failed: {error}")))
 
+    def _publish(self, change: dict[str, Any]) -> None:
+        self._changed.put(encode_change(change))
 
-def _pairs(query: zenoh.Query) -> list[tuple[str, str]]:
-    """Split the selector's parameters by hand, because a missing value must be seen as one."""
-    text = str(query.parameters)
-    return [(part.partition("=")[0], part.partition("=")[2]) for part in text.split(";") if part]
+
+def _asked(query: zenoh.Query) -> tuple[str, dict[str, str]]:
+    return keys.query_of(str(query.key_expr)), split_selector(str(query.parameters))

@@ -10,29 +10,38 @@ import json
 import logging
 import os
 import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from mapserver import evidence as ev
-from mapserver.grid import Grid, GridState
+from mapserver.grid import Grid, GridState, Placed
+from mapserver.pages import CELL, NARROW, WIDE, Page
 from mapserver.votes import FoldConfig
+from protocol.arrays import AnyArray
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2
+_TOTALS = ("folded", "skipped", "newest_ns")
 log = logging.getLogger("mapserver.snapshot")
 
 
-def save(folder: Path, row: int, state: GridState, cell_m: float, config: FoldConfig) -> Path:
-    """Write a snapshot that is true for journal row `row`, and remove all but the newest two."""
+def save(
+    folder: Path, row: int, state: GridState, cell_m: float, config: FoldConfig, left_out: Collection[str] = ()
+) -> Path:
+    """Write a snapshot that is true for journal row `row`, and remove all but the newest two.
+
+    left_out: machines whose rows were not folded.
+    """
     path = folder / f"snapshot-{row}.npz"
     temporary = folder / "snapshot.tmp"
-    header = {**_parameters(cell_m, config), "row": row, "folded": state.folded, "skipped": state.skipped}
-    arrays = {"codes": state.codes, "counts": state.counts, "bitmaps": state.bitmaps, "newest": state.newest}
+    totals = {name: getattr(state, name) for name in _TOTALS}
+    header = {**_parameters(cell_m, config, left_out), "row": row, **totals}
     try:
         with temporary.open("wb") as file:
-            np.savez(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
+            np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.pages))  # type: ignore[arg-type]
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -59,31 +68,63 @@ def remove_beyond(folder: Path, last_row: int) -> None:
             (folder / f"snapshot-{row}.npz").unlink(missing_ok=True)
 
 
-def load(path: Path, cell_m: float, config: FoldConfig) -> tuple[int, Grid] | None:
+def load(path: Path, cell_m: float, config: FoldConfig, left_out: Collection[str] = ()) -> tuple[int, Grid] | None:
     """Return the row and the grid of a snapshot, or None if it is damaged or was made with other parameters."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
-            expected = _parameters(cell_m, config)
+            expected = _parameters(cell_m, config, left_out)
             if {key: header.get(key) for key in expected} != expected:
                 return None
-            arrays = (file["codes"], file["counts"], file["bitmaps"], file["newest"])
-            state = GridState(*arrays, header["folded"], header["skipped"])
+            state = GridState(_pages(file), *(header[name] for name in _TOTALS))
             return header["row"], Grid.from_state(cell_m, config, state)
     except Exception as error:  # zipfile and numpy answer damage with a dozen kinds of error
         log.warning("snapshot passed over path=%s error=%r", path, str(error))
         return None
 
 
-def load_newest(folder: Path, last_row: int, cell_m: float, config: FoldConfig) -> tuple[int, Grid]:
+def load_newest(
+    folder: Path, last_row: int, cell_m: float, config: FoldConfig, left_out: Collection[str] = ()
+) -> tuple[int, Grid]:
     """Return the newest usable snapshot that the journal reaches, or row 0 and an empty grid."""
     for row in rows_on_disk(folder):
-        if row <= last_row and (found := load(folder / f"snapshot-{row}.npz", cell_m, config)):
+        if row <= last_row and (found := load(folder / f"snapshot-{row}.npz", cell_m, config, left_out)):
             return found
     return 0, Grid(cell_m, config)
 
 
-def _parameters(cell_m: float, config: FoldConfig) -> dict[str, object]:
-    """What the evidence depends on; the kernel is not part of it, all kernels agree."""
-    fold = {key: value for key, value in asdict(config).items() if key != "kernel"}
-    return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": [ev.RESISTANCE_BINS, ev.GRADE_BINS, ev.SECTORS], **fold}
+def _parameters(cell_m: float, config: FoldConfig, left_out: Collection[str]) -> dict[str, object]:
+    """What the evidence depends on; the kernel and its space are not part of it, all give the same bits."""
+    fold = {key: value for key, value in asdict(config).items() if key not in ("kernel", "hot_blocks")}
+    bins = [ev.RESISTANCE_BINS, ev.GRADE_BINS, ev.SECTORS]
+    return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": bins, "left_out": sorted(left_out), **fold}
+
+
+def _arrays(pages: Sequence[Placed]) -> dict[str, AnyArray]:
+    """Pages as few long arrays: what each is and how long its parts are, and the parts end to end."""
+    narrow = [at.page.votes for at in pages if at.page.votes.dtype == NARROW]
+    wide = [at.page.votes for at in pages if at.page.votes.dtype == WIDE]
+    rows = [
+        (at.x, at.y, at.rung, at.index, at.page.votes.dtype == WIDE, len(at.page.votes), len(at.page.cells))
+        for at in pages
+    ]
+    return {
+        "pages": np.array(rows, np.int64).reshape(-1, 7),
+        "narrow": np.concatenate([np.empty(0, NARROW), *narrow]),
+        "wide": np.concatenate([np.empty(0, WIDE), *wide]),
+        "cells": np.concatenate([np.empty(0, CELL), *(at.page.cells for at in pages)]),
+    }
+
+
+def _pages(file: Mapping[str, AnyArray]) -> tuple[Placed, ...]:
+    """Undo `_arrays`; pages are copies, so that those which are merged later give their memory back."""
+    parts, cells, taken = (file["narrow"], file["wide"]), file["cells"], [0, 0, 0]
+    found = []
+    for x, y, rung, index, which, votes, k in file["pages"].tolist():
+        page = Page(parts[which][taken[which] :][:votes].copy(), cells[taken[2] :][:k].copy())
+        found.append(Placed(x, y, rung, index, page))
+        taken[which] += votes
+        taken[2] += k
+    if taken != [len(parts[0]), len(parts[1]), len(cells)]:
+        raise ValueError("parts of other lengths than its pages say")
+    return tuple(found)

@@ -5,16 +5,21 @@ from __future__ import annotations
 import fcntl
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mapserver import ingest, snapshot
+from mapserver.archive import FOLDER, Archive
 from mapserver.config import ServerConfig
+from mapserver.decisions import KIND as TRUST
+from mapserver.decisions import Decisions
+from mapserver.grid import Grid
 from mapserver.ingest import Admission, GapError
-from mapserver.journal import Journal
+from mapserver.journal import Journal, Wanted
+from mapserver.past import History, history_rows
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.messages import Ack, Refused, SampleBatch
 from protocol.site import SiteConfig
@@ -45,10 +50,15 @@ class Store:
             opened.enter_context(_hold(folder))
             self._journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
             opened.callback(self._journal.close)
-            snapshot.remove_beyond(folder, self._journal.last_row)
-            self.merged, self.grid = snapshot.load_newest(folder, self._journal.last_row, site.cell_m, config.fold)
+            last_row = self._journal.last_row
+            self.left_out = Decisions(self._journal.events(TRUST)).distrusted
+            snapshot.remove_beyond(folder, last_row)
+            found = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.left_out)
+            self.merged, self.grid = found
             self.snapshot_row = self.merged
-            self._fold_tail()
+            self._fold_tail(self.grid, self.merged)
+            self.merged = last_row
+            self.newest_ns = self._journal.newest_ns()
             self._opened = opened.pop_all()
 
     @property
@@ -77,9 +87,44 @@ class Store:
 
     def save_snapshot(self) -> None:
         """Write a snapshot of the grid as it is."""
-        if self.merged > self.snapshot_row:
-            snapshot.save(self._folder, self.merged, self.grid.state(), self.site.cell_m, self.config.fold)
-            self.snapshot_row = self.merged
+        if write := self.snapshot():
+            write()
+
+    def snapshot(self) -> Callable[[], None] | None:
+        """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
+        if self.merged <= self.snapshot_row:
+            return None
+        row, state, left_out = self.merged, self.grid.state(), self.left_out
+
+        def write() -> None:
+            snapshot.save(self._folder, row, state, self.site.cell_m, self.config.fold, left_out)
+            self.snapshot_row = row
+
+        return write
+
+    def adopt(self, grid: Grid, row: int, left_out: frozenset[str]) -> None:
+        """Go on with a grid that was folded elsewhere up to a journal row, without the machines in left_out."""
+        self.left_out = left_out
+        self._fold_tail(grid, row)
+        self.grid = grid
+        self.snapshot_row = 0  # what is on disk has other machines in it
+        self.grid.touch_all()
+
+    def touch_all(self) -> None:
+        """Have everything looked at for changes."""
+        self.grid.touch_all()
+
+    def remember(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> None:
+        """Keep an event with the journal."""
+        self._journal.append_event(kind, stamp_ns, body)
+
+    def forget(self, until: int) -> int:
+        """Remove some of the journal rows up to `until`, which are archived; returns the last that is gone."""
+        return self._journal.forget(until)
+
+    def shrink(self) -> int:
+        """Give some of the space of removed rows back to the disk."""
+        return self._journal.shrink()
 
     def close(self) -> None:
         """Close the journal and let go of the folder."""
@@ -87,12 +132,6 @@ class Store:
 
     def info(self) -> dict[str, Any]:
         """State of the store in plain values."""
-        machines: dict[str, dict[str, int]] = {}
-        for (machine, _), mark in self._journal.marks().items():
-            entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0})
-            entry["spools"] += 1
-            entry["samples"] += mark.seq - mark.lost
-            entry["lost"] += mark.lost
         site = {name: getattr(self.site, name) for name in SiteConfig.__dataclass_fields__}
         return {
             "site": {**site, "frame": self.site.frame, "crs": self.site.crs},
@@ -104,9 +143,21 @@ class Store:
             "cells": self.grid.known_cells(),
             "bounds": self.grid.bounds(),
             "stamp_ns": self.newest_ns,
-            "machines": machines,
+            "machines": self.machines(),
+            "distrusted": sorted(self.left_out),
             "counters": dict(self.counters),
         }
+
+    def machines(self) -> dict[str, dict[str, int]]:
+        """What each machine sent: spools, samples, samples that it declared lost, newest stamp."""
+        machines: dict[str, dict[str, int]] = {}
+        for (machine, _), mark in self._journal.marks().items():
+            entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0})
+            entry["spools"] += 1
+            entry["samples"] += mark.seq - mark.lost
+            entry["lost"] += mark.lost
+            entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
+        return machines
 
     def _take_one(self, incoming: Incoming) -> tuple[Ack | Refused, Admission | None]:
         try:
@@ -129,16 +180,16 @@ class Store:
             self.counters["samples_lost"] += admission.lost
 
     def _fold(self, row: int, batch: SampleBatch) -> None:
-        self.grid.fold(batch.rows, batch.machine)
+        if batch.machine not in self.left_out:
+            self.grid.fold(batch.rows, batch.machine)
         self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
         self.merged = row
 
-    def _fold_tail(self) -> None:
-        """Fold what the snapshot does not hold; find the site's now."""
-        for row in self._journal.read(after=self.merged):
-            self.grid.fold(row.rows, row.machine)
-            self.merged = row.row
-        self.newest_ns = self._journal.newest_ns()
+    def _fold_tail(self, grid: Grid, merged: int) -> None:
+        """Fold what a grid does not hold yet."""
+        history = History(self._journal, Archive(self._folder / FOLDER))
+        for row in history_rows(history, after=merged, wanted=Wanted(without=self.left_out)):
+            grid.fold(row.rows, row.machine)
 
 
 @contextmanager

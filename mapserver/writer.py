@@ -7,7 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -45,6 +45,9 @@ class Writer:
         self._overloaded = 0
         self._merged = threading.Condition()
         self.failed = False
+        self._snapshots = ThreadPoolExecutor(1, thread_name_prefix="snapshot")
+        self._snapshot: Future[None] = Future()
+        self._snapshot.set_result(None)
         self._thread = threading.Thread(target=self._guard, name="writer", daemon=True)
         self._thread.start()
 
@@ -94,8 +97,10 @@ class Writer:
             log.critical("writer failed", exc_info=True)
             self._refuse_all()
         else:
+            self._snapshot.result()
             self._save_snapshot()
         finally:
+            self._snapshots.shutdown()
             self._store.close()
 
     def _refuse_all(self) -> None:
@@ -155,10 +160,16 @@ class Writer:
             _answer(item, self._store)
 
     def _save_snapshot(self) -> None:
-        try:
-            self._store.save_snapshot()
-        except OSError as error:  # the journal is the truth; a missing snapshot only makes the next start longer
-            log.error("snapshot failed error=%r", str(error))
+        """Have a snapshot written beside the work; one that is still being written puts the next off."""
+        if self._snapshot.done() and (write := self._store.snapshot()):
+            self._snapshot = self._snapshots.submit(_written, write)
+
+
+def _written(write: Callable[[], None]) -> None:
+    try:
+        write()
+    except OSError as error:  # the journal is the truth; a missing snapshot only makes the next start longer
+        log.error("snapshot failed error=%r", str(error))
 
 
 def _answer(item: _Read, store: Store) -> None:

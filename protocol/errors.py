@@ -29,6 +29,7 @@ class Refusal(StrEnum):
     UNKNOWN_PARAMETER = "unknown_parameter"
     UNKNOWN_LAYER = "unknown_layer"
     UNKNOWN_QUERY = "unknown_query"
+    UNKNOWN_MACHINE = "unknown_machine"
     AFTER_TIMEOUT = "after_timeout"
 
 

@@ -61,13 +61,28 @@ def sensors(site: str, machine: str) -> str:
 
 
 def map_query(site: str, query: str) -> str:
-    """One of the map's queryables: point, region, info, ..."""
+    """One of the map's queryables: point, region, history, info, ..."""
     return f"{ROOT}/{check_name(site, 'site')}/map/{check_name(query, 'query')}"
 
 
 def map_queries_all(site: str) -> str:
     """Every queryable of a site's map."""
     return f"{ROOT}/{check_name(site, 'site')}/map/*"
+
+
+def changed(site: str) -> str:
+    """Events: an area of the map changed. Subscribers hear it; as a query it is one that is not known."""
+    return map_query(site, "changed")
+
+
+def admin(site: str, command: str) -> str:
+    """One of the commands to the map server: trust."""
+    return f"{ROOT}/{check_name(site, 'site')}/admin/{check_name(command, 'command')}"
+
+
+def admin_all(site: str) -> str:
+    """Every command to the map server of a site."""
+    return f"{ROOT}/{check_name(site, 'site')}/admin/*"
 
 
 def machine_of(key: str) -> str:
@@ -79,7 +94,7 @@ def machine_of(key: str) -> str:
 
 
 def query_of(key: str) -> str:
-    """Name of the map query that a key asks for."""
+    """Name of the map query, or of the command, that a key asks for."""
     return key.rsplit("/", 1)[-1]
 
 

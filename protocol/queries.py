@@ -1,25 +1,54 @@
-"""Map queries and their answers: selector parameters one way, MessagePack the other (docs/protocol.md, "Map queries").
+"""Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers are in `protocol.answers`.
 
 A query is parsed once, at the server's door, into a frozen type; an unknown parameter is refused by name.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-
-from protocol.arrays import Floats, Floats32
-from protocol.codec import pack, take, unpack
-from protocol.errors import MessageError, QueryError, Refusal
+from protocol import parameters as ps
+from protocol.answers import (
+    HistoryAnswer,
+    PointAnswer,
+    Region,
+    Span,
+    decode_change,
+    decode_changes,
+    decode_error,
+    decode_history,
+    decode_info,
+    decode_machine,
+    decode_machines,
+    decode_point,
+    decode_region,
+    encode_change,
+    encode_changes,
+    encode_error,
+    encode_history,
+    encode_info,
+    encode_machine,
+    encode_machines,
+    encode_point,
+    encode_region,
+)
+from protocol.errors import QueryError, Refusal
 from protocol.geometry import MAX_CELLS, Bounds
 
-MAX_REPLY_BYTES = 2**30
+# fmt: off
+__all__ = [  # queries, and the answers to them
+    "MAX_SPANS", "MAX_SPAN_S", "MAX_WAIT_S", "NOW", "ChangesQuery", "Freshness", "HistoryAnswer",
+    "HistoryQuery", "InfoQuery", "MachinesQuery", "MapQuery", "PointAnswer", "PointQuery", "Region", "RegionQuery",
+    "Span", "When", "check_size", "decode_change", "decode_changes", "decode_error", "decode_history", "decode_info",
+    "decode_machine", "decode_machines", "decode_point", "decode_region", "encode_change", "encode_changes",
+    "encode_error", "encode_history", "encode_info", "encode_machine", "encode_machines", "encode_point",
+    "encode_query", "encode_region", "parse_query",
+]
+# fmt: on
 MAX_WAIT_S = 60.0
-MAX_CELL_M = 1e4
+MAX_SPANS = 2000  # of one history
+MAX_SPAN_S = 1e9
 
 
 @dataclass(frozen=True)
@@ -31,6 +60,17 @@ class Freshness:
 
 
 @dataclass(frozen=True)
+class When:
+    """as_of_ns: the map from samples stamped so or earlier; None: as it is. minus_ns: less the map as of that time."""
+
+    as_of_ns: int | None = None
+    minus_ns: int | None = None
+
+
+NOW = When()
+
+
+@dataclass(frozen=True)
 class PointQuery:
     """The cell at a position in `map` [m]; no layers means all of them."""
 
@@ -38,6 +78,7 @@ class PointQuery:
     y_m: float
     layers: tuple[str, ...] = ()
     fresh: Freshness = Freshness()
+    when: When = NOW
 
     name = "point"
 
@@ -49,8 +90,28 @@ class RegionQuery:
     bounds: Bounds
     layers: tuple[str, ...] = ()
     fresh: Freshness = Freshness()
+    when: When = NOW
 
     name = "region"
+
+
+@dataclass(frozen=True)
+class HistoryQuery:
+    """The cell at a position in `map` [m] over time, span by span.
+
+    from_ns, to_ns: samples stamped from_ns <= stamp <= to_ns; to_ns None: the site's now, from_ns None: MAX_SPANS
+    before. span_s: length of a span, None for a bucket.
+    """
+
+    x_m: float
+    y_m: float
+    layers: tuple[str, ...] = ()
+    from_ns: int | None = None
+    to_ns: int | None = None
+    span_s: float | None = None
+    fresh: Freshness = Freshness()
+
+    name = "history"
 
 
 @dataclass(frozen=True)
@@ -62,85 +123,26 @@ class InfoQuery:
     name = "info"
 
 
-MapQuery = PointQuery | RegionQuery | InfoQuery
+@dataclass(frozen=True)
+class MachinesQuery:
+    """What the server knows of each machine."""
+
+    fresh: Freshness = Freshness()
+
+    name = "machines"
 
 
 @dataclass(frozen=True)
-class PointAnswer:
-    """Layer values of the cell with centre (x_m, y_m); NaN is unknown. merged: the journal row it is true for."""
+class ChangesQuery:
+    """Changes of the ground with a number beyond `after`."""
 
-    x_m: float
-    y_m: float
-    values: Mapping[str, float]
-    merged: int
-    stamp_ns: int
+    after: int = 0
+    fresh = Freshness()  # `after` is another one here
 
-
-@dataclass(frozen=True)
-class Region:
-    """A rectangle of cells.
-
-    x_m (columns,), y_m (rows,): cell centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
-    NaN where unknown; row 0 is the southernmost. merged: the journal row it is true for; stamp_ns: the site's now.
-    """
-
-    x_m: Floats
-    y_m: Floats
-    cell_m: float
-    layers: Mapping[str, Floats32]
-    merged: int
-    stamp_ns: int
-
-    def __getitem__(self, layer: str) -> Floats32:
-        return self.layers[layer]
-
-    @property
-    def bounds(self) -> Bounds:
-        """Outer edges [m]."""
-        half = self.cell_m / 2
-        return Bounds(self.x_m[0] - half, self.y_m[0] - half, self.x_m[-1] + half, self.y_m[-1] + half)
+    name = "changes"
 
 
-# --- the query, as selector parameters -------------------------------------------------------------------------------
-
-
-def encode_query(query: MapQuery) -> dict[str, str]:
-    """Selector parameters."""
-    parameters: dict[str, str] = {}
-    if isinstance(query, PointQuery):
-        parameters |= {"x": _text(query.x_m), "y": _text(query.y_m)}
-    if isinstance(query, RegionQuery):
-        b = query.bounds
-        parameters["bounds"] = ",".join(_text(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
-    if not isinstance(query, InfoQuery) and query.layers:
-        parameters["layers"] = ",".join(query.layers)
-    if query.fresh.after:
-        parameters |= {"after": str(query.fresh.after), "wait": _text(query.fresh.wait_s)}
-    return parameters
-
-
-def _text(number: float) -> str:
-    """All digits; as a plain number, where numpy's own `repr` writes its type."""
-    return repr(float(number))
-
-
-def parse_query(name: str, parameters: Mapping[str, str]) -> MapQuery:
-    """Parse the parameters of the query `name`; QueryError says what is wrong with which of them."""
-    known = {"point": ("x", "y", "layers"), "region": ("bounds", "layers"), "info": ()}.get(name)
-    if known is None:
-        raise QueryError(Refusal.UNKNOWN_QUERY, f"query `{name}` is not known; known: point, region, info")
-    known += ("after", "wait")
-    if unknown := sorted(set(parameters) - set(known)):
-        problem = f"parameter `{unknown[0][:40]}` is not known; `{name}` takes {', '.join(known)}"
-        raise QueryError(Refusal.UNKNOWN_PARAMETER, problem)
-    fresh = _parse_freshness(parameters)
-    layers = tuple(part for part in parameters.get("layers", "").split(",") if part)
-    if name == "point":
-        x, y = (_number(parameters, axis) for axis in ("x", "y"))
-        return PointQuery(x, y, layers, fresh)
-    if name == "region":
-        return RegionQuery(_parse_bounds(parameters), layers, fresh)
-    return InfoQuery(fresh)
+MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | MachinesQuery | ChangesQuery
 
 
 def check_size(columns: int, rows: int) -> None:
@@ -149,118 +151,100 @@ def check_size(columns: int, rows: int) -> None:
         raise QueryError(Refusal.TOO_LARGE, f"region of {columns} x {rows} cells; at most {MAX_CELLS} are answered")
 
 
-def _parse_freshness(parameters: Mapping[str, str]) -> Freshness:
-    after = _number({"after": "0", **parameters}, "after")
-    wait_s = _number({"wait": "10", **parameters}, "wait")
-    if after < 0 or after != int(after) or not 0 <= wait_s <= MAX_WAIT_S:
-        problem = f"`after` must be a journal row and `wait` between 0 and {MAX_WAIT_S:g} s"
+# --- to parameters ---------------------------------------------------------------------------------------------------
+
+
+def encode_query(query: MapQuery) -> dict[str, str]:
+    """Selector parameters."""
+    if isinstance(query, ChangesQuery):
+        return {"after": str(query.after)} if query.after else {}
+    parameters: dict[str, str] = {}
+    if isinstance(query, PointQuery | HistoryQuery):
+        parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
+    if isinstance(query, RegionQuery):
+        b = query.bounds
+        parameters["bounds"] = ",".join(ps.text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
+    if isinstance(query, PointQuery | RegionQuery | HistoryQuery) and query.layers:
+        parameters["layers"] = ",".join(query.layers)
+    if isinstance(query, PointQuery | RegionQuery):
+        parameters |= _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
+    if isinstance(query, HistoryQuery):
+        parameters |= _stamps({"from": query.from_ns, "to": query.to_ns})
+        parameters |= {"span": ps.text_of(query.span_s)} if query.span_s is not None else {}
+    if query.fresh.after:
+        parameters |= {"after": str(query.fresh.after), "wait": ps.text_of(query.fresh.wait_s)}
+    return parameters
+
+
+def _stamps(stamps: Mapping[str, int | None]) -> dict[str, str]:
+    return {name: str(stamp_ns) for name, stamp_ns in stamps.items() if stamp_ns is not None}
+
+
+# --- from parameters -------------------------------------------------------------------------------------------------
+
+
+def parse_query(name: str, parameters: Mapping[str, str]) -> MapQuery:
+    """Parse the parameters of the query `name`; QueryError says what is wrong with which of them."""
+    if name not in _QUERIES:
+        raise QueryError(Refusal.UNKNOWN_QUERY, f"query `{name[:40]}` is not known; known: {', '.join(_QUERIES)}")
+    known, parse = _QUERIES[name]
+    ps.check_known(name, parameters, known)
+    return parse(parameters)
+
+
+def _parse_point(parameters: ps.Parameters) -> PointQuery:
+    return PointQuery(*_place(parameters), _layers(parameters), _freshness(parameters), _when(parameters))
+
+
+def _parse_region(parameters: ps.Parameters) -> RegionQuery:
+    return RegionQuery(_bounds(parameters), _layers(parameters), _freshness(parameters), _when(parameters))
+
+
+def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
+    from_ns, to_ns = ps.stamp(parameters, "from"), ps.stamp(parameters, "to")
+    if from_ns and to_ns and from_ns > to_ns:
+        raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
+    span_s = ps.number(parameters, "span") if "span" in parameters else None
+    if span_s is not None and not 1 <= span_s <= MAX_SPAN_S:
+        problem = f"parameter `span`: {span_s:g} s is not between 1 and {MAX_SPAN_S:g} s"
         raise QueryError(Refusal.OUT_OF_RANGE, problem)
-    return Freshness(int(after), wait_s)
+    x_m, y_m = _place(parameters)
+    return HistoryQuery(x_m, y_m, _layers(parameters), from_ns, to_ns, span_s, _freshness(parameters))
 
 
-def _parse_bounds(parameters: Mapping[str, str]) -> Bounds:
+_FRESH = ("after", "wait")
+_QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
+    "point": (("x", "y", "layers", "as_of", "minus", *_FRESH), _parse_point),
+    "region": (("bounds", "layers", "as_of", "minus", *_FRESH), _parse_region),
+    "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
+    "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
+    "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
+    "info": (_FRESH, lambda parameters: InfoQuery(_freshness(parameters))),
+}
+
+
+def _place(parameters: ps.Parameters) -> tuple[float, float]:
+    return ps.number(parameters, "x"), ps.number(parameters, "y")
+
+
+def _layers(parameters: ps.Parameters) -> tuple[str, ...]:
+    return tuple(part for part in parameters.get("layers", "").split(",") if part)
+
+
+def _when(parameters: ps.Parameters) -> When:
+    return When(ps.stamp(parameters, "as_of"), ps.stamp(parameters, "minus"))
+
+
+def _freshness(parameters: ps.Parameters) -> Freshness:
+    return Freshness(ps.count(parameters, "after"), ps.seconds(parameters, "wait", 10.0, MAX_WAIT_S))
+
+
+def _bounds(parameters: ps.Parameters) -> Bounds:
     parts = parameters.get("bounds", "").split(",")
     if len(parts) != 4:
         raise QueryError(Refusal.MISSING_FIELD, "parameter `bounds` must be west,south,east,north in metres")
-    numbers = [_number({"bounds": part}, "bounds") for part in parts]
+    numbers = [ps.number({"bounds": part}, "bounds") for part in parts]
     try:
         return Bounds(*numbers)
     except ValueError as error:
         raise QueryError(Refusal.OUT_OF_RANGE, str(error)) from None
-
-
-def _number(parameters: Mapping[str, str], name: str) -> float:
-    if name not in parameters:
-        raise QueryError(Refusal.MISSING_FIELD, f"parameter `{name}` is missing")
-    try:
-        value = float(parameters[name])
-    except ValueError:
-        raise QueryError(Refusal.WRONG_TYPE, f"parameter `{name}`: {parameters[name][:40]!r} is no number") from None
-    if not math.isfinite(value) or abs(value) > 1e15:
-        raise QueryError(Refusal.NOT_FINITE, f"parameter `{name}`: {value} is not usable")
-    return value
-
-
-# --- answers ---------------------------------------------------------------------------------------------------------
-
-
-def encode_point(answer: PointAnswer) -> bytes:
-    """Answer of `point`."""
-    values = {name: float(value) for name, value in answer.values.items()}
-    place = {"x_m": answer.x_m, "y_m": answer.y_m}
-    return pack({**place, "values": values, "merged": answer.merged, "stamp_ns": answer.stamp_ns})
-
-
-def decode_point(data: bytes) -> PointAnswer:
-    """Undo `encode_point`."""
-    table = unpack(data, MAX_REPLY_BYTES)
-    x, y, values = take(table, "x_m", float), take(table, "y_m", float), take(table, "values", dict)
-    for name, value in values.items():
-        if type(name) is not str or type(value) is not float:  # NaN is unknown, so `take` would be too strict
-            raise MessageError(Refusal.WRONG_TYPE, "a number is expected", field=f"values.{name!s:.40}")
-    return PointAnswer(x, y, values, take(table, "merged", int), take(table, "stamp_ns", int))
-
-
-def encode_region(region: Region) -> bytes:
-    """Answer of `region`: layers as float32 little-endian, row by row from the south."""
-    layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in region.layers.items()}
-    return pack(
-        {
-            "west_m": float(region.x_m[0] - region.cell_m / 2),
-            "south_m": float(region.y_m[0] - region.cell_m / 2),
-            "cell_m": region.cell_m,
-            "columns": len(region.x_m),
-            "rows": len(region.y_m),
-            "layers": layers,
-            "merged": region.merged,
-            "stamp_ns": region.stamp_ns,
-        }
-    )
-
-
-def decode_region(data: bytes) -> Region:
-    """Undo `encode_region`."""
-    table = unpack(data, MAX_REPLY_BYTES)
-    cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
-    if not (0 < cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
-        raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
-    tables = take(table, "layers", dict)
-    layers = {name: _decode_layer(tables, name, rows, columns) for name in tables}
-    return Region(
-        x_m=take(table, "west_m", float) + (np.arange(columns) + 0.5) * cell_m,
-        y_m=take(table, "south_m", float) + (np.arange(rows) + 0.5) * cell_m,
-        cell_m=cell_m,
-        layers=layers,
-        merged=take(table, "merged", int),
-        stamp_ns=take(table, "stamp_ns", int),
-    )
-
-
-def _decode_layer(layers: dict[str, Any], name: str, rows: int, columns: int) -> Floats32:
-    data: bytes = take(layers, name, bytes)
-    if type(name) is not str or len(data) != 4 * rows * columns:
-        problem = f"{len(data)} bytes, {columns} x {rows} cells take {4 * rows * columns}"
-        raise MessageError(Refusal.COLUMN_LENGTH, problem, field=f"layers.{name!s:.40}")
-    return np.frombuffer(data, "<f4").reshape(rows, columns)
-
-
-def encode_info(info: Mapping[str, Any]) -> bytes:
-    """Answer of `info`: nested tables of plain values."""
-    return pack({"info": dict(info)})
-
-
-def decode_info(data: bytes) -> dict[str, Any]:
-    """Undo `encode_info`."""
-    info: dict[str, Any] = take(unpack(data, MAX_REPLY_BYTES), "info", dict)
-    return info
-
-
-def encode_error(error: QueryError) -> bytes:
-    """Answer to a query that is refused."""
-    return pack({"reason": error.reason, "problem": str(error)})
-
-
-def decode_error(data: bytes) -> QueryError:
-    """Undo `encode_error`."""
-    table = unpack(data, MAX_REPLY_BYTES)
-    return QueryError(take(table, "reason", str), take(table, "problem", str))

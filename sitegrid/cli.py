@@ -12,6 +12,7 @@ import json
 import logging
 import sys
 from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TypeAlias
 
@@ -57,7 +58,7 @@ def build_parser() -> argparse.ArgumentParser:
     network.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="router to connect to (default %(default)s)")
     parser = argparse.ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_demo, _add_router, _add_server, _add_sim, _add_agent, _add_query, _add_plot, _add_eval):
+    for add in (_add_demo, _add_router, _add_server, _add_sim, _add_agent, _add_query, _add_plot, _add_eval, _add_fold):
         add(nouns, common, network)
     return parser
 
@@ -182,6 +183,7 @@ def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
     ground = asks.add_parser("ground", help="rolling resistance and gradient of loaders at work", parents=[quiet])
     _add_recorded(ground, 600.0)
     ground.add_argument("--plots", type=Path, help="folder to draw estimates along the way, errors by place into")
+    _add_merge(asks, quiet)
     log = asks.add_parser("log", help="a real log against fixes that were withheld, or its truth", parents=[quiet])
     log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
     log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
@@ -197,10 +199,37 @@ def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
     log.add_argument("--profile", choices=("default", "paper"), default="default", help="default %(default)s")
 
 
+def _add_merge(asks: Nouns, quiet: Parent) -> None:
+    merge = asks.add_parser("merge", help="the map of many machines' samples against others' merges", parents=[quiet])
+    _add_kept(merge)
+    merge.add_argument("--cases", default="", help="names, comma-separated; default all")
+    merge.add_argument("--plots", type=Path, help="folder to draw the maps of the first seed and the table into")
+
+
+def _add_fold(nouns: Nouns, common: Parent, _: Parent) -> None:
+    fold = _noun(nouns, "fold", "fold archives again, with other parameters, into a new store", [common])
+    fold.add_argument(
+        "archives", type=Path, nargs="+", metavar="ARCHIVE", help="a Parquet file, a folder of them, or a store"
+    )
+    fold.add_argument("--out", type=Path, required=True, metavar="STORE", help="folder of the new store")
+    fold.add_argument("--site-file", type=Path, help="the site, where the archives do not say it (site.toml)")
+    fold.add_argument("--cell", type=_positive, metavar="M", help="edge of a cell (default: that of the site)")
+    fold.add_argument("--config", type=Path, help="options to fold and read with (config/server.toml)")
+    fold.add_argument("--without", action="append", default=[], metavar="MACHINE", help="leave it out; again for more")
+    for name, what in (("from", "samples stamped then or later"), ("until", "samples stamped before then")):
+        help_text = f"{what} only; as 2026-01-31T07:00, UTC where no zone is given"
+        fold.add_argument(f"--{name}", type=_instant, dest=f"{name}_ns", metavar="T", help=help_text)
+
+
 def _add_recorded(ask: argparse.ArgumentParser, seconds: float) -> None:
     """Options of what runs on recordings that are kept."""
-    _add_seeds(ask, 12)
+    _add_kept(ask)
     ask.add_argument("--seconds", type=_positive, default=seconds, help="of each recording (default %(default)g)")
+
+
+def _add_kept(ask: argparse.ArgumentParser) -> None:
+    """Options of what keeps its results by seed."""
+    _add_seeds(ask, 12)
     ask.add_argument(
         "--out", type=Path, default=Path("eval-output"), help="folder of recordings and results (default %(default)s)"
     )
@@ -246,6 +275,16 @@ def _seed(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")
     return value
+
+
+def _instant(text: str) -> int:
+    """Nanoseconds since 1970 of a date and time."""
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no date and time, as 2026-01-31T07:00") from None
+    time = time if time.tzinfo else time.replace(tzinfo=UTC)
+    return (time - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
 def _withhold(text: str) -> tuple[float, float]:

@@ -6,69 +6,161 @@ with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
 import zenoh
 
 from protocol import keys
+from protocol.admin import TrustCommand, encode_command
 from protocol.errors import LinkError
 from protocol.geometry import Bounds
+from protocol.parameters import selector_of
 from protocol.queries import (
+    NOW,
+    ChangesQuery,
     Freshness,
+    HistoryQuery,
     InfoQuery,
+    MachinesQuery,
     MapQuery,
     PointAnswer,
     PointQuery,
     Region,
     RegionQuery,
+    Span,
+    When,
+    decode_change,
+    decode_changes,
     decode_error,
+    decode_history,
     decode_info,
+    decode_machine,
+    decode_machines,
     decode_point,
     decode_region,
     encode_query,
 )
 from protocol.session import DEFAULT_ENDPOINT, SessionConfig, open_session
+from sitegrid.listener import Listener
+
+PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
 
 
 class Client:
-    """Asks the map server of one site. Every call may raise QueryError (refused) or LinkError (no answer)."""
+    """Asks the map server of one site. Every call may raise QueryError (refused) or LinkError (no answer).
+
+    Wherever they stand: layers: names, none for all. after: answer once this journal row is merged, waiting for it at
+    most wait_s. Times are stamps: UTC in nanoseconds, as samples carry them.
+    """
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float = 10.0) -> None:
         self.session = session
         self.site = site
         self._endpoint = endpoint
         self._timeout_s = timeout_s
+        self._listeners: list[Listener[dict[str, Any]]] = []
+
+    # --- the map -----------------------------------------------------------------------------------------------------
 
     def point(
-        self, x_m: float, y_m: float, layers: Sequence[str] = (), *, after: int = 0, wait_s: float = 10.0
+        self,
+        x_m: float,
+        y_m: float,
+        layers: Sequence[str] = (),
+        *,
+        as_of_ns: int | None = None,
+        minus_ns: int | None = None,
+        after: int = 0,
+        wait_s: float = 10.0,
     ) -> PointAnswer:
         """Layers of the cell at a position in `map`; NaN is unknown.
 
-        layers: names, none for all. after: wait until this journal row is merged, at most wait_s.
+        as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
         """
-        query = PointQuery(float(x_m), float(y_m), tuple(layers), Freshness(after, wait_s))
-        return decode_point(self._ask(query))
+        when, fresh = When(as_of_ns, minus_ns), Freshness(after, wait_s)
+        return decode_point(self._ask(PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when)))
 
     def region(
         self,
         bounds: Bounds | tuple[float, float, float, float],
         layers: Sequence[str] = (),
         *,
+        as_of_ns: int | None = None,
+        minus_ns: int | None = None,
         after: int = 0,
         wait_s: float = 10.0,
     ) -> Region:
-        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates."""
+        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates.
+
+        as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
+        """
         box = bounds if isinstance(bounds, Bounds) else Bounds(*(float(v) for v in bounds))
-        return decode_region(self._ask(RegionQuery(box, tuple(layers), Freshness(after, wait_s))))
+        when, fresh = When(as_of_ns, minus_ns), Freshness(after, wait_s)
+        return decode_region(self._ask(RegionQuery(box, tuple(layers), fresh, when)))
+
+    def history(
+        self,
+        x_m: float,
+        y_m: float,
+        layers: Sequence[str] = (),
+        *,
+        from_ns: int | None = None,
+        to_ns: int | None = None,
+        span_s: float | None = None,
+        after: int = 0,
+        wait_s: float = 10.0,
+    ) -> tuple[Span, ...]:
+        """Layers of the cell at a position in `map`, span by span, oldest first; spans without samples are left out.
+
+        from_ns, to_ns: both included; without them the newest 2000 spans until now. span_s: default one bucket.
+        """
+        query = HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, Freshness(after, wait_s))
+        return decode_history(self._ask(query)).spans
 
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> dict[str, Any]:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
         return decode_info(self._ask(InfoQuery(Freshness(after, wait_s))))
 
+    # --- machines and changes ----------------------------------------------------------------------------------------
+
+    def machines(self, *, after: int = 0, wait_s: float = 10.0) -> list[dict[str, Any]]:
+        """What the server knows of each machine: name, trusted, by whom, reasons, evidence, samples, ..."""
+        return decode_machines(self._ask(MachinesQuery(Freshness(after, wait_s))))
+
+    def changes(self, after: int = 0) -> list[dict[str, Any]]:
+        """Changes of the ground with an id beyond `after`: when, where, how many cells, from what to what."""
+        return decode_changes(self._ask(ChangesQuery(after)))
+
+    def on_change(self, callback: Callable[[dict[str, Any]], object]) -> Listener[dict[str, Any]]:
+        """Call `callback`, on a thread of its own, with each change that is found or grows, until the handle is closed.
+
+        Events are not repeated: ask `changes` for what was before, or was missed.
+        """
+        listener = Listener(self.session, keys.changed(self.site), decode_change, callback)
+        self._listeners.append(listener)
+        return listener
+
+    def trust(self, machine: str, reason: str = "", *, wait_s: float = 30.0) -> dict[str, Any]:
+        """Use a machine's samples whatever the server finds; returns its row of `machines`, and `merged`.
+
+        wait_s: how long to wait for the map to be folded again, here as below.
+        """
+        return self._command(TrustCommand(machine, True, reason, wait_s))
+
+    def distrust(self, machine: str, reason: str, *, wait_s: float = 30.0) -> dict[str, Any]:
+        """Leave a machine's samples out of the map, earlier ones too."""
+        return self._command(TrustCommand(machine, False, reason, wait_s))
+
+    def judge_automatically(self, machine: str, *, wait_s: float = 30.0) -> dict[str, Any]:
+        """Leave it to the server again whether a machine's samples are used."""
+        return self._command(TrustCommand(machine, None, "", wait_s))
+
     def close(self) -> None:
-        """Close the session."""
+        """Close the session, and whatever listens to it."""
+        for listener in self._listeners:
+            listener.close()
         self.session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Client:
@@ -80,10 +172,17 @@ class Client:
         self.close()
 
     def _ask(self, query: MapQuery) -> bytes:
-        key = keys.map_query(self.site, query.name)
-        parameters = ";".join(f"{name}={value}" for name, value in encode_query(query).items())
         wait_s = query.fresh.wait_s if query.fresh.after else 0.0
-        selector = zenoh.Selector(key, parameters) if parameters else zenoh.Selector(key)
+        if isinstance(query, HistoryQuery) or (isinstance(query, PointQuery | RegionQuery) and query.when != NOW):
+            wait_s += PAST_S
+        return self._get(keys.map_query(self.site, query.name), encode_query(query), wait_s)
+
+    def _command(self, command: TrustCommand) -> dict[str, Any]:
+        key = keys.admin(self.site, command.name)
+        return decode_machine(self._get(key, encode_command(command), command.wait_s))
+
+    def _get(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
+        selector = zenoh.Selector(key, selector_of(parameters)) if parameters else zenoh.Selector(key)
         for reply in self.session.get(selector, timeout=self._timeout_s + wait_s):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()

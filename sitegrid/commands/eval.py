@@ -17,7 +17,14 @@ SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
 def run(arguments: Namespace) -> int:
     """Run one evaluation and print what it found."""
-    asks = {"physics": _physics, "localisation": _localisation, "ground": _ground, "log": _log, "parity": _parity}
+    asks = {
+        "physics": _physics,
+        "localisation": _localisation,
+        "ground": _ground,
+        "merge": _merge,
+        "log": _log,
+        "parity": _parity,
+    }
     result = asks[arguments.what](arguments)
     if arguments.json:
         say(plain(result))
@@ -69,6 +76,26 @@ def _ground(arguments: Namespace) -> Tables:
         from evaluation import ground_plots  # imported here: only pictures need matplotlib
 
         result["plots"] = [str(path) for path in ground_plots.draw(outcomes, arguments.plots)]
+    return result
+
+
+def _merge(arguments: Namespace) -> Tables:
+    from evaluation import merge
+    from evaluation.merge_cases import select
+    from evaluation.workers import cores
+
+    plan = merge.Plan(
+        seeds=tuple(_seeds(arguments)),
+        cache=arguments.out,
+        processes=arguments.processes or cores(),
+        cases=select([name for name in arguments.cases.split(",") if name]),
+    )
+    with Display("machines drive, maps are merged", headless=arguments.json) as display:
+        result = merge.run(plan, display.show)
+    if arguments.plots:
+        from evaluation import merge_plots  # imported here: only pictures need matplotlib
+
+        result["plots"] = [str(path) for path in merge_plots.draw(result, plan, arguments.plots)]
     return result
 
 

@@ -1,7 +1,8 @@
 """Samples, batches and stores for the tests of the map server."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from mapserver import evidence as ev
 from mapserver.config import ServerConfig
-from mapserver.evidence import COUNTS
-from mapserver.grid import Grid
+from mapserver.grid import Grid, GridState, Placed
+from mapserver.pages import WIDE, Page
 from mapserver.store import Incoming, Store
 from mapserver.votes import FoldConfig
 from mapserver.writer import Writer
@@ -82,14 +84,58 @@ def folded(rows: Table, machine: str = "a", cell_m: float = 1.0, **options: Any)
 
 def total(grid: Grid) -> np.ndarray:
     """Counts of all cells together, (COUNTS,)."""
-    return grid.state().counts.reshape(-1, COUNTS).sum(axis=0, dtype=np.int64)
+    counts = np.zeros(ev.COUNTS, np.int64)
+    for at in grid.state().pages:
+        np.add.at(counts, at.page.votes["place"] // ev.CELLS, at.page.votes["count"].astype(np.int64))
+    return counts
 
 
 def same(one: Grid, other: Grid) -> bool:
     """Equal to the bit."""
     a, b = one.state(), other.state()
-    arrays = all(np.array_equal(getattr(a, f), getattr(b, f)) for f in ("codes", "counts", "bitmaps", "newest"))
-    return arrays and (a.folded, a.skipped) == (b.folded, b.skipped)
+    totals = [(state.folded, state.skipped, state.newest_ns) for state in (a, b)]
+    return totals[0] == totals[1] and [*map(_bits, a.pages)] == [*map(_bits, b.pages)]
+
+
+def same_page(one: Page, other: Page) -> bool:
+    """Equal to the bit."""
+    return _bits_of(one) == _bits_of(other)
+
+
+def _bits(at: Placed) -> tuple[object, ...]:
+    return at.x, at.y, at.rung, at.index, *_bits_of(at.page)
+
+
+def _bits_of(page: Page) -> tuple[object, ...]:
+    return page.votes.dtype, page.votes.tobytes(), page.cells.tobytes()
+
+
+def filled_to(state: GridState, count: int) -> GridState:
+    """The same state with every count that is not zero set to this one."""
+    pages = []
+    for at in state.pages:
+        votes = at.page.votes.astype(WIDE)
+        votes["count"] = count
+        pages.append(replace(at, page=Page(votes, at.page.cells)))
+    return replace(state, pages=tuple(pages))
+
+
+APART = {"keep_buckets": 1000}  # so many buckets that a test sees none of them summed
+
+
+def merged(parts: Iterable[Grid], **options: Any) -> Grid:
+    """Put together grids that were folded apart, with every bucket on a page of its own."""
+    grid = None
+    for part in parts:
+        grid = grid or Grid(part.cell_m, FoldConfig(**options))
+        for at in part.state().pages:
+            assert at.rung == 0
+            grid._ladder((at.x, at.y)).add(at.index, at.page)
+        grid.folded += part.folded
+        grid.skipped += part.skipped
+        grid.newest_ns = max(grid.newest_ns, part.newest_ns)
+    assert grid is not None
+    return grid
 
 
 def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Store:

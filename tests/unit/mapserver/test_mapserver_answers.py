@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mapserver_data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
 
 from mapserver import layers
 from mapserver.answers import Answers
+from mapserver.filling import AREA_LAYERS
 from mapserver.layers import LAYERS, ReadConfig
 from mapserver.writer import Writer
 from protocol.errors import QueryError, Refusal
@@ -22,7 +25,7 @@ def diagonal() -> np.ndarray:
 def answers(tmp_path):
     writer = Writer(tmp_path, SITE, CONFIG, now_ns)
     send(writer, [incoming(diagonal())])
-    yield Answers(writer, SITE, CONFIG.read)
+    yield Answers(writer, SITE, CONFIG)
     writer.close()
 
 
@@ -92,7 +95,7 @@ def test_many_blocks_are_read_in_pieces_and_put_together(tmp_path, monkeypatch):
     rows = random_samples(300, 3)
     writer = Writer(tmp_path, SITE, CONFIG, now_ns)
     send(writer, [incoming(rows)])
-    here = region(Answers(writer, SITE, ReadConfig()), -64, -64, 64, 64, names=("resistance",))
+    here = region(Answers(writer, SITE, CONFIG), -64, -64, 64, 64, names=("resistance",))
     writer.close()
     grid = folded(rows)
     for x in range(-4, 4):
@@ -114,7 +117,8 @@ def test_least_weight_of_the_read_options_is_obeyed(tmp_path):
     writer = Writer(tmp_path, SITE, CONFIG, now_ns)
     send(writer, [incoming(samples(distance_m=2.0))])
     query = PointQuery(8.5, 8.5, ("resistance",))
-    values = [Answers(writer, SITE, ReadConfig(least)).point(query).values["resistance"] for least in (1.9, 2.1)]
+    configs = [replace(CONFIG, read=ReadConfig(least)) for least in (1.9, 2.1)]
+    values = [Answers(writer, SITE, config).point(query).values["resistance"] for config in configs]
     writer.close()
     assert np.isfinite(values[0])
     assert np.isnan(values[1])
@@ -126,7 +130,7 @@ def test_answers_travel_as_bytes(answers):
     here = decode_region(answers.answer("region", {"bounds": "0,-2,2,0", "layers": "grade_east"}))
     np.testing.assert_allclose(here["grade_east"], [[np.nan, 0.01], [0.0, np.nan]], atol=1e-3)
     info = decode_info(answers.answer("info", {"after": "1"}))
-    assert info["layers"] == list(LAYERS)
+    assert info["layers"] == [*LAYERS, *AREA_LAYERS]
     assert info["samples_merged"] == 80
 
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, folded, random_samples, same, samples
+from mapserver_data import NOW_NS, filled_to, folded, random_samples, same, samples
 
 from mapserver import evidence as ev
 from mapserver.grid import READ_BLOCKS, Grid, chunks
@@ -17,7 +17,7 @@ def test_an_empty_grid_knows_nothing():
     assert grid.blocks_in(EVERYTHING) == []
     assert grid.evidence([(0, 0)]).counts.sum() == 0
     grid.fold(samples(0), "a")
-    assert len(grid.state().codes) == 0
+    assert len(grid.state().pages) == 0
 
 
 def test_blocks_exist_only_where_somebody_drove():
@@ -28,7 +28,7 @@ def test_blocks_exist_only_where_somebody_drove():
 def test_a_sample_at_a_corner_touches_four_blocks():
     grid = folded(samples(x_m=0.0, y_m=0.0, cov_xx_m2=0.25, cov_yy_m2=0.25))
     assert grid.blocks_in(EVERYTHING) == [(-1, -1), (-1, 0), (0, -1), (0, 0)]
-    weights = grid.evidence(grid.blocks_in(EVERYTHING)).counts[..., ev.WEIGHT].sum(axis=1)
+    weights = grid.evidence(grid.blocks_in(EVERYTHING)).weight.sum(axis=1)
     assert weights.max() - weights.min() < 0.01 * weights.sum()
 
 
@@ -55,7 +55,7 @@ def test_bounds_are_those_of_the_blocks():
 def test_known_cells_are_counted_once_over_all_buckets():
     once = folded(samples(1))
     again = folded(samples(2, stamp_ns=[NOW_NS, NOW_NS + 3600 * 10**9]))
-    assert len(again.state().codes) == 2
+    assert len(again.state().pages) == 2
     assert once.known_cells() == again.known_cells() > 0
 
 
@@ -63,7 +63,7 @@ def test_evidence_is_summed_over_buckets():
     stamps = NOW_NS + np.array([0, 3600, 7200]) * 10**9
     grid = folded(samples(3, stamp_ns=stamps, distance_m=[1.0, 2.0, 4.0]))
     evidence = grid.evidence([(0, 0)])
-    assert evidence.counts[..., ev.WEIGHT].sum() == 7 * ev.WEIGHT_UNITS_PER_M
+    assert evidence.weight.sum() == 7 * ev.WEIGHT_UNITS_PER_M
     assert evidence.newest_ns.max() == stamps[2]
     assert np.bitwise_count(evidence.bitmaps[..., ev.VISITS]).max() == 3
 
@@ -71,16 +71,15 @@ def test_evidence_is_summed_over_buckets():
 def test_evidence_comes_in_the_order_asked_for_as_a_copy():
     grid = folded(samples(2, x_m=[8.0, 24.0], distance_m=[1.0, 2.0]))
     evidence = grid.evidence([(1, 0), (5, 5), (0, 0)])
-    assert evidence.counts[..., ev.WEIGHT].sum(axis=1).tolist() == [2 * 4096, 0, 4096]
-    before = grid.state()
+    assert evidence.weight.sum(axis=1).tolist() == [2 * 4096, 0, 4096]
     evidence.counts[:] = 0
     evidence.bitmaps[:] = 0
-    assert np.array_equal(grid.state().counts, before.counts)
+    assert same(grid, folded(samples(2, x_m=[8.0, 24.0], distance_m=[1.0, 2.0])))
 
 
 def test_summing_buckets_does_not_wrap():
     grid = folded(samples(4, stamp_ns=NOW_NS + np.arange(4) * 3600 * 10**9))
-    grid._counts[grid._counts > 0] = ev.COUNT_MAX
+    grid = Grid.from_state(1.0, FoldConfig(), filled_to(grid.state(), ev.COUNT_MAX))
     assert grid.evidence([(0, 0)]).counts.max() == 4 * int(ev.COUNT_MAX)
 
 
@@ -98,9 +97,12 @@ def test_a_grid_from_its_state_folds_on_as_if_nothing_happened(seed):
 def test_state_is_a_copy():
     grid = folded(samples(1))
     state = grid.state()
-    before = state.counts.copy()
+    before = [(at.page.votes.copy(), at.page.cells.copy()) for at in state.pages]
     grid.fold(samples(5), "a")
-    assert np.array_equal(state.counts, before)
+    assert grid.known_cells()
+    for at, (votes, cells) in zip(state.pages, before, strict=True):
+        assert np.array_equal(at.page.votes, votes)
+        assert np.array_equal(at.page.cells, cells)
 
 
 def test_many_blocks_keep_their_evidence_while_room_is_made():
@@ -121,9 +123,75 @@ def test_the_ends_of_the_site_and_of_time_have_blocks_of_their_own(cell_m, stamp
     for position in zip(x, y, strict=True):
         column, row = (int(np.floor(p / cell_m)) for p in position)
         near = grid.blocks_in(CellWindow(column - 20, row - 20, 40, 40))
-        assert grid.evidence(near).counts[..., ev.WEIGHT].sum() == 4096
-    assert (grid.state().codes > 0).all()
-    assert set(grid.state().codes >> 36) == {stamp_ns // (60 * 10**9)}
+        assert grid.evidence(near).weight.sum() == 4096
+    assert {(at.rung, at.index) for at in grid.state().pages} == {(0, stamp_ns // (60 * 10**9))}
+
+
+@pytest.mark.parametrize("kernel", ["numpy", "numba"])
+def test_a_stencil_larger_than_all_hot_blocks_makes_room_for_itself(kernel):
+    row = samples(x_m=0.0, y_m=0.0, cov_xx_m2=6.0, cov_yy_m2=6.0, distance_m=50.0)
+    grid = folded(row, cell_m=0.25, hot_blocks=1, kernel=kernel)
+    assert grid.folded == 1
+    assert grid.evidence([(at.x, at.y) for at in grid.state().pages]).weight.sum() == 50 * 4096
+    assert same(grid, folded(row, cell_m=0.25, kernel=kernel))
+
+
+@pytest.mark.parametrize("hot_blocks", [1, 3])
+@pytest.mark.parametrize("kernel", ["numpy", "numba"])
+def test_pieces_are_cut_until_they_fit_and_folded_once(kernel, hot_blocks, monkeypatch):
+    monkeypatch.setattr("mapserver.grid.PIECE", 64)
+    rows = random_samples(200, 4)
+    grid = folded(rows, hot_blocks=hot_blocks, kernel=kernel)
+    assert (grid.folded, grid.skipped) == (200, 0)
+    assert same(grid, folded(rows))
+
+
+@pytest.mark.parametrize("kernel", ["numpy", "numba"])
+def test_rows_that_are_all_too_unsure_of_their_place_open_nothing(kernel):
+    grid = folded(samples(5000, cov_xx_m2=100.0), hot_blocks=1, kernel=kernel)
+    assert (grid.folded, grid.skipped) == (0, 5000)
+    assert grid.state().pages == ()
+    assert len(grid._hot) == 0
+
+
+def test_one_row_of_every_bucket_is_cut_down_to_single_rows():
+    stamps = NOW_NS + np.arange(300) * 300 * 10**9
+    rows = samples(300, stamp_ns=stamps, cov_xx_m2=0, cov_yy_m2=0)
+    assert same(folded(rows, hot_blocks=1), folded(rows))
+
+
+def test_pages_of_a_block_come_in_the_order_of_time():
+    stamps = NOW_NS + np.arange(0, 12 * 24, 2) * 1800 * 10**9
+    draw = np.random.default_rng(1)
+    grid = folded(samples(len(stamps), stamp_ns=stamps[draw.permutation(len(stamps))], cov_xx_m2=0, cov_yy_m2=0))
+    pages, nothing = grid.pages([(0, 0), (9, 9)])
+    newest = [int(timed.page.cells["newest_ns"].max()) for timed in pages]
+    assert newest == sorted(newest)
+    assert nothing == []
+    assert all(timed.first_ns <= stamp < timed.end_ns for timed, stamp in zip(pages, newest, strict=True))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cell_and_bucket_that_machines_drive_take_few_bytes(seed):
+    """Issue 6 allows 500; a page takes about 66, and this tells when that grows."""
+    draw, n = np.random.default_rng(seed), 4000
+    turn = np.cumsum(draw.normal(0, 0.02, n))
+    rows = samples(
+        n,
+        x_m=np.cumsum(0.5 * np.cos(turn)),
+        y_m=np.cumsum(0.5 * np.sin(turn)),
+        heading_rad=(turn + np.pi) % (2 * np.pi) - np.pi,
+        distance_m=0.5,
+        stamp_ns=NOW_NS + np.arange(n) * 250_000_000,
+        cov_xx_m2=1.2**2,
+        cov_yy_m2=1.2**2,
+        c_rr=0.04 * np.exp(draw.normal(0, 0.15, n)),
+        grade_e=draw.normal(0.03, 0.02, n),
+        grade_n=draw.normal(-0.02, 0.02, n),
+    )
+    pages = [at.page for at in folded(rows, keep_buckets=1000).state().pages]
+    per_cell = sum(page.nbytes for page in pages) / sum(len(page.cells) for page in pages)
+    assert per_cell <= 120
 
 
 def test_chunks_hold_every_block_once():

@@ -8,8 +8,9 @@ from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 
 from mapserver import journal as journal_module
 from mapserver.ingest import Admission
-from mapserver.journal import Journal, Mark
+from mapserver.journal import ALL, ArchivedError, Event, Journal, JournalReader, Mark, Wanted
 from protocol.errors import StoreError
+from protocol.geometry import Bounds
 from protocol.samples import SAMPLE_DTYPE
 
 
@@ -66,7 +67,8 @@ def test_rollback_leaves_neither_row_nor_watermark(tmp_path):
     journal.append(admission(2, machine="b"), NOW_NS)
     assert journal.last_row == 3
     journal.rollback()
-    assert (journal.last_row, journal.marks()) == (1, {("a", 7): Mark(3)})
+    assert (journal.last_row, journal.marks()) == (1, {("a", 7): journal.mark("a", 7)})
+    assert (journal.mark("a", 7).seq, journal.mark("a", 7).lost) == (3, 0)
     assert [r.row for r in journal.read()] == [1]
     journal.close()
 
@@ -148,7 +150,7 @@ def test_reopening_continues_the_numbers(tmp_path):
     write(journal, admission(3), admission(2, first_seq=4))
     journal.close()
     journal = open_journal(tmp_path)
-    assert (journal.last_row, journal.mark("a", 7)) == (2, Mark(5))
+    assert (journal.last_row, journal.mark("a", 7).seq) == (2, 5)
     write(journal, admission(2, first_seq=6))
     assert journal.last_row == 3
     journal.close()
@@ -167,7 +169,8 @@ def test_lost_samples_are_summed_and_kept(tmp_path):
     write(journal, admission(2, first_seq=10, lost=6), admission(1, first_seq=13, lost=1))
     journal.close()
     journal = open_journal(tmp_path)
-    assert journal.mark("a", 7) == Mark(13, 7)
+    mark = journal.mark("a", 7)
+    assert (mark.seq, mark.lost) == (13, 7)
     journal.close()
 
 
@@ -198,3 +201,260 @@ def test_column_that_an_older_row_lacks_reads_as_nan():
     found = journal_module._unpack(msgpack.packb(older))
     assert np.isnan(found["grade_var"]).all()
     assert (found["c_rr"] == 1).all()
+
+
+# --- reading by row, time, place and machine -------------------------------------------------------------------------
+
+
+def numbers(rows) -> list[int]:
+    return [r.row for r in rows]
+
+
+@pytest.fixture
+def placed(tmp_path):
+    """Rows of machines a, b, a, b; row i lies at x = 10 i .. 10 i + 4, y = -x, with stamps 100 i .. 100 i + 2."""
+    journal, seqs = open_journal(tmp_path), {"a": 1, "b": 1}
+    for i in (1, 2, 3, 4):
+        x_m, machine = 10.0 * i + np.array([0.0, 4.0, 2.0]), "ab"[(i + 1) % 2]
+        rows = samples(3, x_m=x_m, y_m=-x_m, stamp_ns=100 * i + np.array([1, 0, 2]))
+        write(journal, Admission(batch(rows, seqs[machine], machine), trimmed=0, lost=0))
+        seqs[machine] += 3
+    yield journal
+    journal.close()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        (Wanted(to_ns=199), [1]),
+        (Wanted(to_ns=200), [1, 2]),
+        (Wanted(from_ns=302), [3, 4]),
+        (Wanted(from_ns=303), [4]),
+        (Wanted(from_ns=103, to_ns=199), []),
+        (Wanted(without=frozenset({"a"})), [2, 4]),
+        (Wanted(without=frozenset({"a", "b"})), []),
+        (Wanted(without=frozenset({"a' OR TRUE --"})), [1, 2, 3, 4]),
+        (Wanted(bounds=Bounds(15, -24, 19, -20)), []),
+        (Wanted(bounds=Bounds(15, -24, 20, -20)), [2]),
+        (Wanted(bounds=Bounds(24, -50, 40, 0)), [2, 3, 4]),
+        (Wanted(bounds=Bounds(24.1, -50, 40, 0)), [3, 4]),
+        (Wanted(bounds=Bounds(0, -20, 50, 0)), [1, 2]),
+        (Wanted(bounds=Bounds(0, -50, 50, -34)), [3, 4]),
+        (Wanted(bounds=Bounds(0, -50, 50, -34.1)), [4]),
+        (Wanted(to_ns=350, bounds=Bounds(20, -50, 50, 0), without=frozenset({"b"})), [3]),
+    ],
+)
+def test_reads_by_time_place_and_machine(placed, wanted, expected):
+    assert numbers(placed.read(wanted=wanted)) == expected
+
+
+def test_reads_by_row_numbers(placed):
+    assert numbers(placed.read(after=1, until=3)) == [2, 3]
+    assert numbers(placed.read(after=1, until=3, wanted=Wanted(to_ns=250))) == [2]
+    assert numbers(placed.read(until=0)) == []
+
+
+def test_a_row_whose_box_is_not_known_is_read(placed):
+    placed._db.execute("UPDATE extent SET west_m = NULL, south_m = NULL, east_m = NULL, north_m = NULL WHERE row = 2")
+    assert numbers(placed.read(wanted=Wanted(bounds=Bounds(30, -34, 34, -30)))) == [2, 3]
+
+
+@pytest.mark.parametrize("rows", [199, 200, 201, 401])
+def test_reading_in_pieces_leaves_nothing_out(tmp_path, rows):
+    journal = open_journal(tmp_path)
+    write(journal, *(admission(1, first_seq=i + 1) for i in range(rows)))
+    assert numbers(journal.read()) == list(range(1, rows + 1))
+    assert numbers(journal.read(wanted=Wanted(from_ns=1))) == list(range(1, rows + 1))
+    journal.close()
+
+
+def test_rows_say_when_they_were_received(placed):
+    assert {r.received_ns for r in placed.read()} == {NOW_NS}
+
+
+def test_opening_and_the_newest_stamp_read_no_journal_row(placed):
+    tables = set()
+    placed._db.set_authorizer(lambda action, table, *_: tables.add((action, table)) or sqlite3.SQLITE_OK)
+    placed._return_to_disk()
+    assert placed.newest_ns() == 402
+    assert (sqlite3.SQLITE_READ, "watermark") in tables
+    assert not tables & {(sqlite3.SQLITE_READ, name) for name in ("journal", "extent")}
+
+
+# --- readers ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_reader_sees_what_is_committed(tmp_path):
+    journal = open_journal(tmp_path)
+    write(journal, admission(3))
+    reader = JournalReader(journal.path)
+    journal.begin()
+    journal.append(admission(2, first_seq=4), NOW_NS)
+    assert (numbers(reader.read()), reader.last_row, reader.marks()["a", 7].seq) == ([1], 1, 3)
+    journal.commit()
+    assert (numbers(reader.read()), reader.last_row, reader.marks()) == ([1, 2], 2, journal.marks())
+    assert (reader.site, reader.frame, reader.newest_ns()) == (SITE.name, SITE.frame, journal.newest_ns())
+    reader.close(), journal.close()
+
+
+def test_a_reader_cannot_write(tmp_path):
+    open_journal(tmp_path).close()
+    reader = JournalReader(tmp_path / "journal.db")
+    with pytest.raises(sqlite3.OperationalError, match="readonly"):
+        reader._db.execute("DELETE FROM journal")
+    reader.close()
+
+
+def test_a_reader_in_the_middle_holds_no_lock_on_the_log(tmp_path):
+    journal = open_journal(tmp_path)
+    write(journal, *(admission(1, first_seq=i + 1) for i in range(300)))
+    reader = JournalReader(journal.path)
+    rows = reader.read()
+    next(rows)
+    write(journal, admission(1, first_seq=301))
+    assert journal._db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0] == 0  # 1 would be: busy
+    assert len(list(rows)) == 300
+    reader.close(), journal.close()
+
+
+def test_a_reader_of_nothing_or_of_another_schema_is_refused(tmp_path):
+    with pytest.raises(StoreError, match="no usable journal"):
+        JournalReader(tmp_path / "journal.db")
+    journal = open_journal(tmp_path)
+    journal._db.execute("UPDATE meta SET value = '99' WHERE key = 'schema'")
+    journal.close()
+    with pytest.raises(StoreError, match="schema '99', known is 2"):
+        JournalReader(tmp_path / "journal.db")
+
+
+# --- journals of schema 1 --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def older(tmp_path) -> Path:
+    """A journal as schema 1 left it, with rows of two spools."""
+    journal = open_journal(tmp_path)
+    write(journal, admission(5), admission(2, first_seq=6, lost=1), admission(4, spool_id=2**64 - 1))
+    journal._db.executescript(
+        "DROP TABLE extent; DROP TABLE events; ALTER TABLE watermark DROP COLUMN newest_ns;"
+        "UPDATE meta SET value = '1' WHERE key = 'schema'"
+    )
+    journal.close()
+    return tmp_path / "journal.db"
+
+
+def on_disk(path: Path, query: str) -> list[tuple]:
+    db = sqlite3.connect(path)
+    found = db.execute(query).fetchall()
+    db.close()
+    return found
+
+
+def test_a_journal_of_schema_1_is_brought_up_in_place(older):
+    reader = JournalReader(older)
+    rows, newest = [r.rows.tobytes() for r in reader.read()], reader.newest_ns()
+    assert (numbers(reader.read(wanted=Wanted(from_ns=1))), reader.events(), reader.archived_row) == ([1, 2, 3], [], 0)
+    assert reader.marks()["a", 7].lost == 1
+    reader.close()
+    assert on_disk(older, "SELECT value FROM meta WHERE key = 'schema'") == [("1",)]  # a reader changes nothing
+    for _ in range(2):
+        journal = open_journal(older.parent)
+        assert [r.rows.tobytes() for r in journal.read()] == rows
+        assert journal.newest_ns() == newest == max(mark.newest_ns for mark in journal.marks().values())
+        assert {(m.seq, m.lost) for m in journal.marks().values()} == {(7, 1), (4, 0)}
+        assert numbers(journal.read(wanted=Wanted(bounds=Bounds(1e4, 1e4, 2e4, 2e4)))) == [1, 2, 3]  # boxes unknown
+        assert numbers(journal.read(wanted=Wanted(to_ns=1))) == []
+        journal.close()
+    assert on_disk(older, "SELECT value FROM meta WHERE key = 'schema'") == [("2",)]
+    journal = open_journal(older.parent)
+    write(journal, admission(1, first_seq=8))
+    assert numbers(journal.read(wanted=Wanted(bounds=Bounds(-60, -60, 60, 60)))) == [1, 2, 3, 4]
+    journal.close()
+
+
+def test_an_upgrade_that_fails_leaves_schema_1_as_it_was(older, monkeypatch):
+    before = on_disk(older, "SELECT * FROM sqlite_master")
+    broken = journal_module._FROM_SCHEMA_1.replace("COMMIT;", "INSERT INTO nowhere VALUES (1); COMMIT;")
+    monkeypatch.setattr(journal_module, "_FROM_SCHEMA_1", broken)
+    with pytest.raises(StoreError, match="nowhere"):
+        open_journal(older.parent)
+    monkeypatch.undo()
+    assert on_disk(older, "SELECT * FROM sqlite_master") == before
+    open_journal(older.parent).close()
+
+
+# --- rows that are archived ------------------------------------------------------------------------------------------
+
+
+def test_forgotten_rows_are_gone_and_asked_for_in_vain(placed):
+    assert placed.forget(3, most=2) == 2
+    assert placed.forget(3, most=2) == 3
+    assert (placed.archived_row, placed.last_row, numbers(placed.read(after=3))) == (3, 4, [4])
+    for after, wanted in ((0, ALL), (2, ALL), (0, Wanted(from_ns=400))):
+        with pytest.raises(ArchivedError, match="rows up to 3 are in the archive") as caught:
+            list(placed.read(after, wanted=wanted))
+        assert caught.value.archived_row == 3
+    assert list(placed.read(after=2, until=2)) == []
+    assert placed._number("SELECT COUNT(*) FROM extent") == 1
+
+
+def test_numbers_marks_and_now_outlive_the_rows(placed):
+    marks = placed.marks()
+    assert placed.forget(99) == 4
+    placed.close()
+    journal = open_journal(placed.path.parent)
+    assert (journal.last_row, journal.archived_row, journal.marks(), journal.newest_ns()) == (4, 4, marks, 402)
+    write(journal, admission(1, first_seq=7))
+    assert numbers(journal.read(after=4)) == [5]
+    journal.close()
+    placed._db = sqlite3.connect(":memory:")  # the fixture closes it again
+
+
+def test_forgetting_is_one_transaction(placed):
+    placed._db.execute("CREATE TEMP TRIGGER full BEFORE INSERT ON meta BEGIN SELECT RAISE(FAIL, 'full'); END")
+    with pytest.raises(sqlite3.Error, match="full"):
+        placed.forget(3)
+    assert (placed.archived_row, numbers(placed.read())) == (0, [1, 2, 3, 4])
+
+
+def test_a_journal_with_much_free_space_shrinks_in_steps(tmp_path):
+    journal = open_journal(tmp_path)
+    assert journal._number("PRAGMA auto_vacuum") == 2  # incremental
+    write(journal, *(admission(100, first_seq=1 + 100 * i) for i in range(200)))
+    pages = journal._number("PRAGMA page_count")
+    assert journal.shrink() == 0
+    journal.forget(20)
+    assert journal.shrink() == 0  # what is free is left for the rows to come
+    journal.forget(190)
+    assert journal.shrink(most_pages=50) == 50
+    while journal.shrink():
+        pass
+    assert journal._number("PRAGMA page_count") < 0.2 * pages
+    assert len(list(journal.read(190))) == 10
+    journal.close()
+
+
+# --- events ----------------------------------------------------------------------------------------------------------
+
+
+def test_events_are_kept_in_order(tmp_path):
+    journal = open_journal(tmp_path)
+    bodies = [{"machine": "a", "why": "gain"}, {"cells": [1, 2]}, {"machine": "b"}]
+    ids = [journal.append_event(kind, i, body) for i, (kind, body) in enumerate(zip("tct", bodies, strict=True))]
+    journal.close()
+    reader = JournalReader(journal.path)
+    assert [e.body for e in reader.events()] == bodies
+    assert reader.events("t") == [Event(ids[0], "t", 0, bodies[0]), Event(ids[2], "t", 2, bodies[2])]
+    assert [e.kind for e in reader.events(after=ids[0])] == ["c", "t"]
+    reader.close()
+
+
+def test_an_event_is_never_part_of_a_group_commit(tmp_path):
+    journal = open_journal(tmp_path)
+    journal.begin()
+    journal.append(admission(), NOW_NS)
+    with pytest.raises(sqlite3.OperationalError, match="within a transaction"):
+        journal.append_event("t", 1, {})
+    journal.commit()
+    assert (numbers(journal.read()), journal.events()) == ([1], [])
+    journal.close()

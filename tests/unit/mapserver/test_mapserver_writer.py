@@ -362,7 +362,7 @@ QUERIES = [
 @pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
 def test_a_refused_query_says_why(start, reason, name, parameters):
     with pytest.raises(QueryError) as caught:
-        Answers(start(), SITE, CONFIG.read).answer(name, parameters)
+        Answers(start(), SITE, CONFIG).answer(name, parameters)
     assert caught.value.reason == reason
 
 

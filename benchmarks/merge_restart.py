@@ -1,0 +1,101 @@
+"""How long a map server takes to open a store with weeks of samples in its journal: snapshot, and the tail after it.
+
+The store is opened by a process of its own, `python -m benchmarks.merge_restart FOLDER`, right after it was written:
+its files are still in the system's cache.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections import Counter
+from itertools import islice
+from pathlib import Path
+
+from benchmarks.measure import START_NS, Result, in_child, machine, timed
+from benchmarks.merge_work import BATCH, batches
+from mapserver import snapshot
+from mapserver.config import ServerConfig
+from mapserver.grid import Grid
+from mapserver.ingest import Admission
+from mapserver.journal import Journal
+from mapserver.store import JOURNAL_FILE, Store
+from protocol.arrays import Table
+from protocol.messages import SampleBatch
+from protocol.site import SiteConfig
+
+SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()
+GOAL_S = 5.0
+TAIL_ROWS = CONFIG.store.snapshot_rows  # as many as a crash can leave without a snapshot
+IN_ONE_COMMIT = 10_000  # journal rows: what is measured is the opening, not the writing
+MB = 1e6
+
+
+def run(samples: int) -> Result:
+    """Write a store of so many samples, in batches of BATCH, and open it; every one is folded into its snapshot.
+
+    The row: open_s of the store alone, process_s with the start of Python and its imports, and the sizes on disk.
+    """
+    rows = -(-samples // BATCH)
+    with tempfile.TemporaryDirectory() as path:
+        folder = Path(path)
+        build_s = timed(lambda: build(folder, rows))
+        found: Result = {}
+        process_s = timed(lambda: found.update(in_child("benchmarks.merge_restart", path)))
+        if found["journalled"] != rows or found["merged"] != rows:
+            raise RuntimeError(f"the store has {found['merged']} of {rows} rows in its grid: nothing was measured")
+        sizes = {
+            "journal_mb": round((folder / JOURNAL_FILE).stat().st_size / MB, 1),
+            "snapshot_mb": round(sum(file.stat().st_size for file in folder.glob("snapshot-*")) / MB, 1),
+        }
+    row = {
+        "samples": rows * BATCH,
+        "journal_rows": rows,
+        "tail_rows": rows - found["snapshot_row"],
+        **sizes,
+        "build_s": round(build_s, 1),
+        "open_s": round(found["open_s"], 3),
+        "process_s": round(process_s, 3),
+    }
+    return {"benchmark": "restart", "samples": rows * BATCH, **machine(), "goal_s": GOAL_S, "rows": [row]}
+
+
+def build(folder: Path, rows: int) -> None:
+    """Write a journal of so many rows and a snapshot TAIL_ROWS before its end, none where it is shorter."""
+    journal, grid = Journal(folder / JOURNAL_FILE, SITE.name, SITE.frame), Grid(SITE.cell_m, CONFIG.fold)
+    sent: Counter[str] = Counter()
+    journal.begin()
+    for number, (name, batch) in enumerate(islice(batches(), rows), start=1):
+        journal.append(_admission(name, sent[name] + 1, batch), START_NS)
+        sent[name] += len(batch)
+        if number <= rows - TAIL_ROWS:
+            grid.fold(batch, name)
+        if number == rows - TAIL_ROWS:
+            snapshot.save(folder, number, grid.state(), SITE.cell_m, CONFIG.fold)
+        if number % IN_ONE_COMMIT == 0:
+            journal.commit()
+            journal.begin()
+    journal.commit()
+    journal.close()
+
+
+def opened(folder: Path) -> Result:
+    """Open the store, and say how long that took."""
+    start_s = time.perf_counter()
+    store = Store(folder, SITE, CONFIG, lambda: START_NS)
+    open_s = time.perf_counter() - start_s
+    rows = {"journalled": store.journalled, "merged": store.merged, "snapshot_row": store.snapshot_row}
+    store.close()
+    return {"open_s": open_s, **rows}
+
+
+def _admission(name: str, first_seq: int, rows: Table) -> Admission:
+    return Admission(SampleBatch(name, 1, first_seq, rows, SITE.frame), trimmed=0, lost=0)
+
+
+if __name__ == "__main__":
+    from mapserver import server  # noqa: F401 # a server's imports count in the time of the process
+
+    print(json.dumps(opened(Path(sys.argv[1]))))

@@ -1,0 +1,139 @@
+"""Count, sum and sum of squares per cell, the plain way of merging samples, by five libraries.
+
+Each takes structured rows, as the fold of the map server does, makes of them what its library wants, and adds to what
+it has: no covariance, no histograms, no time. polars and duckdb group a batch's rows by their cells, and what they find
+is added to a dense array; they use all cores, the others one. Libraries are imported where they are used: none is
+needed by the rest of the project.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from protocol.arrays import Floats, Ints, Table
+
+QUERY = "SELECT cell, count(*) AS n, sum(value) AS s, sum(value * value) AS q FROM samples GROUP BY cell"
+
+
+class Sums(Protocol):
+    """Sums over the cells of a site of side * side cells of 1 m, its corner at 0, 0."""
+
+    def fold(self, rows: Table) -> None:
+        """Add samples, all of them on the site."""
+        ...
+
+    def sums(self) -> Floats:
+        """Count, sum and sum of squares of c_rr (side * side, 3), row by row from the south."""
+        ...
+
+
+class HardVotes:
+    """A loop in numba over interleaved cells."""
+
+    def __init__(self, side: int) -> None:
+        from benchmarks.merge_numba import add
+
+        self._add = add
+        self._side = side
+        self._sums = np.zeros((side * side, 3))
+
+    def fold(self, rows: Table) -> None:
+        """See Sums."""
+        self._add(rows, self._sums, self._side)
+
+    def sums(self) -> Floats:
+        """See Sums."""
+        return self._sums
+
+
+class AddAt:
+    """np.add.at, once per sum."""
+
+    def __init__(self, side: int) -> None:
+        self._side = side
+        self._sums = np.zeros((3, side * side))
+
+    def fold(self, rows: Table) -> None:
+        """See Sums."""
+        cell, value = _columns(rows, self._side)
+        np.add.at(self._sums[0], cell, 1.0)
+        np.add.at(self._sums[1], cell, value)
+        np.add.at(self._sums[2], cell, value * value)
+
+    def sums(self) -> Floats:
+        """See Sums."""
+        return self._sums.T
+
+
+class BoostHistogram:
+    """A histogram with a mean per bin: count, mean, and sum of squared deviations in one fill."""
+
+    def __init__(self, side: int) -> None:
+        import boost_histogram as bh
+
+        axes = (bh.axis.Regular(side, 0, side), bh.axis.Regular(side, 0, side))
+        self._histogram = bh.Histogram(*axes, storage=bh.storage.Mean())
+
+    def fold(self, rows: Table) -> None:
+        """See Sums."""
+        y_m, x_m = (np.ascontiguousarray(rows[name]) for name in ("y_m", "x_m"))  # twice as fast as strided
+        self._histogram.fill(y_m, x_m, sample=rows["c_rr"].astype(np.float64))
+
+    def sums(self) -> Floats:
+        """See Sums."""
+        view = np.asarray(self._histogram.view()).ravel()
+        n, mean, deviations = (view[name] for name in ("count", "value", "_sum_of_deltas_squared"))
+        return np.stack([n, n * mean, deviations + n * mean * mean], axis=1)
+
+
+class Polars:
+    """A group-by of polars for each batch."""
+
+    def __init__(self, side: int) -> None:
+        import polars as pl
+
+        self._pl = pl
+        self._side = side
+        self._sums = np.zeros((side * side, 3))
+
+    def fold(self, rows: Table) -> None:
+        """See Sums."""
+        cell, value = _columns(rows, self._side)
+        c = self._pl.col("value")
+        frame = self._pl.DataFrame({"cell": cell, "value": value})
+        found = frame.group_by("cell").agg(self._pl.len(), c.sum().alias("s"), (c * c).sum().alias("q"))
+        self._sums[found["cell"].to_numpy()] += found.select("len", "s", "q").to_numpy()
+
+    def sums(self) -> Floats:
+        """See Sums."""
+        return self._sums
+
+
+class DuckDb:
+    """A group-by of DuckDB for each batch."""
+
+    def __init__(self, side: int) -> None:
+        import duckdb
+
+        self._connection = duckdb.connect()
+        self._side = side
+        self._sums = np.zeros((side * side, 3))
+
+    def fold(self, rows: Table) -> None:
+        """See Sums."""
+        cell, value = _columns(rows, self._side)
+        self._connection.register("samples", {"cell": cell, "value": value})
+        found = self._connection.execute(QUERY).fetchnumpy()
+        self._sums[found["cell"]] += np.stack([found["n"], found["s"], found["q"]], axis=1)
+
+    def sums(self) -> Floats:
+        """See Sums."""
+        return self._sums
+
+
+def _columns(rows: Table, side: int) -> tuple[Ints, Floats]:
+    """Number of the cell that each sample lies in, and its c_rr."""
+    cell = rows["y_m"].astype(np.int64) * side + rows["x_m"].astype(np.int64)
+    return cell, rows["c_rr"].astype(np.float64)

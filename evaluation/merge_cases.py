@@ -1,0 +1,148 @@
+"""The cases on which merges are compared: sites, machines and passes, as the paper's and harder.
+
+A site of 300 x 200 m has five zones. Machines sweep it in lanes 1 m apart, one pass along, the next across.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocol.arrays import Bools, Floats, Ints
+from protocol.errors import ConfigError
+from protocol.ground import ZONES
+
+CELL_M = 1.0
+DRY_CONCRETE, GRAVEL, DRY_DIRT, WET_DIRT, SAND = range(len(ZONES))
+C_RR: Floats = np.array([zone.c_rr for zone in ZONES])
+STEEP = math.tan(math.radians(15))
+# Gradient (east, north) [m/m] of each zone.
+FLAT = ((0.0, 0.0),) * 5
+GENTLE = ((0.0, 0.0), (0.03, 0.0), (0.0, 0.05), (-0.06, 0.04), (0.08, -0.05))
+SLOPES = ((0.0, 0.0), (STEEP, 0.0), (0.0, STEEP), (-STEEP, 0.0), (0.0, -STEEP))
+PASSES_BEFORE = 4  # of `repaved`; the site is repaved while the last of them goes on
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One machine. It states its own covariance truly, and knows neither of its gain nor of its offset.
+
+    first: number of its first pass; even ones go along the site, odd ones across. std_m: of its position error, per
+    axis. gain: factor of its c_rr. offset_m: of its positions, east. parked: stands in the dry dirt and sends all the
+    time.
+    """
+
+    passes: int = 1
+    first: int = 0
+    std_m: float = 1.3
+    gain: float = 1.0
+    offset_m: float = 0.0
+    parked: bool = False
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is driven, on what, and what of the map is judged.
+
+    gradients: of the zones. passes_after: how many whole passes follow upon a repaving. width_m: of a road across wet
+    dirt, whose cells alone are judged. columns, rows: size of the site in cells.
+    """
+
+    name: str
+    machines: tuple[Machine, ...]
+    gradients: Sequence[tuple[float, float]] = FLAT
+    judges_grade: bool = False
+    passes_after: int | None = None
+    width_m: int | None = None
+    columns: int = 300
+    rows: int = 200
+
+    @property
+    def title(self) -> str:
+        """Name, and what tells variants of it apart."""
+        parts = [self.name]
+        parts += [f"{self.passes_after} after"] if self.passes_after is not None else []
+        parts += [f"{self.width_m} m"] if self.width_m is not None else []
+        return ", ".join(parts)
+
+    @property
+    def file_name(self) -> str:
+        """The title without blanks."""
+        return self.title.replace(", ", "-").replace(" ", "_")
+
+
+@dataclass(frozen=True)
+class Site:
+    """True ground by cells (rows, columns), row 0 in the south.
+
+    c_rr; c_rr_later: once it is repaved, the same where it is not. gradient: (rows, columns, 2), east and north.
+    repaved, judged: which cells are.
+    """
+
+    c_rr: Floats
+    c_rr_later: Floats
+    gradient: Floats
+    repaved: Bools
+    judged: Bools
+
+
+def lay(case: Case) -> Site:
+    """The site of a case."""
+    zone = zones(case.columns, case.rows)
+    repaved = np.zeros(zone.shape, np.bool_)
+    judged = np.ones(zone.shape, np.bool_)
+    if case.width_m is not None:
+        zone[:] = WET_DIRT
+        first = (case.rows - case.width_m) // 2
+        zone[first : first + case.width_m] = DRY_CONCRETE
+        judged = zone == DRY_CONCRETE
+    if case.passes_after is not None:
+        repaved = zone == WET_DIRT
+    later = np.where(repaved, GRAVEL, zone)
+    return Site(C_RR[zone], C_RR[later], np.array(case.gradients, float)[zone], repaved, judged)
+
+
+def zones(columns: int, rows: int) -> Ints:
+    """Zone of each cell (rows, columns): two in the south, three in the north."""
+    zone = np.full((rows, columns), DRY_CONCRETE)
+    south, north = slice(0, rows // 2), slice(rows // 2, rows)
+    zone[south, columns // 2 :] = DRY_DIRT
+    zone[north, : columns // 3] = GRAVEL
+    zone[north, columns // 3 : 2 * columns // 3] = SAND
+    zone[north, 2 * columns // 3 :] = WET_DIRT
+    return zone
+
+
+def parking_place(case: Case) -> tuple[float, float]:
+    """Where a machine is parked [m]: in the middle of the dry dirt, which a gain of 1.6 makes wet."""
+    return 0.75 * case.columns * CELL_M, 0.25 * case.rows * CELL_M
+
+
+def _fleet(machines: int, passes: int) -> tuple[Machine, ...]:
+    return tuple(Machine(passes, first) for first in range(machines))
+
+
+_RTK = Machine(std_m=0.05)
+CASES = (
+    Case("1x1", _fleet(1, 1)),
+    Case("1x4", _fleet(1, 4)),
+    Case("4x4", _fleet(4, 4)),
+    Case("bad_machine", (*_fleet(3, 4), Machine(4, 3, gain=1.6, offset_m=3.0))),
+    Case("mixed_receivers", (_RTK, *(Machine(first=first, std_m=2.5) for first in (1, 2, 3)))),
+    Case("parked_bad_machine", (*_fleet(4, 1), Machine(gain=1.6, offset_m=3.0, parked=True))),
+    *(Case("repaved", _fleet(1, PASSES_BEFORE + after), passes_after=after) for after in (1, 2)),
+    *(Case("narrow_road", _fleet(1, 4), width_m=width) for width in (3, 6)),
+    Case("grade_both_ways", _fleet(1, 4), GENTLE, judges_grade=True),
+    Case("slope_15", _fleet(1, 4), SLOPES, judges_grade=True),
+)
+
+
+def select(names: Sequence[str]) -> tuple[Case, ...]:
+    """The cases of these names, in the order of the table; none means all. Raises ConfigError."""
+    known = list(dict.fromkeys(case.name for case in CASES))
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError("--cases", f"`{unknown[0][:40]}` is not known; known: {', '.join(known)}")
+    return tuple(case for case in CASES if not names or case.name in names)

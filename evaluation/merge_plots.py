@@ -1,0 +1,281 @@
+"""Pictures of merged maps: truth and two merges of each case side by side, and all cases by method."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+mpl.use("Agg")  # no screen is needed
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.colors import hsv_to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch
+
+from evaluation.merge import GOALS, GRADE_TOLERANCE, NEAR_M, SERVER, Maps, Plan, Row, Task, classes, figures, solve
+from evaluation.merge_cases import CELL_M, Case, parking_place
+from evaluation.merge_methods import METHODS, Layers
+from evaluation.plots import DPI, STYLE, WIDTH_IN
+from evaluation.workers import each
+from protocol.arrays import Bools, Floats, Ints
+from protocol.ground import UNKNOWN, ZONES, resistance_class
+
+SHOWN = (SERVER, "last_write")
+ZONE_RGB: Floats = np.array([zone.bgr[::-1] for zone in ZONES]) / 255
+UNKNOWN_RGB = (0.88, 0.88, 0.88)
+WRONG_RGB = (1.0, 0.0, 1.0)
+PALENESS = 0.2  # of the true ground behind wrong cells
+# Okabe and Ito's colours, as in the other pictures.
+COLOUR = {SERVER: "#0072B2", "last_write": "#D55E00", "mean": "#E69F00", "median": "#009E73", "kalman": "#CC79A7"}
+BESIDE_ROAD_M = 15.0  # of a narrow road that is shown; the rest of the site is all the same
+LOWEST_PCT = 0.005  # bottom of the bars' scale: three cells of the site
+LABEL_ROOM = 1.6  # a goal that is less than so many times higher would cross the value above a bar
+
+# Groups of bars: what a row is, its figure, and the words below.
+BARS: tuple[tuple[Row, str, str], ...] = (
+    ({"case": "1x1"}, "wrong_pct", "1 machine\n1 pass"),
+    ({"case": "1x4"}, "wrong_pct", "1 machine\n4 passes"),
+    ({"case": "4x4"}, "wrong_pct", "4 machines\n4 passes"),
+    ({"case": "bad_machine"}, "wrong_pct", "4 x 4,\none bad"),
+    ({"case": "mixed_receivers"}, "wrong_pct", "mixed\nreceivers"),
+    ({"case": "parked_bad_machine"}, "wrong_pct", "4 x 1, a bad\none parked"),
+    ({"case": "parked_bad_machine"}, "near_wrong_pct", "the same,\nbeside it"),
+    ({"case": "repaved", "passes_after": 1}, "changed_wrong_pct", "repaved,\n1 pass after"),
+    ({"case": "repaved", "passes_after": 2}, "changed_wrong_pct", "repaved,\n2 after"),
+    ({"case": "repaved", "passes_after": 1}, "unchanged_wrong_pct", "not repaved,\n1 pass after"),
+    ({"case": "narrow_road", "width_m": 3}, "wrong_pct", "road of\n3 m"),
+    ({"case": "narrow_road", "width_m": 6}, "wrong_pct", "road of\n6 m"),
+    ({"case": "grade_both_ways"}, "wrong_pct", "gradient,\nboth ways"),
+    ({"case": "slope_15"}, "wrong_pct", "gradient,\n15 degrees"),
+)
+
+
+def draw(report: Row, plan: Plan, folder: Path) -> list[Path]:
+    """Draw the table, and the maps of each case with the first seed, into a folder; returns the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = [(plan.tasks(case)[0], folder / f"{case.file_name}.png") for case in plan.cases]
+    paths = {task.case: path for (task, path), _ in each(_draw_task, jobs, plan.processes)}
+    table = folder / "table.png"
+    with mpl.rc_context(STYLE):
+        _save(draw_table(report), table)
+    return [table, *(paths[case] for case in plan.cases)]
+
+
+def _draw_task(job: tuple[Task, Path]) -> None:
+    task, path = job
+    with mpl.rc_context(STYLE):
+        _save(draw_maps(task.case, task.seed, solve(task.case, task.seed)), path)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+# --- maps of one case ------------------------------------------------------------------------------------------------
+
+
+def draw_maps(case: Case, seed: int, maps: Maps) -> Figure:
+    """Truth and two merges in the upper row; below, how sure the server is (or a key), and their wrong cells."""
+    figure, panels = plt.subplots(2, 3, figsize=(WIDTH_IN + 3, 8.6), constrained_layout=True)
+    true = _true_layers(maps)
+    for axes, (name, layers) in zip(panels[0], [("truth", true), *_shown(maps)], strict=True):
+        _image(axes, case, _picture(case, layers))
+        axes.set_title(name, loc="left", weight="bold", fontsize=10)
+    for axes, (name, layers) in zip(panels[1, 1:], _shown(maps), strict=True):
+        _draw_wrong(axes, case, maps, layers)
+        found = figures(case, maps.scene, layers)
+        title = f"{name}: {found.get('wrong_pct', math.nan):.2f} % wrong{_parts(found)}"
+        axes.set_title(title, loc="left", weight="bold", fontsize=10)
+        axes.set_xlabel("east [m]")
+    if case.judges_grade:
+        _draw_wheel(panels[1, 0], case)
+    else:
+        _draw_confidence(figure, panels[1, 0], case, maps.layers[SERVER]["confidence"])
+    for axes in panels.flat[[0, 1, 2, 4, 5]]:
+        _draw_marks(axes, case, maps)
+    panels[0, 0].set_ylabel("north [m]")
+    figure.legend(handles=_handles(case), loc="outside lower center", ncols=8)
+    title = f"{case.title}, seed {seed}: {maps.scene.samples:,} samples of {_count(len(case.machines), 'machine')}"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
+    return figure
+
+
+def _shown(maps: Maps) -> list[tuple[str, Layers]]:
+    return [(name, maps.layers[name]) for name in SHOWN]
+
+
+def _true_layers(maps: Maps) -> Layers:
+    site = maps.scene.site
+    east, north = np.moveaxis(site.gradient, -1, 0)
+    return {"resistance": site.c_rr_later, "grade_east": east, "grade_north": north}
+
+
+def _parts(found: dict[str, float]) -> str:
+    """Figures of a case's own, for a title."""
+    words = {"changed_wrong_pct": "changed", "unchanged_wrong_pct": "unchanged", "near_wrong_pct": "beside the machine"}
+    parts = [f"{word} {found[name]:.2f}" for name, word in words.items() if name in found]
+    return f"\n{', '.join(parts)}" if parts else ""
+
+
+def _image(axes: Axes, case: Case, rgb: Any, **options: Any) -> Any:
+    extent = (0.0, case.columns * CELL_M, 0.0, case.rows * CELL_M)
+    axes.grid(visible=False)
+    image = axes.imshow(rgb, origin="lower", extent=extent, interpolation="nearest", **options)
+    if case.width_m is not None:
+        middle = case.rows * CELL_M / 2
+        axes.set_ylim(middle - BESIDE_ROAD_M, middle + BESIDE_ROAD_M)
+        axes.set_aspect("auto")
+    return image
+
+
+def _picture(case: Case, layers: Layers) -> Floats:
+    """Colours (rows, columns, 3) of a map."""
+    if case.judges_grade:
+        return _gradient_rgb(layers["grade_east"], layers["grade_north"], _steepest(case))
+    return _zone_rgb(resistance_class(layers["resistance"]))
+
+
+def _zone_rgb(zone: Ints) -> Floats:
+    return np.where((zone == UNKNOWN)[..., None], UNKNOWN_RGB, ZONE_RGB[np.maximum(zone, 0)])
+
+
+def _gradient_rgb(east: Floats, north: Floats, steepest: float) -> Floats:
+    """Hue is the direction uphill, and the steeper the stronger."""
+    known = np.isfinite(east) & np.isfinite(north)
+    east, north = np.where(known, east, 0), np.where(known, north, 0)
+    hue = np.arctan2(north, east) / (2 * np.pi) % 1
+    strong = np.clip(np.hypot(east, north) / steepest, 0, 1)
+    rgb = hsv_to_rgb(np.stack([hue, strong, 1 - 0.15 * strong], axis=-1))
+    return np.where(known[..., None], rgb, UNKNOWN_RGB)
+
+
+def _steepest(case: Case) -> float:
+    return max(math.hypot(*gradient) for gradient in case.gradients)
+
+
+def _draw_wrong(axes: Axes, case: Case, maps: Maps, layers: Layers) -> None:
+    """Wrong cells over the pale truth; what is not judged is white."""
+    found, true = classes(case, maps.scene, layers)
+    judged = maps.scene.driven & maps.scene.site.judged
+    rgb = 1 - PALENESS * (1 - _picture(case, _true_layers(maps)))
+    rgb[judged & (found == UNKNOWN)] = UNKNOWN_RGB
+    rgb[~judged] = 1.0
+    rgb[judged & (found != UNKNOWN) & (found != true)] = WRONG_RGB
+    _image(axes, case, rgb)
+
+
+def _draw_confidence(figure: Figure, axes: Axes, case: Case, confidence: Floats) -> None:
+    image = _image(axes, case, confidence, cmap="viridis", vmin=0.3, vmax=1.0)
+    axes.set_title(f"{SERVER}: confidence", loc="left", weight="bold", fontsize=10)
+    axes.set_xlabel("east [m]")
+    axes.set_ylabel("north [m]")
+    bar = axes.inset_axes((0.0, -0.3, 1.0, 0.05))  # a colour bar beside the panel would make it smaller than the others
+    label = "share of the votes that the leading class has [-]"
+    figure.colorbar(image, cax=bar, orientation="horizontal", label=label)
+
+
+def _draw_wheel(axes: Axes, case: Case) -> None:
+    """Key of the colours of gradients."""
+    steepest = 100 * _steepest(case)
+    east, north = np.meshgrid(*[np.linspace(-steepest, steepest, 201)] * 2)
+    rgb = _gradient_rgb(east, north, steepest)
+    rgb[np.hypot(east, north) > steepest] = 1.0
+    axes.imshow(rgb, origin="lower", extent=(-steepest, steepest, -steepest, steepest))
+    for each_east, each_north in case.gradients:
+        axes.plot(100 * each_east, 100 * each_north, "o", color="black", ms=5, mfc="none", clip_on=False)
+    axes.set_title("key; circles: the zones", loc="left", weight="bold", fontsize=10)
+    axes.set_xlabel("grade to the east [%]")
+    axes.set_ylabel("grade to the north [%]")
+
+
+def _draw_marks(axes: Axes, case: Case, maps: Maps) -> None:
+    """Outline of what was repaved, and the ring that a parked machine reaches."""
+    if maps.scene.site.repaved.any():
+        _outline(axes, case, maps.scene.site.repaved)
+    for machine in (m for m in case.machines if m.parked):
+        x_m, y_m = parking_place(case)
+        axes.add_patch(Circle((x_m + machine.offset_m, y_m), 3 * NEAR_M, fill=False, color="white", lw=3))
+        axes.add_patch(Circle((x_m + machine.offset_m, y_m), 3 * NEAR_M, fill=False, color="black", lw=1.2))
+
+
+def _outline(axes: Axes, case: Case, cells: Bools) -> None:
+    x, y = ((np.arange(count) + 0.5) * CELL_M for count in (case.columns, case.rows))
+    axes.contour(x, y, cells, levels=[0.5], colors="black", linewidths=1.2, linestyles="--")
+
+
+def _handles(case: Case) -> list[Any]:
+    handles: list[Any] = []
+    if not case.judges_grade:
+        handles += [Patch(color=rgb, label=f"{z.name} {z.c_rr:g}") for rgb, z in zip(ZONE_RGB, ZONES, strict=True)]
+    wrong = f"off by more than {100 * GRADE_TOLERANCE:g} % grade" if case.judges_grade else "wrong class"
+    handles += [Patch(color=WRONG_RGB, label=wrong), Patch(color=UNKNOWN_RGB, label="unknown")]
+    if case.passes_after is not None:
+        handles.append(Line2D([], [], color="black", ls="--", lw=1.2, label="repaved"))
+    if any(machine.parked for machine in case.machines):
+        handles.append(Line2D([], [], color="black", marker="o", mfc="none", ls="", label="parked machine"))
+    return handles
+
+
+# --- all cases -------------------------------------------------------------------------------------------------------
+
+
+def draw_table(report: Row) -> Figure:
+    """Wrong cells of all cases by method, on a logarithmic scale: medians, ranges over the seeds, and goals."""
+    groups = [(wanted, name, words) for wanted, name, words in BARS if _found(report, {**wanted, "method": SERVER})]
+    figure, axes = plt.subplots(figsize=(max(6.0, 1.05 * len(groups) + 1.5), 5.0), constrained_layout=True)
+    wide = 0.84 / len(COLOUR)
+    for x, (wanted, name, _) in enumerate(groups):
+        for i, method in enumerate((SERVER, *METHODS)):
+            row = _found(report, {**wanted, "method": method})
+            if row and row[name] is not None:
+                limits = _limits(wanted, name) if method == SERVER else []
+                _draw_bar(axes, x + (i - (len(COLOUR) - 1) / 2) * wide, wide, row, name, limits)
+    axes.set_yscale("log")
+    axes.set_ylim(LOWEST_PCT, 250.0)
+    axes.set_yticks([0.01, 0.1, 1, 10, 100], ["0.01", "0.1", "1", "10", "100"])
+    axes.set_xlim(-0.6, len(groups) - 0.4)
+    axes.set_xticks(range(len(groups)), [words for _, _, words in groups])
+    axes.grid(visible=False, axis="x")
+    axes.set_ylabel("driven cells that are wrong [%]")
+    handles: list[Any] = [Patch(color=colour, label=name) for name, colour in COLOUR.items()]
+    handles.append(Line2D([], [], color="black", lw=2, label=f"goal of {SERVER}"))
+    axes.legend(handles=handles, ncols=6, loc="upper left")
+    title = f"Medians of {_count(len(report['seeds']), 'seed')}, whiskers from the best to the worst"
+    axes.set_title(title, loc="left", weight="bold", fontsize=10)
+    return figure
+
+
+def _draw_bar(axes: Axes, x: float, wide: float, row: Row, name: str, limits: Sequence[float]) -> None:
+    """One bar; above that of the server its value, free of whisker and goal."""
+    top = max(row[name], LOWEST_PCT)
+    axes.bar(x, top, wide * 0.92, color=COLOUR[row["method"]])
+    if name == "wrong_pct":
+        low, high = (max(row[f"wrong_{end}_pct"], LOWEST_PCT) for end in ("min", "max"))
+        axes.plot([x, x], [low, high], color="black", lw=1)
+        top = max(top, high)
+    for limit in limits:
+        axes.plot([x - 0.7 * wide, x + 0.7 * wide], [limit, limit], color="black", lw=2, zorder=4)
+        top = limit if top < limit < LABEL_ROOM * top else top
+    if row["method"] == SERVER:
+        axes.text(x, top * 1.12, f"{row[name]:.2g}", ha="center", va="bottom", fontsize=7, weight="bold")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _found(report: Row, wanted: Row) -> Row | None:
+    return next((row for row in report["rows"] if wanted.items() <= row.items()), None)
+
+
+def _limits(wanted: Row, name: str) -> list[float]:
+    goal = {**wanted, "method": SERVER}
+    return [limit for row, figure, relation, limit in GOALS if (row, figure, relation) == (goal, name, "<=")]

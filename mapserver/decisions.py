@@ -1,0 +1,73 @@
+"""Whom the map trusts: decisions by the audit and by people, with their reasons, kept in the journal's events.
+
+A machine's newest decision counts. One made by a person stands until a person hands it back to the audit; the audit
+waits for the same verdict several times, so that a doubtful machine does not go in and out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from mapserver.journal import Event
+from mapserver.trust import Verdict
+
+KIND = "trust"
+AUDIT, PERSON = "audit", "person"
+DISTRUST_AFTER, TRUST_AFTER = 2, 4  # verdicts in a row
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What was decided about a machine. by: the audit or a person; evidence: plain values."""
+
+    machine: str
+    trusted: bool
+    by: str
+    reason: str
+    stamp_ns: int
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def body(self) -> dict[str, Any]:
+        """As an event keeps it."""
+        return asdict(self)
+
+
+class Decisions:
+    """Newest decision about each machine."""
+
+    def __init__(self, events: Iterable[Event]) -> None:
+        self._newest = {event.body["machine"]: Decision(**event.body) for event in events}
+        self._in_a_row: dict[str, int] = {}
+
+    @property
+    def distrusted(self) -> frozenset[str]:
+        """Machines whose rows are left out of the map."""
+        return frozenset(name for name, decision in self._newest.items() if not decision.trusted)
+
+    def of(self, machine: str) -> Decision | None:
+        """The newest decision, None where there never was one."""
+        return self._newest.get(machine)
+
+    def take(self, decision: Decision) -> None:
+        """Let a decision count."""
+        self._newest[decision.machine] = decision
+        self._in_a_row.pop(decision.machine, None)
+
+    def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> list[Decision]:
+        """What the audit decides on these verdicts; the caller keeps it, then calls `take`."""
+        return [found for verdict in verdicts.values() if (found := self._judge(verdict, stamp_ns))]
+
+    def _judge(self, verdict: Verdict, stamp_ns: int) -> Decision | None:
+        machine, now = verdict.machine, self._newest.get(verdict.machine)
+        trusted = now is None or now.trusted
+        if (now and now.by == PERSON) or verdict.contradicts != trusted:
+            self._in_a_row.pop(machine, None)
+            return None
+        self._in_a_row[machine] = self._in_a_row.get(machine, 0) + 1
+        if self._in_a_row[machine] < (DISTRUST_AFTER if trusted else TRUST_AFTER):
+            return None
+        reason = ", ".join(verdict.reasons) if trusted else "agrees with the others again"
+        return Decision(machine, not trusted, AUDIT, reason, stamp_ns, dict(verdict.evidence))

@@ -1,0 +1,96 @@
+"""The pages of one block by time: the newest buckets apart, older ones summed into hours, days and all before.
+
+What is kept apart goes by rank, not by age: ground that is driven once a day keeps its last passes apart as well as a
+haul road, and a block never takes more than a fixed number of pages. The newest buckets of a set of buckets do not
+depend on the order in which they came, and summing commutes, so that a ladder is a function of the samples alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from mapserver.pages import Page, merge
+from mapserver.votes import FoldConfig
+
+HOUR_S, DAY_S = 3600, 86_400
+Block = tuple[int, int]  # column and row
+
+
+@dataclass(frozen=True)
+class Rung:
+    """Spans of one length [ns], of which the newest `keep` stay apart; keep 0: all of them are one."""
+
+    span_ns: int
+    keep: int
+
+
+@dataclass(frozen=True, slots=True)
+class TimedPage:
+    """A page, and the span of time that its samples lie in."""
+
+    first_ns: int
+    end_ns: int
+    page: Page
+
+
+def rungs(config: FoldConfig) -> tuple[Rung, ...]:
+    """Buckets, hours, days, and everything before them."""
+    return (
+        Rung(config.bucket_ns, config.keep_buckets),
+        Rung(HOUR_S * 10**9, config.keep_hours),
+        Rung(DAY_S * 10**9, config.keep_days),
+        Rung(0, 0),
+    )
+
+
+class Ladder:
+    """Pages of one block."""
+
+    def __init__(self, rungs: tuple[Rung, ...]) -> None:
+        self._rungs = rungs
+        self._pages: tuple[dict[int, Page], ...] = tuple({} for _ in rungs)
+
+    def add(self, bucket: int, page: Page) -> None:
+        """Add evidence of a time bucket."""
+        self._put(0, bucket, page)
+
+    def put(self, rung: int, index: int, page: Page) -> None:
+        """Put a page back where `items` found it."""
+        self._pages[rung][index] = page
+
+    def items(self) -> Iterator[tuple[int, int, Page]]:
+        """Rung, index on it, and page, sorted."""
+        for rung, pages in enumerate(self._pages):
+            for index in sorted(pages):
+                yield rung, index, pages[index]
+
+    def timed(self) -> list[TimedPage]:
+        """Pages in the order of time.
+
+        A page of a coarser rung may begin before one of a finer rung ends: both have evidence of the same hour. The
+        finer one is newer.
+        """
+        found = []
+        for rung, index, page in self.items():
+            span = self._rungs[rung].span_ns
+            end = (index + 1) * span if span else int(page.cells["newest_ns"].max()) + 1
+            found.append((-rung, TimedPage(index * span, end, page)))
+        return [timed for _, timed in sorted(found, key=lambda item: (item[0], item[1].first_ns))]
+
+    def _put(self, rung: int, index: int, page: Page) -> None:
+        pages, keep = self._pages[rung], self._rungs[rung].keep
+        if index in pages:
+            pages[index] = merge(pages[index], page)
+        elif not keep or len(pages) < keep:
+            pages[index] = page
+        else:
+            oldest = min(pages)
+            if index > oldest:
+                pages[index], page, index = page, pages.pop(oldest), oldest
+            self._put(rung + 1, self._above(rung, index), page)
+
+    def _above(self, rung: int, index: int) -> int:
+        """Index of the coarser span that holds this one."""
+        span = self._rungs[rung + 1].span_ns
+        return index * self._rungs[rung].span_ns // span if span else 0

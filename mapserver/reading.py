@@ -1,0 +1,86 @@
+"""From pages to evidence that holds now: what a read of the map begins with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapserver import evidence as ev
+from mapserver.change import ChangeConfig, first_valid, without_thin
+from mapserver.ladder import Block, TimedPage
+from protocol.arrays import AnyArray, Ints
+from protocol.geometry import BLOCK_CELLS
+
+Pages = Mapping[Block, Sequence[TimedPage]]
+
+
+def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block, Ints]:
+    """For each block, index (256,) of the first page that holds now in each of its cells, 0 where nothing changed.
+
+    Cells at the edge of the blocks see no further: give a ring of blocks more than are wanted.
+    """
+    first = {block: first_valid(of_block, config) for block, of_block in pages.items()}
+    if not any(found.any() for found in first.values()):
+        return first
+    image, (left, bottom) = image_of({block: found > 0 for block, found in first.items()})
+    image = without_thin(image, cell_m, config)
+    n = BLOCK_CELLS
+    for (x, y), found in first.items():
+        wide = image[(y - bottom) * n : (y - bottom + 1) * n, (x - left) * n : (x - left + 1) * n]
+        found[~wide.ravel()] = 0
+    return first
+
+
+def around(block: Block) -> list[Block]:
+    """A block and its eight neighbours."""
+    x, y = block
+    return [(x + dx, y + dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+
+
+def evidence(pages: Sequence[Sequence[TimedPage]], first: Sequence[Ints] | None = None) -> ev.Evidence:
+    """Sum the pages of blocks, from the first that holds on in each cell; all of them where `first` is not given."""
+    counts = np.zeros((len(pages), ev.COUNTS, ev.CELLS), np.uint64)
+    bitmaps = np.zeros((len(pages), ev.CELLS, 2), np.uint64)
+    newest_ns = np.zeros((len(pages), ev.CELLS), np.int64)
+    changed_ns = np.zeros((len(pages), ev.CELLS), np.int64)
+    for i, of_block in enumerate(pages):
+        start = first[i] if first else np.zeros(ev.CELLS, np.int64)
+        _sum(of_block, start, counts[i].reshape(-1), bitmaps[i], newest_ns[i])
+        if start.any():
+            changed_ns[i] = _changed_ns(of_block, start)
+    return ev.Evidence(counts.transpose(0, 2, 1), bitmaps, newest_ns, changed_ns)
+
+
+def _sum(
+    pages: Sequence[TimedPage], start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints
+) -> None:
+    last = int(start.max(initial=0))
+    for index, timed in enumerate(pages):
+        page = timed.page if index >= last else timed.page.of_cells(start <= index)
+        page.add_to(counts, bitmaps, newest_ns)
+
+
+def _changed_ns(pages: Sequence[TimedPage], start: Ints) -> Ints:
+    """When each cell (256,) changed, 0 where it did not: after its last old sample, and within the first new span."""
+    changed_ns = np.zeros(ev.CELLS, np.int64)
+    for index, timed in enumerate(pages):
+        begins = start == index
+        changed_ns[begins & (start > 0)] = np.maximum(changed_ns, timed.first_ns)[begins & (start > 0)]
+        cells = timed.page.cells
+        old = start[cells["cell"]] > index
+        at = cells["cell"][old]
+        changed_ns[at] = np.maximum(changed_ns[at], cells["newest_ns"][old])
+    return changed_ns
+
+
+def image_of(blocks: Mapping[Block, AnyArray]) -> tuple[AnyArray, Block]:
+    """Values (256,) of blocks as one image (rows, columns), 0 elsewhere; and its first block column and row."""
+    xs, ys = [x for x, _ in blocks], [y for _, y in blocks]
+    left, bottom, n = min(xs), min(ys), BLOCK_CELLS
+    kind = next(iter(blocks.values())).dtype
+    image = np.zeros(((max(ys) - bottom + 1) * n, (max(xs) - left + 1) * n), kind)
+    for (x, y), cells in blocks.items():
+        image[(y - bottom) * n : (y - bottom + 1) * n, (x - left) * n : (x - left + 1) * n] = cells.reshape(n, n)
+    return image, (left, bottom)

@@ -1,0 +1,156 @@
+"""Trust: which machines contradict all others, why, and by what evidence.
+
+Each machine has a coarse map of its own (trust_ledger.py). All pairs of maps are compared (trust_compare.py), and so
+are the stamps at reception (trust_clock.py). A machine is found where it is outvoted by machines that agree among
+themselves (trust_vote.py), and where its difference from the map of all that are in good standing is beyond doubt
+(trust_judge.py). No clock, no threads, no files. Whether and when to distrust is the caller's decision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from math import exp, isfinite
+from typing import Any
+
+import numpy as np
+
+from mapserver.trust_clock import ClockWatch
+from mapserver.trust_compare import CompareConfig, Difference, Map, compare, reverse
+from mapserver.trust_judge import GROUND, Finding, Reason, TrustConfig, judge
+from mapserver.trust_ledger import Ledger, map_cell_m, pooled
+from mapserver.trust_vote import AGREE, DISAGREE, UNKNOWN, outvoted
+from mapserver.votes import FoldConfig, is_foldable
+from protocol.arrays import Ints, Table
+
+__all__ = ["Auditor", "Reason", "TrustConfig", "Verdict"]
+
+_PAIR_SIGMAS = 1.0  # a vote may be doubtful where several are needed, a verdict may not
+_PRINTED = {AGREE: "agrees_with", DISAGREE: "disagrees_with", UNKNOWN: "undecided_with"}
+
+Pairs = dict[tuple[str, str], dict[Reason, Finding]]  # findings about the first of two machines
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is known of one machine.
+
+    reasons: empty unless it contradicts all others. evidence: plain values; what could not be compared is missing.
+    cells, gain, offset_east_m, offset_north_m, offset_std_m, agreement [-], spread and spread_of_others (of the levels)
+    against the map of all others in good standing; clock_s: ahead of the others; excess: by reason, 1 at its limit;
+    agrees_with, disagrees_with, undecided_with: machines.
+    """
+
+    machine: str
+    reasons: tuple[Reason, ...]
+    evidence: Mapping[str, Any]
+    contradicts: bool
+
+
+class Auditor:
+    """Listens to all machines of one site. cell_m: of the site's grid; fold: which samples know their place."""
+
+    def __init__(self, config: TrustConfig, cell_m: float, fold: FoldConfig | None = None) -> None:
+        self._config = config
+        self._cell_m = cell_m
+        self._fold = fold or FoldConfig()
+        self._ledgers: dict[str, Ledger] = {}
+        self._clocks = ClockWatch(config.clock_span_s, config.clock_steady_s, config.clock_limit_s)
+        limits = (config.min_cells, config.zero_error, config.error_length_m, config.tolerance)
+        self._compare = CompareConfig(map_cell_m(cell_m), *limits)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all machines' maps."""
+        return sum(ledger.nbytes for ledger in self._ledgers.values())
+
+    def add(self, machine: str, rows: Table, received_ns: int) -> None:  # noqa: ARG002
+        """Add samples of one machine, as they lie in a journal row; rows in the order of the journal.
+
+        The maps depend on no order. The clocks do: compared is what the machines sent at about the same time, and the
+        order of the journal tells that better than received_ns, which steps where the server's clock is set.
+        """
+        if not len(rows):
+            return
+        if machine not in self._ledgers:
+            self._ledgers[machine] = Ledger(self._cell_m, round(self._config.period_s * 1e9), self._config.periods)
+        sure = is_foldable(rows, self._fold)
+        self._ledgers[machine].add(rows if sure.all() else rows[sure])
+        self._clocks.add(machine, int(rows["stamp_ns"].max()))
+
+    def verdicts(self) -> dict[str, Verdict]:
+        """Judge every machine."""
+        names = sorted(self._ledgers)
+        maps = [Map(surface, surface.places()) for surface in (self._ledgers[name].surface() for name in names)]
+        pairs = self._pairs(names, maps)
+        states = {reason: _states(names, pairs, reason) for reason in Reason}
+        groups = {reason: outvoted(states[reason]) for reason in Reason}
+        suspected = [any(groups[reason][i] for reason in GROUND) for i in range(len(names))]
+        verdicts = {}
+        for i, difference in enumerate(self._from_pool(maps, suspected)):
+            findings = judge(difference, self._config, self._config.sigmas)
+            findings[Reason.CLOCK], lead = self._clock(names, i, groups[Reason.CLOCK][i])
+            reasons = tuple(r for r in Reason if groups[r][i] and findings[r].state == DISAGREE)
+            excess = {str(r): round(f.excess, 3) for r, f in findings.items() if f.excess}
+            evidence = _measured(difference) | lead | {"excess": excess} | _sides(names, states, i)
+            verdicts[names[i]] = Verdict(names[i], reasons, evidence, bool(reasons))
+        return verdicts
+
+    def _pairs(self, names: Sequence[str], maps: Sequence[Map]) -> Pairs:
+        """Findings about every machine against every other."""
+        pairs: Pairs = {}
+        for (one, one_map), (other, other_map) in combinations(zip(names, maps, strict=True), 2):
+            difference = compare(one_map, other_map, self._compare)
+            pairs[one, other] = judge(difference, self._config, _PAIR_SIGMAS)
+            pairs[other, one] = judge(reverse(difference) if difference else None, self._config, _PAIR_SIGMAS)
+        for (one, other), findings in pairs.items():
+            findings[Reason.CLOCK] = self._clocks.compare(one, other)[1]
+        return pairs
+
+    def _from_pool(self, maps: Sequence[Map], suspected: Sequence[bool]) -> Iterator[Difference | None]:
+        """Differences of each machine from all others in good standing together: more ground than any one has."""
+        good = [each for each, bad in zip(maps, suspected, strict=True) if not bad]
+        pool = Map(pooled([each.timed for each in good]), pooled([each.placed for each in good]))
+        for own, bad in zip(maps, suspected, strict=True):
+            rest = pool if bad else Map(pool.timed.without(own.timed), pool.placed.without(own.placed))
+            yield compare(own, rest, self._compare)
+
+    def _clock(self, names: Sequence[str], i: int, group: Sequence[int]) -> tuple[Finding, dict[str, Any]]:
+        """Typical lead over the machines that outvote this one, or else over all others."""
+        others = group or [j for j in range(len(names)) if j != i]
+        leads = [self._clocks.compare(names[i], names[j]) for j in others]
+        leads = [(lead, finding) for lead, finding in leads if isfinite(lead)]
+        if not leads:
+            return Finding(), {}
+        lead, finding = sorted(leads, key=lambda each: each[0])[len(leads) // 2]
+        return finding, {"clock_s": round(lead, 1)}
+
+
+def _states(names: Sequence[str], pairs: Pairs, reason: Reason) -> Ints:
+    """Matrix of AGREE, UNKNOWN, DISAGREE for one reason."""
+    states = np.full((len(names), len(names)), UNKNOWN, np.int64)
+    for (one, other), findings in pairs.items():
+        states[names.index(one), names.index(other)] = findings[reason].state
+    return states
+
+
+def _measured(difference: Difference | None) -> dict[str, Any]:
+    """What a comparison found, in plain values."""
+    if difference is None:
+        return {"cells": 0}
+    shift = difference.shift
+    values: dict[str, Any] = {"cells": difference.cells, "gain": exp(difference.gain.log)}
+    if shift:
+        values |= {"offset_east_m": shift.east_m, "offset_north_m": shift.north_m, "offset_std_m": shift.std_m}
+    own, others = difference.spreads
+    values |= {"agreement": difference.agreement, "spread": own, "spread_of_others": others}
+    return {name: round(value, 3) for name, value in values.items()}
+
+
+def _sides(names: Sequence[str], states: Mapping[Reason, Ints], i: int) -> dict[str, Any]:
+    """Whom it disagrees with in anything, agrees with in all that is known, and cannot be compared with."""
+    rows = np.stack([states[reason][i] for reason in Reason])
+    worst = np.where((rows == DISAGREE).any(axis=0), DISAGREE, rows.max(axis=0))
+    others = [j for j in range(len(names)) if j != i]
+    return {text: tuple(names[j] for j in others if worst[j] == state) for state, text in _PRINTED.items()}

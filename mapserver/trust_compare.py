@@ -1,0 +1,173 @@
+"""Two maps of the same ground at the same time: by how much, and in which way, they differ.
+
+Nothing here knows who is right. A `Difference` is of the first map from the second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from mapserver.trust_ledger import LEVEL_FLOOR, ROW, Surface
+from mapserver.trust_shift import Shift, find_shift, near_borders
+from protocol.arrays import Floats, Ints
+
+_LOWEST_C_RR = 0.004  # the lowest that the map knows: ratios of less mean nothing
+_SCATTER = 0.1  # of log(c_rr) between two machines on one cell, besides the zero error
+_MOST_CELLS = 8000
+# Neighbouring cells share samples and errors: so many count as one; and 1.25 / 0.6745 turns a median absolute
+# deviation into the standard error of a median.
+CELLS_PER_DRAW, _MEDIAN_ERROR = 4, 1.85
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Ratio of one map's coefficients to the other's.
+
+    log: its logarithm, std its standard error; share: of the ground that differs in the same direction; c_rr: typical
+    coefficient of the ground compared.
+    """
+
+    log: float
+    std: float
+    share: float
+    c_rr: float
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How one map differs from another.
+
+    cells: compared, of the same period; shift: None where no border tells; agreement: share of the cells whose levels
+    agree within the tolerance once gain and shift are taken out; spreads: standard deviations of both levels on them.
+    """
+
+    cells: int
+    gain: Gain
+    shift: Shift | None
+    agreement: float
+    spreads: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Map:
+    """One side of a comparison: its map by periods, and by places alone."""
+
+    timed: Surface
+    placed: Surface
+
+    @cached_property
+    def borders(self) -> Ints:
+        """Indices of the places near borders."""
+        return near_borders(self.placed)
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """What a comparison takes as given: cell_m of the maps, the others as in TrustConfig."""
+
+    cell_m: float
+    min_cells: int
+    zero_error: float
+    error_length_m: float
+    tolerance: float
+
+
+def compare(one: Map, other: Map, config: CompareConfig) -> Difference | None:
+    """Compare two maps; None where they have too little ground in common.
+
+    Gain and agreement compare cells of the same period, for it may have rained in between. The shift compares places:
+    rain moves no border, and it needs every border that there is.
+    """
+    a, b = _common(one.timed.codes, other.timed.codes)
+    cells = len(a)
+    if cells < config.min_cells:
+        return None
+    a, b = _thinned(a, b)
+    gain = _gain(one.timed, other.timed, a, b, config)
+    shift = _shift(one, other, config)
+    return Difference(
+        cells=cells,
+        gain=gain,
+        shift=shift,
+        agreement=_agreement(one.timed, other.timed, b, gain.log, shift, config),
+        spreads=(float(np.std(one.timed.level[a])), float(np.std(other.timed.level[b]))),
+    )
+
+
+def reverse(d: Difference) -> Difference:
+    """The same, of the second map from the first."""
+    shift = Shift(-d.shift.east_m, -d.shift.north_m, d.shift.std_m) if d.shift else None
+    return replace(d, gain=replace(d.gain, log=-d.gain.log), shift=shift, spreads=(d.spreads[1], d.spreads[0]))
+
+
+def _common(one: Ints, other: Ints) -> tuple[Ints, Ints]:
+    """Indices into both of the codes that both have."""
+    if not len(one):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    place = np.minimum(np.searchsorted(one, other), len(one) - 1)
+    hit = np.flatnonzero(one[place] == other)
+    return place[hit], hit
+
+
+def _gain(one: Surface, other: Surface, a: Ints, b: Ints, config: CompareConfig) -> Gain:
+    """Median of the log ratio; a zero error hides it on concrete, so that each cell weighs by what it can tell."""
+    c_one, c_other = _c_rr(one.level[a]), _c_rr(other.level[b])
+    c_rr = np.sqrt(c_one * c_other)
+    metres = np.minimum(np.minimum(one.metres[a], other.metres[b]), config.cell_m)
+    weight = metres / (_SCATTER**2 + (config.zero_error / c_rr) ** 2)
+    ratio = np.log(c_one / c_other)
+    log = _weighted_median(ratio, weight)
+    draws = max(1.0, weight.sum() ** 2 / (weight @ weight) / CELLS_PER_DRAW)
+    same_direction = ratio * np.sign(log) > abs(log) / 2
+    return Gain(
+        log=log,
+        std=_MEDIAN_ERROR * _weighted_median(np.abs(ratio - log), weight) / float(np.sqrt(draws)),
+        share=float(weight @ same_direction / weight.sum()),
+        c_rr=_weighted_median(c_rr, weight),
+    )
+
+
+def _shift(one: Map, other: Map, config: CompareConfig) -> Shift | None:
+    """Displacement of the places, once the gain between them is taken out."""
+    a, b = _thinned(*_common(one.placed.codes, other.placed.codes))
+    expected = _with_gain(other.placed.level[other.borders], _gain(one.placed, other.placed, a, b, config).log)
+    return find_shift(one.placed, other.placed, other.borders, expected, config.cell_m, config.error_length_m)
+
+
+def _agreement(
+    one: Surface, other: Surface, b: Ints, log_gain: float, shift: Shift | None, config: CompareConfig
+) -> float:
+    """Share of these cells whose levels agree: where the maps lie, or moved by the shift, whichever is better."""
+    moves = {0}
+    if shift:
+        moves.add(round(shift.north_m / config.cell_m) * ROW + round(shift.east_m / config.cell_m))
+    expected = _with_gain(other.level[b], log_gain)
+    shares = []
+    for move in moves:
+        found, at = _common(one.codes, other.codes[b] + move)
+        shares.append(float(np.mean(np.abs(one.level[found] - expected[at]) <= config.tolerance)) if len(at) else 0.0)
+    return max(shares)
+
+
+def _c_rr(level: Floats) -> Floats:
+    return np.maximum(np.exp(level) - LEVEL_FLOOR, _LOWEST_C_RR)
+
+
+def _with_gain(level: Floats, log_gain: float) -> Floats:
+    """Levels (n,) of coefficients that are multiplied by the gain."""
+    return np.asarray(np.log(_c_rr(level) * np.exp(log_gain) + LEVEL_FLOOR), np.float64)
+
+
+def _thinned(a: Ints, b: Ints) -> tuple[Ints, Ints]:
+    """Every so many of very many pairs: medians and shares gain nothing from more."""
+    stride = 1 + len(a) // _MOST_CELLS
+    return a[::stride], b[::stride]
+
+
+def _weighted_median(values: Floats, weights: Floats) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(total, total[-1] / 2)]])

@@ -1,0 +1,110 @@
+"""By how far is one map displaced from another? The shift at which the levels around borders agree best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapserver.trust_ledger import ROW, Surface, block_of
+from protocol.arrays import Bools, Floats, Ints
+
+REACH = 3  # cells; shifts up to here each way are tried
+_EDGE = 2 * REACH + 1
+_SHIFTS = _EDGE * _EDGE
+_MOST_CELLS = 4000  # more make it slower, not surer
+_FEWEST_CELLS = 50
+_BORDER_BITS, _BORDER_LEVELS = 3, 0.25  # a square of 16 m in which levels differ by so much holds a border
+_CLIP = 1.0  # levels: beyond, a difference counts as this one; else the borders of sand alone would decide
+# Where borders run one way only, nothing tells the shift along them: a shift by one cell must improve the cost by 1 %.
+_PRICE = 0.01
+# Left out in turn (jackknife). Whole strips, because what misleads lies together: a repaved zone that some saw before.
+_GROUPS = 8
+
+_STEPS = np.arange(-REACH, REACH + 1)
+_PRICES: Floats = _PRICE * (_STEPS[:, None] ** 2 + _STEPS[None, :] ** 2).ravel().astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Shift:
+    """A displacement, and its standard deviation, of both axes together."""
+
+    east_m: float
+    north_m: float
+    std_m: float
+
+
+def find_shift(
+    one: Surface, other: Surface, borders: Ints, expected: Floats, cell_m: float, error_length_m: float
+) -> Shift | None:
+    """Displacement of the first map from the other; None where too few borders tell.
+
+    borders: indices of the other's cells, expected: levels that the first map should have there, both (n,).
+    error_length_m: a position error stays the same for about so many metres.
+    """
+    if not len(borders) or not len(one.codes):
+        return None
+    at = other.codes[borders]
+    error, known = _errors(one.codes, one.level, at, expected)
+    both = known[:, _SHIFTS // 2]
+    if both.sum() < _FEWEST_CELLS:
+        return None
+    costs, counts = _by_group(error), _by_group(known.astype(np.float64))
+    east, north = _best(costs.sum(axis=0), counts.sum(axis=0))
+    rest = np.array([_best(c, n) for c, n in zip(costs.sum(axis=0) - costs, counts.sum(axis=0) - counts, strict=True)])
+    jackknife = (1 - 1 / _GROUPS) * float(((rest - rest.mean(axis=0)) ** 2).sum()) * cell_m**2
+    metres = float(one.metres.mean()) * both.sum(), float(other.metres[borders][both].sum())
+    drawn = sum(2 * s.std_m**2 * error_length_m / m for s, m in zip((one, other), metres, strict=True))
+    return Shift(east * cell_m, north * cell_m, float(np.sqrt(jackknife + drawn)))
+
+
+def near_borders(surface: Surface) -> Ints:
+    """Indices of the cells in squares that hold a border; where there are very many, evenly thinned."""
+    squares = block_of(surface.codes, _BORDER_BITS)
+    order = np.argsort(squares, kind="stable")
+    if not len(order):
+        return order
+    first = np.flatnonzero(np.diff(squares[order], prepend=-1))
+    level = surface.level[order]
+    spread = np.maximum.reduceat(level, first) - np.minimum.reduceat(level, first)
+    near = np.sort(order[np.repeat(spread > _BORDER_LEVELS, np.diff(first, append=len(order)))])
+    return near[:: 1 + len(near) // _MOST_CELLS]
+
+
+def _errors(codes: Ints, level: Floats, at: Ints, expected: Floats) -> tuple[Floats, Bools]:
+    """Squared differences of levels (n, shifts), clipped, 0 where the shifted cell is not known; and where it is."""
+    found = np.full((len(at), _EDGE, _EDGE), np.nan)
+    for i, north in enumerate(_STEPS):
+        west = at + north * ROW - REACH
+        place = np.searchsorted(codes, west)
+        for step in range(_EDGE):  # at most so many codes lie between the first and the last column
+            index = np.minimum(place + step, len(codes) - 1)
+            column = codes[index] - west
+            hit = np.flatnonzero((column >= 0) & (column < _EDGE))
+            found[hit, i, column[hit]] = level[index[hit]]
+    difference = found.reshape(len(at), _SHIFTS) - expected[:, None]
+    known = ~np.isnan(difference)
+    return np.where(known, np.minimum(difference**2, _CLIP**2), 0.0), known
+
+
+def _by_group(values: Floats) -> Floats:
+    """Sums (groups, shifts) over strips of the site with as many cells each; cells lie sorted from south to north."""
+    return np.add.reduceat(values, np.arange(_GROUPS) * len(values) // _GROUPS, axis=0)
+
+
+def _best(costs: Floats, counts: Floats) -> tuple[float, float]:
+    """Cells east and north at which the mean cost is least, between cells by parabolas."""
+    enough = counts >= counts.max() / 2
+    mean = costs / np.maximum(counts, 1)
+    cost = np.where(enough, mean + _PRICES * mean[enough].mean(), np.inf).reshape(_EDGE, _EDGE)
+    row, column = divmod(int(np.argmin(cost)), _EDGE)
+    return column - REACH + _vertex(cost[row], column), row - REACH + _vertex(cost[:, column], row)
+
+
+def _vertex(cost: Floats, lowest: int) -> float:
+    """Where between its neighbours the lowest cost would lie, -0.5 to 0.5 cells."""
+    if not 0 < lowest < _EDGE - 1:
+        return 0.0
+    below, least, above = cost[lowest - 1 : lowest + 2]
+    bend = below + above - 2 * least
+    return float((below - above) / bend / 2) if 0 < bend < np.inf else 0.0

@@ -1,0 +1,123 @@
+"""Views: evidence of a window of cells as it is now, or as of any time, and the layers that are read from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapserver import layers
+from mapserver.config import ServerConfig
+from mapserver.grid import Grid, chunks
+from mapserver.journal import JournalReader, Wanted
+from mapserver.ladder import Block
+from mapserver.past import History, Moment, grid_as_of, point_history
+from mapserver.reading import Pages, evidence, valid_pages
+from mapserver.store import Store
+from protocol.arrays import Floats32
+from protocol.errors import QueryError, Refusal, StoreError
+from protocol.geometry import BLOCK_CELLS, CellWindow
+
+
+@dataclass(frozen=True)
+class View:
+    """Pages of a window's blocks and of those around them: a change is seen with its surroundings.
+
+    merged: the journal row that they are true for. stamp_ns: the time that they are as of.
+    """
+
+    pages: Pages
+    merged: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class Past:
+    """The past of one store. Every call opens the journal anew, so that any thread may ask."""
+
+    journal: Path
+    cell_m: float
+    config: ServerConfig
+
+    def view(self, window: CellWindow, stamp_ns: int, without: frozenset[str]) -> View:
+        """The map from samples stamped so or earlier; journal rows that are committed meanwhile may be in it."""
+        with self._history() as (history, last_row):
+            grid = grid_as_of(history, stamp_ns, self.cell_m, self.config.fold, _surroundings(window), without)
+        return View(_pages(grid, window), last_row, stamp_ns)
+
+    def moments(self, cell: tuple[int, int], wanted: Wanted, span_s: float) -> tuple[list[Moment], int]:
+        """Evidence of a cell (column, row) span by span, and the journal row that it is true for."""
+        with self._history() as (history, last_row):
+            return point_history(history, cell, self.cell_m, self.config.fold, wanted, span_s), last_row
+
+    @contextmanager
+    def _history(self) -> Iterator[tuple[History, int]]:
+        try:
+            reader = JournalReader(self.journal)
+            try:
+                yield History.of(reader), reader.last_row
+            finally:
+                reader.close()
+        except StoreError as error:
+            raise QueryError(Refusal.STORE, str(error)) from None
+
+
+def view_now(store: Store, window: CellWindow) -> View:
+    """The map as it is; on the thread that owns the store."""
+    return View(_pages(store.grid, window), store.merged, store.newest_ns)
+
+
+def read_cells(
+    view: View, window: CellWindow, names: tuple[str, ...], cell_m: float, config: ServerConfig
+) -> dict[str, Floats32]:
+    """Layers of cells (rows, columns) of a window."""
+    first = valid_pages(view.pages, cell_m, config.change)
+    shape = (window.rows, window.columns)
+    out: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in names}
+    for some in chunks([block for block in view.pages if _touches(block, window)]):
+        found = evidence([view.pages[block] for block in some], [first[block] for block in some])
+        for name, values in layers.read(found, names, config.read, view.stamp_ns).items():
+            _place(out[name], window, some, values)
+    return out
+
+
+def widened(window: CellWindow, cells: int) -> CellWindow:
+    """A window with so many cells more on each side."""
+    return CellWindow(window.column - cells, window.row - cells, window.columns + 2 * cells, window.rows + 2 * cells)
+
+
+def cropped(layer: Floats32, wide: CellWindow, window: CellWindow) -> Floats32:
+    """Cut a window out of a layer (rows, columns) of a wider one."""
+    row, column = window.row - wide.row, window.column - wide.column
+    return layer[row : row + window.rows, column : column + window.columns]
+
+
+def _pages(grid: Grid, window: CellWindow) -> Pages:
+    blocks = grid.blocks_in(_surroundings(window))
+    return dict(zip(blocks, grid.pages(blocks), strict=True))
+
+
+def _surroundings(window: CellWindow) -> CellWindow:
+    """All cells of the blocks that a window touches, and of those around them."""
+    n = BLOCK_CELLS
+    left, bottom = window.column // n - 1, window.row // n - 1
+    right, top = (window.column + window.columns - 1) // n + 2, (window.row + window.rows - 1) // n + 2
+    return CellWindow(left * n, bottom * n, (right - left) * n, (top - bottom) * n)
+
+
+def _touches(block: Block, window: CellWindow) -> bool:
+    column, row = block[0] * BLOCK_CELLS - window.column, block[1] * BLOCK_CELLS - window.row
+    return -BLOCK_CELLS < column < window.columns and -BLOCK_CELLS < row < window.rows
+
+
+def _place(out: Floats32, window: CellWindow, blocks: list[Block], values: Floats32) -> None:
+    """Copy block values (blocks, 256) into the window."""
+    n = BLOCK_CELLS
+    for (x, y), block in zip(blocks, values.reshape(-1, n, n), strict=True):
+        column, row = x * n - window.column, y * n - window.row
+        left, top = max(0, -column), max(0, -row)
+        right, bottom = min(n, window.columns - column), min(n, window.rows - row)
+        out[row + top : row + bottom, column + left : column + right] = block[top:bottom, left:right]

@@ -1,0 +1,173 @@
+"""Changes of the ground as they are found: where, when, from what to what; a list that grows while machines pass.
+
+A change of a larger area is seen piece by piece. What is found next to a change of about the same time is the same
+change, which is larger than it was then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mapserver import evidence as ev
+from mapserver import layers
+from mapserver.change import ChangeConfig, first_valid
+from mapserver.ladder import Block, TimedPage
+from mapserver.reading import evidence, image_of, valid_pages
+from protocol.arrays import Bools, Floats32, Ints
+from protocol.geometry import BLOCK_CELLS
+
+KIND = "change"  # of the journal's events
+SAME_NS = 6 * 3600 * 10**9  # changes next to each other within this time are one
+SETTLES_NS = 2 * 3600 * 10**9  # the time of a change moves by the length of its pages as these are summed, and by this
+NEAR_CELLS = 8.0
+_BEFORE_AFTER = ("resistance", "grade")
+
+
+@dataclass(frozen=True)
+class Change:
+    """One change of the ground.
+
+    id: its number. first_ns, last_ns: between them it took place, cell by cell. bounds: west, south, east, north [m].
+    cells: how many are known to be changed. resistance, grade before and after: medians, None where not known.
+    """
+
+    id: int
+    first_ns: int
+    last_ns: int
+    bounds: tuple[float, float, float, float]
+    cells: int
+    resistance_before: float | None = None
+    resistance_after: float | None = None
+    grade_before: float | None = None
+    grade_after: float | None = None
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """As plain values."""
+        return {**asdict(self), "bounds": list(self.bounds)}
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Change:
+        """Undo `values`."""
+        west, south, east, north = values["bounds"]
+        return cls(**{**values, "bounds": (west, south, east, north)})
+
+
+class ChangeWatch:
+    """Changes of one site. known: plain values of those from before, the newest of each number last."""
+
+    def __init__(
+        self, cell_m: float, change: ChangeConfig, read: layers.ReadConfig, known: Iterable[Mapping[str, Any]] = ()
+    ) -> None:
+        self._cell_m, self._config, self._read = cell_m, change, read
+        self._changes = {values["id"]: Change.of(values) for values in known}
+        self._told: dict[Block, Ints] = {}  # changed_ns of cells that are part of a change already
+        self._members: dict[int, set[tuple[int, int]]] = {number: set() for number in self._changes}
+
+    def changes(self, after: int = 0) -> list[Change]:
+        """All changes with a number beyond `after`."""
+        return [change for number, change in sorted(self._changes.items()) if number > after]
+
+    def look(self, blocks: Collection[Block], pages: Mapping[Block, Sequence[TimedPage]]) -> list[Change]:
+        """Look at blocks, given their pages and those of their neighbours; returns changes that are new or grew."""
+        first = valid_pages(pages, self._cell_m, self._config)
+        changed = [block for block in blocks if block in first and first[block].any()]
+        if not changed:
+            return []
+        now = evidence([pages[block] for block in changed], [first[block] for block in changed])
+        fresh = {
+            block: self._fresh(block, pages[block], first[block], now.changed_ns[i]) for i, block in enumerate(changed)
+        }
+        old_pages = [_older(pages[block], first[block]) for block in changed]
+        old = evidence(old_pages, [first_valid(older, self._config) for older in old_pages])
+        values = _before_and_after(old, now, self._read)
+        image, (left, bottom) = image_of(fresh)
+        count, areas = cv2.connectedComponents(image.astype(np.uint8), connectivity=8)
+        images = {name: image_of(dict(zip(changed, part, strict=True)))[0] for name, part in values.items()}
+        stamps, _ = image_of({block: now.changed_ns[i] for i, block in enumerate(changed)})
+        found: dict[int, Change] = {}
+        for area in range(1, count):
+            row, column = _of_one_time(areas == area, stamps)
+            medians = {name: _median(part[row, column]) for name, part in images.items()}
+            place = (row + bottom * BLOCK_CELLS, column + left * BLOCK_CELLS)
+            if change := self._note(*place, stamps[row, column], medians):
+                found[change.id] = change
+        return list(found.values())
+
+    def _fresh(self, block: Block, pages: Sequence[TimedPage], first: Ints, changed_ns: Ints) -> Bools:
+        """Cells (256,) that changed, and are not part of a change yet."""
+        told = self._told.setdefault(block, np.zeros(ev.CELLS, np.int64))
+        spans_ns = np.array([timed.end_ns - timed.first_ns for timed in pages])
+        settled_ns = told + np.maximum(spans_ns[first], SETTLES_NS)
+        fresh = (changed_ns > 0) & ((told == 0) | (changed_ns > settled_ns))
+        told[fresh] = changed_ns[fresh]
+        return np.asarray(fresh, np.bool_)
+
+    def _note(self, row: Ints, column: Ints, changed_ns: Ints, medians: Mapping[str, float | None]) -> Change | None:
+        """Make an area part of a change nearby, or a change of its own; None where that was known before."""
+        cells = set(zip(row.tolist(), column.tolist(), strict=True))
+        area = Change(
+            id=max(self._changes, default=0) + 1,
+            first_ns=int(changed_ns.min()),
+            last_ns=int(changed_ns.max()),
+            bounds=tuple(  # type: ignore[arg-type]
+                float(v) * self._cell_m for v in (column.min(), row.min(), column.max() + 1, row.max() + 1)
+            ),
+            cells=len(cells),
+            **medians,
+        )
+        same = next((c for c in self._changes.values() if self._is_near(c, area)), None)
+        if same is None:
+            self._changes[area.id], self._members[area.id] = area, cells
+            return area
+        members = self._members[same.id]
+        members |= cells
+        if len(members) <= same.cells:  # found again after a restart
+            return None
+        boxes = zip(same.bounds, area.bounds, (min, min, max, max), strict=True)
+        grown = replace(
+            same,
+            first_ns=min(same.first_ns, area.first_ns),
+            last_ns=max(same.last_ns, area.last_ns),
+            bounds=tuple(choose(one, other) for one, other, choose in boxes),  # type: ignore[arg-type]
+            cells=len(members),
+        )
+        self._changes[same.id] = grown
+        return grown
+
+    def _is_near(self, one: Change, other: Change) -> bool:
+        reach_m = NEAR_CELLS * self._cell_m
+        (west, south, east, north), (w, s, e, n) = one.bounds, other.bounds
+        apart = w > east + reach_m or e < west - reach_m or s > north + reach_m or n < south - reach_m
+        return not apart and other.first_ns <= one.last_ns + SAME_NS and other.last_ns >= one.first_ns - SAME_NS
+
+
+def _of_one_time(area: Bools, changed_ns: Ints) -> tuple[Ints, Ints]:
+    """Rows and columns of an area's cells, without those few whose change of long ago is only seen now."""
+    typical_ns = np.median(changed_ns[area])
+    row, column = np.nonzero(area & (np.abs(changed_ns - typical_ns) <= SAME_NS))
+    return row, column
+
+
+def _older(pages: Sequence[TimedPage], first: Ints) -> Sequence[TimedPage]:
+    """Pages of a block from before its change; where cells changed at different times, before most of them."""
+    return pages[: int(np.median(first[first > 0]))]
+
+
+def _before_and_after(old: ev.Evidence, now: ev.Evidence, config: layers.ReadConfig) -> dict[str, Floats32]:
+    """Layers (blocks, 256) from the evidence before a change, and from what holds now."""
+    found = {}
+    for when, part in (("before", old), ("after", now)):
+        for name, values in layers.read(part, _BEFORE_AFTER, config).items():
+            found[f"{name}_{when}"] = values
+    return found
+
+
+def _median(values: Floats32) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None

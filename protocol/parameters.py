@@ -1,0 +1,98 @@
+"""Selector parameters of queries: text one way, checked values the other; QueryError names what is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from urllib.parse import quote, unquote
+
+from protocol.errors import QueryError, Refusal
+from protocol.readings import MAX_STAMP_NS
+
+MAX_TEXT = 200  # characters of a text that a person writes
+
+Parameters = Mapping[str, str]
+
+
+def text_of(number: float) -> str:
+    """All digits; as a plain number, where numpy's own `repr` writes its type."""
+    return repr(float(number))
+
+
+def quoted(text: str) -> str:
+    """Any text as a value: percent-encoded, since `;` and `=` divide parameters."""
+    return quote(text, safe="")
+
+
+def selector_of(parameters: Parameters) -> str:
+    """Parameters as they stand in a selector, behind its question mark."""
+    return ";".join(f"{name}={value}" for name, value in parameters.items())
+
+
+def split_selector(text: str) -> dict[str, str]:
+    """Undo `selector_of`; by hand, because a missing value must be seen as one."""
+    pairs = (part.partition("=") for part in text.split(";") if part)
+    return {name: value for name, _, value in pairs}
+
+
+def check_known(query: str, parameters: Parameters, known: Sequence[str]) -> None:
+    """Refuse a parameter that the query does not take."""
+    if unknown := sorted(set(parameters) - set(known)):
+        problem = f"parameter `{unknown[0][:40]}` is not known; `{query}` takes {', '.join(known)}"
+        raise QueryError(Refusal.UNKNOWN_PARAMETER, problem)
+
+
+def required(parameters: Parameters, name: str) -> str:
+    """Text of a parameter that has to be there."""
+    if name not in parameters:
+        raise QueryError(Refusal.MISSING_FIELD, f"parameter `{name}` is missing")
+    return parameters[name]
+
+
+def number(parameters: Parameters, name: str) -> float:
+    """A finite number."""
+    text = required(parameters, name)
+    try:
+        value = float(text)
+    except ValueError:
+        raise QueryError(Refusal.WRONG_TYPE, f"parameter `{name}`: {text[:40]!r} is no number") from None
+    if not math.isfinite(value) or abs(value) > 1e15:
+        raise QueryError(Refusal.NOT_FINITE, f"parameter `{name}`: {value} is not usable")
+    return value
+
+
+def count(parameters: Parameters, name: str) -> int:
+    """A whole number that is not negative; 0 where it is missing."""
+    value = number({name: "0", **parameters}, name)
+    if value < 0 or value != int(value):
+        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {value:g} is no whole number from 0 on")
+    return int(value)
+
+
+def seconds(parameters: Parameters, name: str, default_s: float, most_s: float) -> float:
+    """A time to wait [s], 0 to most_s."""
+    value = number({name: text_of(default_s), **parameters}, name)
+    if not 0 <= value <= most_s:
+        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {value:g} s is not between 0 and {most_s:g} s")
+    return value
+
+
+def stamp(parameters: Parameters, name: str) -> int | None:
+    """A stamp in ns, to the last digit; None where it is missing."""
+    text = parameters.get(name)
+    if text is None:
+        return None
+    if not (text.isascii() and text.isdigit()):
+        raise QueryError(Refusal.WRONG_TYPE, f"parameter `{name}`: {text[:40]!r} is no stamp in nanoseconds")
+    if len(text) > len(str(MAX_STAMP_NS)) or not 1 <= int(text) <= MAX_STAMP_NS:
+        problem = f"parameter `{name}`: {text[:40]} is not between 1 and {MAX_STAMP_NS}"
+        raise QueryError(Refusal.OUT_OF_RANGE, problem)
+    return int(text)
+
+
+def free_text(parameters: Parameters, name: str) -> str:
+    """One line that a person wrote, percent-encoded; empty where it is missing."""
+    text = unquote(parameters.get(name, "")).strip()
+    if len(text) > MAX_TEXT or not text.isprintable():
+        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}` must be one line of at most {MAX_TEXT} characters")
+    return text

@@ -1,0 +1,65 @@
+"""Events for a callback that may take its time: Zenoh's own callbacks must not (EVIDENCE: they stall the session)."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import zenoh
+
+from protocol.errors import MessageError
+
+MOST_WAITING = 1000  # events; more are left out
+T = TypeVar("T")
+log = logging.getLogger("sitegrid.listener")
+
+
+class Listener(Generic[T]):
+    """Calls `callback` with every event put on a key, one after the other, on a thread of its own, until closed.
+
+    Events that cannot be read, or come faster than they are taken, are left out; an error in the callback is logged.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, key: str, decode: Callable[[bytes], T], callback: Callable[[T], object]
+    ) -> None:
+        self._decode, self._callback = decode, callback
+        self._waiting: queue.Queue[bytes | None] = queue.Queue(MOST_WAITING)
+        self._thread = threading.Thread(target=self._run, name="listener", daemon=True)
+        self._thread.start()
+        self._subscriber = session.declare_subscriber(key, self._on_sample)
+
+    def close(self) -> None:
+        """Stop listening; returns once the callback has. May be called again, and from the callback itself."""
+        if not self._thread.is_alive():
+            return
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._drop_waiting()
+        self._waiting.put(None)
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        try:
+            self._waiting.put_nowait(sample.payload.to_bytes())
+        except queue.Full:
+            log.warning("event left out key=%s waiting=%d", sample.key_expr, MOST_WAITING)
+
+    def _drop_waiting(self) -> None:
+        try:
+            while True:
+                self._waiting.get_nowait()
+        except queue.Empty:
+            return
+
+    def _run(self) -> None:
+        while (data := self._waiting.get()) is not None:
+            try:
+                self._callback(self._decode(data))
+            except MessageError as error:
+                log.warning("event left out error=%r", str(error))
+            except Exception:  # the callback's bug is not the end of the events
+                log.exception("callback failed")

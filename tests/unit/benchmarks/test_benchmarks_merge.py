@@ -1,0 +1,163 @@
+import json
+import sys
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from benchmarks import merge, merge_memory, merge_restart, merge_work
+from benchmarks.__main__ import main
+from benchmarks.measure import START_NS, scattered, track
+from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, Polars
+
+SIDE = 1024
+LIBRARIES = {
+    HardVotes: "numba",
+    AddAt: "numpy",
+    BoostHistogram: "boost_histogram",
+    Polars: "polars",
+    DuckDb: "duckdb",
+}
+
+
+@pytest.mark.parametrize("kind", LIBRARIES)
+@pytest.mark.parametrize("draw", [track, scattered])
+def test_every_library_finds_the_same_sums(kind, draw):
+    pytest.importorskip(LIBRARIES[kind])
+    rows, sums = draw(3000), kind(SIDE)
+    rows["x_m"][1::2], rows["y_m"][1::2] = rows["x_m"][::2], rows["y_m"][::2]  # cells that are hit again
+    for part in (rows[:1000], rows[1000:]):
+        sums.fold(part)
+    cell = np.floor(rows["y_m"]).astype(int) * SIDE + np.floor(rows["x_m"]).astype(int)
+    value = rows["c_rr"].astype(float)
+    expected = [np.bincount(cell, weights, SIDE * SIDE) for weights in (None, value, value * value)]
+    assert expected[0].max() >= 2
+    np.testing.assert_allclose(sums.sums(), np.stack(expected, axis=1), rtol=1e-9, atol=1e-15)
+
+
+def merged(capsys, *words):
+    assert main(["merge", "--json", "--runs", "1", *words]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_merge_measures_every_variant_on_every_pattern(capsys):
+    result = merged(capsys, "--samples", "1000")
+    assert (result["benchmark"], result["samples"], result["runs"]) == ("merge", 1000, 1)
+    rows, missing = result["rows"], result["missing"]
+    assert [row["pattern"] for row in rows] == ["track"] * (len(rows) // 2) + ["random"] * (len(rows) // 2)
+    for pattern in ("track", "random"):
+        assert [r["variant"] for r in rows if r["pattern"] == pattern] == [
+            v for v in merge.VARIANTS if v not in missing
+        ]
+    columns = {"variant", "pattern", "samples", "msamples_per_s", "ratio_to_add_at", "us_per_batch_of_100"}
+    assert all(set(row) == columns for row in rows)
+    assert all(value > 0 for row in rows for value in row.values() if not isinstance(value, str))
+    assert [row["ratio_to_add_at"] for row in rows if row["variant"] == "np.add.at"] == [1.0, 1.0]
+
+
+def test_ratios_and_shares_are_those_of_the_figures(capsys):
+    for row in merged(capsys, "--samples", "20000")["rows"]:
+        share = merge.VARIANTS[row["variant"]].shares.get(row["pattern"], 1)
+        assert row["samples"] == max(100, 20_000 // share)
+
+
+def test_ratio_is_to_add_at_of_the_same_pattern(monkeypatch, capsys):
+    names = ("hard_votes", "np.add.at")
+    monkeypatch.setattr(merge, "VARIANTS", {name: merge.VARIANTS[name] for name in names})
+    rows = merged(capsys, "--samples", "1000")["rows"]
+    for hard, yardstick in (rows[:2], rows[2:]):
+        expected = hard["msamples_per_s"] / yardstick["msamples_per_s"]
+        assert hard["ratio_to_add_at"] == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("module", "variant", "extra"),
+    [
+        ("polars", "polars group-by", "bench"),
+        ("duckdb", "duckdb group-by", "bench"),
+        ("boost_histogram", "boost_histogram", "bench"),
+        ("benchmarks.merge_numba", "hard_votes", "server"),
+        ("mapserver.fold_numba", "soft_votes", "server"),
+    ],
+)
+def test_a_variant_without_its_library_is_listed_with_what_to_install(module, variant, extra, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main(["merge", "--json", "--runs", "1", "--samples", "100"]) == 0
+    output = capsys.readouterr()
+    result = json.loads(output.out)
+    assert f"sitegrid[{extra}]" in result["missing"][variant]
+    assert variant not in {row["variant"] for row in result["rows"]}
+    assert "np.add.at" in {row["variant"] for row in result["rows"]}
+    assert f"not measured: {variant}; pip install" in output.err
+
+
+def test_work_drives_a_tenth_of_a_square_kilometre():
+    rows = np.concatenate([rows for _, rows in islice(merge_work.batches(), merge_work.samples_of(2.0) // 100)])
+    driven = {(x, y) for x, y in zip((rows["x_m"] // 10).tolist(), (rows["y_m"] // 10).tolist(), strict=True)}
+    roads = sum(min(x % 25, 24 - x % 25) == 0 or min(y % 25, 24 - y % 25) == 0 for x, y in driven)
+    assert 0.95 * len(driven) < roads <= len(driven)  # along roads every 250 m, errors of position aside
+    assert np.ptp(rows["x_m"]) == pytest.approx(1000, abs=20)
+    assert np.ptp(rows["y_m"]) == pytest.approx(1000, abs=20)
+    assert rows["distance_m"].sum() == pytest.approx(10 * 3.0 * 2 * 3600, rel=0.01)
+    assert np.hypot(rows["grade_e"], rows["grade_n"]).max() < 0.2
+
+
+def test_work_comes_in_batches_of_ten_machines_in_the_order_of_time_with_nights_off():
+    a_day = merge_work.samples_of(10.0) // 100
+    taken = list(islice(merge_work.batches(), a_day + 10))
+    assert len({name for name, _ in taken[:10]}) == 10
+    assert {len(rows) for _, rows in taken} == {100}
+    starts = [int(rows["stamp_ns"][0]) for name, rows in taken if name == "loader-1"]
+    assert starts == sorted(starts)
+    assert starts[0] == START_NS
+    assert (starts[-2] - START_NS) / 3.6e12 == pytest.approx(10.0, abs=0.1)
+    assert starts[-1] == START_NS + 24 * 3600 * 10**9
+
+
+def test_work_is_a_function_of_its_seed():
+    one, same, other = (next(merge_work.batches(seed))[1] for seed in (1, 1, 2))
+    assert one.tobytes() == same.tobytes() != other.tobytes()
+
+
+def test_memory_prints_what_a_day_takes(capsys):
+    assert main(["memory", "--json", "--hours", "0.05"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["benchmark"], result["hours"]) == ("memory", 0.05)
+    (row,) = result["rows"]
+    assert row["samples"] == 10_000
+    assert 0 < row["pages"] < row["cells"]
+    assert 25 < row["bytes_per_cell_and_bucket"] <= result["goals"]["bytes_per_cell_and_bucket"]
+    assert 50 < row["resident_mb"] <= row["peak_mb"]
+    assert row["evidence_mb"] > 0
+    assert row["snapshot_mb"] > 0
+    assert row["snapshot_save_s"] > 0
+    assert row["snapshot_load_s"] > 0
+
+
+def test_more_hours_are_more_samples():
+    assert merge_work.samples_of(10.0) == 2_160_000
+    assert merge_memory.measured(0.02)["samples"] < merge_memory.measured(0.05)["samples"]
+
+
+def test_restart_opens_a_store_with_snapshot_and_tail(monkeypatch, capsys):
+    monkeypatch.setattr(merge_restart, "TAIL_ROWS", 7)
+    assert main(["restart", "--json", "--samples", "1950"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    (row,) = result["rows"]
+    assert (result["samples"], row["samples"], row["journal_rows"], row["tail_rows"]) == (2000, 2000, 20, 7)
+    assert 0 < row["open_s"] < row["process_s"]
+    assert row["journal_mb"] > 0
+    assert row["snapshot_mb"] > 0
+
+
+def test_a_store_of_the_benchmark_holds_the_same_grid_as_folding_all_of_it(monkeypatch, tmp_path):
+    monkeypatch.setattr(merge_restart, "TAIL_ROWS", 7)
+    merge_restart.build(tmp_path, 20)
+    store = merge_restart.Store(tmp_path, merge_restart.SITE, merge_restart.CONFIG, lambda: START_NS)
+    grid = merge_restart.Grid(1.0, merge_restart.CONFIG.fold)
+    for name, rows in islice(merge_work.batches(), 20):
+        grid.fold(rows, name)
+    one, other = store.grid.state(), grid.state()
+    store.close()
+    assert (one.folded, one.newest_ns) == (other.folded, other.newest_ns) == (2000, other.newest_ns)
+    assert [at.page.votes.tobytes() for at in one.pages] == [at.page.votes.tobytes() for at in other.pages]

@@ -1,0 +1,219 @@
+"""The cases on which merges are compared are what they say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evaluation.merge_cases import CASES, CELL_M, Case, Machine, lay, parking_place, select
+from evaluation.merge_samples import (
+    BATCH_ROWS,
+    BUCKET_NS,
+    C_RR_STD,
+    GRADE_BIAS_STD,
+    GRADE_STD,
+    LATENCY_NS,
+    PERIOD_NS,
+    START_NS,
+    START_WITHIN_NS,
+    STEP_M,
+    cell_of,
+    gauss_markov,
+    simulate,
+    sweep,
+)
+from protocol.samples import SAMPLE_DTYPE, check_samples
+
+
+def case(name: str, columns: int = 60, rows: int = 40, index: int = 0) -> Case:
+    return replace(select([name])[index], columns=columns, rows=rows)
+
+
+def rows_of(scene, machine: str):
+    return np.concatenate([delivery.rows for delivery in scene.deliveries if delivery.machine == machine])
+
+
+def test_cases_come_in_the_order_of_the_table_and_by_name():
+    assert select([]) == CASES
+    assert [c.title for c in select(["slope_15", "repaved"])] == ["repaved, 1 after", "repaved, 2 after", "slope_15"]
+    assert len({c.file_name for c in CASES}) == len(CASES) == 12
+
+
+def test_position_errors_last_and_have_the_deviation_that_is_stated():
+    errors = gauss_markov(200_000, 1.3, np.random.default_rng(1))
+    assert errors.std() == pytest.approx(1.3, rel=0.05)
+    lag = 150  # 30 s
+    correlation = np.corrcoef(errors[:-lag], errors[lag:])[0, 1]
+    assert correlation == pytest.approx(np.exp(-1), abs=0.06)
+
+
+def test_position_errors_are_stationary_from_the_first_sample_on():
+    draw = np.random.default_rng(2)
+    first = np.array([gauss_markov(2, 1.3, draw)[0] for _ in range(4000)])
+    assert first.std() == pytest.approx(1.3, rel=0.05)
+
+
+def test_a_pass_goes_along_in_lanes_of_1_m_and_the_next_across():
+    way = sweep(case("1x1"), Machine(passes=2), np.random.default_rng(3))
+    along, across = way.number == 0, way.number == 1
+    assert along.sum() == 40 * 100
+    assert across.sum() == 60 * 67
+    assert np.unique(np.round(np.diff(np.unique(way.y_m[along])), 9)).tolist() == [1.0]
+    assert np.unique(np.round(np.diff(np.unique(way.x_m[across])), 9)).tolist() == [1.0]
+    step = np.diff(way.x_m[along][:100])
+    np.testing.assert_allclose(step, STEP_M)
+    assert (np.diff(way.x_m[along][100:200]) < 0).all()  # and back
+    for part, sign in ((along, np.cos), (across, np.sin)):
+        assert np.abs(sign(way.heading_rad[part])).min() == pytest.approx(1.0)
+    first_across = sweep(case("1x1"), Machine(first=1), np.random.default_rng(3))
+    assert np.abs(np.sin(first_across.heading_rad)).min() == pytest.approx(1.0)
+
+
+def test_headings_point_the_way_that_is_driven():
+    way = sweep(case("1x1"), Machine(passes=2), np.random.default_rng(3))
+    moved = np.stack([np.diff(way.x_m), np.diff(way.y_m)])
+    on_a_lane = np.hypot(*moved) < STEP_M + 1e-6
+    ahead = moved[0] * np.cos(way.heading_rad[1:]) + moved[1] * np.sin(way.heading_rad[1:])
+    np.testing.assert_allclose(ahead[on_a_lane], STEP_M)
+    assert on_a_lane.mean() > 0.95
+
+
+def test_one_pass_drives_every_cell_and_cells_between_samples_count():
+    scene = simulate(case("1x1", columns=9), 0)
+    assert scene.driven.all()
+    narrow = simulate(replace(case("1x1"), columns=60, rows=1), 0)
+    assert narrow.driven.tolist() == [[True] * 60]
+
+
+def test_machines_send_valid_samples_of_one_work_day_at_5_hz():
+    scene = simulate(case("4x4"), 1)
+    starts = []
+    for name in ("machine1", "machine2", "machine3", "machine4"):
+        rows = rows_of(scene, name)
+        assert rows.dtype == SAMPLE_DTYPE
+        check_samples(rows, extent_m=1000.0)
+        assert set(np.diff(rows["stamp_ns"])) == {PERIOD_NS}
+        assert rows["distance_m"].min() == rows["distance_m"].max() == np.float32(STEP_M)
+        assert rows["speed_mps"][0] == 3.0
+        assert (rows["cov_xx_m2"] == np.float32(1.69)).all()
+        assert (rows["cov_yy_m2"] == np.float32(1.69)).all()
+        assert (rows["c_rr_var"] == np.float32(C_RR_STD**2)).all()
+        starts.append(int(rows["stamp_ns"][0]))
+    assert START_NS <= min(starts) <= max(starts) < START_NS + START_WITHIN_NS + PERIOD_NS
+    assert max(starts) - min(starts) < PERIOD_NS
+    assert len(set(starts)) == 4
+    assert scene.samples == sum(len(rows_of(scene, f"machine{i}")) for i in (1, 2, 3, 4))
+
+
+def test_batches_of_100_arrive_machine_by_machine_in_turn():
+    scene = simulate(case("4x4"), 1)
+    received = [delivery.received_ns for delivery in scene.deliveries]
+    assert received == sorted(received)
+    assert {delivery.machine for delivery in scene.deliveries[:4]} == {"machine1", "machine2", "machine3", "machine4"}
+    assert max(len(delivery.rows) for delivery in scene.deliveries) == BATCH_ROWS
+    for delivery in scene.deliveries:
+        assert delivery.received_ns == delivery.rows["stamp_ns"][-1] + LATENCY_NS
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_other_ones():
+    first, again, other = (rows_of(simulate(case("1x1"), seed), "machine1").tobytes() for seed in (5, 5, 6))
+    assert first == again
+    assert first != other
+
+
+def test_the_bad_machine_measures_too_much_and_is_off_to_the_east_and_knows_neither():
+    scene, plan = simulate(case("bad_machine"), 2), case("bad_machine")
+    good, bad = rows_of(scene, "machine2"), rows_of(scene, "machine4")
+    assert bad["c_rr"].mean() == pytest.approx(1.6 * good["c_rr"].mean(), rel=0.02)
+    assert bad["x_m"].mean() - good["x_m"].mean() == pytest.approx(3.0, abs=0.8)
+    assert bad["y_m"].mean() - good["y_m"].mean() == pytest.approx(0.0, abs=0.8)
+    assert (bad["cov_xx_m2"] == good["cov_xx_m2"][0]).all()
+    assert [machine.gain for machine in plan.machines] == [1, 1, 1, 1.6]
+
+
+def test_receivers_state_what_they_are():
+    scene = simulate(case("mixed_receivers"), 3)
+    assert [rows_of(scene, f"machine{i}")["cov_xx_m2"][0] for i in (1, 2, 3, 4)] == pytest.approx([0.0025, *[6.25] * 3])
+    way = sweep(case("mixed_receivers"), Machine(), np.random.default_rng(0))
+    rtk = rows_of(scene, "machine1")
+    across = rtk["y_m"] - np.round(rtk["y_m"])  # a lane's offset, and the error
+    assert len(rtk) == len(way.x_m)
+    assert np.abs(across - np.median(across)).max() < 0.4
+
+
+def test_the_parked_machine_stands_sends_all_the_time_and_drives_nothing():
+    parked_case = case("parked_bad_machine")
+    scene = simulate(parked_case, 4)
+    parked, busy = rows_of(scene, "machine5"), rows_of(scene, "machine1")
+    assert parked["distance_m"].max() == parked["speed_mps"].max() == 0.0
+    assert len(parked) >= len(busy)
+    x_m, y_m = parking_place(parked_case)
+    assert parked["x_m"].mean() == pytest.approx(x_m + 3, abs=1.5)
+    assert parked["y_m"].mean() == pytest.approx(y_m, abs=1.5)
+    assert parked["c_rr"].mean() == pytest.approx(1.6 * 0.04, abs=0.001)
+    alone = replace(parked_case, machines=(Machine(passes=1), Machine(parked=True)))
+    assert simulate(alone, 4).driven.sum() == simulate(case("1x1"), 4).driven.sum()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_zone_is_repaved_inside_a_bucket_while_the_fourth_pass_is_in_it(seed: int):
+    scene = simulate(case("repaved", columns=150, rows=100), seed)
+    assert scene.repaved_ns is not None
+    assert 0.15 * BUCKET_NS < scene.repaved_ns % BUCKET_NS < 0.85 * BUCKET_NS
+    rows = rows_of(scene, "machine1")
+    way = sweep(case("repaved", columns=150, rows=100), Machine(passes=5), np.random.default_rng(0))
+    number = way.number[np.searchsorted(rows["stamp_ns"], scene.repaved_ns)]
+    assert number == 3
+    there = scene.site.repaved[cell_of(way.x_m, way.y_m, scene.site)]
+    late = rows["stamp_ns"] >= scene.repaved_ns
+    assert np.median(rows["c_rr"][there & ~late]) == pytest.approx(0.06, abs=0.001)
+    assert np.median(rows["c_rr"][there & late]) == pytest.approx(0.02, abs=0.001)
+    assert (late & there & (way.number == 3)).any()
+    assert (~late & there & (way.number == 3)).any()
+
+
+def test_how_many_passes_follow_is_the_cases_own():
+    one, two = (simulate(case("repaved", index=index), 0) for index in (0, 1))
+    assert 0 < two.samples - one.samples < 60 * 40 / 0.6 + 60
+    site = one.site
+    assert set(site.c_rr[site.repaved]) == {0.06}
+    assert set(site.c_rr_later[site.repaved]) == {0.02}
+    assert (site.c_rr == site.c_rr_later)[~site.repaved].all()
+    assert simulate(case("1x1"), 0).repaved_ns is None
+
+
+@pytest.mark.parametrize(("index", "width"), [(0, 3), (1, 6)])
+def test_a_narrow_road_lies_across_wet_dirt_and_alone_is_judged(index: int, width: int):
+    site = lay(case("narrow_road", index=index))
+    assert site.judged.sum() * CELL_M**2 == width * 60
+    assert set(site.c_rr[site.judged]) == {0.008}
+    assert set(site.c_rr[~site.judged]) == {0.06}
+
+
+def test_the_site_has_the_five_zones():
+    site = lay(CASES[0])
+    assert site.c_rr.shape == (200, 300)
+    places = [site.c_rr[row, column] for row, column in ((0, 149), (99, 150), (100, 99), (100, 100), (199, 200))]
+    assert places == [0.008, 0.04, 0.02, 0.25, 0.06]
+    assert not site.repaved.any()
+    assert site.judged.all()
+    assert not site.gradient.any()
+
+
+def test_gradients_are_measured_along_and_across_with_a_bias_that_turns():
+    slope = case("slope_15")
+    assert np.hypot(*lay(slope).gradient[39, 0]) == pytest.approx(np.tan(np.radians(15)))
+    biases, deviations = [], []
+    for seed in range(12):
+        scene = simulate(slope, seed)
+        way = sweep(slope, slope.machines[0], np.random.default_rng(0))
+        rows = rows_of(scene, "machine1")
+        true = scene.site.gradient[cell_of(way.x_m, way.y_m, scene.site)]
+        error = np.stack([rows["grade_e"], rows["grade_n"]], axis=-1) - true
+        inside = np.abs(error).max(axis=1) < 0.05  # its lanes are not quite this way's
+        along = error[inside, 0] * np.cos(way.heading_rad[inside]) + error[inside, 1] * np.sin(way.heading_rad[inside])
+        biases.append(along.mean())
+        deviations.append(along.std())
+        assert rows["grade_var"][0] == pytest.approx(GRADE_STD**2 + GRADE_BIAS_STD**2)
+    assert np.median(deviations) == pytest.approx(GRADE_STD, rel=0.1)
+    assert 0.4 * GRADE_BIAS_STD < np.std(biases) < 2 * GRADE_BIAS_STD

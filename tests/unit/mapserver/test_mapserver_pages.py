@@ -1,0 +1,109 @@
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapserver_data import same_page
+
+from mapserver import evidence as ev
+from mapserver.pages import CELL, NARROW, WIDE, Page, merge, pack
+
+PLACES = ev.COUNTS * ev.CELLS
+counts = st.one_of(st.integers(1, 2**17), st.integers(ev.COUNT_MAX - 3, ev.COUNT_MAX))
+votes = st.dictionaries(st.integers(0, PLACES - 1) | st.integers(0, 5), counts, max_size=6)
+cells = st.dictionaries(st.integers(0, 255), st.tuples(st.integers(0, 2**64 - 1), st.integers(1, 2**62)), max_size=5)
+
+
+def page(places: dict[int, int], stamps: dict[int, tuple[int, int]] | None = None) -> Page:
+    """A page from place -> count and cell -> (bits of both bitmaps, stamp)."""
+    dense = np.zeros(PLACES, np.uint32)
+    dense[list(places)] = list(places.values())
+    bitmaps, newest_ns = np.zeros((2, ev.CELLS), np.uint64), np.zeros(ev.CELLS, np.int64)
+    for cell, (bits, stamp_ns) in (stamps or {}).items():
+        bitmaps[:, cell], newest_ns[cell] = bits, stamp_ns
+    return pack(dense.reshape(ev.COUNTS, ev.CELLS), bitmaps, newest_ns)
+
+
+pages = st.builds(page, votes, cells)
+
+
+def unpacked(one: Page) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    counts, bitmaps = np.zeros(PLACES, np.uint64), np.zeros((ev.CELLS, 2), np.uint64)
+    newest_ns = np.zeros(ev.CELLS, np.int64)
+    one.add_to(counts, bitmaps, newest_ns)
+    return counts, bitmaps, newest_ns
+
+
+@given(votes, cells)
+def test_what_is_packed_is_what_was_there(places, stamps):
+    counts, bitmaps, newest_ns = unpacked(page(places, stamps))
+    assert {int(i): int(counts[i]) for i in np.flatnonzero(counts)} == places
+    assert {int(i): (int(bitmaps[i, 0]), int(newest_ns[i])) for i in np.flatnonzero(newest_ns)} == stamps
+    assert np.array_equal(bitmaps[:, 0], bitmaps[:, 1])
+
+
+@pytest.mark.parametrize(("count", "dtype"), [(2**16 - 1, NARROW), (2**16, WIDE), (ev.COUNT_MAX, WIDE)])
+def test_counts_that_fit_take_two_bytes(count, dtype):
+    one = page({3: count, 7: 1})
+    assert one.votes.dtype == dtype
+    assert one.votes["count"].tolist() == [count, 1]
+    assert one.nbytes == 2 * dtype.itemsize
+
+
+def test_a_cell_takes_25_bytes_and_its_votes_four_each():
+    assert page({0: 1, 256: 2}, {0: (1, 5)}).nbytes == CELL.itemsize + 2 * NARROW.itemsize == 25 + 8
+
+
+@settings(max_examples=60)
+@given(st.lists(pages, min_size=3, max_size=3))
+def test_pages_merge_in_any_order_to_the_same_bits(three):
+    results = [merge(merge(a, b), c) for a, b, c in permutations(three)]
+    results += [merge(a, merge(b, c)) for a, b, c in permutations(three)]
+    assert all(same_page(result, results[0]) for result in results)
+
+
+@given(pages, pages)
+def test_a_merged_page_is_the_sum_of_both_and_saturates(one, other):
+    counts, bitmaps, newest_ns = unpacked(one)
+    other.add_to(counts, bitmaps, newest_ns)
+    found = unpacked(merge(one, other))
+    assert np.array_equal(found[0], np.minimum(counts, np.uint64(ev.COUNT_MAX)))
+    assert np.array_equal(found[1], bitmaps)
+    assert np.array_equal(found[2], newest_ns)
+
+
+def test_merging_leaves_both_pages_alone():
+    one, other = page({1: 5}, {1: (1, 7)}), page({1: 6}, {1: (2, 9)})
+    merge(one, other)
+    assert same_page(one, page({1: 5}, {1: (1, 7)}))
+    assert same_page(other, page({1: 6}, {1: (2, 9)}))
+
+
+def test_a_page_that_grows_becomes_a_wide_one_and_is_the_one_that_was_packed_so():
+    assert same_page(merge(page({9: 2**16 - 1}), page({9: 1})), page({9: 2**16}))
+
+
+def test_nothing_merged_with_a_page_is_the_page():
+    one = page({1: 5}, {1: (1, 7)})
+    assert same_page(merge(one, page({})), one)
+    assert same_page(merge(page({}), one), one)
+
+
+@given(pages, st.sets(st.integers(0, 255)))
+def test_a_part_of_the_cells_and_the_rest_are_the_page(one, chosen):
+    wanted = np.zeros(ev.CELLS, np.bool_)
+    wanted[list(chosen)] = True
+    part, rest = one.of_cells(wanted), one.of_cells(~wanted)
+    assert set(part.cells["cell"].tolist()) <= chosen
+    assert not set((part.votes["place"] % ev.CELLS).tolist()) - chosen
+    together = unpacked(part)
+    rest.add_to(*together)
+    assert all(np.array_equal(a, b) for a, b in zip(together, unpacked(one), strict=True))
+
+
+def test_reading_adds_many_full_pages_without_wrapping():
+    counts, bitmaps, newest_ns = unpacked(page({2: ev.COUNT_MAX}))
+    for _ in range(3):
+        page({2: ev.COUNT_MAX}).add_to(counts, bitmaps, newest_ns)
+    assert counts[2] == 4 * int(ev.COUNT_MAX)

@@ -1,0 +1,389 @@
+"""Archives and stores are folded again with other parameters."""
+
+from __future__ import annotations
+
+import json
+import time
+from argparse import ArgumentTypeError
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapserver.archive import FOLDER, HOUR_NS, archive
+from mapserver.config import ServerConfig
+from mapserver.grid import Grid
+from mapserver.journal import JournalReader, JournalRow
+from mapserver.past import History, history_rows
+from mapserver.store import JOURNAL_FILE, Incoming, Store
+from protocol.arrays import Table
+from protocol.codec import encode_batch
+from protocol.config import from_table, load_toml
+from protocol.geometry import CellWindow
+from protocol.messages import Ack, SampleBatch
+from protocol.samples import COLUMNS, empty
+from protocol.site import KnownGround, SiteConfig, load_site
+from sitegrid.cli import _instant, main
+from sitegrid.commands import fold
+
+pytest.importorskip("pyarrow.parquet")
+SITE = SiteConfig("pit", 48.0, 11.0)
+T0 = 1_767_225_600_000_000_000  # 2026-01-01T00:00Z
+S = 10**9
+BATCH = 20
+
+
+def track(seed: int, n: int = 120) -> Table:
+    """One sample every ten seconds, on a walk."""
+    draw = np.random.default_rng(seed)
+    rows = empty(n)
+    rows["stamp_ns"] = T0 + 10 * S * np.arange(n)
+    for name in ("x_m", "y_m"):
+        rows[name] = draw.uniform(-20, 20) + np.cumsum(draw.uniform(-1, 1, n))
+    for name in ("cov_xx_m2", "cov_yy_m2"):
+        rows[name] = draw.uniform(0.01, 4, n)
+    rows["distance_m"] = draw.uniform(0, 2, n)
+    rows["c_rr"] = draw.uniform(0.01, 0.3, n)
+    rows["grade_e"] = draw.uniform(-0.2, 0.2, n)
+    return rows
+
+
+TRACKS = {"a": track(1), "b": track(2), "c": track(3)}
+
+
+def make_store(
+    folder: Path,
+    names: str = "abc",
+    *,
+    batch: int = BATCH,
+    spool_id: int = 7,
+    site: SiteConfig = SITE,
+    archived: float = 0,
+    changed: int | None = None,
+) -> Path:
+    """A store of these machines, a batch an hour; what came in the first `archived` hours is in its archive."""
+    clock = [T0]
+    store = Store(folder, site, ServerConfig(), lambda: clock[0])
+    for first in range(0, 120, batch):
+        for name in names:
+            rows = TRACKS[name][first : first + batch].copy()
+            if changed is not None and first <= changed < first + batch:
+                rows["c_rr"][changed - first] += 0.01
+            sent = encode_batch(SampleBatch(name, spool_id, first + 1, rows, site.frame))
+            assert isinstance(store.take([Incoming(name, sent)])[0], Ack)
+        clock[0] += HOUR_NS
+    with JournalReader(folder / JOURNAL_FILE) as reader:
+        archive(folder / FOLDER, reader, site, int(T0 + archived * HOUR_NS), store._journal.forget)
+    store.close()
+    (folder / "site.toml").write_text("\n".join(fold._site_lines(site)))
+    return folder
+
+
+def run(*words: object) -> int:
+    return main(["fold", *(str(word) for word in words)])
+
+
+def opened(folder: Path) -> Store:
+    """As `sitegrid server` opens it."""
+    config = from_table(ServerConfig, load_toml(folder / "server.toml"), "server.toml")
+    return Store(folder, load_site(folder / "site.toml"), config, time.time_ns)
+
+
+def rows_of(folder: Path) -> list[JournalRow]:
+    with JournalReader(folder / JOURNAL_FILE) as reader:
+        return list(history_rows(History.of(reader)))
+
+
+def identities(folder: Path) -> list[tuple[object, ...]]:
+    return [(r.machine, r.spool_id, r.first_seq, r.received_ns, r.rows.tobytes()) for r in rows_of(folder)]
+
+
+def folded(
+    names: str = "abc", cell_m: float = 1.0, config: ServerConfig | None = None, keep: slice = slice(None)
+) -> Grid:
+    grid = Grid(cell_m, (config or ServerConfig()).fold)
+    for name in names:
+        grid.fold(TRACKS[name][keep], name)
+    return grid
+
+
+def same(one: Grid, other: Grid) -> bool:
+    """Equal evidence, to the bit, in all blocks."""
+    if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
+        return False
+    column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
+    blocks = one.blocks_in(CellWindow(column, row, end_column - column, end_row - row))
+    a, b = one.evidence(blocks), other.evidence(blocks)
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("counts", "bitmaps", "newest_ns"))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three machines, two hours archived, four in the journal. Nothing writes to it."""
+    return make_store(tmp_path_factory.mktemp("made") / "store", archived=2)
+
+
+def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
+    assert run(store, "--out", tmp_path / "new") == 0
+    assert identities(tmp_path / "new") == identities(store)
+    again = opened(tmp_path / "new")
+    assert same(again.grid, folded())
+    assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
+    with JournalReader(store / JOURNAL_FILE) as reader:
+        assert again._journal.marks() == reader.marks()
+    assert (again.site, again.newest_ns) == (SITE, T0 + 1190 * S)
+    again.close()
+
+
+def test_the_machines_go_on_sending_to_the_new_store(store: Path, tmp_path: Path):
+    assert run(store, "--out", tmp_path / "new", "--without", "b") == 0
+    again = opened(tmp_path / "new")
+    for name in "abc":
+        more = encode_batch(SampleBatch(name, 7, 121, track(9, 5), SITE.frame))
+        assert isinstance(again.take([Incoming(name, more)])[0], Ack)
+    again.close()
+
+
+def test_the_size_of_cells_can_be_changed(store: Path, tmp_path: Path):
+    assert run(store, "--out", tmp_path / "new", "--cell", 2.5) == 0
+    again = opened(tmp_path / "new")
+    assert again.site == replace(SITE, cell_m=2.5)
+    assert same(again.grid, folded(cell_m=2.5))
+    again.close()
+
+
+def test_options_are_taken_and_written_beside_the_store(store: Path, tmp_path: Path):
+    text = "# mine\n[fold]\nstd_cap_m = 1.2\n[store]\ngroup_batches = 3\n"
+    (tmp_path / "other.toml").write_text(text)
+    assert run(store, "--out", tmp_path / "new", "--config", tmp_path / "other.toml") == 0
+    assert (tmp_path / "new" / "server.toml").read_text() == text
+    again = opened(tmp_path / "new")
+    config = from_table(ServerConfig, load_toml(tmp_path / "other.toml"), "")
+    assert same(again.grid, folded(config=config))
+    assert again.grid.skipped > 0
+    again.close()
+    assert run(tmp_path / "new", "--out", tmp_path / "newer") == 0  # a store's own options stay
+    assert (tmp_path / "newer" / "server.toml").read_text() == text
+
+
+def test_machines_are_left_out_and_their_progress_is_kept(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert run(store, "--out", tmp_path / "new", "--without", "a", "--without", "c", "--json") == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["left_out"] == {"machine": 240, "time": 0, "twice": 0}
+    assert summary["machines"] == {"b": 120}
+    again = opened(tmp_path / "new")
+    assert same(again.grid, folded("b"))
+    marks = {name: (mark.seq, mark.lost) for (name, _), mark in again._journal.marks().items()}
+    assert marks == {"a": (120, 120), "b": (120, 0), "c": (120, 120)}
+    assert again.info()["machines"]["a"]["samples"] == 0
+    again.close()
+
+
+def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    span = ("--from", "2026-01-01T00:01:40", "--until", "2026-01-01T01:05+01:00")  # samples 10 to 29
+    assert run(store, "--out", tmp_path / "new", *span, "--json") == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["samples"], summary["left_out"]["time"]) == (60, 60)  # rows outside are not even read
+    rows = rows_of(tmp_path / "new")
+    assert {(r.machine, r.first_seq, len(r.rows)) for r in rows} == {(n, f, 10) for n in "abc" for f in (11, 21)}
+    again = opened(tmp_path / "new")
+    assert same(again.grid, folded(keep=slice(10, 30)))
+    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(120, 100)}
+    again.close()
+
+
+def test_samples_out_of_time_in_the_middle_of_a_batch_cut_it_in_two(tmp_path: Path):
+    folder = make_store(tmp_path / "store", "a", batch=120)
+    rows = TRACKS["a"][:6].copy()
+    rows["stamp_ns"] = T0 + S * np.array([5, 6, 900, 7, 8, 901])
+    store = Store(folder, SITE, ServerConfig(), lambda: T0)
+    store.take([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
+    store.close()
+    assert run(folder, "--out", tmp_path / "new", "--until", "2026-01-01T00:00:10") == 0
+    found = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
+    assert found == [(1, 2), (4, 2)]
+
+
+# --- several archives ------------------------------------------------------------------------------------------------
+
+
+def test_files_folders_and_stores_are_folded(store: Path, tmp_path: Path):
+    files = sorted((store / FOLDER).glob("*.parquet"))
+    assert len(files) == 2
+    assert run(store / FOLDER, "--out", tmp_path / "folder") == 0
+    assert run(*files, "--out", tmp_path / "files") == 0
+    assert run(files[1], "--out", tmp_path / "file") == 0
+    assert identities(tmp_path / "folder") == identities(tmp_path / "files") == identities(store)[:6]
+    assert identities(tmp_path / "file") == identities(store)[3:6]
+    again = opened(tmp_path / "folder")  # the files say which site they are of
+    assert again.site == SITE
+    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(40, 0)}
+    again.close()
+
+
+def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Also where batches were cut differently, and where a file is named twice."""
+    other = make_store(tmp_path / "other", "ab", batch=30, archived=1)
+    file = min((store / FOLDER).glob("*.parquet"))
+    assert run(store, other, file, file, "--out", tmp_path / "new", "--json") == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["left_out"] == {"machine": 0, "time": 0, "twice": 240 + 120}
+    assert (summary["samples"], summary["archives"]) == (360, 4)
+    again = opened(tmp_path / "new")
+    assert same(again.grid, folded())
+    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(120, 0)}
+    again.close()
+
+
+def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tmp_path: Path):
+    one = make_store(tmp_path / "one", "a", spool_id=1, batch=30)
+    two = make_store(tmp_path / "two", "ab", spool_id=2, batch=40, archived=2)
+    orders = [(store, one, two), (two, store, one), (one, two / FOLDER, two, store)]
+    for i, order in enumerate(orders):
+        assert run(*order, "--out", tmp_path / f"new{i}") == 0
+    found = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
+    assert found[0] == found[1] == found[2]
+    received = [row[3] for row in found[0]]
+    assert received == sorted(received)
+
+
+def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    other = make_store(tmp_path / "other", "b", batch=30, changed=76)
+    assert run(store, other, "--out", tmp_path / "new") == 1
+    error = capsys.readouterr().err
+    assert "sample 77 of b, spool 0000000000000007, is another in a further archive" in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other"]  # nothing half-made is left
+    assert run(store, other, "--out", tmp_path / "new", "--without", "b") == 0
+
+
+def test_known_ground_is_kept(tmp_path: Path):
+    ground = (KnownGround("pad", 0.012, ((0.0, 0.0), (5.0, 0.0), (0.0, 5.5))), KnownGround('"x"', 0.1, ((0, 0),) * 3))
+    site = replace(SITE, known_ground=ground)
+    folder = make_store(tmp_path / "store", "a", archived=6, site=site)
+    assert run(folder / FOLDER, "--out", tmp_path / "new") == 0
+    assert load_site(tmp_path / "new" / "site.toml") == site
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    assert run(*words) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    return error
+
+
+def test_a_place_that_is_taken_is_refused(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "something").touch()
+    for out in (tmp_path / "full", tmp_path / "full" / "something"):
+        assert "exists and is not empty; choose another --out" in refused(capsys, store, "--out", out)
+    (tmp_path / "empty").mkdir()
+    assert run(store, "--out", tmp_path / "empty") == 0
+    (tmp_path / "new.part").mkdir()
+    assert "is left from a fold that was killed" in refused(capsys, store, "--out", tmp_path / "new")
+    assert (tmp_path / "new.part").exists()
+
+
+def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    moved = make_store(tmp_path / "moved", "a", site=replace(SITE, origin_lat_deg=48.1), archived=1)
+    named = make_store(tmp_path / "named", "a", site=replace(SITE, name="quarry"))
+    out = ("--out", tmp_path / "new")
+    assert f"{moved}: is of site 'pit', frame" in refused(capsys, store, moved, *out)
+    assert "fold them apart" in refused(capsys, store / FOLDER, moved / FOLDER, *out)
+    assert f"{named}: is of site 'quarry'" in refused(capsys, store, named, *out)
+    error = refused(capsys, store, "--site-file", moved / "site.toml", *out)
+    assert f"{moved}/site.toml: is site 'pit', frame" in error
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_journal_alone_needs_a_site_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = make_store(tmp_path / "store", "a")
+    site_file = (folder / "site.toml").rename(tmp_path / "pit.toml")
+    assert "give --site-file" in refused(capsys, folder, "--out", tmp_path / "new")
+    assert run(folder, "--out", tmp_path / "new", "--site-file", site_file) == 0
+    with_archive = make_store(tmp_path / "archived", "a", archived=3)
+    (with_archive / "site.toml").unlink()
+    assert run(with_archive, "--out", tmp_path / "newer") == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (("--without", "d"), "'d' is no machine of these archives; they are: a, b, c"),
+        (("--from", "2026-01-02", "--until", "2026-01-02"), "--until: is not after --from"),
+        (("--from", "2027-01-01"), "no sample is left"),
+        (("--without", "a", "--without", "b", "--without", "c"), "no sample is left"),
+        (("--cell", "1000"), "--cell: cell_m: 1000.0 is not between"),
+        (("--config", "nowhere.toml"), "nowhere.toml: no such file"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_and_leaves_nothing(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], problem: str
+):
+    assert problem in refused(capsys, store, "--out", tmp_path / "new", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_archive_is_refused(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = ("--out", tmp_path / "new")
+    (tmp_path / "nothing").mkdir()
+    assert "no such file or folder" in refused(capsys, store, tmp_path / "nowhere", *out)
+    assert "neither Parquet files nor a journal.db" in refused(capsys, tmp_path / "nothing", *out)
+    assert "site.toml: is damaged, or no file of" in refused(capsys, store / "site.toml", *out)
+    data = bytearray(min((store / FOLDER).glob("*.parquet")).read_bytes())
+    data[1000] ^= 1
+    damaged = tmp_path / "nothing" / "damaged.parquet"
+    damaged.write_bytes(data)
+    assert f"{damaged}: is damaged" in refused(capsys, damaged, *out)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("text", ["", "yesterday", "12:00", "2026-13-01"])
+def test_a_time_that_is_none_is_refused(text: str):
+    with pytest.raises(ArgumentTypeError, match="no date and time"):
+        _instant(text)
+
+
+def test_times_are_utc_where_no_zone_is_given():
+    texts = ("2026-01-01", "2026-01-01T00:00Z", "2026-01-01T02:00+02:00")
+    assert {_instant(text) for text in texts} == {T0}
+    assert _instant("2026-01-01T00:00:01.5") == T0 + 3 * S // 2
+
+
+# --- what is shown ---------------------------------------------------------------------------------------------------
+
+
+def test_people_read_what_became_of_the_samples(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run(store, "--out", tmp_path / "new", "--without", "b") == 0
+    said = capsys.readouterr()
+    assert "240 samples in 12 journal rows" in said.out
+    assert "  a: 120 samples" in said.out
+    assert "left out: 120 of machines, 0 by time, 0 that came twice" in said.out
+    assert f"sitegrid server --store {tmp_path}/new --site-file {tmp_path}/new/site.toml" in said.out
+    assert said.err == ""
+
+
+@pytest.mark.parametrize(
+    ("terminal", "as_json", "shown"), [(True, False, True), (False, False, False), (True, True, False)]
+)
+def test_progress_is_shown_on_a_terminal(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, terminal: bool, as_json: bool, shown: bool
+):
+    seen = []
+    monkeypatch.setattr(fold, "COMMIT_ROWS", 6)
+    monkeypatch.setattr(fold.sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.setattr(fold.Display, "show", lambda _, *what: seen.append(what[:2]))
+    assert run(store, "--out", tmp_path / "new", *(["--json"] if as_json else [])) == 0
+    assert seen == ([(120, 360), (240, 360), (360, 360)] if shown else [])
+
+
+def test_every_column_is_carried(store: Path, tmp_path: Path):
+    assert run(store / FOLDER, "--out", tmp_path / "new") == 0
+    rows = np.concatenate([r.rows for r in rows_of(tmp_path / "new") if r.machine == "c"])
+    for name in COLUMNS:
+        assert rows[name].tobytes() == TRACKS["c"][name][:40].tobytes()
