@@ -41,7 +41,7 @@ class HardVotes:
 
     def fold(self, rows: Table) -> None:
         """See Sums."""
-        self._add(rows, self._sums, self._side)
+        self._add(rows, self._sums.reshape(-1), self._side)
 
     def sums(self) -> Floats:
         """See Sums."""

@@ -212,9 +212,7 @@ def reads_past(name: str, parameters: Mapping[str, str]) -> bool:
 def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:
     names = layers.select(names)
     if filled := [name for name in names if name in AREA_LAYERS]:
-        problem = (
-            f"layer `{filled[0]}` is made from neighbours; a history has layers of cells: {', '.join(layers.LAYERS)}"
-        )
+        problem = f"layer `{filled[0]}` is made from a cell's neighbours, a history is of one cell: leave it out"
         raise QueryError(Refusal.UNKNOWN_LAYER, problem)
     return names
 

@@ -30,7 +30,8 @@ class ChangeConfig:
 
     detect: whether it ever does. variation: total variation between the two [0..1] above which they contradict each
     other. bins: least difference of their medians, in bins of votes (22 % of c_rr, 0.031 of gradient). weight_m: least
-    evidence on either side. size_m: changes narrower than this are position errors at a border.
+    evidence on either side. size_m: changes narrower than this are position errors at a border, and those narrower than
+    twice this where the new kind of ground is that of the ground beside.
     """
 
     detect: bool = True
@@ -45,11 +46,23 @@ class ChangeConfig:
             raise ValueError(f"variation: {self.variation} is not between 0 and 1")
 
 
-def first_valid(pages: Sequence[TimedPage], config: ChangeConfig) -> Ints:
-    """For each cell (256,) of a block: index of the first page that holds for the ground as it is now."""
-    first = np.zeros(ev.CELLS, np.int64)
+@dataclass(frozen=True)
+class Cuts:
+    """Where the evidence of a block's cells (256,) is cut.
+
+    first: index of the first page that holds for the ground as it is now, 0 where nothing changed. kind: median of the
+    c_rr votes after the cut, in bins; NaN where c_rr did not change.
+    """
+
+    first: Ints
+    kind: Floats
+
+
+def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
+    """Find the last change in every cell of a block."""
+    found = Cuts(np.zeros(ev.CELLS, np.int64), np.full(ev.CELLS, np.nan))
     if len(pages) < 2 or not config.detect:
-        return first
+        return found
     histograms = _histograms(pages)
     for part in _PARTS:
         votes = histograms[:, part]
@@ -57,19 +70,43 @@ def first_valid(pages: Sequence[TimedPage], config: ChangeConfig) -> Ints:
         for _ in range(MOST_CHANGES):
             if not len(cells):
                 break
-            cut = _best_cut(votes[:, :, cells], first[cells], config)
-            changed = cut > first[cells]
-            first[cells] = np.maximum(first[cells], cut)
+            cut, kind = _best_cut(votes[:, :, cells], found.first[cells], config)
+            changed = cut > found.first[cells]
             cells = cells[changed]
-    return first
+            found.first[cells] = cut[changed]
+            found.kind[cells] = kind[changed] if part == ev.RESISTANCE else np.nan
+    return found
 
 
-def without_thin(changed: Bools, cell_m: float, config: ChangeConfig) -> Bools:
-    """Cells (rows, columns) that lie in a changed area of at least size_m across: opening by a square of that size."""
+def kinds(pages: Sequence[TimedPage]) -> Floats:
+    """Median (256,) of all c_rr votes of each cell, in bins; NaN where there are none."""
+    votes = _histograms(pages)[:, ev.RESISTANCE].sum(axis=0)
+    weight = votes.sum(axis=0)
+    return np.where(weight > 0, _median(votes / np.maximum(weight, 1e-9)), np.nan)
+
+
+def credible(changed: Bools, kind: Floats, now: Floats, cell_m: float, config: ChangeConfig) -> Bools:
+    """Changed cells (rows, columns) that are no position errors.
+
+    A wrong position moves the ground of one side of a border to the other. So a strip of changed cells counts where it
+    is size_m wide and its new kind is not that of the ground around, or twice as wide. kind: after the change, as in
+    Cuts; now: `kinds` of all cells, NaN where they are not known.
+    """
     edge = max(1, round(config.size_m / cell_m))
+    ground = np.where(changed, np.nan, now)
+    near = np.zeros(changed.shape, np.bool_)
+    for one in np.unique(np.rint(kind[changed & np.isfinite(kind)])):
+        alike = (np.abs(ground - one) <= ALIKE_BINS).astype(np.uint8)
+        around = cv2.dilate(alike, np.ones((4 * edge + 1, 4 * edge + 1), np.uint8)) > 0
+        near |= around & (np.rint(kind) == one)
+    new = changed & np.isfinite(kind) & ~near
+    return _opened(changed, 2 * edge) | _opened(new, edge)
+
+
+def _opened(cells: Bools, edge: int) -> Bools:
+    """Those that lie in a square of `edge` cells, all of which are set."""
     square = np.ones((edge, edge), np.uint8)
-    opened = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, square, borderValue=0)
-    return np.asarray(opened > 0, np.bool_)
+    return np.asarray(cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_OPEN, square, borderValue=0) > 0, np.bool_)
 
 
 def _histograms(pages: Sequence[TimedPage]) -> AnyArray:
@@ -91,10 +128,10 @@ def _may_differ(votes: Floats, weight_m: float) -> Bools:
     return np.asarray(spread > ALIKE_BINS, np.bool_)
 
 
-def _best_cut(votes: Floats, first: Ints, config: ChangeConfig) -> Ints:
+def _best_cut(votes: Floats, first: Ints, config: ChangeConfig) -> tuple[Ints, Floats]:
     """Index of the page (cells,) at which the ground changed, the given first page where it did not.
 
-    votes: (pages, bins, cells); pages before `first` are left out.
+    votes: (pages, bins, cells); pages before `first` are left out. Also returns the median (cells,) after it.
     """
     pages = np.arange(len(votes))
     kept = np.where(pages[:, None, None] >= first, votes, 0)
@@ -108,9 +145,10 @@ def _best_cut(votes: Floats, first: Ints, config: ChangeConfig) -> Ints:
     before, after = old[best, :, cells].T, new[best, :, cells].T  # (bins, cells)
     share_before, share_after = (part / np.maximum(part.sum(axis=0), 1e-9) for part in (before, after))
     variation = np.abs(share_before - share_after).sum(axis=0) / 2
-    apart = np.abs(_median(share_before) - _median(share_after))
+    kind = _median(share_after)
+    apart = np.abs(_median(share_before) - kind)
     changed = (weights[best, cells] >= config.weight_m) & (variation > config.variation) & (apart >= config.bins)
-    return np.where(changed, best + 1, first)
+    return np.where(changed, best + 1, first), kind
 
 
 def _entropy(votes: Floats) -> Floats:

@@ -307,7 +307,8 @@ class Journal(JournalReads):
 
         most: how many at most, so that batches need not wait long; call it again until `until` is reached.
         """
-        last = min(until, self.archived_row + most, self.last_row)
+        archived = self.archived_row
+        last = max(archived, min(until, archived + most, self.last_row))
         self.begin()
         try:
             for table in ("journal", "extent"):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver import evidence as ev
-from mapserver.change import ChangeConfig, first_valid, without_thin
+from mapserver.change import ChangeConfig, credible, cuts, kinds
 from mapserver.ladder import Block, TimedPage
 from protocol.arrays import AnyArray, Ints
 from protocol.geometry import BLOCK_CELLS
@@ -21,15 +21,18 @@ def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block
 
     Cells at the edge of the blocks see no further: give a ring of blocks more than are wanted.
     """
-    first = {block: first_valid(of_block, config) for block, of_block in pages.items()}
-    if not any(found.any() for found in first.values()):
+    found = {block: cuts(of_block, config) for block, of_block in pages.items()}
+    first = {block: cut.first for block, cut in found.items()}
+    changed = [block for block, cut in found.items() if cut.first.any()]
+    if not changed:
         return first
-    image, (left, bottom) = image_of({block: found > 0 for block, found in first.items()})
-    image = without_thin(image, cell_m, config)
-    n = BLOCK_CELLS
-    for (x, y), found in first.items():
-        wide = image[(y - bottom) * n : (y - bottom + 1) * n, (x - left) * n : (x - left + 1) * n]
-        found[~wide.ravel()] = 0
+    near = {block for one in changed for block in around(one) if block in found}
+    image, corner = image_of({block: first[block] > 0 for block in near}, False)
+    kind, _ = image_of({block: found[block].kind for block in near}, np.nan)
+    now, _ = image_of({block: kinds(pages[block]) for block in near}, np.nan)
+    holds = credible(image, kind, now, cell_m, config)
+    for block in changed:
+        first[block][~cells_of(holds, corner, block)] = 0
     return first
 
 
@@ -75,12 +78,18 @@ def _changed_ns(pages: Sequence[TimedPage], start: Ints) -> Ints:
     return changed_ns
 
 
-def image_of(blocks: Mapping[Block, AnyArray]) -> tuple[AnyArray, Block]:
-    """Values (256,) of blocks as one image (rows, columns), 0 elsewhere; and its first block column and row."""
-    xs, ys = [x for x, _ in blocks], [y for _, y in blocks]
-    left, bottom, n = min(xs), min(ys), BLOCK_CELLS
-    kind = next(iter(blocks.values())).dtype
-    image = np.zeros(((max(ys) - bottom + 1) * n, (max(xs) - left + 1) * n), kind)
+def image_of(blocks: Mapping[Block, AnyArray], nothing: float) -> tuple[AnyArray, Block]:
+    """Values (256,) of blocks as one image (rows, columns), `nothing` elsewhere; and its first block column and row."""
+    left, bottom = (min(block[axis] for block in blocks) for axis in (0, 1))
+    right, top = (max(block[axis] for block in blocks) for axis in (0, 1))
+    n, kind = BLOCK_CELLS, next(iter(blocks.values())).dtype
+    image = np.full(((top - bottom + 1) * n, (right - left + 1) * n), nothing, kind)
     for (x, y), cells in blocks.items():
         image[(y - bottom) * n : (y - bottom + 1) * n, (x - left) * n : (x - left + 1) * n] = cells.reshape(n, n)
     return image, (left, bottom)
+
+
+def cells_of(image: AnyArray, corner: Block, block: Block) -> AnyArray:
+    """Undo `image_of` for one block: (256,)."""
+    n, x, y = BLOCK_CELLS, block[0] - corner[0], block[1] - corner[1]
+    return image[y * n : (y + 1) * n, x * n : (x + 1) * n].ravel()

@@ -99,7 +99,7 @@ def compare(one: Map, other: Map, config: CompareConfig) -> Difference | None:
 
 def reverse(d: Difference) -> Difference:
     """The same, of the second map from the first."""
-    shift = Shift(-d.shift.east_m, -d.shift.north_m, d.shift.std_m) if d.shift else None
+    shift = replace(d.shift, east_m=-d.shift.east_m, north_m=-d.shift.north_m) if d.shift else None
     return replace(d, gain=replace(d.gain, log=-d.gain.log), shift=shift, spreads=(d.spreads[1], d.spreads[0]))
 
 

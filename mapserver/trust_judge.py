@@ -22,7 +22,8 @@ class TrustConfig:
     many of a machine's newest periods are remembered; a repaired machine is cleared when most of them are good.
     min_cells: of about 4 m2 that two machines must share; with fewer nothing is decided.
     gain_limit: ratio of coefficients; agents know mass and torque to 3 % each, a class is wrong from about 1.25.
-    gain_share: of the ground that must differ in the same direction: a repaved corner is no gain.
+    share: of the ground that must differ by a gain in the same direction, and of the borders that must speak for a
+    displacement: a repaved corner is neither.
     zero_error: of c_rr, an accelerometer's zero error divided by g; it may explain a difference on hard ground.
     offset_limit_m: of positions; what slow receiver errors leave after hours. error_length_m: metres over which a
     position error stays the same (twice 30 s at 3 m/s). sigmas: so many standard errors are added to each limit.
@@ -38,7 +39,7 @@ class TrustConfig:
     periods: int = 16
     min_cells: int = 20
     gain_limit: float = 1.15
-    gain_share: float = 0.7
+    share: float = 0.75
     zero_error: float = 0.003
     offset_limit_m: float = 1.5
     error_length_m: float = 200.0
@@ -55,7 +56,7 @@ class TrustConfig:
         require_positive(self, self.__dataclass_fields__)
         if self.gain_limit <= 1:
             raise ValueError(f"gain_limit: {self.gain_limit} is not above 1")
-        for name in ("gain_share", "agreement", "stuck_spread"):
+        for name in ("share", "agreement", "stuck_spread"):
             if getattr(self, name) >= 1:
                 raise ValueError(f"{name}: {getattr(self, name)} is not below 1")
         for small, large in (("clock_steady_s", "clock_limit_s"), ("clock_steady_s", "clock_span_s")):
@@ -120,7 +121,7 @@ def _disagrees(difference: Difference, config: TrustConfig, sigmas: float) -> Fi
 def _gain(gain: Gain, config: TrustConfig, sigmas: float) -> Finding:
     limit = log(config.gain_limit) + config.zero_error / gain.c_rr
     excess = abs(gain.log) / (limit + sigmas * gain.std)
-    if excess > 1 and gain.share >= config.gain_share:
+    if excess > 1 and gain.share >= config.share:
         return Finding(excess, DISAGREE)
     return Finding(excess, AGREE if abs(gain.log) <= limit else UNKNOWN)
 
@@ -130,5 +131,7 @@ def _offset(shift: Shift | None, config: TrustConfig, sigmas: float) -> Finding:
         return _NO_FINDING
     far_m, limit_m = hypot(shift.east_m, shift.north_m), config.offset_limit_m
     excess = far_m / (limit_m + sigmas * shift.std_m)
+    if excess > 1 and shift.share >= config.share:
+        return Finding(excess, DISAGREE)
     agrees = far_m <= limit_m and shift.std_m <= limit_m
-    return Finding(excess, DISAGREE if excess > 1 else AGREE if agrees else UNKNOWN)
+    return Finding(excess, AGREE if agrees else UNKNOWN)

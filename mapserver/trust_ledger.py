@@ -144,10 +144,10 @@ class Ledger:
 
         A period that is forgotten can never come back among the newest ones, so that when this runs has no influence.
         """
-        codes = np.concatenate([self._codes, *(codes for codes, _ in self._pending)])
-        sums = np.concatenate([self._sums, *(sums for _, sums in self._pending)])
+        waiting = [Surface(codes, sums, 0.0) for codes, sums in self._pending]
         self._pending, self._waiting = [], 0
-        whole = _summed(codes, sums, 0.0)
+        # what waits is small: summed first, it leaves two sorted runs to merge
+        whole = pooled([Surface(self._codes, self._sums, 0.0), pooled(waiting)])
         newest = np.unique(whole.codes >> _PERIOD_SHIFT)[-self._periods :]
         start = int(np.searchsorted(whole.codes, newest[0] << _PERIOD_SHIFT)) if len(newest) else 0
         self._codes, self._sums = whole.codes[start:].copy(), whole.sums[start:].copy()

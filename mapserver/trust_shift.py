@@ -18,8 +18,8 @@ _BORDER_BITS, _BORDER_LEVELS = 3, 0.25  # a square of 16 m in which levels diffe
 _CLIP = 1.0  # levels: beyond, a difference counts as this one; else the borders of sand alone would decide
 # Where borders run one way only, nothing tells the shift along them: a shift by one cell must improve the cost by 1 %.
 _PRICE = 0.01
-# Left out in turn (jackknife). Whole strips, because what misleads lies together: a repaved zone that some saw before.
-_GROUPS = 8
+_GROUPS = 8  # of squares of 32 m, left out in turn (jackknife)
+_GROUP_BITS = 4
 
 _STEPS = np.arange(-REACH, REACH + 1)
 _PRICES: Floats = _PRICE * (_STEPS[:, None] ** 2 + _STEPS[None, :] ** 2).ravel().astype(np.float64)
@@ -27,11 +27,12 @@ _PRICES: Floats = _PRICE * (_STEPS[:, None] ** 2 + _STEPS[None, :] ** 2).ravel()
 
 @dataclass(frozen=True)
 class Shift:
-    """A displacement, and its standard deviation, of both axes together."""
+    """A displacement, its standard deviation, of both axes together, and what share of the borders speaks for it."""
 
     east_m: float
     north_m: float
     std_m: float
+    share: float
 
 
 def find_shift(
@@ -49,13 +50,22 @@ def find_shift(
     both = known[:, _SHIFTS // 2]
     if both.sum() < _FEWEST_CELLS:
         return None
-    costs, counts = _by_group(error), _by_group(known.astype(np.float64))
+    costs, counts = _by_group(at, error), _by_group(at, known.astype(np.float64))
     east, north = _best(costs.sum(axis=0), counts.sum(axis=0))
     rest = np.array([_best(c, n) for c, n in zip(costs.sum(axis=0) - costs, counts.sum(axis=0) - counts, strict=True)])
-    jackknife = (1 - 1 / _GROUPS) * float(((rest - rest.mean(axis=0)) ** 2).sum()) * cell_m**2
+    jackknife = (1 - 1 / len(rest)) * float(((rest - rest.mean(axis=0)) ** 2).sum()) * cell_m**2
     metres = float(one.metres.mean()) * both.sum(), float(other.metres[borders][both].sum())
     drawn = sum(2 * s.std_m**2 * error_length_m / m for s, m in zip((one, other), metres, strict=True))
-    return Shift(east * cell_m, north * cell_m, float(np.sqrt(jackknife + drawn)))
+    moved = (round(north) + REACH) * _EDGE + round(east) + REACH
+    gained = np.where(both & known[:, moved], error[:, _SHIFTS // 2] - error[:, moved], 0.0)
+    return Shift(east * cell_m, north * cell_m, float(np.sqrt(jackknife + drawn)), _share(at, gained))
+
+
+def _share(codes: Ints, gained: Floats) -> float:
+    """Share of what squares gain by the shift in what they gain or lose: a repaved zone misleads only its own."""
+    squares, index = np.unique(block_of(codes, _GROUP_BITS), return_inverse=True)
+    gains = np.bincount(index, gained, len(squares))
+    return float(gains[gains > 0].sum() / max(np.abs(gains).sum(), 1e-9))
 
 
 def near_borders(surface: Surface) -> Ints:
@@ -87,9 +97,11 @@ def _errors(codes: Ints, level: Floats, at: Ints, expected: Floats) -> tuple[Flo
     return np.where(known, np.minimum(difference**2, _CLIP**2), 0.0), known
 
 
-def _by_group(values: Floats) -> Floats:
-    """Sums (groups, shifts) over strips of the site with as many cells each; cells lie sorted from south to north."""
-    return np.add.reduceat(values, np.arange(_GROUPS) * len(values) // _GROUPS, axis=0)
+def _by_group(codes: Ints, values: Floats) -> Floats:
+    """Sums (groups, shifts) over groups of squares."""
+    group = ((codes >> _GROUP_BITS) * 5 + (codes // ROW >> _GROUP_BITS) * 3) % _GROUPS
+    order = np.argsort(group, kind="stable")  # no matrix product: it would wake the threads of BLAS
+    return np.add.reduceat(values[order], np.flatnonzero(np.diff(group[order], prepend=-1)), axis=0)
 
 
 def _best(costs: Floats, counts: Floats) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from mapserver import evidence as ev
 from mapserver import layers
-from mapserver.change import ChangeConfig, first_valid
+from mapserver.change import ChangeConfig, cuts
 from mapserver.ladder import Block, TimedPage
 from mapserver.reading import evidence, image_of, valid_pages
 from protocol.arrays import Bools, Floats32, Ints
@@ -84,12 +84,12 @@ class ChangeWatch:
             block: self._fresh(block, pages[block], first[block], now.changed_ns[i]) for i, block in enumerate(changed)
         }
         old_pages = [_older(pages[block], first[block]) for block in changed]
-        old = evidence(old_pages, [first_valid(older, self._config) for older in old_pages])
+        old = evidence(old_pages, [cuts(older, self._config).first for older in old_pages])
         values = _before_and_after(old, now, self._read)
-        image, (left, bottom) = image_of(fresh)
+        image, (left, bottom) = image_of(fresh, False)
         count, areas = cv2.connectedComponents(image.astype(np.uint8), connectivity=8)
-        images = {name: image_of(dict(zip(changed, part, strict=True)))[0] for name, part in values.items()}
-        stamps, _ = image_of({block: now.changed_ns[i] for i, block in enumerate(changed)})
+        images = {name: image_of(dict(zip(changed, part, strict=True)), np.nan)[0] for name, part in values.items()}
+        stamps, _ = image_of({block: now.changed_ns[i] for i, block in enumerate(changed)}, 0)
         found: dict[int, Change] = {}
         for area in range(1, count):
             row, column = _of_one_time(areas == area, stamps)

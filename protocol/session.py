@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import socket
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import zenoh
 
+from protocol.credentials import Credentials
 from protocol.errors import LinkError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+DEFAULT_TLS_ENDPOINT = "tls/127.0.0.1:7447"
 
 
 @dataclass(frozen=True)
@@ -18,18 +21,26 @@ class SessionConfig:
     """How a process joins the network.
 
     mode: "client" connects to a router; "router" is the site's router and listens. wait_s: how long to wait for the
-    router; negative opens at once and goes on looking for it in the background, as an agent does.
+    router; negative opens at once and goes on looking for it in the background, as an agent does. credentials: with
+    them both ends of every link prove their names, without them nobody does. guard: the router's rules, as Zenoh's
+    settings.
     """
 
     endpoint: str = DEFAULT_ENDPOINT
     mode: str = "client"
     wait_s: float = 5.0
+    credentials: Credentials | None = None
+    guard: Mapping[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.mode not in ("client", "router"):
             raise ValueError(f'mode: {self.mode!r} is neither "client" nor "router"')
         if "/" not in self.endpoint:
             raise ValueError(f"endpoint: {self.endpoint!r} is not like {DEFAULT_ENDPOINT}")
+        if self.credentials and not self.endpoint.startswith("tls/"):
+            raise ValueError(f"endpoint: {self.endpoint!r} proves no names; with keys it is like {DEFAULT_TLS_ENDPOINT}")
+        if not self.credentials and self.endpoint.startswith("tls/"):
+            raise ValueError(f"endpoint: {self.endpoint!r} needs keys")
 
 
 def open_session(config: SessionConfig) -> zenoh.Session:
@@ -51,8 +62,10 @@ def _settings(config: SessionConfig) -> dict[str, object]:
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
     }
+    if config.credentials:
+        settings["transport/link/tls"] = config.credentials.tls(listens=config.mode == "router")
     if config.mode == "router":
-        return settings | {"listen/endpoints": [config.endpoint]}
+        return settings | {"listen/endpoints": [config.endpoint]} | config.guard
     # A client's open blocks until the router is there; a peer that listens nowhere connects in the background.
     in_background = config.wait_s < 0
     wait_ms = -1 if in_background else int(config.wait_s * 1000)

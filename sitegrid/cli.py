@@ -10,6 +10,7 @@ import argparse
 import importlib
 import json
 import logging
+import re
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -18,6 +19,8 @@ from typing import TypeAlias
 
 from protocol.errors import SitegridError
 from protocol.session import DEFAULT_ENDPOINT
+from sitegrid.times import HELP as TIME_HELP
+from sitegrid.times import parse_time
 
 EXTRA = {
     "numba": "server",
@@ -58,7 +61,18 @@ def build_parser() -> argparse.ArgumentParser:
     network.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="router to connect to (default %(default)s)")
     parser = argparse.ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_demo, _add_router, _add_server, _add_sim, _add_agent, _add_query, _add_plot, _add_eval, _add_fold):
+    for add in (
+        _add_demo,
+        _add_router,
+        _add_server,
+        _add_sim,
+        _add_agent,
+        _add_query,
+        _add_trust,
+        _add_plot,
+        _add_eval,
+        _add_fold,
+    ):
         add(nouns, common, network)
     return parser
 
@@ -137,17 +151,77 @@ def _add_agent(nouns: Nouns, common: Parent, network: Parent) -> None:
 def _add_query(nouns: Nouns, common: Parent, network: Parent) -> None:
     query = _noun(nouns, "query", "ask the map", [common, network])
     query.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
-    query.add_argument("--after", type=int, default=0, help="wait until this journal row is merged")
+    query.add_argument(
+        "--after", type=int, default=0, help="wait until this journal row is merged; changes: those beyond this number"
+    )
     query.add_argument("--layers", default="", help="layers, comma-separated; default all")
     asks = query.add_subparsers(metavar="QUERY", required=True, dest="ask")
-    point = asks.add_parser("point", help="the cell at a position", description="The cell at a position in metres.")
-    point.add_argument("x_m", type=float)
-    point.add_argument("y_m", type=float)
-    region = asks.add_parser("region", help="a rectangle of cells", description="A rectangle of cells, in metres.")
+    point = _ask(asks, "point", "the cell at a position, in metres")
+    _add_place(point)
+    _add_when(point)
+    region = _ask(asks, "region", "a rectangle of cells, in metres")
     for side in ("west_m", "south_m", "east_m", "north_m"):
         region.add_argument(side, type=float)
     region.add_argument("--out", type=Path, help="write coordinates and layers as .npz")
-    asks.add_parser("info", help="state of the map and its server", description="State of the map and its server.")
+    _add_when(region)
+    history = _ask(asks, "history", "the cell at a position over time")
+    _add_place(history)
+    _add_times(
+        history, ("from", "samples from this time on"), ("to", "samples up to this time; default the site's now")
+    )
+    history.add_argument("--span", type=_positive, metavar="SECONDS", help="length of a span; default 5 minutes")
+    _ask(asks, "machines", "what the map server knows of each machine")
+    changes = _ask(asks, "changes", "where the ground changed, and when")
+    changes.add_argument("--follow", action="store_true", help="go on with each change that is found, until stopped")
+    _ask(asks, "info", "state of the map and its server")
+
+
+def _ask(asks: Nouns, name: str, what: str) -> argparse.ArgumentParser:
+    ask: argparse.ArgumentParser = asks.add_parser(
+        name, help=what, description=what[0].upper() + what[1:] + ".", parents=[_quiet()]
+    )
+    return ask
+
+
+def _add_trust(nouns: Nouns, common: Parent, network: Parent) -> None:
+    trust = _noun(nouns, "trust", "use a machine's samples, whatever the map server finds", [common, network])
+    trust.add_argument("--auto", action="store_true", help="leave it to the map server again")
+    distrust = _noun(nouns, "distrust", "leave a machine's samples out of the map, earlier ones too", [common, network])
+    distrust.add_argument("--reason", required=True, help="one line that is kept with the decision")
+    for noun, trusted in ((trust, True), (distrust, False)):
+        noun.set_defaults(module="sitegrid.commands.trust", trusted=trusted)
+        noun.add_argument("machine", metavar="MACHINE")
+        noun.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
+        noun.add_argument(
+            "--wait",
+            type=_not_negative,
+            default=30.0,
+            help="seconds for the map to be folded again (default %(default)g)",
+        )
+
+
+def _quiet() -> argparse.ArgumentParser:
+    """--json behind a word as well as before it: without a default, which would undo the one before."""
+    quiet = argparse.ArgumentParser(add_help=False)
+    quiet.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help="print JSON for machines")
+    return quiet
+
+
+def _add_place(ask: argparse.ArgumentParser) -> None:
+    ask.add_argument("x_m", type=float)
+    ask.add_argument("y_m", type=float)
+
+
+def _add_when(ask: argparse.ArgumentParser) -> None:
+    _add_times(ask, ("as-of", "the map as of this time"), ("minus", "less the map as of this time"))
+
+
+def _add_times(ask: argparse.ArgumentParser, *options: tuple[str, str]) -> None:
+    for name, what in options:
+        ask.add_argument(f"--{name}", dest=f"{name.replace('-', '_')}_time", type=parse_time, metavar="TIME", help=what)
+    ask.epilog = f"TIME: {TIME_HELP}."
+    # argparse knows no public way to say that -2h is a value as -2 is one, not an option
+    ask._negative_number_matcher = re.compile(r"-\.?\d.*")  # noqa: SLF001
 
 
 def _add_plot(nouns: Nouns, common: Parent, network: Parent) -> None:
@@ -164,8 +238,7 @@ def _add_plot(nouns: Nouns, common: Parent, network: Parent) -> None:
 def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
     evaluation = _noun(nouns, "eval", "run the experiments behind the project's figures", [common])
     asks = evaluation.add_subparsers(metavar="WHAT", required=True, dest="what")
-    quiet = argparse.ArgumentParser(add_help=False)  # no default: it would undo a --json before WHAT
-    quiet.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help="print JSON for machines")
+    quiet = _quiet()
     physics = asks.add_parser(
         "physics", help="the simulator against mechanics, and its two worlds against each other", parents=[quiet]
     )

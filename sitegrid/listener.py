@@ -27,6 +27,7 @@ class Listener(Generic[T]):
         self, session: zenoh.Session, key: str, decode: Callable[[bytes], T], callback: Callable[[T], object]
     ) -> None:
         self._decode, self._callback = decode, callback
+        self._closed = False
         self._waiting: queue.Queue[bytes | None] = queue.Queue(MOST_WAITING)
         self._thread = threading.Thread(target=self._run, name="listener", daemon=True)
         self._thread.start()
@@ -34,8 +35,9 @@ class Listener(Generic[T]):
 
     def close(self) -> None:
         """Stop listening; returns once the callback has. May be called again, and from the callback itself."""
-        if not self._thread.is_alive():
+        if self._closed:
             return
+        self._closed = True
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._drop_waiting()
         self._waiting.put(None)

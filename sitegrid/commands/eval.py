@@ -90,7 +90,7 @@ def _merge(arguments: Namespace) -> Tables:
         processes=arguments.processes or cores(),
         cases=select([name for name in arguments.cases.split(",") if name]),
     )
-    with Display("machines drive, maps are merged", headless=arguments.json) as display:
+    with Display("machines drive, their samples are merged", headless=arguments.json) as display:
         result = merge.run(plan, display.show)
     if arguments.plots:
         from evaluation import merge_plots  # imported here: only pictures need matplotlib

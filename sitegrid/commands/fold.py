@@ -188,6 +188,7 @@ def _copy(part: Path, sources: list[Source], site: SiteConfig, wanted: Wanted, *
                 journal.begin()
                 if display:
                     display.show(done, total, f"{done / 1e6:.2f} of {total / 1e6:.2f} M samples")
+        copier.left_out["time"] += max(0, total - done)  # whole batches and files that were passed over
         copier.finish({spool: mark.seq for source in sources for spool, mark in source.marks.items()})
         journal.commit()
     if not copier.kept.total():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from argparse import Namespace
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,31 +13,35 @@ from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.queries import Region
 from sitegrid.client import Client, connect
-from sitegrid.process import plain, say
+from sitegrid.process import plain, say, stop_flag, wait
+from sitegrid.times import SiteTime, told
 
 
 def run(arguments: Namespace) -> int:
-    """Ask once and print the answer."""
+    """Ask once and print the answer; changes, while they are followed, until stopped."""
     layers = tuple(part for part in arguments.layers.split(",") if part)
     with connect(arguments.endpoint, arguments.site) as client:
-        {"point": _point, "region": _region, "info": _info}[arguments.ask](client, arguments, layers)
+        _ASKS[arguments.ask](client, arguments, layers)
     return 0
 
 
 def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> None:
-    answer = client.point(arguments.x_m, arguments.y_m, layers, after=arguments.after)
+    when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
+    answer = client.point(arguments.x_m, arguments.y_m, layers, **when, after=arguments.after)
     if arguments.json:
-        say(plain({"x_m": answer.x_m, "y_m": answer.y_m, **answer.values, "merged": answer.merged}))
+        row = {"x_m": answer.x_m, "y_m": answer.y_m, **answer.values}
+        say(plain({**row, "merged": answer.merged, "stamp_ns": answer.stamp_ns}))
         return
-    print(f"cell at {answer.x_m:g}, {answer.y_m:g} m")
+    print(f"cell at {answer.x_m:g}, {answer.y_m:g} m{_as_of(when, answer.stamp_ns)}")
     for name, value in answer.values.items():
-        print(f"  {name:18} {'unknown' if math.isnan(value) else f'{value:.4g}'}")
+        print(f"  {name:18} {_value(value)}")
 
 
 def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> None:
     sides = (arguments.west_m, arguments.south_m, arguments.east_m, arguments.north_m)
+    when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
     try:
-        region = client.region(sides, layers, after=arguments.after)
+        region = client.region(sides, layers, **when, after=arguments.after)
     except ValueError as error:
         raise ConfigError("sitegrid query region", str(error)) from None
     if arguments.out:
@@ -44,12 +49,82 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> No
         np.savez_compressed(arguments.out, **arrays)
     summary = {name: _statistics(values) for name, values in region.layers.items()}
     if arguments.json:
-        say(plain({"columns": len(region.x_m), "rows": len(region.y_m), "merged": region.merged, "layers": summary}))
+        size = {"columns": len(region.x_m), "rows": len(region.y_m)}
+        say(plain({**size, "merged": region.merged, "stamp_ns": region.stamp_ns, "layers": summary}))
         return
-    print(f"{_size(region)}, journal row {region.merged}")
+    print(f"{_size(region)}{_as_of(when, region.stamp_ns)}, journal row {region.merged}")
     for name, row in summary.items():
         span = f"min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
         print(f"  {name:18} {row['known']:7d} known   {span}")
+
+
+def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> None:
+    times = _stamps(client, **{"from": arguments.from_time, "to": arguments.to_time})
+    spans = client.history(arguments.x_m, arguments.y_m, layers, **times, span_s=arguments.span, after=arguments.after)
+    if arguments.json:
+        rows = [{"first_ns": span.first_ns, "last_ns": span.last_ns, **span.values} for span in spans]
+        say(plain({"spans": rows}))
+        return
+    if not spans:
+        print("nobody was there")
+        return
+    names = list(spans[0].values)
+    _table(["from (UTC)", *names], ([told(s.first_ns), *(_value(s.values[name]) for name in names)] for s in spans))
+
+
+def _machines(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
+    machines = client.machines(after=arguments.after)
+    if arguments.json:
+        say(plain({"machines": machines}))
+        return
+    _table(["machine", "trusted", "since", "samples", "lost", "newest", "why"], map(_machine_row, machines))
+
+
+def _machine_row(machine: Mapping[str, Any]) -> list[str]:
+    reasons = ", ".join([*machine.get("reasons", ()), *filter(None, [machine.get("reason")])])
+    trusted = ("yes" if machine["trusted"] else "NO") + (f", by {machine['by']}" if machine.get("by") else "")
+    since = told(machine["since_ns"]) if machine.get("since_ns") else "-"
+    numbers = [str(machine.get(name, "-")) for name in ("samples", "lost")]
+    return [machine["name"], trusted, since, *numbers, told(machine.get("newest_ns", 0)), reasons or "-"]
+
+
+def _changes(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
+    if arguments.follow:
+        _follow_changes(client, arguments)
+        return
+    changes = client.changes(arguments.after)
+    if arguments.json:
+        say(plain({"changes": changes}))
+        return
+    for change in changes:
+        print(_told_change(change))
+    if not changes:
+        print("no change of the ground was found")
+
+
+def _follow_changes(client: Client, arguments: Namespace) -> None:
+    """First what is known, then what is found; listens before it asks, so that none is missed in between."""
+    stop = stop_flag()
+
+    def show(change: Mapping[str, Any]) -> None:
+        say(plain(change)) if arguments.json else print(_told_change(change), flush=True)
+
+    listener = client.on_change(show)
+    for change in client.changes(arguments.after):
+        show(change)
+    wait(stop)
+    listener.close()
+
+
+def _told_change(change: Mapping[str, Any]) -> str:
+    west, south, east, north = change["bounds"]
+    parts = [f"{change['id']}: {told(change['first_ns'])} to {told(change['last_ns'])}"]
+    parts += [f"{west:g}..{east:g} x {south:g}..{north:g} m", f"{change['cells']} cells"]
+    for name in ("resistance", "grade"):
+        before, after = (change.get(f"{name}_{side}") for side in ("before", "after"))
+        if before is not None or after is not None:
+            parts.append(f"{name} {_value(before)} -> {_value(after)}")
+    return "  ".join(parts)
 
 
 def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
@@ -64,6 +139,43 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
         print(f"  {name}: {machine['samples']} samples, {machine['lost']} lost, {machine['spools']} spools")
     for name, count in sorted(info["counters"].items()):
         print(f"  {name}: {count}")
+
+
+_ASKS = {
+    "point": _point,
+    "region": _region,
+    "history": _history,
+    "machines": _machines,
+    "changes": _changes,
+    "info": _info,
+}
+
+
+def _stamps(client: Client, **times: SiteTime | None) -> dict[str, Any]:
+    """Times of options as the client's arguments: `as_of` becomes `as_of_ns`."""
+
+    def now_ns() -> int:
+        return int(client.info()["stamp_ns"])
+
+    given = {name: time for name, time in times.items() if time}
+    return {f"{name}_ns": time.stamp(f"--{name.replace('_', '-')}", now_ns) for name, time in given.items()}
+
+
+def _as_of(when: Mapping[str, int], stamp_ns: int) -> str:
+    """What to say of the time of an answer, nothing where it is the map as it is."""
+    as_of = f", as of {told(stamp_ns)}" if "as_of_ns" in when else ""
+    return as_of + (f", minus that of {told(when['minus_ns'])}" if "minus_ns" in when else "")
+
+
+def _value(value: float | None) -> str:
+    return "unknown" if value is None or math.isnan(value) else f"{value:.4g}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    lines = [head, *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
+        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
 
 
 def _statistics(values: Floats32) -> dict[str, float]:

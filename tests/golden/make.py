@@ -84,6 +84,41 @@ ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
 POINT = queries.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
+HISTORY = queries.HistoryAnswer(
+    0.5,
+    1.5,
+    (
+        queries.Span(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
+        queries.Span(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
+    ),
+    17,
+    T0 + 700_000_000_000,
+)
+MACHINE = {
+    "name": "loader-2",
+    "trusted": False,
+    "by": "audit",
+    "reason": "contradicts all others",
+    "since_ns": T0,
+    "contradicts": True,
+    "reasons": ["offset"],
+    "evidence": {"offset_m": 2.75, "machines": 3},
+    "spools": 1,
+    "samples": 1200,
+    "lost": 3,
+    "newest_ns": T0 + 1,
+}
+CHANGE = {
+    "id": 4,
+    "first_ns": T0,
+    "last_ns": T0 + 60_000_000_000,
+    "bounds": [10.0, -20.0, 40.0, 12.5],
+    "cells": 615,
+    "resistance_before": 0.25,
+    "resistance_after": 0.0078125,
+    "grade_before": 0.0,
+    "grade_after": None,
+}
 
 GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
@@ -96,6 +131,11 @@ GOLDEN: dict[str, Golden] = {
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, queries.encode_point, queries.decode_point),
     "region.bin": Golden(region(), queries.encode_region, queries.decode_region),
+    "history.bin": Golden(HISTORY, queries.encode_history, queries.decode_history),
+    "machines.bin": Golden([MACHINE], queries.encode_machines, queries.decode_machines),
+    "machine.bin": Golden({**MACHINE, "merged": 17}, queries.encode_machine, queries.decode_machine),
+    "changes.bin": Golden([CHANGE], queries.encode_changes, queries.decode_changes),
+    "change.bin": Golden(CHANGE, queries.encode_change, queries.decode_change),
     "info.bin": Golden(
         {"site": "paper", "merged": 17, "refused": {"gap": 1}}, queries.encode_info, queries.decode_info
     ),

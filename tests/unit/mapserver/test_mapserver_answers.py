@@ -8,6 +8,7 @@ from mapserver import layers
 from mapserver.answers import Answers
 from mapserver.filling import AREA_LAYERS
 from mapserver.layers import LAYERS, ReadConfig
+from mapserver.store import Store
 from mapserver.writer import Writer
 from protocol.errors import QueryError, Refusal
 from protocol.geometry import Bounds
@@ -138,3 +139,106 @@ def test_an_answer_waits_for_the_row_asked_for(answers):
     with pytest.raises(QueryError, match="row 2 is not merged") as caught:
         answers.answer("point", {"x": "0", "y": "0", "after": "2", "wait": "0.01"})
     assert caught.value.reason == Refusal.AFTER_TIMEOUT
+
+
+# --- change and gaps across the borders of blocks -----------------------------------------------------------------------
+
+
+def driven(cell_m: float, half: int, changed: tuple[int, int, int, int], step: int = 1) -> list[np.ndarray]:
+    """Three passes an hour apart over a square of cells; a part (west, south, east, north) is repaved before the last.
+
+    half: half the square's edge; step: so many cells lie between two samples. Everything but step 1 leaves gaps.
+    """
+    places = np.arange(-half, half, step) + 0.5
+    x, y = (axis.ravel() for axis in np.meshgrid(places, places))
+    west, south, east, north = changed
+    found = []
+    for hour in range(3):
+        new = (hour == 2) & (x > west) & (x < east) & (y > south) & (y < north)
+        stamps = NOW_NS + hour * 3600 * 10**9 + np.arange(x.size) * 240 * 10**9 // x.size
+        place = {"x_m": x * cell_m, "y_m": y * cell_m, "stamp_ns": stamps, "cov_xx_m2": 0, "cov_yy_m2": 0}
+        found.append(samples(x.size, **place, c_rr=np.where(new, 0.2, 0.04), grade_e=np.where(new, -0.3, 0.1)))
+    return found
+
+
+def answers_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tuple[Writer, Answers]:
+    """The map of passes, which are folded past the door: there, a batch has so many samples at most."""
+    writer = Writer(folder, site, config, now_ns)
+
+    def fold(store: Store) -> None:
+        for part in rows:
+            store.grid.fold(part, "a")
+        store.newest_ns = store.grid.newest_ns
+
+    writer.read(fold)
+    return writer, Answers(writer, site, config)
+
+
+CHANGED = ("resistance", "weight", "changed_s", "visits", "age_s")
+FILLED = ("resistance_filled", "resistance_class_filled", "resistance")
+
+
+def assert_parts_are_cut_from_the_whole(answers: Answers, cell_m: float, half: int, names, seed: int) -> np.ndarray:
+    """Compare random windows of the site with the same cells of one window of all of it."""
+    whole = region(answers, *(np.array([-half, -half, half, half]) * cell_m), names=names)
+    draw = np.random.default_rng(seed)
+    for _ in range(25):
+        west, south = draw.integers(-half, half - 1, 2)
+        east, north = (min(half, int(low + draw.integers(1, 30))) for low in (west, south))
+        part = region(answers, *(np.array([west, south, east, north]) * cell_m), names=names)
+        for name in names:
+            expected = whole[name][south + half : north + half, west + half : east + half]
+            assert np.array_equal(part[name], expected, equal_nan=True), (name, west, south, east, north)
+    return whole
+
+
+# The repaved area lies across two and across four blocks, and along the border of one.
+@pytest.mark.parametrize("changed", [(10, 2, 22, 12), (-8, -7, 6, 9), (16, 16, 23, 22), (-23, -5, -16, 1)])
+def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, changed):
+    writer, answers = answers_of(tmp_path, driven(1.0, 40, changed))
+    whole = assert_parts_are_cut_from_the_whole(answers, 1.0, 48, CHANGED, seed=1)
+    west, south, east, north = (edge + 48 for edge in changed)
+    inside = np.zeros((96, 96), np.bool_)
+    inside[south + 1 : north - 1, west + 1 : east - 1] = True
+    assert np.allclose(whole["resistance"][inside], 0.2, rtol=0.05)
+    assert np.isfinite(whole["changed_s"][inside]).all()
+    assert np.isnan(whole["changed_s"]).sum() > 0.8 * 96 * 96
+    for x, y in zip(np.arange(changed[0], changed[2]), np.arange(changed[1], changed[3]), strict=False):
+        values = answers.point(PointQuery(x + 0.5, y + 0.5, CHANGED)).values
+        for name in CHANGED:
+            assert np.array_equal(np.float32(values[name]), whole[name][y + 48, x + 48], equal_nan=True)
+    writer.close()
+
+
+SMALL_CELLS = pytest.mark.xfail(
+    strict=True, reason="the ring is one block wide: less than size_m where cells are smaller than size_m / 16"
+)
+
+
+@pytest.mark.parametrize("cell_m", [1.0, 0.5, pytest.param(0.2, marks=SMALL_CELLS)])
+def test_a_change_is_seen_with_all_its_surroundings_in_cells_of_any_size(tmp_path, cell_m):
+    cells = round(6.0 / cell_m)  # the edge of the area, which is a metre more than the least
+    writer, answers = answers_of(
+        tmp_path, driven(cell_m, cells + 20, (-cells + 3, -4, 3, cells - 4)), replace(SITE, cell_m=cell_m)
+    )
+    whole = assert_parts_are_cut_from_the_whole(answers, cell_m, cells + 16, ("resistance", "changed_s"), seed=2)
+    writer.close()
+    assert np.isfinite(whole["changed_s"]).any()
+
+
+@pytest.mark.parametrize("step", [3, 5])
+def test_gaps_are_filled_alike_in_every_window(tmp_path, step):
+    writer, answers = answers_of(tmp_path, driven(1.0, 40, (-8, -7, 6, 9), step))
+    whole = assert_parts_are_cut_from_the_whole(answers, 1.0, 48, FILLED, seed=3)
+    writer.close()
+    assert np.isfinite(whole["resistance_filled"]).sum() > 2 * np.isfinite(whole["resistance"]).sum()
+
+
+def test_the_change_options_reach_the_answer(tmp_path):
+    rows = driven(1.0, 20, (-6, -6, 6, 6))
+    writer, answers = answers_of(tmp_path, rows)
+    off = Answers(writer, SITE, replace(CONFIG, change=replace(CONFIG.change, detect=False)))
+    seen, not_seen = (region(found, -20, -20, 20, 20, names=("changed_s",))["changed_s"] for found in (answers, off))
+    writer.close()
+    assert np.isfinite(seen).any()
+    assert np.isnan(not_seen).all()

@@ -1,4 +1,6 @@
+import os
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
@@ -238,7 +240,7 @@ def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
             assert (len(decoded), len(checked)) == (groups, files), wanted
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(data=st.data())
 def test_rows_come_back_whatever_the_cuts(data):
     """Whatever batches come in, whenever hours are archived and with whatever sizes of files and row groups."""
@@ -275,7 +277,7 @@ def test_any_flipped_bit_is_found_and_the_file_is_named(file):
     path, _ = file
     data, seed = path.read_bytes(), 11
     draw = np.random.default_rng(seed)
-    for place in {*range(16), *range(len(data) - 40, len(data)), *draw.integers(0, len(data), 300).tolist()}:
+    for place in {*range(16), *range(len(data) - 20, len(data)), *draw.integers(0, len(data), 100).tolist()}:
         damaged = bytearray(data)
         damaged[place] ^= 1 << int(draw.integers(8))
         path.write_bytes(damaged)
@@ -402,6 +404,22 @@ def test_a_crash_while_rows_are_forgotten_is_made_good(day, pieces):
     day.archive()
     assert day.both() == before
     assert len(list(day.folder.iterdir())) == 3
+
+
+def test_nothing_is_forgotten_before_file_and_name_are_on_disk(day, monkeypatch):
+    done = []
+
+    def spy(name: str, real: Callable) -> Callable:
+        def call(first: object, *rest: object) -> object:
+            done.append(f"{name} folder" if name == "sync" and stat.S_ISDIR(os.fstat(first).st_mode) else name)
+            return real(first, *rest)
+
+        return call
+
+    monkeypatch.setattr(ar.os, "fsync", spy("sync", os.fsync))
+    monkeypatch.setattr(Path, "rename", spy("rename", Path.rename))
+    day.archive(NOW_NS + HOUR_NS, forget=spy("forget", day.journal.forget))
+    assert done == ["sync", "rename", "sync folder", "forget"]
 
 
 def test_what_a_kill_left_half_written_is_removed(day):

@@ -194,6 +194,29 @@ def test_a_cell_and_bucket_that_machines_drive_take_few_bytes(seed):
     assert per_cell <= 120
 
 
+def test_blocks_are_touched_once_until_they_are_folded_into_again():
+    grid = folded(samples(2, x_m=[8.0, 40.0]))
+    assert sorted(grid.take_touched(9)) == [(0, 0), (2, 0)]
+    assert grid.take_touched(9) == []
+    grid.fold(samples(1), "b")
+    grid.fold(samples(1), "a")
+    assert grid.take_touched(9) == [(0, 0)]
+    grid.touch_all()
+    assert len(grid.take_touched(1)) == len(grid.take_touched(1)) == 1
+    assert grid.take_touched(1) == []
+
+
+def test_a_sample_that_adds_nothing_touches_nothing():
+    grid = folded(samples(2, x_m=[8.0, 40.0], distance_m=[0.0, 1.0], cov_xx_m2=[0.0, 100.0]))
+    assert grid.take_touched(9) == []
+
+
+def test_pages_are_counted():
+    grid = folded(samples(3, x_m=[8.5, 40.5, 40.5], cov_xx_m2=0, cov_yy_m2=0, stamp_ns=NOW_NS + np.array([0, 0, 3600]) * 10**9))
+    assert grid.known_cells() == 2
+    assert grid.page_count() == len(grid.state().pages) == 3
+
+
 def test_chunks_hold_every_block_once():
     blocks = [(i, -i) for i in range(2 * READ_BLOCKS + 3)]
     pieces = list(chunks(blocks))

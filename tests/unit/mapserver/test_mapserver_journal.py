@@ -389,6 +389,7 @@ def test_an_upgrade_that_fails_leaves_schema_1_as_it_was(older, monkeypatch):
 def test_forgotten_rows_are_gone_and_asked_for_in_vain(placed):
     assert placed.forget(3, most=2) == 2
     assert placed.forget(3, most=2) == 3
+    assert placed.forget(1) == 3  # what is gone stays gone
     assert (placed.archived_row, placed.last_row, numbers(placed.read(after=3))) == (3, 4, [4])
     for after, wanted in ((0, ALL), (2, ALL), (0, Wanted(from_ns=400))):
         with pytest.raises(ArchivedError, match="rows up to 3 are in the archive") as caught:

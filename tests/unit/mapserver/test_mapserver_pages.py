@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from mapserver_data import same_page
 
 from mapserver import evidence as ev
-from mapserver.pages import CELL, NARROW, WIDE, Page, merge, pack
+from mapserver import pages as module
+from mapserver.pages import CELL, NARROW, WIDE, Page, add_numpy, merge, pack, take_numpy
 
 PLACES = ev.COUNTS * ev.CELLS
 counts = st.one_of(st.integers(1, 2**17), st.integers(ev.COUNT_MAX - 3, ev.COUNT_MAX))
@@ -17,15 +18,19 @@ cells = st.dictionaries(st.integers(0, 255), st.tuples(st.integers(0, 2**64 - 1)
 
 def page(places: dict[int, int], stamps: dict[int, tuple[int, int]] | None = None) -> Page:
     """A page from place -> count and cell -> (bits of both bitmaps, stamp)."""
-    dense = np.zeros(PLACES, np.uint32)
-    dense[list(places)] = list(places.values())
     bitmaps, newest_ns = np.zeros((2, ev.CELLS), np.uint64), np.zeros(ev.CELLS, np.int64)
     for cell, (bits, stamp_ns) in (stamps or {}).items():
         bitmaps[:, cell], newest_ns[cell] = bits, stamp_ns
-    return pack(dense.reshape(ev.COUNTS, ev.CELLS), bitmaps, newest_ns)
+    return pack(dense(places).reshape(ev.COUNTS, ev.CELLS), bitmaps, newest_ns)
 
 
 pages = st.builds(page, votes, cells)
+
+
+def dense(places: dict[int, int]) -> np.ndarray:
+    counts = np.zeros(PLACES, np.uint32)
+    counts[list(places)] = list(places.values())
+    return counts
 
 
 def unpacked(one: Page) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -41,6 +46,43 @@ def test_what_is_packed_is_what_was_there(places, stamps):
     assert {int(i): int(counts[i]) for i in np.flatnonzero(counts)} == places
     assert {int(i): (int(bitmaps[i, 0]), int(newest_ns[i])) for i in np.flatnonzero(newest_ns)} == stamps
     assert np.array_equal(bitmaps[:, 0], bitmaps[:, 1])
+
+
+def test_packing_leaves_nothing_behind():
+    counts, bitmaps = dense({3: 7, 300: 2}).reshape(ev.COUNTS, ev.CELLS), np.ones((2, ev.CELLS), np.uint64)
+    newest_ns = np.ones(ev.CELLS, np.int64)
+    pack(counts, bitmaps, newest_ns)
+    assert not (counts.any() or bitmaps.any() or newest_ns.any())
+
+
+@settings(max_examples=60)
+@given(votes)
+def test_both_ways_to_pack_agree_to_the_bit(places):
+    first, second = dense(places), dense(places)
+    one, other = module._take(first), take_numpy(second)
+    assert (one.dtype, one.tobytes()) == (other.dtype, other.tobytes())
+    assert not (first.any() or second.any())
+
+
+@settings(max_examples=60)
+@given(votes, votes)
+def test_both_ways_to_add_agree_to_the_bit(one, other):
+    parts = [take_numpy(dense(places)) for places in (one, other)]
+    found, expected = module._add(*parts), add_numpy(*parts)
+    assert (found.dtype, found.tobytes()) == (expected.dtype, expected.tobytes())
+
+
+def test_every_place_of_a_full_block_is_packed():
+    full = np.full(PLACES, ev.COUNT_MAX, np.uint32)
+    packed = module._take(full)
+    assert packed["place"].tolist() == list(range(PLACES))
+    assert (packed["count"] == ev.COUNT_MAX).all()
+    assert (module._add(packed, packed)["count"] == ev.COUNT_MAX).all()
+
+
+def test_numba_is_at_work_where_it_is_installed():
+    assert module._take is not take_numpy
+    assert module._add is not add_numpy
 
 
 @pytest.mark.parametrize(("count", "dtype"), [(2**16 - 1, NARROW), (2**16, WIDE), (ev.COUNT_MAX, WIDE)])

@@ -78,9 +78,9 @@ def test_filters_reach_archive_and_journal(store):
     assert numbers(history_rows(store, wanted=Wanted(bounds=Bounds(100, 100, 200, 200)))) == []
 
 
-@pytest.mark.parametrize("where", [0, 7, 13, 20])
+@pytest.mark.parametrize("where", [0, 7, 20, 25])
 def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
-    """More rows than are read at once; some, or all of them, are archived while a reader stands at any of them."""
+    """More rows than are read at once; archiving overtakes a reader that stands at any of them, twice."""
     journal = Journal(tmp_path / "journal.db", SITE.name, SITE.frame)
     journal.begin()
     for i in range(600):
@@ -88,10 +88,9 @@ def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
     journal.commit()
     reader, other = JournalReader(journal.path), JournalReader(journal.path)
     rows, found = history_rows(History.of(reader)), []
-    for i in range(6):
-        while len(found) < 100 * i + 5 * where:
-            found.append(next(rows).row)
-        archive(tmp_path / FOLDER, other, SITE, NOW_NS + (i + 1) * HOUR_NS, journal.forget)
+    for i in range(2):
+        found += [next(rows).row for _ in range(10 * where + 5 * i)]
+        archive(tmp_path / FOLDER, other, SITE, NOW_NS + 3 * (i + 1) * HOUR_NS, journal.forget)
     assert found + numbers(rows) == list(range(1, 601))
     reader.close(), other.close(), journal.close()
 

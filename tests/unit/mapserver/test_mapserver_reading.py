@@ -128,12 +128,21 @@ def test_the_least_size_is_obeyed(size_m, seen):
 def test_detection_off_leaves_everything():
     found = read(repaved(-5, 4, 10), replace(CONFIG, detect=False))
     assert not found.changed_ns.any()
-    assert found.weight.sum() == PASSES * 64 * 64 * ev.WEIGHT_UNITS_PER_M - outside_of_site(found)
+    everything = grid_of_blocks(repaved(-5, 4, 10))
+    assert found.counts.sum() == everything.counts.sum()
 
 
-def outside_of_site(found: ev.Evidence) -> int:
-    """Weight that left the image over its edge."""
-    return PASSES * 64 * 64 * ev.WEIGHT_UNITS_PER_M - int(found.weight.sum())
+def grid_of_blocks(grid: Grid) -> ev.Evidence:
+    return grid.evidence([(x, y) for x in range(-2, 2) for y in range(-2, 2)])
+
+
+@pytest.mark.parametrize("grounds", [[OLD, NEW, OLD], [OLD, OLD, OLD, NEW, OLD], [OLD, OLD, NEW, NEW, OLD]])
+def test_ground_that_was_different_for_a_while_is_read_as_it_is(grounds):
+    """Whether the short time is cut off or outvoted."""
+    grid = Grid(1.0, FoldConfig())
+    for hour, c_rr in enumerate(grounds):
+        grid.fold(lane(hour, -16, -16, 32, 32, c_rr=c_rr), "a")
+    assert np.allclose(resistance(read(grid))[area(-16, -16, 32, -2)], OLD, rtol=0.05)
 
 
 def test_of_two_changes_the_last_counts_and_dates():

@@ -1,14 +1,19 @@
+import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mapserver_data import CONFIG, folded, incoming, open_store, random_samples, same, samples
+from mapserver_data import APART, CONFIG, folded, incoming, merged, open_store, random_samples, same, samples
 
 from mapserver import evidence as ev
 from mapserver import snapshot
 from mapserver.grid import Grid
+from mapserver.pages import NARROW, WIDE
 from mapserver.votes import FoldConfig
 from protocol.messages import Ack
 
@@ -48,8 +53,13 @@ def test_an_empty_folder_gives_an_empty_grid(tmp_path):
 
 
 def test_a_snapshot_reads_back_to_the_bit(tmp_path):
-    grid = folded(random_samples(100, 6, std_m=4.0))
+    rows = random_samples(100, 6, half_m=10.0, std_m=4.0)
+    rows["stamp_ns"] += np.arange(100) % 9 * 86_400 * 10**9
+    wide = samples(30, distance_m=100.0)
+    grid = folded(np.concatenate([rows, wide]))
     assert grid.skipped
+    assert {at.rung for at in grid.state().pages} >= {0, 2}
+    assert {at.page.votes.dtype for at in grid.state().pages} == {NARROW, WIDE}
     row, again = snapshot.load(save(tmp_path, 17, grid), 1.0, FOLD) or (0, None)
     assert row == 17
     assert same(again, grid)
@@ -88,15 +98,153 @@ def test_a_snapshot_of_another_schema_is_passed_over(tmp_path, monkeypatch):
     assert snapshot.load(path, 1.0, FOLD) is None
 
 
-@pytest.mark.parametrize("change", [{"bucket_s": 60.0}, {"std_floor_m": 0.4}, {"std_cap_m": 2.0}])
+@pytest.mark.parametrize(
+    "change",
+    [{"bucket_s": 60.0}, {"std_floor_m": 0.4}, {"std_cap_m": 2.0}, {"keep_buckets": 5}, {"keep_hours": 5}, {"keep_days": 5}],
+)
 def test_a_snapshot_of_other_parameters_is_passed_over(tmp_path, change):
     path = save(tmp_path, 1)
     assert snapshot.load(path, 1.0, replace(FOLD, **change)) is None
     assert snapshot.load(path, 0.5, FOLD) is None
 
 
-def test_the_kernel_does_not_matter_to_a_snapshot(tmp_path):
-    assert snapshot.load(save(tmp_path, 1), 1.0, replace(FOLD, kernel="numpy")) is not None
+@pytest.mark.parametrize("change", [{"kernel": "numpy"}, {"hot_blocks": 3}])
+def test_how_the_bits_were_made_does_not_matter_to_a_snapshot(tmp_path, change):
+    assert snapshot.load(save(tmp_path, 1), 1.0, replace(FOLD, **change)) is not None
+
+
+def test_a_snapshot_without_other_machines_is_passed_over(tmp_path):
+    state = folded(samples(3)).state()
+    path = snapshot.save(tmp_path, 1, state, 1.0, FOLD, left_out={"b", "a"})
+    assert snapshot.load(path, 1.0, FOLD, left_out=frozenset({"a", "b"})) is not None
+    for left_out in ((), ("a",), ("a", "b", "c")):
+        assert snapshot.load(path, 1.0, FOLD, left_out) is None
+        assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD, left_out)[0] == 0
+    assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD, {"a", "b"})[0] == 1
+
+
+def test_an_empty_grid_is_kept_too(tmp_path):
+    row, grid = snapshot.load(save(tmp_path, 3, Grid(1.0, FOLD)), 1.0, FOLD) or (0, None)
+    assert row == 3
+    assert same(grid, Grid(1.0, FOLD))
+
+
+# Columns of the table of pages: x, y, rung, index, wide, votes, cells. What is not caught makes a grid whose reads fail
+# later, or a map with less in it; a checksum catches all that happens to a file by itself.
+LATER = pytest.mark.xfail(strict=True, reason="parts are not compared with what a page can be")
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        (2, 4),
+        (2, 10**6),
+        pytest.param(2, -1, marks=LATER),
+        (4, 2),
+        (4, -1),
+        (5, 10**6),
+        (5, -1),
+        (5, 0),
+        (6, 10**6),
+        (6, -1),
+        (6, 0),
+    ],
+)
+def test_pages_of_impossible_parts_are_passed_over(tmp_path, column, value):
+    def change(arrays):
+        arrays["pages"][0, column] = value
+
+    assert load_changed(tmp_path, change) is None
+
+
+@pytest.mark.parametrize(
+    ("array", "change"),
+    [
+        ("pages", lambda pages: pages[:-1]),
+        ("pages", lambda pages: pages[:0]),
+        ("pages", lambda pages: pages[:, :-1]),
+        ("pages", lambda pages: pages.ravel()),
+        pytest.param("pages", lambda pages: np.concatenate([pages, [[9, 9, 3, 0, 0, 0, 0]]]), marks=LATER),
+        ("narrow", lambda votes: votes[:-1]),
+        ("cells", lambda cells: cells[1:]),
+        pytest.param("narrow", lambda votes: votes["place"], marks=LATER),
+        pytest.param("narrow", lambda votes: np.array([(65_000, 1)] * len(votes), NARROW), marks=LATER),
+    ],
+)
+def test_arrays_of_impossible_contents_are_passed_over(tmp_path, array, change):
+    def changed(arrays):
+        arrays[array] = change(arrays[array])
+
+    assert load_changed(tmp_path, changed) is None
+
+
+@pytest.mark.parametrize("array", ["header", "pages", "narrow", "wide", "cells"])
+def test_a_missing_array_is_passed_over(tmp_path, array):
+    assert load_changed(tmp_path, lambda arrays: arrays.pop(array)) is None
+
+
+@pytest.mark.parametrize("name", ["row", "folded", "skipped", "newest_ns"])
+def test_a_header_without_a_total_is_passed_over(tmp_path, name):
+    def change(arrays):
+        header = json.loads(str(arrays["header"]))
+        del header[name]
+        arrays["header"] = np.array(json.dumps(header))
+
+    assert load_changed(tmp_path, change) is None
+
+
+def load_changed(folder: Path, change):
+    """Load a snapshot of two blocks, of which something was changed in a way that no checksum sees."""
+    path = save(folder, 1, folded(samples(2, x_m=[8.0, 24.0])))
+    with np.load(path) as file:
+        arrays = dict(file)
+    change(arrays)
+    np.savez(path, **arrays)
+    return snapshot.load(path, 1.0, FOLD)
+
+
+@pytest.mark.xfail(strict=True, reason="the row in the header is believed, whatever the name says")
+def test_a_snapshot_under_the_name_of_an_earlier_row_is_passed_over(tmp_path):
+    save(tmp_path, 8).rename(tmp_path / "snapshot-2.npz")
+    assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD)[0] <= 5
+
+
+FOLD_A_PART = """
+import sys
+from pathlib import Path
+import numpy as np
+from mapserver import snapshot
+from mapserver.grid import Grid
+from mapserver.votes import FoldConfig
+
+folder, part, kernel, hot_blocks = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], int(sys.argv[4])
+config = FoldConfig(keep_buckets=1000, kernel=kernel, hot_blocks=hot_blocks)
+grid = Grid(1.0, config)
+for machine in ("a", "b"):
+    grid.fold(np.load(folder.parent / f"{machine}.npy")[part::3], machine)
+snapshot.save(folder, 1, grid.state(), 1.0, config)
+"""
+
+
+def test_parts_folded_in_processes_of_their_own_are_the_fold_of_everything(tmp_path):
+    """Three processes, hashing strings in three ways, on different kernels with different space."""
+    rows = {machine: random_samples(90, seed, half_m=20.0) for seed, machine in enumerate("ab")}
+    for machine, of_machine in rows.items():
+        of_machine["stamp_ns"] += np.arange(90) % 30 * 9 * 3600 * 10**9
+        np.save(tmp_path / f"{machine}.npy", of_machine)
+    kinds, children = [("numba", 1), ("numpy", 5), ("numba", 512)], []
+    for part, (kernel, hot_blocks) in enumerate(kinds):
+        (folder := tmp_path / str(part)).mkdir()
+        words = [sys.executable, "-c", FOLD_A_PART, folder, str(part), kernel, str(hot_blocks)]
+        children.append(subprocess.Popen(words, env={**os.environ, "PYTHONHASHSEED": str(part + 1)}))
+    assert [child.wait(60) for child in children] == [0, 0, 0]
+    config = FoldConfig(**APART)
+    parts = [snapshot.load_newest(tmp_path / str(part), 1, 1.0, config)[1] for part in range(3)]
+    whole = folded(rows["a"])
+    whole.fold(rows["b"], "b")
+    assert {at.rung for at in whole.state().pages} == {0, 1, 2, 3}
+    assert same(merged(parts), whole)
+    assert same(merged(parts[::-1]), whole)
 
 
 def test_a_snapshot_beyond_the_journal_is_passed_over(tmp_path):

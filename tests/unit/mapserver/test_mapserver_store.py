@@ -1,10 +1,17 @@
+import shutil
+import signal
 import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from mapserver_data import NOW_NS, SITE, Incoming, folded, incoming, open_store, random_samples, same, samples
 
+from mapserver import snapshot
 from protocol.errors import Refusal, StoreError
 from protocol.messages import Ack, Refused
 
@@ -73,7 +80,7 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(tmp_path, monkeypatch):
     again = store.take([incoming(samples(3), 3), incoming(samples(4), machine="b")])
     assert [(a.watermark, a.trimmed) for a in again] == [(5, 0), (4, 0)]
     assert store.grid.folded == 9
-    assert store.info()["machines"]["b"] == {"spools": 1, "samples": 4, "lost": 0}
+    assert store.info()["machines"]["b"] == {"spools": 1, "samples": 4, "lost": 0, "newest_ns": NOW_NS + 3 * 10**9}
     store.close()
 
 
@@ -95,7 +102,7 @@ def test_losses_and_repeats_are_counted(tmp_path):
     store = open_store(tmp_path)
     store.take([incoming(samples(3)), incoming(samples(2), 2), incoming(samples(1), 10, lost_before=6)])
     assert store.counters == {"batches": 2, "samples_trimmed": 2, "samples_lost": 6}
-    assert store.info()["machines"] == {"a": {"spools": 1, "samples": 4, "lost": 6}}
+    assert store.info()["machines"] == {"a": {"spools": 1, "samples": 4, "lost": 6, "newest_ns": NOW_NS + 2 * 10**9}}
     store.close()
 
 
@@ -115,7 +122,7 @@ def test_info_tells_the_state_in_plain_values(tmp_path):
     assert (info["samples_merged"], info["samples_too_unsure"], info["cells"]) == (5, 2, 1)
     assert info["bounds"] == (0, 0, 16, 16)
     assert info["stamp_ns"] == NOW_NS + 10**12
-    assert info["machines"]["a"] == {"spools": 2, "samples": 5, "lost": 0}
+    assert info["machines"]["a"] == {"spools": 2, "samples": 5, "lost": 0, "newest_ns": NOW_NS + 2 * 10**9}
     store.close()
 
 
@@ -165,3 +172,85 @@ def test_a_damaged_journal_is_named_at_the_start(tmp_path):
     db.close()
     with pytest.raises(StoreError, match="row 1 is damaged; restore"):
         open_store(tmp_path)
+
+
+# --- kill and replay ---------------------------------------------------------------------------------------------------
+
+# Takes batches of 20 samples; in the fold of number `stuck`, half of it lies in the hot blocks, and nothing goes on.
+TAKES = """
+import signal
+import sys
+from pathlib import Path
+import numpy as np
+from mapserver_data import incoming, open_store
+
+folder, stuck, saved = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+store = open_store(folder / "store")
+kernel = store.grid._kernel
+
+def half(rows, machine, cell_m, config, hot):
+    done = kernel(rows, machine, cell_m, config, hot)
+    if store.merged < stuck - 1 or done.missing:
+        return done
+    print("folding", flush=True)
+    signal.pause()
+
+store.grid._kernel = half
+for i, part in enumerate(np.split(np.load(folder / "rows.npy"), 10)):
+    if i == saved:
+        store.save_snapshot()
+    store.take([incoming(part, 1 + 20 * i)])
+    print("taken", i + 1, flush=True)
+"""
+
+
+@contextmanager
+def taking(folder, stuck: int, saved: int) -> Iterator[subprocess.Popen]:
+    """A process that takes batches until it folds number `stuck`; killed at the end."""
+    words = [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}\n" + TAKES, folder, str(stuck), str(saved)]
+    child = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    try:
+        yield child
+    finally:
+        child.kill()
+        child.wait()
+        child.stdout.close()
+
+
+@pytest.mark.parametrize(("stuck", "saved"), [(1, 9), (7, 9), (7, 4), (7, 6)])
+def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, saved):
+    rows = random_samples(200, 12)
+    np.save(tmp_path / "rows.npy", rows)
+    with taking(tmp_path, stuck, saved) as child:
+        lines = iter(child.stdout.readline, "")
+        heard = [line for line in iter(lambda: next(lines), "folding\n")]
+        assert heard == [f"taken {i + 1}\n" for i in range(stuck - 1)]
+        with pytest.raises(StoreError, match="another server"):
+            open_store(tmp_path / "store")
+        child.send_signal(signal.SIGKILL)
+        assert child.wait(20) == -signal.SIGKILL
+    store = open_store(tmp_path / "store")
+    assert store.snapshot_row == (saved if saved < stuck else 0)
+    assert (store.merged, store.journalled) == (stuck, stuck)  # committed, though never acknowledged
+    assert same(store.grid, folded(rows[: 20 * stuck]))
+    answers = store.take([incoming(part, 1 + 20 * i) for i, part in enumerate(np.split(rows, 10))])
+    assert [answer.trimmed for answer in answers] == [20] * stuck + [0] * (10 - stuck)
+    assert same(store.grid, folded(rows))
+    store.close()
+
+
+@pytest.mark.parametrize("parts", [1, 5, 25])
+def test_a_replay_of_any_part_of_the_journal_after_a_snapshot_gives_the_same_bits(tmp_path, parts):
+    rows = random_samples(100, 13, half_m=20.0)
+    rows["stamp_ns"] += np.arange(100) % 9 * 10**9 * 40_000
+    store = open_store(tmp_path / "store")
+    for i, part in enumerate(np.split(rows, parts * 4)):
+        store.take([incoming(part, 1 + i * len(part))])
+        if i == parts:
+            store.save_snapshot()
+    shutil.copytree(tmp_path / "store", tmp_path / "copy")  # as a kill leaves it
+    again = open_store(tmp_path / "copy")
+    assert again.snapshot_row == parts + 1 == max(snapshot.rows_on_disk(tmp_path / "copy"))
+    assert same(again.grid, store.grid)
+    assert same(again.grid, folded(rows))
+    store.close(), again.close()

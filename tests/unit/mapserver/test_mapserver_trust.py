@@ -98,7 +98,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_machine_is_found_with_the_reason_and_no_other(case: str, seed: int) -> None:
     faults, reasons = BAD[case]
@@ -109,7 +109,7 @@ def test_a_bad_machine_is_found_with_the_reason_and_no_other(case: str, seed: in
         assert verdicts[name].evidence["excess"][reason] > 1
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_gain_and_displacement_together_are_both_found_and_measured(seed: int) -> None:
     verdicts = audit(fleet(seed, GOOD, GOOD, GOOD, {"gain": 1.6, "off_m": (0.0, 3.5)}, km=10.8))
     assert found(verdicts) == {"d": (Reason.GAIN, Reason.OFFSET)}
@@ -197,7 +197,7 @@ def test_a_repaired_machine_is_cleared_once_its_bad_periods_are_forgotten() -> N
     [
         ({"min_cells": 100_000}, {"gain": 1.6}),
         ({"gain_limit": 1.7}, {"gain": 1.6}),
-        ({"gain_share": 0.999}, {"gain": 1.6}),
+        ({"share": 0.999}, {"gain": 1.6}),
         ({"zero_error": 0.3}, {"gain": 1.6}),
         ({"stuck_spread": 0.003}, {"stuck": 0.04}),
         ({"min_spread": 5.0}, {"stuck": 0.04}),

@@ -129,9 +129,10 @@ def both(
     pace: float = 1.0, late_s: float = 0.0, jitter_s: float = 0.0, others_stop_s: float = 1e9
 ) -> Iterator[tuple[str, float]]:
     """Every 10 s of the others' time each sends once; x is late and sends at its own pace, as it can."""
+    rng = np.random.default_rng(0)
     for now in range(10_000, 13_000, 10):
         yield "o", min(now, others_stop_s)
-        yield "x", min(now, 10_000 + (now - 10_000) * pace - late_s + jitter_s * (now // 10 % 7 < 3))
+        yield "x", min(now, 10_000 + (now - 10_000) * pace - late_s + jitter_s * rng.random())
 
 
 @pytest.mark.parametrize(
@@ -152,7 +153,7 @@ def test_only_a_steady_lead_is_a_wrong_clock(case: dict[str, float], state: int)
 
 
 def test_how_steady_a_lead_must_be_is_an_option() -> None:
-    assert judged(both(late_s=3600.0, jitter_s=40.0), steady_s=30.0) == UNKNOWN
+    assert judged(both(late_s=3600.0, jitter_s=40.0), steady_s=5.0) == UNKNOWN
 
 
 def test_a_machine_that_has_caught_up_agrees() -> None:
@@ -167,7 +168,7 @@ def test_every_option_is_refused_by_name_where_it_makes_no_sense(name: str) -> N
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("gain_limit", 1.0), ("gain_share", 1.0), ("agreement", 1.5), ("stuck_spread", 1.0), ("clock_steady_s", 300.0)],
+    [("gain_limit", 1.0), ("share", 1.0), ("agreement", 1.5), ("stuck_spread", 1.0), ("clock_steady_s", 300.0)],
 )
 def test_options_out_of_range_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):

@@ -212,10 +212,53 @@ def test_waiting_for_a_row_that_does_not_come_times_out(start):
 
 def test_a_snapshot_is_made_after_so_many_rows(start, tmp_path):
     writer = start(snapshot_rows=3)
-    for i in range(7):
-        send(writer, [incoming(samples(1), i + 1)])
-    writer.info()
-    assert snapshot.rows_on_disk(tmp_path) == [6, 3]
+    expected = {0: [], 3: [3], 6: [6, 3]}
+    for row in range(1, 8):
+        send(writer, [incoming(samples(1), row)])
+        writer.info()  # what was due has begun
+        wait_for(lambda row=row: snapshot.rows_on_disk(tmp_path) == expected[row // 3 * 3] and writer._snapshot.done())
+
+
+def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start, tmp_path, monkeypatch):
+    release, entered, real = threading.Event(), threading.Event(), snapshot.save
+
+    def slow(*args):
+        entered.set()
+        assert release.wait(WAIT_S)
+        return real(*args)
+
+    monkeypatch.setattr(snapshot, "save", slow)
+    writer = start(snapshot_rows=2)
+    for row in range(1, 7):
+        assert send(writer, [incoming(samples(1), row)]) == [Ack(row, row)]
+    assert entered.wait(WAIT_S)
+    assert snapshot.rows_on_disk(tmp_path) == []
+    release.set()
+    wait_for(lambda: writer._snapshot.done())
+    assert snapshot.rows_on_disk(tmp_path) == [2]
+    writer.close()
+    assert snapshot.rows_on_disk(tmp_path) == [6, 2]
+    assert start().info()["snapshot"] == 6
+
+
+def test_a_snapshot_is_of_the_moment_at_which_it_was_taken(start, tmp_path, monkeypatch):
+    """What is folded while it is written is not in it."""
+    release, real = threading.Event(), snapshot.save
+
+    def slow(*args):
+        assert release.wait(WAIT_S)
+        return real(*args)
+
+    monkeypatch.setattr(snapshot, "save", slow)
+    writer = start(snapshot_rows=1)
+    parts = np.split(random_samples(60, 14), 3)
+    for i, part in enumerate(parts):
+        send(writer, [incoming(part, 1 + 20 * i)])
+    release.set()
+    wait_for(lambda: writer._snapshot.done())
+    row, grid = snapshot.load_newest(tmp_path, 3, 1.0, CONFIG.fold)
+    assert row == 1
+    assert same(grid, folded(parts[0]))
 
 
 def test_a_snapshot_is_made_after_so_many_seconds_even_if_nothing_comes(start, tmp_path):
@@ -243,7 +286,8 @@ def test_a_snapshot_that_fails_is_tried_again_only_when_due(start, tmp_path, mon
     writer = start(snapshot_rows=3)
     for i in range(7):
         assert send(writer, [incoming(samples(1), i + 1)]) == [Ack(i + 1, i + 1)]
-    writer.info()
+        writer.info()
+        wait_for(lambda i=i: len(tries) == (i + 1) // 3 and writer._snapshot.done())
     assert tries == [3, 6]
     writer.close()
     assert not writer.failed
@@ -368,6 +412,7 @@ def test_a_refused_query_says_why(start, reason, name, parameters):
 
 def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
+    elsewhere |= {Refusal.UNKNOWN_MACHINE}  # commands, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 
 

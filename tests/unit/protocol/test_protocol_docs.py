@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol import codec
+from protocol import admin, codec, parameters, queries
 from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.geometry import MAX_CELLS
@@ -41,6 +41,48 @@ def test_limits_are_the_documented_ones():
     for number in (codec.MAX_BATCH_SAMPLES, MAX_STAMP_NS, f"{MAX_CELLS:,}", "2^62", "2^64 - 1"):
         assert str(number) in WIRE
     assert codec.MAX_SEQ == 2**62
+
+
+@pytest.mark.parametrize("query", queries._QUERIES)
+def test_every_parameter_of_a_query_is_documented(query):
+    known = set(queries._QUERIES[query][0]) - {"after", "wait"}
+    [row] = re.findall(rf"\n\| `{query}` \| (.*) \|", WIRE[: WIRE.index("Answers:")])
+    assert {name.split("=")[0] for name in re.findall(r"`(.*?)`", row)} - {"after"} == known
+
+
+def test_every_parameter_and_limit_of_a_command_is_documented():
+    [row] = re.findall(r"\n\| `trust` \| (.*?) \|", WIRE)
+    assert re.findall(r"`(.*?)`", row) == [*admin._NAMES]
+    assert [word for word in admin._WORDS if f"`{word}`" not in WIRE] == []
+    assert f"at most {parameters.MAX_TEXT} characters" in WIRE
+    assert f"More than {queries.MAX_SPANS} spans" in WIRE
+    assert queries.MAX_WAIT_S == admin.MAX_WAIT_S == 60
+
+
+EXAMPLES = re.findall(r"`sitegrid/paper/(map|admin)/(\w+)\?(.*?)`", WIRE)
+
+
+@pytest.mark.parametrize(("root", "name", "selector"), EXAMPLES)
+def test_example_of_a_query_is_read_and_written(root, name, selector):
+    given = parameters.split_selector(selector)
+    if root == "admin":
+        parsed = admin.parse_command(name, given)
+        assert parsed.reason == "antenna moved; x = 3 m"
+        assert admin.parse_command(name, admin.encode_command(parsed)) == parsed
+    else:
+        parsed = queries.parse_query(name, given)
+        assert queries.parse_query(name, queries.encode_query(parsed)) == parsed
+
+
+def test_every_kind_of_query_has_an_example():
+    assert {name for _, name, _ in EXAMPLES} == {"point", "region", "history", "changes", "trust"}
+
+
+def test_rows_of_machines_and_changes_are_the_documented_ones(golden):
+    for title, row in (("### Machines", golden.MACHINE), ("### Changes", golden.CHANGE)):
+        table = WIRE[WIRE.index(title) :].partition("\n\n")[0]
+        rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+        assert re.findall(r"`(.*?)`", "".join(rows)) == [*row]
 
 
 @pytest.mark.parametrize("kind", GIVES)

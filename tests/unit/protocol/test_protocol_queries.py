@@ -5,31 +5,52 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protocol.admin import TrustCommand, encode_command, parse_command
 from protocol.codec import pack
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.geometry import MAX_CELLS, Bounds
+from protocol.parameters import MAX_TEXT, quoted, selector_of, split_selector
 from protocol.queries import (
+    ChangesQuery,
     Freshness,
+    HistoryAnswer,
+    HistoryQuery,
     InfoQuery,
+    MachinesQuery,
     PointAnswer,
     PointQuery,
     Region,
     RegionQuery,
+    Span,
+    When,
     check_size,
+    decode_change,
+    decode_changes,
     decode_error,
+    decode_history,
     decode_info,
+    decode_machine,
+    decode_machines,
     decode_point,
     decode_region,
+    encode_change,
+    encode_changes,
     encode_error,
+    encode_history,
     encode_info,
+    encode_machine,
+    encode_machines,
     encode_point,
     encode_query,
     encode_region,
     parse_query,
 )
+from protocol.readings import MAX_STAMP_NS
 
 positions = st.floats(-1e15, 1e15)
 layers = st.lists(st.sampled_from(["resistance", "grade_east", "age_s"]), max_size=3).map(tuple)
+stamps = st.none() | st.integers(1, MAX_STAMP_NS)
+when = st.builds(When, stamps, stamps)
 freshness = st.just(Freshness()) | st.builds(Freshness, st.integers(1, 10**15), st.floats(0, 60))
 
 
@@ -40,13 +61,77 @@ def bounds(draw):
     return Bounds(west, south, east, north)
 
 
+@st.composite
+def histories(draw):
+    times = draw(st.just((None, None)) | st.tuples(stamps, stamps))
+    if None not in times:
+        times = tuple(sorted(times))
+    span_s = draw(st.none() | st.floats(1, 1e9))
+    return HistoryQuery(draw(positions), draw(positions), draw(layers), *times, span_s, draw(freshness))
+
+
 @given(
-    st.builds(PointQuery, positions, positions, layers, freshness)
-    | st.builds(RegionQuery, bounds(), layers, freshness)
+    st.builds(PointQuery, positions, positions, layers, freshness, when)
+    | st.builds(RegionQuery, bounds(), layers, freshness, when)
+    | histories()
+    | st.builds(MachinesQuery, freshness)
+    | st.builds(ChangesQuery, st.integers(0, 10**15))
     | st.builds(InfoQuery, freshness)
 )
 def test_query_round_trip(query):
-    assert parse_query(query.name, encode_query(query)) == query
+    assert parse_query(query.name, split_selector(selector_of(encode_query(query)))) == query
+
+
+def test_a_stamp_is_read_to_the_last_digit():
+    query = parse_query("point", {"x": "0", "y": "0", "as_of": "1750000000000000001", "minus": "1750000000000000003"})
+    assert query.when == When(1750000000000000001, 1750000000000000003)
+
+
+@given(st.text(st.characters(exclude_categories=("C", "Z")) | st.just(" "), max_size=MAX_TEXT), st.floats(0, 60))
+def test_a_command_round_trips_whatever_its_reason(text, wait_s):
+    for trusted in (True, None, False):
+        command = TrustCommand("loader-1", trusted, text.strip() or "why", wait_s)
+        assert parse_command("trust", split_selector(selector_of(encode_command(command)))) == command
+
+
+def test_a_command_without_reason_and_wait_is_complete():
+    assert parse_command("trust", {"machine": "a", "trusted": "auto"}) == TrustCommand("a", None, "", 30.0)
+    assert parse_command("trust", {"machine": "a", "trusted": "yes"}).trusted is True
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reason", "words"),
+    [
+        ({"machine": "a", "trusted": "yes", "colour": "red"}, Refusal.UNKNOWN_PARAMETER, "colour"),
+        ({"trusted": "yes"}, Refusal.MISSING_FIELD, "`machine`"),
+        ({"machine": "a"}, Refusal.MISSING_FIELD, "`trusted`"),
+        ({"machine": "*", "trusted": "yes"}, Refusal.OUT_OF_RANGE, "`machine`"),
+        ({"machine": "a", "trusted": "maybe"}, Refusal.OUT_OF_RANGE, "yes, no, auto"),
+        ({"machine": "a", "trusted": "no"}, Refusal.MISSING_FIELD, "`reason`"),
+        ({"machine": "a", "trusted": "no", "reason": "%20"}, Refusal.MISSING_FIELD, "`reason`"),
+        ({"machine": "a", "trusted": "no", "reason": "a%0Ab"}, Refusal.OUT_OF_RANGE, "`reason`"),
+        ({"machine": "a", "trusted": "no", "reason": "x" * (MAX_TEXT + 1)}, Refusal.OUT_OF_RANGE, "`reason`"),
+        ({"machine": "a", "trusted": "yes", "wait": "61"}, Refusal.OUT_OF_RANGE, "`wait`"),
+        ({"machine": "a", "trusted": "yes", "wait": "-1"}, Refusal.OUT_OF_RANGE, "`wait`"),
+        ({"machine": "a", "trusted": "yes", "wait": "long"}, Refusal.WRONG_TYPE, "`wait`"),
+    ],
+)
+def test_bad_command_is_refused_by_name(parameters, reason, words):
+    with pytest.raises(QueryError) as caught:
+        parse_command("trust", parameters)
+    assert caught.value.reason == reason
+    assert words in str(caught.value)
+
+
+def test_unknown_command_is_refused():
+    with pytest.raises(QueryError, match="command `shutdown` is not known; known: trust") as caught:
+        parse_command("shutdown", {})
+    assert caught.value.reason == Refusal.UNKNOWN_QUERY
+
+
+def test_what_divides_parameters_survives_in_a_text():
+    assert quoted("a;b=c %&?#/é") == "a%3Bb%3Dc%20%25%26%3F%23%2F%C3%A9"
+    assert split_selector("a=1;b=x=y;c;;d=") == {"a": "1", "b": "x=y", "c": "", "d": ""}
 
 
 def test_bounds_of_an_answer_can_be_asked_again():
@@ -70,6 +155,27 @@ def test_bounds_of_an_answer_can_be_asked_again():
         ("point", {"x": "nan", "y": "2"}, Refusal.NOT_FINITE, "`x`"),
         ("point", {"x": "1", "y": "-inf"}, Refusal.NOT_FINITE, "`y`"),
         ("point", {"x": "1e16", "y": "0"}, Refusal.NOT_FINITE, "`x`"),
+        ("changed", {}, Refusal.UNKNOWN_QUERY, "changed"),  # events are heard there
+        ("history", {"x": "0", "y": "0", "as_of": "1"}, Refusal.UNKNOWN_PARAMETER, "as_of"),
+        ("machines", {"machine": "a"}, Refusal.UNKNOWN_PARAMETER, "machine"),
+        ("changes", {"wait": "1"}, Refusal.UNKNOWN_PARAMETER, "wait"),
+        ("changes", {"after": "-1"}, Refusal.OUT_OF_RANGE, "after"),
+        ("changes", {"after": "0.5"}, Refusal.OUT_OF_RANGE, "after"),
+        ("point", {"x": "1", "y": "2", "as_of": "1.5"}, Refusal.WRONG_TYPE, "as_of"),
+        ("point", {"x": "1", "y": "2", "as_of": ""}, Refusal.WRONG_TYPE, "as_of"),
+        ("point", {"x": "1", "y": "2", "as_of": "-1"}, Refusal.WRONG_TYPE, "as_of"),
+        ("point", {"x": "1", "y": "2", "as_of": "0"}, Refusal.OUT_OF_RANGE, "as_of"),
+        ("point", {"x": "1", "y": "2", "as_of": str(MAX_STAMP_NS + 1)}, Refusal.OUT_OF_RANGE, "as_of"),
+        ("point", {"x": "1", "y": "2", "as_of": "9" * 5000}, Refusal.OUT_OF_RANGE, "as_of"),
+        ("region", {"bounds": "0,0,1,1", "minus": "-2h"}, Refusal.WRONG_TYPE, "minus"),
+        ("region", {"bounds": "0,0,1,1", "minus": "0"}, Refusal.OUT_OF_RANGE, "minus"),
+        ("history", {"x": "1"}, Refusal.MISSING_FIELD, "`y`"),
+        ("history", {"x": "1", "y": "2", "from": "2", "to": "1"}, Refusal.OUT_OF_RANGE, "`from`"),
+        ("history", {"x": "1", "y": "2", "from": "x"}, Refusal.WRONG_TYPE, "`from`"),
+        ("history", {"x": "1", "y": "2", "to": "0"}, Refusal.OUT_OF_RANGE, "`to`"),
+        ("history", {"x": "1", "y": "2", "span": "0.5"}, Refusal.OUT_OF_RANGE, "`span`"),
+        ("history", {"x": "1", "y": "2", "span": "1e10"}, Refusal.OUT_OF_RANGE, "`span`"),
+        ("history", {"x": "1", "y": "2", "span": "nan"}, Refusal.NOT_FINITE, "`span`"),
         ("region", {}, Refusal.MISSING_FIELD, "bounds"),
         ("region", {"bounds": "0,0,1"}, Refusal.MISSING_FIELD, "bounds"),
         ("region", {"bounds": "0,0,1,1,1"}, Refusal.MISSING_FIELD, "bounds"),
@@ -90,9 +196,12 @@ def test_bad_query_is_refused_by_name(name, parameters, reason, words):
     assert words in str(caught.value)
 
 
+NAMES = ["x", "y", "bounds", "layers", "as_of", "minus", "from", "to", "span", "after", "wait"]
+
+
 @given(
-    st.sampled_from(["point", "region", "info", "x"]),
-    st.dictionaries(st.sampled_from(["x", "y", "bounds", "layers", "after", "wait"]) | st.text(max_size=3), st.text()),
+    st.sampled_from(["point", "region", "history", "machines", "changes", "info", "x"]),
+    st.dictionaries(st.sampled_from(NAMES) | st.text(max_size=3), st.text() | st.integers().map(str)),
 )
 def test_any_parameters(name, parameters):
     try:
@@ -166,6 +275,51 @@ def test_point_whose_values_are_no_numbers_is_refused():
     table = {"x_m": 0.5, "y_m": 0.5, "values": {"resistance": "high"}, "merged": 1, "stamp_ns": 1}
     with pytest.raises(MessageError, match=r"values\.resistance"):
         decode_point(pack(table))
+
+
+def test_history_round_trips_and_keeps_unknown_as_nan():
+    spans = (Span(10, 19, {"resistance": math.nan, "visits": 3}), Span(30, 39, {"resistance": 0.5, "visits": 1.0}))
+    got = decode_history(encode_history(HistoryAnswer(0.5, -0.5, spans, 7, 8)))
+    assert (got.x_m, got.y_m, got.merged, got.stamp_ns) == (0.5, -0.5, 7, 8)
+    assert [(span.first_ns, span.last_ns) for span in got.spans] == [(10, 19), (30, 39)]
+    assert math.isnan(got.spans[0].values["resistance"])
+    assert got.spans[1] == spans[1]
+
+
+@pytest.mark.parametrize(
+    ("spans", "words"),
+    [
+        ([{"first_ns": 1, "values": {}}], "last_ns"),
+        ([{"first_ns": 1, "last_ns": 2}], "values"),
+        ([{"first_ns": 1, "last_ns": 2, "values": {"a": "high"}}], r"values\.a"),
+        (["span"], r"spans\[0\]: map expected"),
+        ({}, "spans: list expected"),
+    ],
+)
+def test_malformed_history_is_refused(spans, words):
+    with pytest.raises(MessageError, match=words):
+        decode_history(pack({"x_m": 0.5, "y_m": 0.5, "spans": spans, "merged": 1, "stamp_ns": 1}))
+
+
+def test_tables_round_trip():
+    rows = [{"name": "a", "evidence": {"shift_m": 1.5}, "reasons": ["gain"]}, {"name": "b"}]
+    assert decode_machines(encode_machines(rows)) == rows
+    assert decode_changes(encode_changes(rows)) == rows
+    assert decode_machine(encode_machine(rows[0])) == rows[0]
+    assert decode_change(encode_change(rows[0])) == rows[0]
+
+
+@pytest.mark.parametrize("decode", [decode_machines, decode_changes])
+def test_a_table_whose_rows_are_no_maps_is_refused(decode):
+    name = decode.__name__.removeprefix("decode_")
+    with pytest.raises(MessageError, match=rf"{name}\[1\]: map expected"):
+        decode(pack({name: [{}, 1]}))
+
+
+def test_an_event_is_small():
+    with pytest.raises(MessageError) as caught:
+        decode_change(encode_change({"bounds": [0.0] * 10_000}))
+    assert caught.value.reason is Refusal.TOO_LARGE
 
 
 def test_info_and_error_round_trip():

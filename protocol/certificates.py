@@ -1,0 +1,110 @@
+"""X.509 certificates of one site: its authority, and what that signs. Needs `cryptography`; touches no files.
+
+P-256 with SHA-256, PKCS #8 keys without a password. The router's certificates serve, all others only connect: so a
+stolen machine cannot pose as the router.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from ipaddress import ip_address
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+EARLY = timedelta(minutes=10)  # valid from before now: the clocks of machines differ
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A certificate and its private key, both PEM."""
+
+    certificate: bytes
+    key: bytes
+
+    @property
+    def serial(self) -> str:
+        """The serial number of the certificate, as hex digits."""
+        return f"{_certificate(self).serial_number:x}"
+
+
+def make_authority(site: str, begins: datetime, expires: datetime) -> Pair:
+    """Make the authority of a site: it signs certificates, and no further authorities."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name(f"sitegrid {site} authority")
+    builder = _builder(name, name, key, begins, expires)
+    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+    builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
+    return _pair(builder.sign(key, hashes.SHA256()), key)
+
+
+def issue(authority: Pair, common_name: str, begins: datetime, expires: datetime, hosts: Sequence[str] = ()) -> Pair:
+    """Make a key and have the authority sign it. hosts: names and addresses that it serves at; none: it only connects.
+
+    ValueError where a host cannot stand in a certificate.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    issuer = _certificate(authority)
+    builder = _builder(_name(common_name), issuer.subject, key, begins, min(expires, issuer.not_valid_after_utc))
+    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
+    purpose = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
+    builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+    if hosts:
+        builder = builder.add_extension(x509.SubjectAlternativeName([_host(h) for h in hosts]), critical=False)
+    signer = serialization.load_pem_private_key(authority.key, None)
+    assert isinstance(signer, ec.EllipticCurvePrivateKey)
+    return _pair(builder.sign(signer, hashes.SHA256()), key)
+
+
+def expires_at(pair: Pair) -> datetime:
+    """The end of a certificate's validity, UTC."""
+    return _certificate(pair).not_valid_after_utc
+
+
+def _certificate(pair: Pair) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(pair.certificate)
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, begins: datetime, expires: datetime
+) -> x509.CertificateBuilder:
+    builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
+    builder = builder.serial_number(x509.random_serial_number())
+    builder = builder.not_valid_before(begins - EARLY).not_valid_after(expires)
+    return builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+
+
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _pair(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> Pair:
+    pem = serialization.Encoding.PEM
+    form, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    return Pair(certificate.public_bytes(pem), key.private_bytes(pem, form, plain))

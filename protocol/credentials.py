@@ -1,0 +1,68 @@
+"""What a process proves its name with: one folder of files that `sitegrid keys` makes. The base install is enough.
+
+identity.toml says in plain words what the certificate says, so that a wrong or outdated folder is named at once: a
+router that refuses only lets the time run out (EVIDENCE: denials are silent).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from protocol.config import from_table, load_toml
+from protocol.errors import ConfigError
+
+AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, IDENTITY_FILE = "ca.pem", "cert.pem", "key.pem", "identity.toml"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Whom a certificate names. role: see docs/security.md. expires: the last moment at which it is taken."""
+
+    site: str
+    name: str
+    role: str
+    expires: datetime
+
+
+@dataclass(frozen=True)
+class Credentials:
+    """A folder with the certificate, its private key, the certificate of the site's authority, and the identity."""
+
+    folder: Path
+    identity: Identity
+
+    def tls(self, *, listens: bool) -> Mapping[str, object]:
+        """The settings of Zenoh that make both ends of a link prove themselves; it ends when a certificate does."""
+        end = "listen" if listens else "connect"
+        return {
+            "root_ca_certificate": str(self.folder / AUTHORITY_FILE),
+            f"{end}_certificate": str(self.folder / CERTIFICATE_FILE),
+            f"{end}_private_key": str(self.folder / KEY_FILE),
+            "enable_mtls": True,  # on both ends (EVIDENCE: a client without it shows no certificate)
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+
+
+def load_credentials(folder: Path) -> Credentials:
+    """Read a folder that `sitegrid keys` made; ConfigError where a file is missing."""
+    for name in (IDENTITY_FILE, AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE):
+        if not (folder / name).is_file():
+            raise ConfigError(folder, f"holds no {name}; name the folder of one certificate, as KEYS/loader-1")
+    where = folder / IDENTITY_FILE
+    identity = from_table(Identity, load_toml(where), str(where))
+    if identity.expires.tzinfo is None:
+        raise ConfigError(where, "expires: no time zone is given")
+    return Credentials(folder, identity)
+
+
+def check_valid(credentials: Credentials, now: datetime) -> None:
+    """ConfigError if the certificate has expired."""
+    identity = credentials.identity
+    if now > identity.expires:
+        day = identity.expires.astimezone(UTC).date()
+        advice = f"make a new one with `sitegrid keys add {identity.name} --renew`"
+        raise ConfigError(credentials.folder, f"the certificate of {identity.name} expired on {day}; {advice}")

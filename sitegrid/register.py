@@ -1,0 +1,102 @@
+"""The register of a site's names: who has which role, until when, and who is let in no more. Readable TOML.
+
+The router makes its rules from it, by the common names of certificates. A name that was revoked and is added again gets
+a new common name, so that the old certificate stays refused.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from protocol.config import from_table, load_toml
+from protocol.errors import ConfigError
+from protocol.keys import check_name
+
+REGISTER_FILE = "register.toml"
+ROUTER = "router"  # a name and a role: one per site
+ROLES = ("machine", "visitor", "server", "admin", "sim")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One name. serial: of its newest certificate, hex. issue: 1, and one more each time it comes back from revoked."""
+
+    role: str
+    serial: str
+    expires: datetime
+    issue: int = 1
+    revoked: bool = False
+
+    def __post_init__(self) -> None:
+        if self.role not in (*ROLES, ROUTER):
+            raise ValueError(f"role: {self.role!r} is none of {', '.join(ROLES)}")
+        if self.issue < 1:
+            raise ValueError(f"issue: {self.issue} is not positive")
+        if self.expires.tzinfo is None:
+            raise ValueError("expires: no time zone is given")
+
+
+@dataclass(frozen=True)
+class Register:
+    """All names of one site. hosts: names and addresses that the router is reached at."""
+
+    site: str
+    hosts: tuple[str, ...]
+    names: Mapping[str, Entry]
+
+    def admitted(self) -> dict[str, Entry]:
+        """Those that are let in: neither revoked nor the router itself."""
+        return {name: entry for name, entry in self.names.items() if not entry.revoked and entry.role != ROUTER}
+
+    def next_issue(self, name: str) -> int:
+        """The issue that a new certificate of this name belongs to."""
+        known = self.names.get(name)
+        return 1 if known is None else known.issue + known.revoked
+
+    def with_entry(self, name: str, entry: Entry) -> Register:
+        """With a name added or replaced."""
+        return replace(self, names={**self.names, name: entry})
+
+    def without(self, name: str) -> Register:
+        """With a name revoked; ConfigError where that is not possible."""
+        entry = self.names.get(name)
+        if entry is None:
+            raise ConfigError("keys", f"{name!r} is not in the register; see `sitegrid keys list`")
+        if entry.role == ROUTER:
+            raise ConfigError("keys", "machines trust the router's certificate itself: make a new folder with init")
+        return self.with_entry(name, replace(entry, revoked=True))
+
+
+def common_name(name: str, issue: int) -> str:
+    """What the certificate of a name says; names hold no dot, so these never meet."""
+    return name if issue == 1 else f"{name}.{issue}"
+
+
+def load_register(folder: Path) -> Register:
+    """Read the register of a folder of keys; ConfigError where it is none."""
+    path = folder / REGISTER_FILE
+    if not path.is_file():
+        raise ConfigError(folder, f"holds no {REGISTER_FILE}: make the folder with `sitegrid keys init --dir {folder}`")
+    register = from_table(Register, load_toml(path), str(path))
+    for name in (register.site, *register.names):
+        check_name(name, str(path))
+    return register
+
+
+def register_toml(register: Register) -> str:
+    """The register as TOML."""
+    lines = ["# Who is let in. Written by `sitegrid keys`.", *_plain(site=register.site, hosts=list(register.hosts))]
+    for name, entry in sorted(register.names.items()):
+        lines += ["", f"[names.{name}]", *_plain(role=entry.role, serial=entry.serial)]
+        lines += [f"expires = {entry.expires.astimezone(UTC):%Y-%m-%dT%H:%M:%SZ}"]
+        lines += _plain(issue=entry.issue, revoked=entry.revoked)
+    return "\n".join(lines) + "\n"
+
+
+def _plain(**values: object) -> list[str]:
+    """JSON's texts, numbers and lists are TOML's."""
+    return [f"{key} = {json.dumps(value)}" for key, value in values.items()]
