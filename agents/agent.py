@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zenoh
 
 from agents import calibration_file
@@ -17,15 +18,17 @@ from agents.drivers import Driver
 from agents.estimation.calibration import Calibration
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
-from agents.presence import Presence
+from agents.presence import Owner, Presence
 from agents.spool import Spool
 from agents.uplink import Uplink, UplinkState, linger
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine import MachineConfig
+from protocol.samples import empty
 from protocol.site import SiteConfig
 
 HEALTH_S = 1.0
+MOST_UNSAVED = 100_000  # samples that wait in memory while the disk takes nothing
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ class Agent:
         places: Places,
         *,
         withhold: bool = False,
+        owner: Owner | None = None,
     ) -> None:
         self._config = config
         self._machine, self._calibration_file = machine.name, places.calibration
@@ -57,9 +61,10 @@ class Agent:
         self._kept_ns = self._pipeline.calibration.stamp_ns
         self._holdout = Holdout(site, machine, config.holdout) if withhold else None
         self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
-        self._presence = Presence(session, site.name, machine.name)
+        self._presence = Presence(session, site.name, machine.name, owner)
         state = UplinkState(machine.name, site.frame, self._spool, config.uplink)
         self._uplink = Uplink(session, site.name, machine.name, state, config.uplink.timeout_s)
+        self._unsaved, self._given_up, self._spool_problem = empty(), 0, ""
         self._readings = 0
         self._samples = 0
         self._newest_ns = 0
@@ -81,6 +86,7 @@ class Agent:
             if clock() >= health_s:
                 health_s = clock() + HEALTH_S
                 self._keep_calibration()
+                self._yield_name()
                 self._presence.show_health(self._newest_ns, self.report(driver))
         driver.close()
         self._deliver(self._pipeline.finish())
@@ -92,15 +98,18 @@ class Agent:
 
     def report(self, driver: Driver) -> dict[str, Any]:
         """Health in plain values."""
-        uplink = self._uplink.state
+        uplink, owner = self._uplink.state, self._presence.owner
         return {
+            "host": owner.host,
+            "pid": owner.pid,
             "readings": self._readings,
             "samples": self._samples,
             "driver": dict(driver.counters()),
             "pipeline": self._pipeline.health(),
-            "spool": self._spool.counters(),
+            "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._given_up},
+            "spool_problem": self._spool_problem,
             "calibration_problem": self._calibration_problem,
-            "uplink": {"problem": uplink.problem, "counters": dict(uplink.counters)},
+            "uplink": {"problem": uplink.held or uplink.problem, "counters": dict(uplink.counters)},
             "holdout": self._holdout.report() if self._holdout else None,
         }
 
@@ -122,10 +131,26 @@ class Agent:
             self._presence.show_pose(pose)
 
     def _deliver(self, rows: Table) -> None:
-        if len(rows):
-            self._spool.record(rows)
-            self._samples += len(rows)
-            self._uplink.wake()
+        """Write samples to the spool; while the disk takes none they wait here, and the machine goes on."""
+        waiting = np.concatenate([self._unsaved, rows])
+        if not len(waiting):
+            return
+        try:
+            self._spool.record(waiting)
+        except StoreError as error:
+            self._unsaved, self._spool_problem = waiting[-MOST_UNSAVED:], str(error)
+            self._given_up += len(waiting) - len(self._unsaved)
+            return
+        self._unsaved, self._spool_problem = empty(), ""
+        self._samples += len(waiting)
+        self._uplink.wake()
+
+    def _yield_name(self) -> None:
+        """Send nothing while an earlier agent of the same name is alive; the samples wait in the spool."""
+        rival = self._presence.look_around()
+        self._uplink.state.held = (
+            f"another agent of this name runs as {rival}: it sends, this one waits; stop one of them" if rival else ""
+        )
 
     def _known(self) -> Calibration | None:
         """The calibration from before; one that cannot be read is reported, and found anew."""
@@ -148,4 +173,4 @@ class Agent:
             self._kept_ns, self._calibration_problem = calibration.stamp_ns, ""
 
     def _is_delivered(self) -> bool:
-        return self._spool.counters()["depth"] == 0
+        return not len(self._unsaved) and self._spool.is_settled()

@@ -1,8 +1,9 @@
 """The audit file: what an agent recorded, line by line at recording time, to compare with what the server has.
 
 `+ <spool_id> <seq> <hash>` is a recorded sample (a later line for the same sample replaces it), `- <spool_id> <seq>`
-one whose identity is void because it was numbered anew. A line is written before its sample is committed; what a crash
-left without its sample is taken out when the spool is opened again.
+one whose identity is void because it was numbered anew. A line is written after its sample is committed, and what a
+crash kept from being written is added when the spool is opened again: no line claims what was never on disk, and a disk
+that forgets what it committed shows as a loss.
 """
 
 from __future__ import annotations
@@ -28,18 +29,23 @@ class AuditLog:
         """Note samples."""
         self._write(f"+ {spool_id:016x} {first_seq + i} {content_hash(row)}" for i, row in enumerate(rows))
 
-    def renumbered(self, old_id: int, old_seqs: list[int], new_id: int, rows: Table) -> None:
+    def renumbered(self, old_id: int, old_seqs: Iterable[int], new_id: int, rows: Table) -> None:
         """Note that samples have a new identity: 1, 2, 3... of spool `new_id`."""
         self._write(f"- {old_id:016x} {seq}" for seq in old_seqs)
         self.recorded(new_id, 1, rows)
 
-    def reconcile(self, spool_id: int, newest: int) -> None:
-        """Void lines of samples that a crash kept from being committed, and end a line that it cut off."""
+    def complete(self, spooled: Iterable[tuple[int, int, Table]]) -> None:
+        """Add what a crash kept from being noted, and end a line that it cut off.
+
+        spooled: the samples that are on disk, as (spool_id, seq, row).
+        """
         text = self._path.read_text(encoding="ascii")
         if text and not text.endswith("\n"):
             self._write([" # cut off"])
-        lost = [seq for (spool, seq) in parse(_whole_lines(text)) if spool == spool_id and seq > newest]
-        self._write(f"- {spool_id:016x} {seq}" for seq in lost)
+        known = parse(_whole_lines(text))
+        hashes = ((spool_id, seq, content_hash(row)) for spool_id, seq, row in spooled)
+        missing = (found for found in hashes if known.get(found[:2]) != found[2])
+        self._write(f"+ {spool_id:016x} {seq} {content}" for spool_id, seq, content in missing)
 
     def close(self) -> None:
         """Close the file."""

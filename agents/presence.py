@@ -1,30 +1,104 @@
-"""What others see of a machine: live pose, health, and a liveliness token."""
+"""What others see of a machine: live pose, health, a liveliness token, and an answer to who it is.
+
+The token tells that an agent is there, for as long as the router believes so (up to the lease after a broken link). Who
+asks on the same key gets an answer from a live agent only: so a machine that restarts never takes its own dead
+predecessor for another agent.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import secrets
+import socket
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import zenoh
 
 from agents.localisation.belief import PoseBelief
 from protocol import keys
-from protocol.codec import encode_health, encode_pose
+from protocol.codec import MAX_SMALL_BYTES, encode_health, encode_pose, pack, take, unpack
+from protocol.errors import MessageError
 from protocol.messages import Health, Pose
 
 POSE_NS = 200_000_000  # five a second, of the machine's own time
+ANSWER_S = 1.0  # how long to wait for another agent of the same name
+
+
+@dataclass(frozen=True, order=True)
+class Owner:
+    """One running agent. Where two have one name, the one that is less (earlier, then by chance) keeps it."""
+
+    started_ns: int
+    token: int
+    host: str
+    pid: int
+
+    def __str__(self) -> str:
+        return f"pid {self.pid} on host {self.host}"
+
+
+def this_process(now_ns: Callable[[], int] = time.time_ns) -> Owner:
+    """Describe an agent that starts now in this process."""
+    return Owner(now_ns(), secrets.randbits(62), socket.gethostname(), os.getpid())
+
+
+def wait_for_link(session: zenoh.Session, wait_s: float) -> bool:
+    """Wait until the session has reached a router, at most wait_s; returns whether it has."""
+    end_s = time.monotonic() + wait_s
+    while not session.info.routers_zid():
+        if time.monotonic() >= end_s:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def find_namesake(session: zenoh.Session, site: str, machine: str, wait_s: float = ANSWER_S) -> Owner | None:
+    """Ask for a live agent of this name elsewhere; None if none answers."""
+    found = []
+    asked = session.get(keys.alive(site, machine), timeout=wait_s, allowed_destination=zenoh.Locality.REMOTE)
+    for reply in asked:
+        if owner := _owner(reply):
+            found.append(owner)
+    return min(found, default=None)
 
 
 class Presence:
-    """Publishes pose and health; both may be dropped on the way, the next one replaces them."""
+    """Publishes pose and health; both may be dropped on the way, the next one replaces them.
 
-    def __init__(self, session: zenoh.Session, site: str, machine: str) -> None:
+    Their priority is above that of samples: a machine that catches up stays live. rivals: other agents of this name
+    that have answered since the last `look_around`.
+    """
+
+    def __init__(self, session: zenoh.Session, site: str, machine: str, owner: Owner | None = None) -> None:
+        self._session = session
         self._machine = machine
-        drop = zenoh.CongestionControl.DROP
-        self._pose = session.declare_publisher(keys.pose(site, machine), congestion_control=drop)
-        self._health = session.declare_publisher(keys.health(site, machine), congestion_control=drop)
-        self._token = session.liveliness().declare_token(keys.alive(site, machine))
+        self._owner = owner or this_process()
+        self._key = keys.alive(site, machine)
+        drop, first = zenoh.CongestionControl.DROP, zenoh.Priority.INTERACTIVE_HIGH
+        self._pose = session.declare_publisher(keys.pose(site, machine), congestion_control=drop, priority=first)
+        self._health = session.declare_publisher(keys.health(site, machine), congestion_control=drop, priority=first)
+        self._answer = session.declare_queryable(self._key, self._on_query)
+        self._token = session.liveliness().declare_token(self._key)
         self._pose_ns = 0
+        self._rivals: set[Owner] = set()
+
+    @property
+    def owner(self) -> Owner:
+        """This agent."""
+        return self._owner
+
+    def look_around(self) -> Owner | None:
+        """Return the agent whose name this is, if it is another one; and ask again for the next call.
+
+        Answers come in beside the work, within ANSWER_S.
+        """
+        found, self._rivals = self._rivals, set()
+        options = {"timeout": ANSWER_S, "allowed_destination": zenoh.Locality.REMOTE}
+        self._session.get(self._key, self._on_reply, **options)
+        return min((owner for owner in found if owner < self._owner), default=None)
 
     def show_pose(self, belief: PoseBelief) -> None:
         """Publish the pose if the last one is old enough."""
@@ -41,5 +115,23 @@ class Presence:
 
     def close(self) -> None:
         """Leave."""
-        for entity in (self._token, self._pose, self._health):
+        for entity in (self._token, self._answer, self._pose, self._health):
             entity.undeclare()  # type: ignore[no-untyped-call]
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, pack(asdict(self._owner)))
+
+    def _on_reply(self, reply: zenoh.Reply) -> None:
+        owner = _owner(reply)
+        if owner and owner != self._owner:
+            self._rivals.add(owner)
+
+
+def _owner(reply: zenoh.Reply) -> Owner | None:
+    try:
+        table = unpack(reply.ok.payload.to_bytes() if reply.ok else b"", MAX_SMALL_BYTES)
+        fields = (("started_ns", int), ("token", int), ("host", str), ("pid", int))
+        return Owner(*(take(table, name, kind) for name, kind in fields))
+    except MessageError:
+        return None

@@ -1,15 +1,18 @@
 """The spool: samples on the machine's own disk until the server has acknowledged them (SQLite, WAL, FULL).
 
-`seq` numbers samples 1, 2, 3... within a spool; `spool_id` is drawn when the spool is made, and anew when the server
-turns out to know more of it than it does itself (a restored or cloned file).
+Samples are numbered through in the file. What is recorded between one opening and the next is a **run**, with a random
+`spool_id` of its own; `seq` counts 1, 2, 3... within a run, so that seq = number - base. A file that was copied,
+cloned, restored from a backup or taken back by a lying disk therefore never gives one identity to two samples: what
+copies have in common has the same identity and the same bytes, what they record from then on has another spool_id.
 """
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -18,13 +21,24 @@ import numpy as np
 from agents.audit import AuditLog
 from protocol.arrays import Table
 from protocol.errors import StoreError
-from protocol.samples import SAMPLE_DTYPE
+from protocol.samples import SAMPLE_DTYPE, empty
 
-SCHEMA = 1
+SCHEMA = 2
+KEPT_RUNS = 16  # earlier runs that are declared again: a server restored from a backup learns what it has lost
+_RUN = "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INTEGER, closed INTEGER)"
 _TABLES = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
-    "CREATE TABLE sample (seq INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL)",
+    "CREATE TABLE sample (number INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL)",
     "CREATE TABLE aside (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL)",
+    _RUN,
+    f"PRAGMA user_version={SCHEMA}",
+)
+_FROM_SCHEMA_1 = (
+    _RUN,
+    "INSERT INTO run SELECT 0, value, 0, 0 FROM meta WHERE key = 'spool_id'",
+    "UPDATE run SET acknowledged = (SELECT value FROM meta WHERE key = 'acknowledged')",
+    "DELETE FROM meta WHERE key IN ('spool_id', 'acknowledged')",
+    "ALTER TABLE sample RENAME COLUMN seq TO number",
     f"PRAGMA user_version={SCHEMA}",
 )
 
@@ -42,7 +56,10 @@ class SpoolConfig:
 
 @dataclass(frozen=True)
 class Head:
-    """The oldest samples that are final. lost_before: how many directly before them will never be sent."""
+    """The oldest samples that are final. lost_before: how many directly before them will never be sent.
+
+    Without rows it closes an earlier run: nothing more will come of it.
+    """
 
     spool_id: int
     first_seq: int
@@ -51,23 +68,37 @@ class Head:
 
 
 @dataclass(frozen=True)
-class _Meta:
-    """What the spool knows of itself: its identity, the last number given out, the last acknowledged, and counts."""
+class Run:
+    """What one opening recorded. base: number of the last sample before it; acknowledged: a seq.
 
+    closed: the server has once accounted for all of it.
+    """
+
+    base: int
     spool_id: int
-    newest: int = 0
     acknowledged: int = 0
-    dropped: int = 0
-    recorded: int = 0
+    closed: bool = False
+
+
+@dataclass(frozen=True)
+class _Meta:
+    """Counts of the file: the last number given out, samples that were dropped, samples that were recorded."""
+
+    newest: int
+    dropped: int
+    recorded: int
 
 
 def random_id() -> int:
-    """A spool's identity: 64 random bits, never zero."""
+    """A run's identity: 64 random bits, never zero."""
     return secrets.randbits(64) or 1
 
 
 class Spool:
-    """One machine's samples that are not yet acknowledged. All methods may be called from any thread."""
+    """One machine's samples that are not yet acknowledged. All methods may be called from any thread.
+
+    StoreError if the file is damaged, or if another process has it open.
+    """
 
     def __init__(
         self,
@@ -82,38 +113,48 @@ class Spool:
         self._draw_id = draw_id
         self._lock = threading.Lock()
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=FULL")
-            self._meta = self._open()
-            self._newest_at_open = self._meta.newest
-            if audit:
-                audit.reconcile(self._meta.spool_id, self._meta.newest)
-        except (sqlite3.Error, ValueError, KeyError) as error:
-            raise StoreError(path, f"is no usable spool: {error}") from None
+        with contextlib.ExitStack() as opened:
+            try:
+                self._db = self._connect(path)
+                opened.callback(self._db.close)
+                self._db.execute("PRAGMA locking_mode=EXCLUSIVE")  # two agents on one file would send under one name
+                self._db.execute("PRAGMA journal_mode=WAL")
+                self._db.execute("PRAGMA synchronous=FULL")
+                self._open()
+            except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
+                raise StoreError(path, _problem(error)) from None
+            opened.pop_all()
 
     @property
     def spool_id(self) -> int:
-        """Identity of this spool."""
-        return self._meta.spool_id
+        """Identity of the run that is being recorded."""
+        return self._runs[-1].spool_id
 
     @property
     def newest(self) -> int:
-        """The last sequence number given out."""
-        return self._meta.newest
+        """The last sequence number given out in this run."""
+        return self._end(len(self._runs) - 1)
 
     @property
     def acknowledged(self) -> int:
-        """The last sample that the server has confirmed."""
-        return self._meta.acknowledged
+        """The last sample of this run that the server has confirmed."""
+        return self._runs[-1].acknowledged
 
     def counters(self) -> dict[str, int]:
         """Depth, and what never reached the server."""
+        with self._lock:  # kept, not counted: that would take long in a full spool
+            meta = self._meta
+            return {
+                "depth": self._depth,
+                "dropped": meta.dropped,
+                "put_aside": self._aside,
+                "recorded": meta.recorded,
+            }
+
+    def is_settled(self) -> bool:
+        """Whether nothing is left to be sent, and the server has accounted for all earlier runs."""
         with self._lock:
-            depth = self._db.execute("SELECT COUNT(*) FROM sample").fetchone()[0]
-            aside = self._db.execute("SELECT COUNT(*) FROM aside").fetchone()[0]
-        return {"depth": depth, "dropped": self._meta.dropped, "put_aside": aside, "recorded": self._meta.recorded}
+            return self._depth == 0 and self._at == len(self._runs) - 1
 
     def record(self, rows: Table, *, final: bool = True) -> int:
         """Write samples durably; returns the sequence number of the first. StoreError if the disk does not take them.
@@ -121,128 +162,213 @@ class Spool:
         Pending ones (not final) are not sent before they are made final.
         """
         with self._lock:
-            first = self._meta.newest + 1
-            if self._audit:
-                self._audit.recorded(self._meta.spool_id, first, rows)
+            first = self.newest + 1
             try:
-                self._meta = self._insert(first, rows, final=final)
+                self._insert(rows, final=final)
             except sqlite3.Error as error:
                 raise StoreError(self._path, f"cannot be written: {error}; look at the machine's disk") from None
+            self._note(first, rows)
             return first
 
-    def _insert(self, first: int, rows: Table, *, final: bool) -> _Meta:
-        values = [(first + i, row.tobytes(), int(final)) for i, row in enumerate(rows)]
-        old, n = self._meta, len(rows)
-        with _transaction(self._db):
-            self._db.executemany("INSERT INTO sample VALUES (?, ?, ?)", values)
-            dropped = old.dropped + self._drop_oldest()
-            new = replace(old, newest=old.newest + n, recorded=old.recorded + n, dropped=dropped)
-            self._save(new)
-        return new
-
     def finalise(self, first_seq: int, rows: Table) -> None:
-        """Replace pending samples by their final values."""
-        with self._lock, _transaction(self._db):
-            if self._audit:
-                self._audit.recorded(self._meta.spool_id, first_seq, rows)
-            values = [(row.tobytes(), first_seq + i) for i, row in enumerate(rows)]
-            self._db.executemany("UPDATE sample SET row = ?, final = 1 WHERE seq = ? AND final = 0", values)
+        """Replace pending samples of this run by their final values; those that are final stay as they are."""
+        with self._lock:
+            base = self._runs[-1].base
+            kept = [i for i in range(len(rows)) if self._is_pending(base + first_seq + i)]
+            with _transaction(self._db):
+                values = [(rows[i].tobytes(), base + first_seq + i) for i in kept]
+                self._db.executemany("UPDATE sample SET row = ?, final = 1 WHERE number = ?", values)
+            for i in kept:
+                self._note(first_seq + i, rows[i : i + 1])
 
     def head(self, limit: int) -> Head | None:
-        """The oldest final samples, at most `limit`, without a hole between them; None if there are none."""
-        with self._lock:
-            query = "SELECT seq, row, final FROM sample ORDER BY seq LIMIT ?"
-            found = self._db.execute(query, (limit,)).fetchall()
-            ready: list[tuple[int, bytes]] = []
-            for seq, row, final in found:
-                if not final or (ready and seq != ready[-1][0] + 1):
-                    break
-                ready.append((seq, row))
-            if not ready:
-                return None
-            rows = np.frombuffer(b"".join(row for _, row in ready), SAMPLE_DTYPE)
-            return Head(self._meta.spool_id, ready[0][0], rows, ready[0][0] - 1 - self._meta.acknowledged)
+        """What to send next, at most `limit` samples without a hole between them; None if there is nothing.
 
-    def acknowledge(self, watermark: int) -> None:
-        """Delete what the server has on disk."""
+        Runs come one after the other; one that has no samples left is closed with an empty head.
+        """
         with self._lock:
-            new = replace(self._meta, acknowledged=watermark)
+            run, end = self._runs[self._at], self._end(self._at)
+            query = "SELECT number, row, final FROM sample WHERE number > ? AND number <= ? ORDER BY number LIMIT ?"
+            found = self._db.execute(query, (run.base, run.base + end, limit)).fetchall()
+            if not found:
+                is_earlier = self._at < len(self._runs) - 1
+                return Head(run.spool_id, end + 1, empty(), end) if is_earlier else None
+            first = found[0][0]
+            n = next((i for i, (number, _, final) in enumerate(found) if not final or number != first + i), len(found))
+            if n == 0:
+                return None
+            seq = first - run.base
+            return Head(run.spool_id, seq, _table(row for _, row, _ in found[:n]), seq - 1 - run.acknowledged)
+
+    def acknowledge(self, spool_id: int, watermark: int) -> None:
+        """Delete what the server has on disk, of one run."""
+        with self._lock:
+            at = self._index(spool_id)
+            run, end = self._runs[at], self._end(at)
+            upto = max(run.acknowledged, min(watermark, end))
+            is_earlier = at < len(self._runs) - 1
+            new = replace(run, acknowledged=upto, closed=run.closed or (is_earlier and watermark >= end))
             with _transaction(self._db):
-                self._db.execute("DELETE FROM sample WHERE seq <= ?", (watermark,))
-                self._save(new)
-            self._meta = new
+                span = (run.base, run.base + upto)
+                deleted = self._db.execute("DELETE FROM sample WHERE number > ? AND number <= ?", span).rowcount
+                self._save_run(new)
+            self._runs[at] = new
+            self._depth -= deleted
+            if at == self._at and is_earlier and watermark >= end:
+                self._at += 1
+
+    def fall_back(self, spool_id: int, watermark: int) -> bool:
+        """Take in that the server knows less than it acknowledged (restored from a backup); returns whether it does.
+
+        What it has lost is gone here as well: it is declared lost, of this run and of the earlier ones.
+        """
+        with self._lock:
+            at = self._index(spool_id)
+            run = self._runs[at]
+            if watermark >= run.acknowledged:
+                return False
+            new = replace(run, acknowledged=watermark)
+            with _transaction(self._db):
+                self._save_run(new)
+            self._runs[at], self._at = new, 0
+            return True
+
+    def fork(self) -> None:
+        """Give what is not acknowledged of this run a new identity: somebody else sends under the present one."""
+        with self._lock:
+            old = self._runs[-1]
+            new = Run(old.base + old.acknowledged, self._draw_id())
+            found = self._db.execute("SELECT number, row FROM sample WHERE number > ?", (new.base,)).fetchall()
+            kept = [replace(old, closed=True)] if old.acknowledged else []
+            with _transaction(self._db):
+                self._db.execute("DELETE FROM run WHERE base = ?", (old.base,))
+                for run in (*kept, new):
+                    self._save_run(run)
+            self._runs[-1:] = [*kept, new]
+            self._at = len(self._runs) - 1
+            if self._audit and found:
+                seqs = [number - old.base for number, _ in found]
+                with contextlib.suppress(OSError):
+                    self._audit.renumbered(old.spool_id, seqs, new.spool_id, _table(row for _, row in found))
 
     def put_aside(self, head: Head, problem: str) -> None:
         """Keep samples that the server will never take out of the way, for a person to look at."""
-        with self._lock, _transaction(self._db):
+        with self._lock:
+            base = self._runs[self._index(head.spool_id)].base
             seqs = range(head.first_seq, head.first_seq + len(head.rows))
             values = [(f"{head.spool_id:016x}", s, r.tobytes(), problem) for s, r in zip(seqs, head.rows, strict=True)]
-            self._db.executemany("INSERT INTO aside VALUES (?, ?, ?, ?)", values)
-            self._db.executemany("DELETE FROM sample WHERE seq = ?", [(seq,) for seq in seqs])
-
-    def meet(self, watermark: int) -> bool:
-        """First contact after opening: compare with the server's watermark; returns whether a new spool_id was drawn.
-
-        A watermark beyond what was on disk when the spool was opened tells of a restored or cloned file. What the file
-        held then has been delivered; what was recorded since has numbers that are taken, and gets a new identity.
-        """
-        if watermark <= self._newest_at_open:
-            self.acknowledge(watermark)
-            return False
-        with self._lock:
-            seqs = self._db.execute("SELECT seq, row FROM sample WHERE seq > ?", (self._newest_at_open,)).fetchall()
-            rows = np.frombuffer(b"".join(row for _, row in seqs), SAMPLE_DTYPE)
-            new = replace(self._meta, spool_id=self._draw_id(), newest=len(rows), acknowledged=0)
-            if self._audit:
-                self._audit.renumbered(self._meta.spool_id, [seq for seq, _ in seqs], new.spool_id, rows)
             with _transaction(self._db):
-                self._db.execute("DELETE FROM sample")
-                values = [(i + 1, row.tobytes()) for i, row in enumerate(rows)]
-                self._db.executemany("INSERT INTO sample VALUES (?, ?, 1)", values)
-                self._save(new)
-            self._meta, self._newest_at_open = new, new.newest
-        return True
+                self._db.executemany("INSERT INTO aside VALUES (?, ?, ?, ?)", values)
+                self._db.executemany("DELETE FROM sample WHERE number = ?", [(base + seq,) for seq in seqs])
+            self._aside += len(values)
+            self._depth -= len(values)
 
     def close(self) -> None:
         """Fold the write-ahead log into the file and close."""
         with self._lock:
-            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            with contextlib.suppress(sqlite3.Error):  # a full disk: the log stays, and is read at the next opening
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._db.close()
             if self._audit:
                 self._audit.close()
 
-    def _open(self) -> _Meta:
-        if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
-            with _transaction(self._db):  # tables and identity together: a kill leaves all or nothing
-                for statement in _TABLES:
-                    self._db.execute(statement)
-                self._save(_Meta(self._draw_id()))
-        if (schema := self._db.execute("PRAGMA user_version").fetchone()[0]) != SCHEMA:
-            raise ValueError(f"schema {schema}, this agent knows {SCHEMA}")
-        # After a crash pending samples are sent as they are: a coarse place is better than none.
-        self._db.execute("UPDATE sample SET final = 1 WHERE final = 0")
-        values = dict(self._db.execute("SELECT key, value FROM meta"))
-        return _Meta(int(values.pop("spool_id"), 16), **{key: int(value) for key, value in values.items()})
+    def _connect(self, path: Path) -> sqlite3.Connection:
+        return sqlite3.connect(path, isolation_level=None, check_same_thread=False)
 
-    def _drop_oldest(self) -> int:
-        """Keep to the limit; returns how many were dropped."""
-        first, last = self._db.execute("SELECT MIN(seq), MAX(seq) FROM sample").fetchone()
-        if first is None or last - first < self._config.max_samples:  # counting takes time that grows with the spool
-            return 0
-        depth: int = self._db.execute("SELECT COUNT(*) FROM sample").fetchone()[0]
-        excess = max(0, depth - self._config.max_samples)
-        if excess:
-            oldest = "SELECT seq FROM sample ORDER BY seq LIMIT ?"
-            self._db.execute(f"DELETE FROM sample WHERE seq IN ({oldest})", (excess,))  # noqa: S608 - no input in it
-        return excess
+    def _open(self) -> None:
+        """Make or read the file, and start a run."""
+        with _transaction(self._db):  # all together: a kill leaves all or nothing
+            if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
+                self._run_all(_TABLES)
+                self._save(_Meta(0, 0, 0))
+            elif self._schema() == 1:
+                self._run_all(_FROM_SCHEMA_1)
+            if (schema := self._schema()) != SCHEMA:
+                raise ValueError(f"schema {schema}, this agent knows {SCHEMA}")
+            # After a crash pending samples are sent as they are: a coarse place is better than none.
+            self._db.execute("UPDATE sample SET final = 1 WHERE final = 0")
+            self._meta = _Meta(**{k: int(v) for k, v in self._db.execute("SELECT key, value FROM meta")})
+            self._runs = self._start_run()
+        self._at = 0
+        self._depth = int(self._db.execute("SELECT COUNT(*) FROM sample").fetchone()[0])
+        self._aside = int(self._db.execute("SELECT COUNT(*) FROM aside").fetchone()[0])
+        if self._audit:
+            self._audit.complete(self._identified())
+
+    def _start_run(self) -> list[Run]:
+        """Add a run to those that are still of interest: not closed, or among the last. One without samples is not."""
+        found = [
+            Run(base, int(spool_id, 16), acknowledged, bool(closed))
+            for base, spool_id, acknowledged, closed in self._db.execute("SELECT * FROM run ORDER BY base")
+        ]
+        filled = [run for run in found if run.base < self._meta.newest]
+        last = filled[-KEPT_RUNS:]
+        first = next((i for i, run in enumerate(filled) if not run.closed or run in last), len(filled))
+        runs = [*filled[first:], Run(self._meta.newest, self._draw_id())]
+        self._db.execute("DELETE FROM run")
+        for run in runs:
+            self._save_run(run)
+        return runs
+
+    def _run_all(self, statements: tuple[str, ...]) -> None:
+        for statement in statements:
+            self._db.execute(statement)
+
+    def _schema(self) -> int:
+        return int(self._db.execute("PRAGMA user_version").fetchone()[0])
+
+    def _identified(self) -> Iterator[tuple[int, int, Table]]:
+        """All samples of the file as (spool_id, seq, row)."""
+        for i, run in enumerate(self._runs):
+            span = (run.base, run.base + self._end(i))
+            for number, row in self._db.execute(
+                "SELECT number, row FROM sample WHERE number > ? AND number <= ?", span
+            ):
+                yield run.spool_id, number - run.base, _table([row])[0]
+
+    def _end(self, at: int) -> int:
+        """The last seq of a run."""
+        is_last = at == len(self._runs) - 1
+        return (self._meta.newest if is_last else self._runs[at + 1].base) - self._runs[at].base
+
+    def _index(self, spool_id: int) -> int:
+        return next(i for i, run in enumerate(self._runs) if run.spool_id == spool_id)
+
+    def _insert(self, rows: Table, *, final: bool) -> None:
+        old, n = self._meta, len(rows)
+        values = [(old.newest + 1 + i, row.tobytes(), int(final)) for i, row in enumerate(rows)]
+        excess = max(0, self._depth + n - self._config.max_samples)
+        with _transaction(self._db):
+            self._db.executemany("INSERT INTO sample VALUES (?, ?, ?)", values)
+            if excess:
+                oldest = "SELECT number FROM sample ORDER BY number LIMIT ?"
+                self._db.execute(f"DELETE FROM sample WHERE number IN ({oldest})", (excess,))  # noqa: S608 - no input
+            new = _Meta(old.newest + n, old.dropped + excess, old.recorded + n)
+            self._save(new)
+        self._meta = new
+        self._depth += n - excess
+
+    def _note(self, first_seq: int, rows: Table) -> None:
+        """Write the audit, if there is one: what a full disk keeps from it is added at the next opening."""
+        if self._audit:
+            with contextlib.suppress(OSError):
+                self._audit.recorded(self.spool_id, first_seq, rows)
+
+    def _is_pending(self, number: int) -> bool:
+        found = self._db.execute("SELECT 1 FROM sample WHERE number = ? AND final = 0", (number,)).fetchone()
+        return found is not None
 
     def _save(self, meta: _Meta) -> None:
-        values = {**asdict(meta), "spool_id": f"{meta.spool_id:016x}"}
-        self._db.executemany("REPLACE INTO meta VALUES (?, ?)", [(key, str(value)) for key, value in values.items()])
+        values = [(key, str(value)) for key, value in asdict(meta).items()]
+        self._db.executemany("REPLACE INTO meta VALUES (?, ?)", values)
+
+    def _save_run(self, run: Run) -> None:
+        values = (run.base, f"{run.spool_id:016x}", run.acknowledged, int(run.closed))
+        self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?)", values)
 
 
 class _transaction:  # noqa: N801 - used like a keyword
-    """All or nothing; an error rolls back and goes on up."""
+    """All or nothing; an error rolls back and goes on up, also one of the commit itself."""
 
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
@@ -251,4 +377,19 @@ class _transaction:  # noqa: N801 - used like a keyword
         self._db.execute("BEGIN IMMEDIATE")
 
     def __exit__(self, kind: object, *_: object) -> None:
-        self._db.execute("ROLLBACK" if kind else "COMMIT")
+        try:
+            if not kind:
+                self._db.execute("COMMIT")
+        finally:
+            if self._db.in_transaction:  # SQLite itself has rolled back after some errors of the disk
+                self._db.execute("ROLLBACK")
+
+
+def _table(rows: Iterable[bytes]) -> Table:
+    return np.frombuffer(b"".join(rows), SAMPLE_DTYPE)
+
+
+def _problem(error: Exception) -> str:
+    if "locked" in str(error):
+        return "another agent is using this spool; stop it, or choose another --spool"
+    return f"is no usable spool: {error}"

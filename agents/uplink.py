@@ -9,15 +9,16 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import zenoh
 
 from agents.spool import Head, Spool
 from protocol import keys
-from protocol.arrays import Table
 from protocol.codec import decode_reply, encode_batch
 from protocol.errors import MessageError, Refusal
 from protocol.messages import Ack, Refused, SampleBatch
@@ -37,15 +38,16 @@ BLOCKING = {
     Refusal.COLUMN_LENGTH,
 }
 PASSING = {Refusal.OVERLOADED, Refusal.STORE}  # the server will take the same batch later
+SHARE = 1 / 3  # of the time-out that an exchange should take: a link that gets twice as slow still answers in time
 
 
 @dataclass(frozen=True)
 class UplinkConfig:
     """How samples are sent.
 
-    batch_samples, max_batch_samples: how many at first and at most; halved on a time-out, doubled on success.
-    timeout_s: how long to wait for an acknowledgement. backoff_s, max_backoff_s: pause after a failure, doubled each
-    time.
+    batch_samples, max_batch_samples: how many at first and at most; halved on a time-out, doubled while exchanges stay
+    short. timeout_s: how long to wait for an acknowledgement; an exchange is kept to about a third of it. backoff_s,
+    max_backoff_s: pause after a failure, doubled each time, of which half to all is taken at random.
     """
 
     batch_samples: int = 200
@@ -62,41 +64,57 @@ class UplinkConfig:
 
 
 class UplinkState:
-    """Decides what to send and what an answer means; no clock, no network."""
+    """Decides what to send and what an answer means; no clock, no network.
 
-    def __init__(self, machine: str, frame: str, spool: Spool, config: UplinkConfig) -> None:
+    held: why nothing is sent although it could be, empty if it is. rng: spreads retries, so that a fleet does not
+    return to a restarted server all at once.
+    """
+
+    def __init__(
+        self, machine: str, frame: str, spool: Spool, config: UplinkConfig, rng: np.random.Generator | None = None
+    ) -> None:
         self.counters: Counter[str] = Counter()
         self.problem = ""
+        self.held = ""
         self._machine = machine
         self._frame = frame
         self._spool = spool
         self._config = config
+        self._rng = rng or np.random.default_rng()
         self._limit = config.batch_samples
         self._has_met = False
         self._failures = 0
         self._head: Head | None = None
 
     def next_payload(self) -> bytes | None:
-        """Bytes of the next batch, None if there is nothing to send. The first one asks for the watermark."""
-        self._head = self._spool.head(self._limit) if self._has_met else None
-        if self._has_met and self._head is None:
-            return None
-        head = self._head
-        if head is None:
-            return self._encode(self._spool.spool_id, 1, empty(), 0)
-        return self._encode(head.spool_id, head.first_seq, head.rows, head.lost_before)
+        """Bytes of the next batch, None if there is nothing to send.
 
-    def on_reply(self, reply: Ack | Refused | None) -> float:
-        """Take in the answer to the last payload, None for none; returns the pause before the next [s]."""
+        Without samples the first one is an empty batch: whether the server takes this machine is known before it has
+        driven.
+        """
+        if self.held:
+            return None
+        self._head = self._spool.head(self._limit)
+        if self._head is None and self._has_met:
+            return None
+        head = self._head or Head(self._spool.spool_id, 1, empty(), 0)
+        return encode_batch(
+            SampleBatch(self._machine, head.spool_id, head.first_seq, head.rows, self._frame, head.lost_before)
+        )
+
+    def on_reply(self, reply: Ack | Refused | None, took_s: float) -> float:
+        """Take in the answer to the last payload, None for none; returns the pause before the next [s].
+
+        took_s: how long the exchange took.
+        """
         if reply is None:
-            self.counters["timeouts"] += 1
-            self.problem = "no answer from the map server"
-            self._limit = max(1, self._limit // 2)
-            return self._back_off()
+            return self._on_silence(took_s)
         if isinstance(reply, Refused):
             return self._on_refused(reply)
-        self._on_ack(reply)
-        self.problem, self._failures = "", 0
+        if not self._on_ack(reply, took_s):
+            self.problem = f"the map server acknowledges {reply.watermark}, which is not what was sent"
+            return self._back_off()
+        self.problem, self._failures, self._has_met = "", 0, True
         return 0.0
 
     def on_disk_error(self, error: Exception) -> float:
@@ -105,31 +123,58 @@ class UplinkState:
         self.problem = f"the spool cannot be used: {error}; look at the machine's disk"
         return self._back_off()
 
-    def _encode(self, spool_id: int, first_seq: int, rows: Table, lost_before: int) -> bytes:
-        return encode_batch(SampleBatch(self._machine, spool_id, first_seq, rows, self._frame, lost_before))
+    def _on_silence(self, took_s: float) -> float:
+        """No server answers at once with nothing; a link that is too slow for the batch uses up the time-out."""
+        if took_s < self._config.timeout_s / 2:
+            self.counters["unanswered"] += 1
+            self.problem = "no map server answers; is one running, and does the router let this machine write?"
+            return self._back_off()
+        self.counters["timeouts"] += 1
+        self.problem = f"no answer from the map server within {self._config.timeout_s:g} s"
+        if self._head and len(self._head.rows):
+            self._limit = max(1, len(self._head.rows) // 2)
+        return self._back_off()
 
-    def _on_ack(self, ack: Ack) -> None:
-        if self._has_met:
-            self.counters["batches"] += 1
-            self._spool.acknowledge(ack.watermark)
-            self._limit = min(self._limit * 2, self._config.max_batch_samples)
-        else:
-            self._has_met = True
-            self.counters["new_spool_ids"] += self._spool.meet(ack.watermark)
+    def _on_ack(self, ack: Ack, took_s: float) -> bool:
+        """Delete what is on the server's disk; returns whether that is at least the first sample of the batch."""
+        head = self._head
+        if head is None:
+            return True
+        if not len(head.rows):  # an earlier run is closed, whatever an older server makes of it
+            self._spool.acknowledge(head.spool_id, max(ack.watermark, head.first_seq - 1))
+            return True
+        if head.spool_id == self._spool.spool_id and ack.watermark > self._spool.newest:
+            # Only a machine that was copied or set back while it ran, memory and all, gives a number twice.
+            self.counters["new_spool_ids"] += 1
+            self._spool.fork()
+            return True
+        if ack.watermark < head.first_seq:
+            return False
+        self.counters["batches"] += 1
+        self._spool.acknowledge(head.spool_id, ack.watermark)
+        self._adapt(len(head.rows), took_s)
+        return True
+
+    def _adapt(self, n: int, took_s: float) -> None:
+        """Fit the size of a batch to the link, by how long one of n samples took."""
+        wanted_s, first = SHARE * self._config.timeout_s, self._config.batch_samples
+        if took_s > wanted_s and n > first:  # smaller than at first only by time-outs: the delay may be the link's own
+            self._limit = max(first, int(n * wanted_s / took_s))
+        elif took_s <= wanted_s / 2:
+            self._limit = min(max(self._limit, 2 * n), self._config.max_batch_samples)
+        elif n < first and took_s < self._config.timeout_s / 2:
+            self._limit = max(self._limit, n + 1 + n // 4)
 
     def _on_refused(self, refused: Refused) -> float:
         self.counters[f"refused_{refused.reason}"] += 1
         self.problem = refused.problem
         if refused.reason in PASSING or refused.reason in BLOCKING:
             return self._back_off()
-        if self._head is None:
+        if self._head is None or not len(self._head.rows):
             return self._back_off()
         if refused.reason == Refusal.GAP:
-            if not 1 <= refused.expected <= self._head.first_seq:
-                return self._back_off()
-            # The server knows less than it once acknowledged (restored from a backup): what it lost is declared lost.
-            self._spool.acknowledge(refused.expected - 1)
-            return 0.0
+            fell = refused.expected >= 1 and self._spool.fall_back(self._head.spool_id, refused.expected - 1)
+            return 0.0 if fell else self._back_off()
         if len(self._head.rows) > 1:  # find the sample that is to blame
             self._limit = len(self._head.rows) // 2
             return 0.0
@@ -139,8 +184,8 @@ class UplinkState:
 
     def _back_off(self) -> float:
         self._failures += 1
-        pause_s: float = self._config.backoff_s * 2 ** min(self._failures - 1, 10)
-        return min(pause_s, self._config.max_backoff_s)
+        pause_s = min(self._config.backoff_s * 2 ** min(self._failures - 1, 10), self._config.max_backoff_s)
+        return float(pause_s * self._rng.uniform(0.5, 1.0))
 
 
 class Uplink:
@@ -171,7 +216,8 @@ class Uplink:
             self._wake.clear()
             try:
                 payload = self.state.next_payload()
-                pause_s = self.state.on_reply(self._ask(payload)) if payload else None
+                start_s = time.monotonic()
+                pause_s = self.state.on_reply(self._ask(payload), time.monotonic() - start_s) if payload else None
             except sqlite3.Error as error:  # a full or failing disk: the samples wait, the agent goes on
                 pause_s = self.state.on_disk_error(error)
             if pause_s is None:
@@ -181,7 +227,10 @@ class Uplink:
 
     def _ask(self, payload: bytes) -> Ack | Refused | None:
         try:
-            for reply in self._session.get(self._key, payload=payload, timeout=self._timeout_s):
+            replies = self._session.get(
+                self._key, payload=payload, timeout=self._timeout_s, priority=zenoh.Priority.DATA_LOW
+            )
+            for reply in replies:
                 if reply.ok is not None:
                     return decode_reply(reply.ok.payload.to_bytes())
         except (zenoh.ZError, MessageError) as error:

@@ -36,8 +36,8 @@ MB = 1e6
 def run(samples: int) -> Result:
     """Write a store of so many samples, in batches of BATCH, and open it; every one is folded into its snapshot.
 
-    The row: open_s of the store alone, open_cpu_s on the CPU (less, where others work as well), process_s with the start
-    of Python and its imports, and the sizes on disk.
+    The row: open_s of the store alone, open_cpu_s on the CPU (less, where others work as well), process_s with the
+    start of Python and its imports, and the sizes on disk.
     """
     rows = -(-samples // BATCH)
     with tempfile.TemporaryDirectory() as path:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,9 +18,12 @@ from agents.audit import read_audit
 from mapserver import evidence as ev
 from mapserver import snapshot
 from mapserver.config import ServerConfig
+from mapserver.decisions import KIND as TRUST
+from mapserver.decisions import Decisions
 from mapserver.grid import Grid, GridState, Placed
-from mapserver.journal import Journal, JournalRow
+from mapserver.journal import JournalReader, JournalRow
 from mapserver.pages import Page
+from mapserver.past import History, history_rows
 from mapserver.store import JOURNAL_FILE
 from protocol.arrays import Ints
 from protocol.samples import content_hash
@@ -33,9 +36,10 @@ Identity = tuple[str, int, int]  # machine, spool_id, seq
 class AuditResult:
     """What became of the recorded samples.
 
-    recorded: in the audit files; merged: voted in the grid, or journalled but too unsure of their place to vote. lost:
-    recorded, but not in the journal with the same content, or missing in the grid; double: more than once in the
-    journal, by identity or by content, or too often in the grid. unrecorded: in the journal, but in no audit file.
+    recorded: in the audit files; merged: voted in the grid, or journalled but too unsure of their place to vote, or of
+    a machine that is not trusted. lost: recorded, but not in the journal with the same content, or missing in the grid;
+    double: more than once in the journal, by identity or by content, or too often in the grid. unrecorded: in the
+    journal, but in no audit file.
     """
 
     recorded: int
@@ -56,25 +60,32 @@ def read_audits(audits: Mapping[str, Path]) -> dict[Identity, str]:
 
 def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, config: ServerConfig) -> AuditResult:
     """Compare audit files with the store of a server that has ended."""
-    journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
-    try:
-        rows = list(journal.read())
-    finally:
-        journal.close()
+    with JournalReader(folder / JOURNAL_FILE) as journal:
+        rows = list(history_rows(History.of(journal)))
+        left_out = Decisions(journal.events(TRUST)).distrusted
     last = rows[-1].row if rows else 0
-    _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold)
-    return compare(read_audits(audits), rows, grid, site, config)
+    _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, left_out)
+    return compare(read_audits(audits), rows, grid, site, config, left_out)
 
 
 def compare(
-    recorded: Mapping[Identity, str], rows: Iterable[JournalRow], grid: Grid, site: SiteConfig, config: ServerConfig
+    recorded: Mapping[Identity, str],
+    rows: Iterable[JournalRow],
+    grid: Grid,
+    site: SiteConfig,
+    config: ServerConfig,
+    left_out: Collection[str] = (),
 ) -> AuditResult:
-    """Compare recorded samples with journal rows, and those, folded again, with a grid."""
+    """Compare recorded samples with journal rows, and those, folded again, with a grid; left_out: of the grid."""
+    withheld = 0
     refolded = Grid(site.cell_m, config.fold)
     found: dict[Identity, list[str]] = {}
     contents: Counter[tuple[str, str]] = Counter()
     for row in rows:
-        refolded.fold(row.rows, row.machine)
+        if row.machine in left_out:
+            withheld += len(row.rows)
+        else:
+            refolded.fold(row.rows, row.machine)
         for i, sample in enumerate(row.rows):
             content = content_hash(sample)
             found.setdefault((row.machine, row.spool_id, row.first_seq + i), []).append(content)
@@ -85,7 +96,7 @@ def compare(
     short, over = grid_difference(refolded.state(), grid.state())
     return AuditResult(
         recorded=len(recorded),
-        merged=grid.folded + grid.skipped,
+        merged=grid.folded + grid.skipped + withheld,
         lost=lost + short,
         double=max(by_identity, by_content) + over,
         unrecorded=sum(identity not in recorded for identity in found),

@@ -105,8 +105,10 @@ def credible(changed: Bools, kind: Floats, now: Floats, cell_m: float, config: C
 
 def _opened(cells: Bools, edge: int) -> Bools:
     """Those that lie in a square of `edge` cells, all of which are set."""
-    square = np.ones((edge, edge), np.uint8)
-    return np.asarray(cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_OPEN, square, borderValue=0) > 0, np.bool_)
+    square, last = np.ones((edge, edge), np.uint8), edge - 1
+    # not MORPH_OPEN, which moves what it opens by a cell where the edge is even
+    corners = cv2.erode(cells.astype(np.uint8), square, anchor=(0, 0), borderValue=0)
+    return np.asarray(cv2.dilate(corners, square, anchor=(last, last), borderValue=0) > 0, np.bool_)
 
 
 def _histograms(pages: Sequence[TimedPage]) -> AnyArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from argparse import Namespace
+from contextlib import ExitStack
 
 import zenoh
 
@@ -13,12 +14,15 @@ from agents.config import AgentConfig, load_agent
 from agents.drivers import Driver
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
-from protocol.errors import ConfigError
+from agents.presence import Owner, find_namesake, this_process, wait_for_link
+from protocol.errors import ConfigError, LinkError
 from protocol.logfolder import LogFolder, open_log
 from protocol.machine import MachineConfig
 from protocol.session import SessionConfig, open_session
 from protocol.site import SiteConfig, load_site
 from sitegrid.process import note, plain, say, stop_flag
+
+LINK_S = 1.0  # how long to wait for the router before starting without it
 
 
 def run(arguments: Namespace) -> int:
@@ -27,15 +31,24 @@ def run(arguments: Namespace) -> int:
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
     site, machine, config = _configure(arguments, log)
     session = open_session(SessionConfig(arguments.endpoint, wait_s=-1))
-    agent = Agent(session, site, machine, config, _places(arguments), withhold=arguments.withhold)
-    say({"ready": "agent", "machine": machine.name, "site": site.name})
-    try:
+    with ExitStack() as opened:
+        opened.callback(session.close)
+        owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
+        agent = Agent(session, site, machine, config, _places(arguments), withhold=arguments.withhold, owner=owner)
+        opened.callback(agent.close)
+        say({"ready": "agent", "machine": machine.name, "site": site.name})
         report = agent.run(_driver(arguments, log, session, site, machine), stop.is_set, wait=stop.wait)
-    finally:
-        agent.close()
-        session.close()  # type: ignore[no-untyped-call]
     say({"ended": plain(report)}) if arguments.json else note(_summary(machine, report))
     return 0 if report["delivered"] or stop.is_set() else 1
+
+
+def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) -> Owner:
+    """Refuse to start beside a live agent of the same name; without a router that shows later, and this one waits."""
+    owner = this_process()
+    if wait_for_link(session, LINK_S) and (other := find_namesake(session, site, machine)):
+        problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"
+        raise LinkError(endpoint, problem)
+    return owner
 
 
 def _places(arguments: Namespace) -> Places:

@@ -16,6 +16,8 @@ from sitegrid.client import Client, connect
 from sitegrid.process import plain, say, stop_flag, wait
 from sitegrid.times import SiteTime, told
 
+HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of a table for people, unless named
+
 
 def run(arguments: Namespace) -> int:
     """Ask once and print the answer; changes, while they are followed, until stopped."""
@@ -59,6 +61,7 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> No
 
 
 def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> None:
+    layers = layers or (() if arguments.json else HISTORY_LAYERS)
     times = _stamps(client, **{"from": arguments.from_time, "to": arguments.to_time})
     spans = client.history(arguments.x_m, arguments.y_m, layers, **times, span_s=arguments.span, after=arguments.after)
     if arguments.json:

@@ -348,7 +348,12 @@ def test_so_many_spans_are_kept_apart(option, pages):
     keeps = {"keep_buckets": 1, "keep_hours": 2, "keep_days": 2} | {option: max(pages)}
     found = folded(samples(len(stamps), stamp_ns=stamps, cov_xx_m2=0, cov_yy_m2=0), **keeps).state().pages
     rungs = [at.rung for at in found]
-    assert [rungs.count(rung) for rung in range(4)] == [keeps["keep_buckets"], keeps["keep_hours"], keeps["keep_days"], 1]
+    assert [rungs.count(rung) for rung in range(4)] == [
+        keeps["keep_buckets"],
+        keeps["keep_hours"],
+        keeps["keep_days"],
+        1,
+    ]
 
 
 def test_space_of_the_hot_blocks_is_obeyed():
@@ -412,7 +417,9 @@ def test_least_floor_keeps_every_admitted_covariance_invertible():
     assert (a * c > b * b / 4).all()
 
 
-@pytest.mark.xfail(strict=True, reason="std_cap_m above 1000 times std_floor_m: a negative distance, and a crash in numba")
+@pytest.mark.xfail(
+    strict=True, reason="std_cap_m above 1000 times std_floor_m: a negative distance, and a crash in numba"
+)
 def test_every_admitted_option_keeps_every_admitted_covariance_invertible():
     xx = np.linspace(1.0, 449.9, 50)  # along the diagonal, twice as much
     rows = samples(50, cov_xx_m2=xx, cov_yy_m2=xx, cov_xy_m2=xx * (1 + 4e-7))

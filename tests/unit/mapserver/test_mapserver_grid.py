@@ -212,7 +212,9 @@ def test_a_sample_that_adds_nothing_touches_nothing():
 
 
 def test_pages_are_counted():
-    grid = folded(samples(3, x_m=[8.5, 40.5, 40.5], cov_xx_m2=0, cov_yy_m2=0, stamp_ns=NOW_NS + np.array([0, 0, 3600]) * 10**9))
+    grid = folded(
+        samples(3, x_m=[8.5, 40.5, 40.5], cov_xx_m2=0, cov_yy_m2=0, stamp_ns=NOW_NS + np.array([0, 0, 3600]) * 10**9)
+    )
     assert grid.known_cells() == 2
     assert grid.page_count() == len(grid.state().pages) == 3
 

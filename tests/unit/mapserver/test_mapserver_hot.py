@@ -71,7 +71,7 @@ def test_draining_gives_what_was_written_and_forgets_it():
     assert page.cells["bits"].tolist() == [[0, 3]]
     assert (len(hot), hot.room, hot.load) == (0, 3, 0)
     assert found(hot, [11, 22, 33]) == [FREE] * 3
-    assert not (hot.counts.any() or hot.bitmaps.any() or hot.newest.any())
+    assert not any(array.any() for array in (hot.counts, hot.bitmaps, hot.newest))
 
 
 def test_blocks_open_in_later_rounds_are_empty():

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -115,7 +117,7 @@ def test_pages_lie_in_their_spans_and_in_the_order_of_time(buckets, a, b, c):
         stamps = one.page.cells["newest_ns"]
         assert one.first_ns <= stamps.min()
         assert stamps.max() < one.end_ns
-    for one, other in zip(timed, timed[1:], strict=False):
+    for one, other in pairwise(timed):
         assert one.page.cells["newest_ns"].max() < other.page.cells["newest_ns"].min()
 
 

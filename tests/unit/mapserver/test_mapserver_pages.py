@@ -52,7 +52,7 @@ def test_packing_leaves_nothing_behind():
     counts, bitmaps = dense({3: 7, 300: 2}).reshape(ev.COUNTS, ev.CELLS), np.ones((2, ev.CELLS), np.uint64)
     newest_ns = np.ones(ev.CELLS, np.int64)
     pack(counts, bitmaps, newest_ns)
-    assert not (counts.any() or bitmaps.any() or newest_ns.any())
+    assert not any(array.any() for array in (counts, bitmaps, newest_ns))
 
 
 @settings(max_examples=60)
@@ -61,7 +61,7 @@ def test_both_ways_to_pack_agree_to_the_bit(places):
     first, second = dense(places), dense(places)
     one, other = module._take(first), take_numpy(second)
     assert (one.dtype, one.tobytes()) == (other.dtype, other.tobytes())
-    assert not (first.any() or second.any())
+    assert not any(array.any() for array in (first, second))
 
 
 @settings(max_examples=60)

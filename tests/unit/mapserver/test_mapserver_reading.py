@@ -30,7 +30,9 @@ def repaved(west: float, south: float, size: int, **options: int) -> Grid:
     grid = Grid(1.0, FoldConfig(**options))
     for hour in range(PASSES):
         rows = lane(hour, -32, -32, 64, 64, c_rr=OLD)
-        inside = (np.abs(rows["x_m"] - west - size / 2) < size / 2) & (np.abs(rows["y_m"] - south - size / 2) < size / 2)
+        inside = (np.abs(rows["x_m"] - west - size / 2) < size / 2) & (
+            np.abs(rows["y_m"] - south - size / 2) < size / 2
+        )
         rows["c_rr"][inside & (hour == PASSES - 1)] = NEW
         grid.fold(rows, "a")
     return grid
@@ -154,6 +156,26 @@ def test_of_two_changes_the_last_counts_and_dates():
     assert np.allclose(resistance(found)[inside], 0.01, rtol=0.1)
     assert (found.changed_ns[inside] >= NOW_NS + 3 * HOUR_NS).all()
     assert (found.changed_ns[inside] <= NOW_NS + 4 * HOUR_NS).all()
+
+
+@pytest.mark.parametrize(
+    "days",
+    [
+        0,
+        pytest.param(
+            1, marks=pytest.mark.xfail(strict=True, reason="old and new evidence of one day are summed into one page")
+        ),
+    ],
+)
+def test_a_change_stays_found_where_the_rest_of_its_block_is_driven_on(days):
+    """Pages are summed by what the block has seen since, not by what the cell has."""
+    grid = Grid(1.0, FoldConfig())
+    for hour, c_rr in [(0, OLD), (1, OLD), (2, OLD), (5, NEW)]:
+        grid.fold(lane(hour, 0, 0, 10, 10, c_rr=c_rr), "a")
+    for day in range(days + 1):
+        for hour in range(6, 13):
+            grid.fold(lane(24 * day + hour, 0, 12, 16, 2, c_rr=0.06), "b")
+    assert np.allclose(resistance(read(grid))[area(1, 1, 8)], NEW, rtol=0.05)
 
 
 def test_late_samples_of_the_time_before_the_change_are_left_out_too():

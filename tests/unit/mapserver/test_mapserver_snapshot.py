@@ -100,7 +100,14 @@ def test_a_snapshot_of_another_schema_is_passed_over(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "change",
-    [{"bucket_s": 60.0}, {"std_floor_m": 0.4}, {"std_cap_m": 2.0}, {"keep_buckets": 5}, {"keep_hours": 5}, {"keep_days": 5}],
+    [
+        {"bucket_s": 60.0},
+        {"std_floor_m": 0.4},
+        {"std_cap_m": 2.0},
+        {"keep_buckets": 5},
+        {"keep_hours": 5},
+        {"keep_days": 5},
+    ],
 )
 def test_a_snapshot_of_other_parameters_is_passed_over(tmp_path, change):
     path = save(tmp_path, 1)
@@ -232,7 +239,7 @@ def test_parts_folded_in_processes_of_their_own_are_the_fold_of_everything(tmp_p
     for machine, of_machine in rows.items():
         of_machine["stamp_ns"] += np.arange(90) % 30 * 9 * 3600 * 10**9
         np.save(tmp_path / f"{machine}.npy", of_machine)
-    kinds, children = [("numba", 1), ("numpy", 5), ("numba", 512)], []
+    kinds, children = [("numba", 1), ("numpy", 64), ("numba", 512)], []
     for part, (kernel, hot_blocks) in enumerate(kinds):
         (folder := tmp_path / str(part)).mkdir()
         words = [sys.executable, "-c", FOLD_A_PART, folder, str(part), kernel, str(hot_blocks)]

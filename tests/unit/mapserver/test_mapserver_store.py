@@ -174,7 +174,35 @@ def test_a_damaged_journal_is_named_at_the_start(tmp_path):
         open_store(tmp_path)
 
 
-# --- kill and replay ---------------------------------------------------------------------------------------------------
+@pytest.mark.xfail(strict=True, reason="the snapshot that was being written says it is the newest, of other machines")
+def test_a_grid_adopted_while_a_snapshot_is_written_gets_one_of_its_own(tmp_path):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(3)), incoming(samples(3), machine="b")])
+    write = store.snapshot()
+    store.adopt(folded(samples(3)), store.merged, frozenset({"b"}))
+    write()
+    store.save_snapshot()
+    found = snapshot.load_newest(tmp_path, store.merged, SITE.cell_m, store.config.fold, {"b"})
+    store.close()
+    assert found[0] == 2
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_an_adopted_grid_takes_what_came_since_without_those_left_out(tmp_path, row):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(3)), incoming(samples(3), machine="b"), incoming(samples(5), 4)])
+    store.adopt(folded(samples(3 * row)), row, frozenset({"b"}))
+    expected = folded(samples(3))
+    expected.fold(samples(5), "a")
+    assert same(store.grid, expected)
+    store.take([incoming(samples(1), 4, machine="b"), incoming(samples(2), 9)])
+    expected.fold(samples(2), "a")
+    assert same(store.grid, expected)
+    assert (store.merged, store.journalled) == (5, 5)
+    store.close()
+
+
+# --- kill and replay -------------------------------------------------------------------------------------------------
 
 # Takes batches of 20 samples; in the fold of number `stuck`, half of it lies in the hot blocks, and nothing goes on.
 TAKES = """
@@ -217,13 +245,13 @@ def taking(folder, stuck: int, saved: int) -> Iterator[subprocess.Popen]:
         child.stdout.close()
 
 
-@pytest.mark.parametrize(("stuck", "saved"), [(1, 9), (7, 9), (7, 4), (7, 6)])
+@pytest.mark.parametrize(("stuck", "saved"), [(1, 9), (7, 9), (7, 4)])
 def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, saved):
     rows = random_samples(200, 12)
     np.save(tmp_path / "rows.npy", rows)
     with taking(tmp_path, stuck, saved) as child:
         lines = iter(child.stdout.readline, "")
-        heard = [line for line in iter(lambda: next(lines), "folding\n")]
+        heard = list(iter(lambda: next(lines), "folding\n"))
         assert heard == [f"taken {i + 1}\n" for i in range(stuck - 1)]
         with pytest.raises(StoreError, match="another server"):
             open_store(tmp_path / "store")

@@ -1,0 +1,256 @@
+"""Times on the command line, and the questions about the past that they are for."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.errors import ConfigError
+from protocol.geometry import Bounds
+from protocol.parameters import split_selector
+from protocol.queries import (
+    Freshness,
+    HistoryAnswer,
+    HistoryQuery,
+    InfoQuery,
+    MapQuery,
+    PointAnswer,
+    PointQuery,
+    Region,
+    RegionQuery,
+    Span,
+    When,
+    encode_history,
+    encode_info,
+    encode_point,
+    encode_region,
+    parse_query,
+)
+from protocol.readings import MAX_STAMP_NS
+from sitegrid.cli import main
+from sitegrid.client import PAST_S, Client
+from sitegrid.commands import query
+from sitegrid.times import SiteTime, parse_time, told
+
+T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
+S = 10**9
+
+
+class Session:
+    """Stands for a Zenoh session: answers queries from a table, and notes them and their time-outs."""
+
+    def __init__(self, now_ns: int = T0) -> None:
+        self.asked: list[MapQuery] = []
+        self.timeouts: list[float] = []
+        self.now_ns = now_ns
+
+    def get(self, selector: zenoh.Selector, timeout: float) -> list[Any]:
+        name = str(selector.key_expr).rsplit("/", 1)[-1]
+        parsed = parse_query(name, split_selector(str(selector.parameters)))
+        self.asked.append(parsed)
+        self.timeouts.append(timeout)
+        return [Reply(self._answer(parsed))]
+
+    def close(self) -> None: ...
+
+    def _answer(self, asked: MapQuery) -> bytes:
+        if isinstance(asked, InfoQuery):
+            return encode_info({"stamp_ns": self.now_ns})
+        if isinstance(asked, HistoryQuery):
+            first = Span(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
+            spans = (first, Span(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
+            return encode_history(HistoryAnswer(0.5, 1.5, () if asked.x_m < 0 else spans, 17, T0))
+        assert isinstance(asked, PointQuery | RegionQuery)
+        stamp_ns = asked.when.as_of_ns or self.now_ns
+        if isinstance(asked, PointQuery):
+            return encode_point(PointAnswer(0.5, 1.5, {"visits": 2.0}, 17, stamp_ns))
+        layers = {"visits": np.ones((1, 1), np.float32)}
+        return encode_region(Region(np.array([0.5]), np.array([1.5]), 1.0, layers, 17, stamp_ns))
+
+
+class Reply:
+    def __init__(self, data: bytes) -> None:
+        self.ok = self.payload = self
+        self.err = None
+        self.to_bytes = lambda: data
+
+
+@pytest.fixture
+def session(monkeypatch: pytest.MonkeyPatch) -> Session:
+    session = Session()
+    monkeypatch.setattr(query, "connect", lambda endpoint, site: Client(session, endpoint, site))  # type: ignore[arg-type]
+    return session
+
+
+# --- times -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "ns"),
+    [
+        ("2025-06-15T15:06:40", T0),  # without a zone: UTC
+        ("2025-06-15 15:06:40Z", T0),
+        ("2025-06-15T17:06:40+02:00", T0),
+        ("2025-06-15T15:06:40.000001", T0 + 1000),
+        ("2025-06-15", T0 - (15 * 3600 + 6 * 60 + 40) * S),
+        (str(T0 + 1), T0 + 1),
+        ("1", 1),
+    ],
+)
+def test_a_time_is_iso_or_a_stamp(text: str, ns: int):
+    assert parse_time(text) == SiteTime(ns)
+
+
+@pytest.mark.parametrize(
+    ("text", "s"), [("-90s", 90), ("-30m", 1800), ("-2h", 7200), ("-1.5h", 5400), ("-3d", 259_200), ("-0s", 0)]
+)
+def test_a_time_may_count_back_from_the_sites_now(text: str, s: int):
+    time = parse_time(text)
+    assert time == SiteTime(-s * S, from_now=True)
+    assert time.stamp("--as-of", lambda: T0) == T0 - s * S
+
+
+@given(st.integers(S, MAX_STAMP_NS))
+def test_every_stamp_is_a_time_and_is_told_to_the_second(ns: int):
+    assert parse_time(str(ns)).stamp("--as-of", lambda: pytest.fail("not needed")) == ns
+    assert parse_time(told(ns)).ns == ns // S * S
+
+
+def test_a_stamp_is_told_for_people():
+    assert (told(T0 + 999_999_999), told(0)) == ("2025-06-15 15:06:40Z", "never")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("yesterday", "'yesterday' is no time: ISO 8601"),
+        ("", "'' is no time"),
+        ("2h", "'2h' is no time"),
+        ("-2", "'-2' is no time"),
+        ("-2w", "'-2w' is no time"),
+        ("2025-13-01", "is no time"),
+        ("0", "0 is not between the years 1970 and 2100"),
+        ("1969-12-31", "is not between"),
+        ("2101-01-01", "is not between"),
+        ("9" * 20, "is not between"),
+        ("9" * 5000, "is no time"),
+    ],
+)
+@pytest.mark.parametrize(("option", "ask"), [("--as-of", "point"), ("--to", "history")])
+def test_a_bad_time_is_a_usage_error_that_names_its_option(
+    capsys: pytest.CaptureFixture[str], text: str, words: str, option: str, ask: str
+):
+    with pytest.raises(SystemExit) as end:
+        main(["query", ask, "1", "2", option, text])
+    assert end.value.code == 2
+    err = capsys.readouterr().err
+    assert f"argument {option}: " in err
+    assert words in err
+
+
+def test_a_time_that_cannot_be_counted_names_its_option(session: Session, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(ConfigError, match="--minus: so long before the site's now, 2025-06-15 15:06:40Z, is before"):
+        parse_time("-99999d").stamp("--minus", lambda: T0)
+    session.now_ns = 0
+    assert main(["query", "point", "1", "2", "--as-of", "-2h"]) == 1
+    assert "sitegrid: --as-of: the site has no samples yet" in capsys.readouterr().err
+
+
+# --- questions -------------------------------------------------------------------------------------------------------
+
+
+def test_point_and_region_are_asked_as_of_a_time_and_less_another(session: Session):
+    times = ["--as-of", "2025-06-15T15:00:00", "--minus", "-2h"]
+    assert main(["query", "--after", "3", "--layers", "visits", "point", "-500", "-2.5", *times]) == 0
+    assert main(["query", "region", "-5", "0", "1", "2", *times]) == 0
+    when = When(T0 - 400 * S, T0 - 7200 * S)
+    point, region = (asked for asked in session.asked if not isinstance(asked, InfoQuery))
+    assert point == PointQuery(-500.0, -2.5, ("visits",), Freshness(3), when)
+    assert region == RegionQuery(Bounds(-5, 0, 1, 2), when=when)
+
+
+def test_without_times_the_map_is_asked_as_it_is(session: Session):
+    main(["query", "point", "1", "2"])
+    main(["query", "region", "0", "0", "1", "2"])
+    assert session.asked == [PointQuery(1.0, 2.0), RegionQuery(Bounds(0, 0, 1, 2))]
+    assert session.timeouts == [10.0, 10.0]
+
+
+def test_a_history_is_asked_with_its_times(session: Session):
+    assert main(["query", "--layers", "a,b", "history", "1", "-2"]) == 0
+    times = ["--from", "-1h", "--to", str(T0), "--span", "60"]
+    assert main(["query", "history", "1", "-2", *times]) == 0
+    assert session.asked[0] == HistoryQuery(1.0, -2.0, ("a", "b"))
+    assert session.asked[2] == HistoryQuery(1.0, -2.0, query.HISTORY_LAYERS, T0 - 3600 * S, T0, 60.0)
+    assert main(["query", "history", "1", "-2", "--json"]) == 0
+    assert session.asked[3] == HistoryQuery(1.0, -2.0)  # all layers, which no terminal is wide enough for
+    with pytest.raises(SystemExit):
+        main(["query", "history", "1", "2", "--span", "0"])
+
+
+def test_answers_that_are_folded_first_are_waited_for_longer(session: Session):
+    client = Client(session, "tcp/x", "pit", timeout_s=1.0)  # type: ignore[arg-type]
+    client.point(0, 0)
+    client.point(0, 0, after=3, wait_s=5.0)
+    client.point(0, 0, as_of_ns=T0)
+    client.region((0, 0, 1, 1), minus_ns=T0)
+    client.history(0, 0, after=3, wait_s=5.0)
+    assert session.timeouts == [1, 6, 1 + PAST_S, 1 + PAST_S, 6 + PAST_S]
+
+
+def test_the_python_client_passes_every_argument(session: Session):
+    client = Client(session, "tcp/x", "pit")  # type: ignore[arg-type]
+    fresh = Freshness(3, 4.0)
+    client.point(1, 2, ["a"], as_of_ns=5, minus_ns=6, after=3, wait_s=4.0)
+    client.region((0, 1, 2, 3), ["a"], as_of_ns=5, minus_ns=6, after=3, wait_s=4.0)
+    spans = client.history(1, 2, ["a"], from_ns=5, to_ns=6, span_s=7.0, after=3, wait_s=4.0)
+    assert session.asked == [
+        PointQuery(1.0, 2.0, ("a",), fresh, When(5, 6)),
+        RegionQuery(Bounds(0, 1, 2, 3), ("a",), fresh, When(5, 6)),
+        HistoryQuery(1.0, 2.0, ("a",), 5, 6, 7.0, fresh),
+    ]
+    assert [span.first_ns for span in spans] == [T0, T0 + 300 * S]
+
+
+def test_people_see_the_time_of_an_answer(session: Session, capsys: pytest.CaptureFixture[str]):
+    def first_line(*words: str) -> str:
+        assert main(["query", *words]) == 0
+        return capsys.readouterr().out.splitlines()[0]
+
+    assert first_line("point", "1", "2") == "cell at 0.5, 1.5 m"
+    as_of, minus = ["--as-of", str(T0 - 40 * S)], ["--minus", str(T0 - 100 * S)]
+    assert first_line("point", "1", "2", *as_of) == "cell at 0.5, 1.5 m, as of 2025-06-15 15:06:00Z"
+    assert first_line("point", "1", "2", *minus) == "cell at 0.5, 1.5 m, minus that of 2025-06-15 15:05:00Z"
+    line = first_line("region", "0", "1", "1", "2", *as_of, *minus)
+    assert "as of 2025-06-15 15:06:00Z, minus that of 2025-06-15 15:05:00Z, journal row 17" in line
+
+
+def test_machines_see_stamps(session: Session, capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    main(["query", "point", "1", "2", "--as-of", "-1h", "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == {"x_m": 0.5, "y_m": 1.5, "visits": 2.0, "merged": 17, "stamp_ns": T0 - 3600 * S}
+    main(["query", "region", "0", "1", "1", "2", "--as-of", "-1h", "--json", "--out", str(tmp_path / "a.npz")])
+    assert json.loads(capsys.readouterr().out)["stamp_ns"] == T0 - 3600 * S
+    assert np.load(tmp_path / "a.npz")["visits"].tolist() == [[1.0]]
+    main(["query", "history", "1", "2", "--json"])
+    spans = json.loads(capsys.readouterr().out)["spans"]
+    assert spans[0] == {"first_ns": T0, "last_ns": T0 + 299, "resistance": 0.25, "age_s": None}
+
+
+def test_a_history_is_a_table_for_people(session: Session, capsys: pytest.CaptureFixture[str]):
+    main(["query", "history", "1", "2"])
+    assert capsys.readouterr().out.splitlines() == [
+        "from (UTC)            resistance  age_s",
+        "2025-06-15 15:06:40Z  0.25        unknown",
+        "2025-06-15 15:11:40Z  0.5         3",
+    ]
+    main(["query", "history", "-1", "2"])
+    assert capsys.readouterr().out == "nobody was there\n"

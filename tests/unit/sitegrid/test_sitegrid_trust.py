@@ -1,0 +1,305 @@
+"""Machines, trust and changes from Python and from the command line."""
+
+from __future__ import annotations
+
+import json
+import threading
+from argparse import Namespace
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import zenoh
+
+from protocol import keys
+from protocol.admin import TrustCommand, parse_command
+from protocol.errors import QueryError, Refusal
+from protocol.parameters import split_selector
+from protocol.queries import (
+    ChangesQuery,
+    Freshness,
+    MachinesQuery,
+    encode_change,
+    encode_changes,
+    encode_error,
+    encode_machine,
+    encode_machines,
+    parse_query,
+)
+from protocol.session import SessionConfig, free_endpoint, open_session
+from sitegrid.cli import build_parser, main
+from sitegrid.client import Client, connect
+from sitegrid.commands import query
+
+WAIT_S = 20.0
+T0 = 1_750_000_000_000_000_000
+MACHINES = [
+    {"name": "a", "trusted": True, "by": "", "reasons": [], "since_ns": 0, "samples": 1200, "lost": 3, "newest_ns": T0},
+    {
+        "name": "b",
+        "trusted": False,
+        "by": "audit",
+        "reason": "",
+        "reasons": ["gain"],
+        "since_ns": T0 + 60 * 10**9,
+        "samples": 7,
+        "lost": 0,
+        "newest_ns": T0,
+    },
+]
+CHANGE = {
+    "id": 4,
+    "first_ns": T0,
+    "last_ns": T0 + 60 * 10**9,
+    "bounds": [10.0, -20.0, 40.0, 12.5],
+    "cells": 615,
+    "resistance_before": 0.25,
+    "resistance_after": 0.008,
+    "grade_before": None,
+    "grade_after": None,
+}
+
+
+class FakeServer:
+    """Answers machines, changes and trust on a router of its own, and notes what it was asked."""
+
+    def __init__(self) -> None:
+        self.endpoint = free_endpoint()
+        self.session = open_session(SessionConfig(self.endpoint, mode="router"))
+        self.asked: list[object] = []
+        self._queryables = [
+            self.session.declare_queryable(keys.map_queries_all("pit"), self._on_query),
+            self.session.declare_queryable(keys.admin_all("pit"), self._on_command),
+        ]
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        with query:
+            parsed = parse_query(keys.query_of(str(query.key_expr)), split_selector(str(query.parameters)))
+            self.asked.append(parsed)
+            machines = isinstance(parsed, MachinesQuery)
+            query.reply(query.key_expr, encode_machines(MACHINES) if machines else encode_changes([CHANGE]))
+
+    def _on_command(self, query: zenoh.Query) -> None:
+        with query:
+            command = parse_command(keys.query_of(str(query.key_expr)), split_selector(str(query.parameters)))
+            self.asked.append(command)
+            if command.machine == "nobody":
+                query.reply_err(encode_error(QueryError(Refusal.UNKNOWN_MACHINE, "machine `nobody` is not known")))
+                return
+            row = {"name": command.machine, "trusted": command.trusted is not False, "merged": 17}
+            query.reply(query.key_expr, encode_machine(row))
+
+    def publish(self, payload: bytes) -> None:
+        self.session.put(keys.changed("pit"), payload)
+
+    def close(self) -> None:
+        for queryable in self._queryables:
+            queryable.undeclare()
+        self.session.close()
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[FakeServer]:
+    server = FakeServer()
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def server(running: FakeServer) -> FakeServer:
+    running.asked.clear()
+    return running
+
+
+@pytest.fixture
+def client(server: FakeServer) -> Iterator[Client]:
+    with connect(server.endpoint, "pit") as client:
+        yield client
+
+
+def sitegrid(server: FakeServer, *words: str) -> int:
+    noun, *rest = words
+    return main([noun, "--endpoint", server.endpoint, "--site", "pit", *rest])
+
+
+# --- from Python -----------------------------------------------------------------------------------------------------
+
+
+def test_commands_say_what_was_meant(server: FakeServer, client: Client):
+    assert client.trust("a") == {"name": "a", "trusted": True, "merged": 17}
+    assert client.distrust("a", "gain; x=1.6", wait_s=3.0)["trusted"] is False
+    client.judge_automatically("a", wait_s=4.0)
+    client.trust("a", "checked")
+    assert server.asked == [
+        TrustCommand("a", True),
+        TrustCommand("a", False, "gain; x=1.6", 3.0),
+        TrustCommand("a", None, "", 4.0),
+        TrustCommand("a", True, "checked"),
+    ]
+    with pytest.raises(QueryError, match="`nobody` is not known") as caught:
+        client.trust("nobody")
+    assert caught.value.reason == Refusal.UNKNOWN_MACHINE
+
+
+def test_machines_and_changes_are_plain_tables(server: FakeServer, client: Client):
+    assert client.machines(after=3, wait_s=1.0) == MACHINES
+    assert client.changes() == client.changes(after=3) == [CHANGE]
+    assert server.asked == [MachinesQuery(Freshness(3, 1.0)), ChangesQuery(0), ChangesQuery(3)]
+
+
+class Heard:
+    """A callback that notes what it is called with."""
+
+    def __init__(self) -> None:
+        self.events: list[dict[str, Any]] = []
+        self._more = threading.Condition()
+
+    def __call__(self, event: dict[str, Any]) -> None:
+        with self._more:
+            self.events.append(event)
+            self._more.notify_all()
+        if event.get("broken"):
+            raise RuntimeError("a bug in a callback")
+
+    def wait(self, n: int) -> list[dict[str, Any]]:
+        with self._more:
+            assert self._more.wait_for(lambda: len(self.events) >= n, WAIT_S)
+            return list(self.events)
+
+
+def test_a_change_calls_back_until_it_is_closed(server: FakeServer, client: Client):
+    heard, other = Heard(), Heard()
+    listener = client.on_change(heard)
+    client.on_change(other)
+    client.changes()  # the server knows of the subscription with this answer
+    for payload in (b"no message", encode_change({"broken": True}), encode_change(CHANGE)):
+        server.publish(payload)
+    assert heard.wait(2) == [{"broken": True}, CHANGE]
+    listener.close()
+    listener.close()
+    server.publish(encode_change({"id": 5}))
+    assert other.wait(3)[2] == {"id": 5}
+    assert len(heard.events) == 2
+
+
+def test_a_slow_callback_stalls_nothing(server: FakeServer, client: Client):
+    entered, release = threading.Event(), threading.Event()
+    quick = Heard()
+
+    def slow(_: object) -> None:
+        entered.set()
+        release.wait(WAIT_S)
+
+    client.on_change(slow)
+    client.on_change(quick)
+    client.changes()
+    for i in range(600):  # more than Zenoh holds for a callback
+        server.publish(encode_change({"id": i}))
+    assert entered.wait(WAIT_S)
+    assert [event["id"] for event in quick.wait(600)] == list(range(600))
+    assert client.changes() == [CHANGE]
+    release.set()
+
+
+def test_a_callback_may_close_its_own_listener(server: FakeServer, client: Client):
+    closed = threading.Event()
+
+    def once(_: object) -> None:
+        listener.close()
+        closed.set()
+
+    listener = client.on_change(once)
+    client.changes()
+    server.publish(encode_change(CHANGE))
+    assert closed.wait(WAIT_S)
+
+
+# --- from the command line -------------------------------------------------------------------------------------------
+
+
+def test_trust_and_distrust_reach_the_server(server: FakeServer, capsys: pytest.CaptureFixture[str]):
+    assert sitegrid(server, "distrust", "b", "--reason", "hit a wall; 3 m off", "--wait", "5") == 0
+    assert capsys.readouterr().out == "b is left out of the map, as of journal row 17\n"
+    assert sitegrid(server, "trust", "b") == 0
+    assert capsys.readouterr().out == "b is trusted, as of journal row 17\n"
+    assert sitegrid(server, "trust", "b", "--auto", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"name": "b", "trusted": True, "merged": 17}
+    assert server.asked == [
+        TrustCommand("b", False, "hit a wall; 3 m off", 5.0),
+        TrustCommand("b", True),
+        TrustCommand("b", None),
+    ]
+    assert sitegrid(server, "trust", "nobody") == 1
+    assert capsys.readouterr().err == "sitegrid: machine `nobody` is not known\n"
+
+
+@pytest.mark.parametrize("words", [["distrust", "b"], ["trust"], ["trust", "b", "--wait", "-1"]])
+def test_commands_need_their_words(words: list[str]):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2
+
+
+def test_machines_are_a_table_for_people(server: FakeServer, capsys: pytest.CaptureFixture[str]):
+    assert sitegrid(server, "query", "machines") == 0
+    head, first, second = capsys.readouterr().out.splitlines()
+    assert head.split() == ["machine", "trusted", "since", "samples", "lost", "newest", "why"]
+    assert first.split() == ["a", "yes", "-", "1200", "3", "2025-06-15", "15:06:40Z", "-"]
+    assert second.startswith("b        NO, by audit  2025-06-15 15:07:40Z  7        0     2025-06-15 15:06:40Z  gain")
+    assert sitegrid(server, "query", "--after", "3", "machines", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"machines": MACHINES}
+    assert server.asked[-1] == MachinesQuery(Freshness(3))
+
+
+def test_changes_are_a_line_each(server: FakeServer, capsys: pytest.CaptureFixture[str]):
+    assert sitegrid(server, "query", "--after", "3", "changes") == 0
+    assert capsys.readouterr().out == (
+        "4: 2025-06-15 15:06:40Z to 2025-06-15 15:07:40Z  10..40 x -20..12.5 m  615 cells  resistance 0.25 -> 0.008\n"
+    )
+    assert sitegrid(server, "query", "changes", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"changes": [CHANGE]}
+    assert server.asked == [ChangesQuery(3), ChangesQuery(0)]
+
+
+class NoChanges:
+    """A client of a site without changes."""
+
+    def changes(self, after: int) -> list[object]:
+        return []
+
+
+def test_no_changes_are_said(capsys: pytest.CaptureFixture[str]):
+    query._changes(NoChanges(), Namespace(follow=False, after=0, json=False), ())  # type: ignore[arg-type]
+    assert capsys.readouterr().out == "no change of the ground was found\n"
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_changes_are_followed_until_stopped(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], as_json: bool
+):
+    """The change that is known, then one that is found while following."""
+    stop = threading.Event()
+    monkeypatch.setattr(query, "stop_flag", lambda: stop)
+    shown: list[str] = []
+
+    def show(text: object, **_: object) -> None:
+        shown.append(text if isinstance(text, str) else json.dumps(text))
+        if len(shown) == 1:
+            server.publish(encode_change({**CHANGE, "cells": 700}))
+        else:
+            stop.set()
+
+    monkeypatch.setattr(query, "say", show)
+    monkeypatch.setattr(query, "print", show, raising=False)
+    watchdog = threading.Timer(WAIT_S, stop.set)
+    watchdog.start()
+    assert sitegrid(server, "query", "changes", "--follow", *(["--json"] if as_json else [])) == 0
+    watchdog.cancel()
+    assert ["615" in shown[0], "700" in shown[1], len(shown)] == [True, True, 2]
+    assert shown[0].startswith("{") == as_json
+
+
+def test_json_may_stand_before_or_behind_the_query():
+    for words in (["query", "--json", "machines"], ["query", "machines", "--json"]):
+        assert build_parser().parse_args(words).json
+    assert not build_parser().parse_args(["query", "machines"]).json
