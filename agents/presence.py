@@ -25,6 +25,13 @@ from protocol.messages import Health, Pose
 
 POSE_NS = 200_000_000  # five a second, of the machine's own time
 ANSWER_S = 1.0  # how long to wait for another agent of the same name
+PATIENCE = 5  # looks without an answer, until another agent counts as gone
+# Every agent but this one, each with its own answer.
+EVERY_OTHER: Any = {
+    "target": zenoh.QueryTarget.ALL,
+    "consolidation": zenoh.ConsolidationMode.NONE,
+    "allowed_destination": zenoh.Locality.REMOTE,
+}
 
 
 @dataclass(frozen=True, order=True)
@@ -57,19 +64,14 @@ def wait_for_link(session: zenoh.Session, wait_s: float) -> bool:
 
 def find_namesake(session: zenoh.Session, site: str, machine: str, wait_s: float = ANSWER_S) -> Owner | None:
     """Ask for a live agent of this name elsewhere; None if none answers."""
-    found = []
-    asked = session.get(keys.alive(site, machine), timeout=wait_s, allowed_destination=zenoh.Locality.REMOTE)
-    for reply in asked:
-        if owner := _owner(reply):
-            found.append(owner)
-    return min(found, default=None)
+    asked = session.get(keys.alive(site, machine), timeout=wait_s, **EVERY_OTHER)
+    return min((owner for reply in asked if (owner := _owner(reply))), default=None)
 
 
 class Presence:
     """Publishes pose and health; both may be dropped on the way, the next one replaces them.
 
-    Their priority is above that of samples: a machine that catches up stays live. rivals: other agents of this name
-    that have answered since the last `look_around`.
+    Their priority is above that of samples: a machine that catches up stays live.
     """
 
     def __init__(self, session: zenoh.Session, site: str, machine: str, owner: Owner | None = None) -> None:
@@ -83,11 +85,13 @@ class Presence:
         self._answer = session.declare_queryable(self._key, self._on_query)
         self._token = session.liveliness().declare_token(self._key)
         self._pose_ns = 0
-        self._rivals: set[Owner] = set()
+        self._answers: set[Owner] = set()
+        self._rival: Owner | None = None
+        self._missed = 0
 
     @property
     def owner(self) -> Owner:
-        """This agent."""
+        """Who this agent is."""
         return self._owner
 
     def look_around(self) -> Owner | None:
@@ -95,10 +99,15 @@ class Presence:
 
         Answers come in beside the work, within ANSWER_S.
         """
-        found, self._rivals = self._rivals, set()
-        options = {"timeout": ANSWER_S, "allowed_destination": zenoh.Locality.REMOTE}
-        self._session.get(self._key, self._on_reply, **options)
-        return min((owner for owner in found if owner < self._owner), default=None)
+        answers, self._answers = self._answers, set()
+        self._session.get(self._key, self._on_reply, timeout=ANSWER_S, **EVERY_OTHER)
+        if rival := min((owner for owner in answers if owner < self._owner), default=None):
+            self._rival, self._missed = rival, 0
+        elif (missed := self._missed + 1) < PATIENCE:
+            self._missed = missed
+        else:
+            self._rival = None
+        return self._rival
 
     def show_pose(self, belief: PoseBelief) -> None:
         """Publish the pose if the last one is old enough."""
@@ -125,7 +134,7 @@ class Presence:
     def _on_reply(self, reply: zenoh.Reply) -> None:
         owner = _owner(reply)
         if owner and owner != self._owner:
-            self._rivals.add(owner)
+            self._answers.add(owner)
 
 
 def _owner(reply: zenoh.Reply) -> Owner | None:

@@ -12,15 +12,13 @@ import numpy as np
 
 from evaluation.merge_cases import CELL_M
 from evaluation.merge_samples import Delivery
-from mapserver import layers
-from mapserver.change import ChangeConfig
-from mapserver.grid import Grid, chunks
-from mapserver.ladder import Block
-from mapserver.reading import evidence, valid_pages
+from mapserver.config import ServerConfig
+from mapserver.grid import Grid
 from mapserver.trust import Auditor, TrustConfig
+from mapserver.views import read_cells, view_of
 from mapserver.votes import FoldConfig
-from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
-from protocol.geometry import BLOCK_CELLS, CellWindow
+from protocol.arrays import Bools, Floats, Ints, Table
+from protocol.geometry import CellWindow
 
 Layers = dict[str, Floats]  # (rows, columns) by name, NaN where unknown
 SERVER_LAYERS = ("resistance", "grade_east", "grade_north", "confidence")
@@ -51,15 +49,8 @@ def soft_votes(deliveries: Sequence[Delivery], window: CellWindow) -> ServerMap:
     for delivery in deliveries:
         if delivery.machine not in bad:
             grid.fold(delivery.rows, delivery.machine)
-    blocks = grid.blocks_in(_with_ring(window))
-    pages = dict(zip(blocks, grid.pages(blocks), strict=True))
-    first = valid_pages(pages, CELL_M, ChangeConfig())
-    parts = []
-    for some in chunks(blocks):
-        found = evidence([pages[block] for block in some], [first[block] for block in some])
-        parts.append(layers.read(found, SERVER_LAYERS, layers.ReadConfig()))
-    values = {name: np.concatenate([part[name] for part in parts]) for name in SERVER_LAYERS}
-    return ServerMap({name: _assemble(blocks, layer, window) for name, layer in values.items()}, bad)
+    values = read_cells(view_of(grid, window), window, SERVER_LAYERS, CELL_M, ServerConfig())
+    return ServerMap({name: layer.astype(np.float64) for name, layer in values.items()}, bad)
 
 
 def contradicting(deliveries: Sequence[Delivery]) -> tuple[str, ...]:
@@ -68,24 +59,6 @@ def contradicting(deliveries: Sequence[Delivery]) -> tuple[str, ...]:
     for delivery in deliveries:
         auditor.add(delivery.machine, delivery.rows, delivery.received_ns)
     return tuple(name for name, verdict in auditor.verdicts().items() if verdict.contradicts)
-
-
-def _with_ring(window: CellWindow) -> CellWindow:
-    """The window and a block around it: whether a cell at its edge changed is seen with its surroundings."""
-    n = BLOCK_CELLS
-    return CellWindow(window.column - n, window.row - n, window.columns + 2 * n, window.rows + 2 * n)
-
-
-def _assemble(blocks: Sequence[Block], values: AnyArray, window: CellWindow) -> Floats:
-    """Cut the window (rows, columns) out of the values (blocks, 256) of the blocks in and around it."""
-    n = BLOCK_CELLS
-    first_x, first_y = window.column // n - 1, window.row // n - 1
-    left, bottom = window.column - first_x * n, window.row - first_y * n
-    canvas = np.full((bottom + window.rows + 2 * n, left + window.columns + 2 * n), np.nan)
-    for (x, y), block in zip(blocks, values.reshape(-1, n, n), strict=True):
-        column, row = (x - first_x) * n, (y - first_y) * n
-        canvas[row : row + n, column : column + n] = block
-    return canvas[bottom : bottom + window.rows, left : left + window.columns]
 
 
 # --- one cell per sample ---------------------------------------------------------------------------------------------

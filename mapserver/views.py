@@ -70,6 +70,11 @@ def view_now(store: Store, window: CellWindow) -> View:
     return View(_pages(store.grid, window), store.merged, store.newest_ns)
 
 
+def view_of(grid: Grid, window: CellWindow) -> View:
+    """The map that a grid makes, without a journal."""
+    return View(_pages(grid, window), 0, grid.newest_ns)
+
+
 def read_cells(
     view: View, window: CellWindow, names: tuple[str, ...], cell_m: float, config: ServerConfig
 ) -> dict[str, Floats32]:

@@ -43,21 +43,23 @@ def make_authority(site: str, begins: datetime, expires: datetime) -> Pair:
 
 
 def issue(authority: Pair, common_name: str, begins: datetime, expires: datetime, hosts: Sequence[str] = ()) -> Pair:
-    """Make a key and have the authority sign it. hosts: names and addresses that it serves at; none: it only connects.
+    """Make a key and have the authority sign it.
 
-    ValueError where a host cannot stand in a certificate.
+    hosts: names and addresses that it serves at; none: it only connects.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     issuer = _certificate(authority)
+    signer = serialization.load_pem_private_key(authority.key, None)
+    assert isinstance(signer, ec.EllipticCurvePrivateKey)
     builder = _builder(_name(common_name), issuer.subject, key, begins, min(expires, issuer.not_valid_after_utc))
     builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
     builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
     purpose = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
     builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+    origin = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
+    builder = builder.add_extension(origin, critical=False)
     if hosts:
         builder = builder.add_extension(x509.SubjectAlternativeName([_host(h) for h in hosts]), critical=False)
-    signer = serialization.load_pem_private_key(authority.key, None)
-    assert isinstance(signer, ec.EllipticCurvePrivateKey)
     return _pair(builder.sign(signer, hashes.SHA256()), key)
 
 

@@ -38,7 +38,9 @@ class SessionConfig:
         if "/" not in self.endpoint:
             raise ValueError(f"endpoint: {self.endpoint!r} is not like {DEFAULT_ENDPOINT}")
         if self.credentials and not self.endpoint.startswith("tls/"):
-            raise ValueError(f"endpoint: {self.endpoint!r} proves no names; with keys it is like {DEFAULT_TLS_ENDPOINT}")
+            raise ValueError(
+                f"endpoint: {self.endpoint!r} proves no names; with keys it is like {DEFAULT_TLS_ENDPOINT}"
+            )
         if not self.credentials and self.endpoint.startswith("tls/"):
             raise ValueError(f"endpoint: {self.endpoint!r} needs keys")
 
@@ -51,8 +53,18 @@ def open_session(config: SessionConfig) -> zenoh.Session:
             settings.insert_json5(key, json.dumps(value))
         return zenoh.open(settings)
     except zenoh.ZError as error:
-        role = "listen here" if config.mode == "router" else "reach a router here: start one with `sitegrid router`"
-        raise LinkError(config.endpoint, f"cannot {role} ({str(error).splitlines()[0][:120]})") from None
+        raise LinkError(config.endpoint, f"cannot {_aim(config)} ({str(error).splitlines()[0][:120]})") from None
+
+
+def _aim(config: SessionConfig) -> str:
+    """What could not be done, and what may be the reason: a link that is refused looks like one that is not there."""
+    if config.mode == "router":
+        return "listen here"
+    if config.credentials:
+        return (
+            "reach a router here: start one with `sitegrid router --keys`, or it and these keys do not know each other"
+        )
+    return "reach a router here: start one with `sitegrid router`, or pass --keys if it asks for them"
 
 
 def _settings(config: SessionConfig) -> dict[str, object]:
@@ -65,7 +77,7 @@ def _settings(config: SessionConfig) -> dict[str, object]:
     if config.credentials:
         settings["transport/link/tls"] = config.credentials.tls(listens=config.mode == "router")
     if config.mode == "router":
-        return settings | {"listen/endpoints": [config.endpoint]} | config.guard
+        return {**settings, "listen/endpoints": [config.endpoint], **config.guard}
     # A client's open blocks until the router is there; a peer that listens nowhere connects in the background.
     in_background = config.wait_s < 0
     wait_ms = -1 if in_background else int(config.wait_s * 1000)

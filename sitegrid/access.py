@@ -6,7 +6,6 @@ Everything is denied that is not granted. Zenoh compares by inclusion: a granted
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 

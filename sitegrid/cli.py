@@ -31,6 +31,7 @@ EXTRA = {
     "pybullet": "sim",
     "scipy": "eval",
     "matplotlib": "eval",
+    "cryptography": "security",
 }
 
 
@@ -59,11 +60,18 @@ def build_parser() -> argparse.ArgumentParser:
     common.add_argument("--verbose", action="store_true", help="log what happens, not only what goes wrong")
     network = argparse.ArgumentParser(add_help=False)
     network.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="router to connect to (default %(default)s)")
+    network.add_argument(
+        "--keys",
+        type=Path,
+        metavar="FOLDER",
+        help="keys of this process (`sitegrid keys`); the endpoint is tls/... then",
+    )
     parser = argparse.ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True)
     for add in (
         _add_demo,
         _add_router,
+        _add_keys,
         _add_server,
         _add_sim,
         _add_agent,
@@ -99,6 +107,35 @@ def _add_demo(nouns: Nouns, common: Parent, _: Parent) -> None:
 def _add_router(nouns: Nouns, common: Parent, _: Parent) -> None:
     router = _noun(nouns, "router", "the site's Zenoh router", [common])
     router.add_argument("--listen", default=DEFAULT_ENDPOINT, help="where to listen (default %(default)s)")
+    safety = router.add_mutually_exclusive_group()
+    safety.add_argument(
+        "--keys", type=Path, metavar="KEYS", help="folder of the site's keys; it listens on tls/... then"
+    )
+    safety.add_argument("--insecure", action="store_true", help="listen beyond this host, although there are no keys")
+
+
+def _add_keys(nouns: Nouns, common: Parent, _: Parent) -> None:
+    keys = _noun(nouns, "keys", "the certificates of a site: who is let in, as what", [common])
+    actions = keys.add_subparsers(metavar="ACTION", required=True, dest="action")
+    quiet = _quiet()
+    init = actions.add_parser("init", help="the site's authority, its router and its map server", parents=[quiet])
+    init.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
+    init.add_argument(
+        "--host", nargs="+", action="extend", default=[], help="names and addresses that the router is reached at"
+    )
+    add = actions.add_parser("add", help="keys for a machine, or another that is to be let in", parents=[quiet])
+    roles = ("machine", "visitor", "server", "admin", "sim")
+    add.add_argument("--role", choices=roles, help="what it may do (default machine)")
+    add.add_argument(
+        "--renew", action="store_true", help="a new certificate for one that has it; the old one stays valid"
+    )
+    revoke = actions.add_parser("revoke", help="let it in no more", parents=[quiet])
+    for action in (add, revoke):
+        action.add_argument("name", metavar="MACHINE")
+    for action in (init, add):
+        action.add_argument("--days", type=_days, default=365, help="how long it is valid (default %(default)s)")
+    for action in (init, add, revoke, actions.add_parser("list", help="who is let in, until when", parents=[quiet])):
+        action.add_argument("--dir", type=Path, default=Path("keys"), help="folder of the keys (default %(default)s)")
 
 
 def _add_server(nouns: Nouns, common: Parent, network: Parent) -> None:
@@ -326,6 +363,13 @@ def _count(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not positive")
+    return value
+
+
+def _days(text: str) -> int:
+    value = _count(text)
+    if value > 3650:
+        raise argparse.ArgumentTypeError(f"{text} is more than 3650, the ten years of the authority")
     return value
 
 

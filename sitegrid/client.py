@@ -7,6 +7,7 @@ with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -42,8 +43,9 @@ from protocol.queries import (
     decode_region,
     encode_query,
 )
-from protocol.session import DEFAULT_ENDPOINT, SessionConfig, open_session
+from protocol.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.listener import Listener
+from sitegrid.security import join
 
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
 
@@ -189,9 +191,17 @@ class Client:
             if reply.err is not None:
                 raise decode_error(reply.err.payload.to_bytes())
         problem = f"no map server answers for site {self.site!r}: start one with `sitegrid server`, or check the name"
+        if self._endpoint.startswith("tls/"):
+            problem += "; or these keys may not ask this (see docs/security.md)"
         raise LinkError(self._endpoint, problem)
 
 
-def connect(endpoint: str = DEFAULT_ENDPOINT, site: str = "paper", *, timeout_s: float = 10.0) -> Client:
-    """Connect to the router at `endpoint` and ask for the map of `site`; LinkError if no router is there."""
-    return Client(open_session(SessionConfig(endpoint)), endpoint, site, timeout_s)
+def connect(
+    endpoint: str = DEFAULT_ENDPOINT, site: str = "paper", *, timeout_s: float = 10.0, keys: Path | None = None
+) -> Client:
+    """Connect to the router at `endpoint` and ask for the map of `site`; LinkError if no router is there.
+
+    keys: folder of this client's keys, on a site that has them.
+    """
+    config = join(endpoint, keys, site=site)
+    return Client(open_session(config), config.endpoint, site, timeout_s)

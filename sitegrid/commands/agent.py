@@ -18,9 +18,10 @@ from agents.presence import Owner, find_namesake, this_process, wait_for_link
 from protocol.errors import ConfigError, LinkError
 from protocol.logfolder import LogFolder, open_log
 from protocol.machine import MachineConfig
-from protocol.session import SessionConfig, open_session
+from protocol.session import open_session
 from protocol.site import SiteConfig, load_site
 from sitegrid.process import note, plain, say, stop_flag
+from sitegrid.security import join
 
 LINK_S = 1.0  # how long to wait for the router before starting without it
 
@@ -30,7 +31,9 @@ def run(arguments: Namespace) -> int:
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
     site, machine, config = _configure(arguments, log)
-    session = open_session(SessionConfig(arguments.endpoint, wait_s=-1))
+    session = open_session(
+        join(arguments.endpoint, arguments.keys, wait_s=-1, role="machine", name=machine.name, site=site.name)
+    )
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)

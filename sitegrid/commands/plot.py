@@ -24,7 +24,7 @@ LAYERS = ("resistance", "grade_east", "grade_north")
 def run(arguments: Namespace) -> int:
     """Draw the map; with --follow again and again until stopped."""
     stop = stop_flag()
-    with connect(arguments.endpoint, arguments.site) as client:
+    with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         tracks = TrackRecorder(client.session, arguments.site)
         drawn = 0
         while not stop.is_set():

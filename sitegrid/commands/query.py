@@ -22,7 +22,7 @@ HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of
 def run(arguments: Namespace) -> int:
     """Ask once and print the answer; changes, while they are followed, until stopped."""
     layers = tuple(part for part in arguments.layers.split(",") if part)
-    with connect(arguments.endpoint, arguments.site) as client:
+    with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         _ASKS[arguments.ask](client, arguments, layers)
     return 0
 

@@ -2,17 +2,82 @@
 
 from __future__ import annotations
 
+import logging
+import threading
 from argparse import Namespace
+from datetime import UTC, datetime
+from pathlib import Path
 
+from protocol.credentials import check_valid, load_credentials
+from protocol.errors import ConfigError
 from protocol.session import SessionConfig, open_session
+from sitegrid.access import router_settings
 from sitegrid.process import say, stop_flag, wait
+from sitegrid.register import REGISTER_FILE, ROUTER, Register, load_register
+from sitegrid.security import is_loopback, with_keys
+
+log = logging.getLogger("sitegrid.router")
 
 
 def run(arguments: Namespace) -> int:
     """Route until stopped."""
     stop = stop_flag()
-    session = open_session(SessionConfig(arguments.listen, mode="router"))
-    say({"ready": "router", "endpoint": arguments.listen})
+    if arguments.keys:
+        _route_guarded(arguments.keys, with_keys(arguments.listen), stop)
+    else:
+        _route_open(arguments.listen, stop, insecure=arguments.insecure)
+    return 0
+
+
+def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None:
+    """Without keys whoever gets here may do everything: so nobody from elsewhere does, unless that is asked for."""
+    on_this_host = is_loopback(endpoint)
+    if not (on_this_host or insecure):
+        advice = "pass --keys (`sitegrid keys init`), listen on tcp/127.0.0.1:7447, or say --insecure"
+        raise ConfigError(endpoint, f"anyone on the network could read and write the map: {advice}")
+    session = open_session(SessionConfig(endpoint, mode="router"))
+    security = "none: this host only" if on_this_host else "none: open to everyone who gets here"
+    say({"ready": "router", "endpoint": endpoint, "security": security})
     wait(stop)
     session.close()  # type: ignore[no-untyped-call]
-    return 0
+
+
+def _route_guarded(folder: Path, endpoint: str, stop: threading.Event) -> None:
+    """With keys. Zenoh reads rules when a session opens, so a changed register means a new session.
+
+    Links are cut for half a second then; whoever may, is back by itself. A register that cannot be read changes
+    nothing.
+    """
+    text, register = _text(folder), load_register(folder)
+    session = open_session(_guarded(folder, endpoint, register))
+    say({"ready": "router", "endpoint": endpoint, "security": "mutual TLS", "names": len(register.admitted())})
+    while not stop.wait(0.5):
+        if (newer := _text(folder)) == text:
+            continue
+        text = newer
+        try:
+            register = load_register(folder)
+            config = _guarded(folder, endpoint, register)
+        except ConfigError as error:
+            log.warning("the rules stay as they were error=%r", str(error))
+            continue
+        session.close()  # type: ignore[no-untyped-call]
+        session = open_session(config)
+        say({"renewed": "rules", "names": len(register.admitted())})
+    session.close()  # type: ignore[no-untyped-call]
+
+
+def _guarded(folder: Path, endpoint: str, register: Register) -> SessionConfig:
+    credentials = load_credentials(folder / ROUTER)
+    check_valid(credentials, datetime.now(UTC))
+    try:
+        return SessionConfig(endpoint, mode="router", credentials=credentials, guard=router_settings(register))
+    except ValueError as error:
+        raise ConfigError("--listen", str(error)) from None
+
+
+def _text(folder: Path) -> bytes:
+    try:
+        return (folder / REGISTER_FILE).read_bytes()
+    except OSError:
+        return b""

@@ -8,9 +8,10 @@ from argparse import Namespace
 from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol.config import from_table, load_toml
-from protocol.session import SessionConfig, open_session
+from protocol.session import open_session
 from protocol.site import load_site
 from sitegrid.process import say, stop_flag
+from sitegrid.security import join
 
 
 def run(arguments: Namespace) -> int:
@@ -19,7 +20,7 @@ def run(arguments: Namespace) -> int:
     site = load_site(arguments.site_file)
     table = load_toml(arguments.config) if arguments.config else {}
     config = from_table(ServerConfig, table, str(arguments.config))
-    session = open_session(SessionConfig(arguments.endpoint, wait_s=30.0))
+    session = open_session(join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name))
     server = Server(session, arguments.store, site, config, time.time_ns)
     say({"ready": "server", "site": site.name, "store": str(arguments.store)})
     while not stop.wait(0.5):

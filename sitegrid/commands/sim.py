@@ -9,12 +9,12 @@ from pathlib import Path
 
 from protocol.errors import ConfigError
 from protocol.machine import machine_toml, plain_lines
-from protocol.session import SessionConfig
 from sim.config import SimConfig, load_sim, resolve
 from sim.publisher import run as publish
 from sim.recorder import record
 from sitegrid.process import note, say, stop_flag
 from sitegrid.progress import Display
+from sitegrid.security import join
 
 OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site")
 ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
@@ -34,7 +34,7 @@ def run(arguments: Namespace) -> int:
         return 0
     report = publish(
         config,
-        SessionConfig(arguments.endpoint),
+        join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name),
         stop,
         on_progress=(lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None,
         truth_dir=arguments.truth,

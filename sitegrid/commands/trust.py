@@ -11,7 +11,7 @@ from sitegrid.process import plain, say
 
 def run(arguments: Namespace) -> int:
     """Give the command, wait until the map follows, print what is known of the machine then."""
-    with connect(arguments.endpoint, arguments.site) as client:
+    with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         row = _decide(client, arguments)
     if arguments.json:
         say(plain(row))

@@ -219,10 +219,6 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
     assert grid_difference(whole, less) == (pytest.approx(BATCH, abs=5), 0)
 
 
-OLD_AUDIT = "the audit knows the snapshot of a map with all machines, and the rows of the journal alone"
-
-
-@pytest.mark.xfail(strict=True, reason=OLD_AUDIT)
 def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, tmp_path):
     shutil.copytree(clean[0], tmp_path / "store")
     store = Store(tmp_path / "store", SITE, CONFIG, lambda: 1)
@@ -236,7 +232,6 @@ def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, tmp_path)
     assert (result.lost, result.double, result.unrecorded) == (0, 0, 0)
 
 
-@pytest.mark.xfail(strict=True, reason=OLD_AUDIT)
 def test_rows_that_are_archived_are_not_lost(clean, tmp_path):
     shutil.copytree(clean[0], tmp_path / "store")
     path = tmp_path / "store" / JOURNAL_FILE

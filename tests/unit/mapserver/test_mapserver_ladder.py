@@ -54,7 +54,7 @@ def by_definition(buckets, keeps: tuple[int, int, int]) -> set[tuple[int, int]]:
     return found | ({(3, 0)} if left else set())
 
 
-bucket = st.one_of(st.integers(0, 4 * PER_DAY), st.integers(0, 30)).map(lambda i: START + i)
+bucket = st.one_of(st.integers(0, 12 * PER_DAY), st.integers(0, 30)).map(lambda i: START + i)
 keep = st.integers(1, 4)
 
 
@@ -67,6 +67,14 @@ def test_any_order_of_buckets_gives_the_same_ladder(buckets, a, b, c, random):
     found = ladder(buckets, **keeps)
     assert same(found, ladder(shuffled, **keeps))
     assert set(places(found)) == by_definition(buckets, (a, b, c))
+
+
+@pytest.mark.parametrize("keeps", [(1, 2, 4), (4, 1, 2), (2, 4, 1)])
+def test_the_newest_of_each_length_stay_apart(keeps):
+    buckets = [START + i * PER_HOUR // 2 for i in range(8 * 48)]
+    found = ladder(buckets, **dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True)))
+    assert [len([rung for rung, _ in places(found) if rung == k]) for k in range(4)] == [*keeps, 1]
+    assert set(places(found)) == by_definition(buckets, keeps)
 
 
 @given(st.lists(bucket, min_size=1, max_size=30))

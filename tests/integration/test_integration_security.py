@@ -1,0 +1,450 @@
+"""Nobody is let in: real processes with mutual TLS on loopback, and everyone who should not get through."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from protocol import keys
+from protocol.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
+from protocol.credentials import Credentials, Identity, load_credentials
+from protocol.errors import LinkError
+from protocol.messages import Ack, SampleBatch
+from protocol.samples import SAMPLE_DTYPE
+from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.site import load_site
+from sim.config import SimConfig
+from sitegrid import connect
+from sitegrid.access import SPARE_BYTES
+from sitegrid.cli import main
+from sitegrid.commands.sim import write_configs
+from sitegrid.processes import Child, Children, wait_until
+
+certificates = pytest.importorskip("protocol.certificates", reason="cryptography is not installed")
+pytestmark = pytest.mark.processes
+
+READY_S = 40.0
+SITE = "paper"
+ROLES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim"}
+DAY = timedelta(days=1)
+
+
+class Guarded:
+    """Router and map server of a site with keys."""
+
+    def __init__(self, folder: Path, children: Children) -> None:
+        self.keys, self.children = folder / "keys", children
+        self.make_keys("init", "--site", SITE)
+        for name, role in ROLES.items():
+            self.make_keys("add", name, "--role", role)
+        self.endpoint = free_endpoint().replace("tcp/", "tls/")
+        self.configs = write_configs(SimConfig(machines=1, seed=1, world="fast"), folder)
+        self.site_file = folder / "site.toml"
+        self.router = children.start("router", "router", "--keys", self.keys, "--listen", self.endpoint)
+        assert self.router.expect("ready", READY_S)["security"] == "mutual TLS"
+        files = ("--site-file", self.site_file, "--store", folder / "store")
+        self.server = children.start("server", "server", *self.network("server"), *files)
+        self.server.expect("ready", READY_S)
+
+    def make_keys(self, action: str, *words: str) -> None:
+        assert main(["keys", action, *words, "--dir", str(self.keys)]) == 0
+
+    def network(self, name: str) -> tuple[str | Path, ...]:
+        return ("--endpoint", self.endpoint, "--keys", self.keys / name)
+
+    def settings(self, name: str) -> SessionConfig:
+        return SessionConfig(self.endpoint, credentials=load_credentials(self.keys / name))
+
+    @contextlib.contextmanager
+    def session(self, name: str) -> Iterator[zenoh.Session]:
+        with closing(open_session(self.settings(name))) as session:
+            yield session
+
+    def still_works(self) -> str:
+        """Raises unless a visitor still reads the map; returns whom a failed assertion is about."""
+        with connect(self.endpoint, SITE, keys=self.keys / "guest") as client:
+            client.info()
+        return f"router pid {self.router.pid}, server pid {self.server.pid}"
+
+    def batch(self, machine: str) -> bytes:
+        """One sample of a machine, as its agent sends it, in a spool of its own."""
+        rows = np.ones(1, SAMPLE_DTYPE)
+        rows["cov_xy_m2"] = 0.0
+        return encode_batch(SampleBatch(machine, time.time_ns(), 1, rows, load_site(self.site_file).frame))
+
+
+@contextlib.contextmanager
+def closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
+    folder = tmp_path_factory.mktemp("guarded")
+    with Children(folder) as children:
+        yield Guarded(folder, children)
+
+
+def answers(session: zenoh.Session, key: str, payload: bytes = b"", **options: Any) -> list[bytes]:
+    replies = session.get(key, payload=payload, timeout=5.0, **options)
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+
+def acknowledged(session: zenoh.Session, key: str, batch: bytes) -> list[bool]:
+    return [isinstance(decode_reply(data), Ack) for data in answers(session, key, batch)]
+
+
+@contextlib.contextmanager
+def listening(session: zenoh.Session, key: str) -> Iterator[list[bytes]]:
+    """What arrives of a key; the router knows of it once a question behind it is answered."""
+    heard: list[bytes] = []
+    subscriber = session.declare_subscriber(key, lambda sample: heard.append(sample.payload.to_bytes()))
+    assert answers(session, keys.map_query(SITE, "info"))
+    yield heard
+    subscriber.undeclare()
+
+
+def put_until(heard: list[bytes], wanted: bytes, put: Callable[[], object]) -> None:
+    """Put again and again until it arrives: a router's knowledge of listeners spreads by itself."""
+
+    def arrived() -> bool:
+        put()
+        return wanted in heard
+
+    wait_until(arrived, 10.0, f"{wanted!r} heard")
+
+
+# --- who may, can ----------------------------------------------------------------------------------------------------
+
+
+def test_a_machine_gets_its_acknowledgements_from_the_map_server(guarded: Guarded):
+    with guarded.session("loader-1") as session, connect(guarded.endpoint, keys=guarded.keys / "loader-1") as client:
+        before = client.info()["journalled"]
+        for _ in range(200):  # faster than any rate limit: these never fall under one
+            assert acknowledged(session, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
+        assert client.info(after=before + 200)["journalled"] == before + 200
+
+
+def test_agent_and_simulator_work_with_keys_as_without(guarded: Guarded, tmp_path: Path):
+    config = guarded.configs[0]
+    files = ("--spool", tmp_path / "spool.db", "--site-file", guarded.site_file, "--config", config)
+    agent = guarded.children.start("agent", "agent", *guarded.network("loader-1"), *files, "--json")
+    agent.expect("ready", READY_S)
+    words = ("--machines", 1, "--seed", 1, "--world", "fast", "--seconds", 20, "--speed", 10, "--json")
+    sim = guarded.children.start("sim", "sim", *guarded.network("sim"), *words)
+    with guarded.session("guest") as session, listening(session, keys.poses_all(SITE)) as poses:
+        report = agent.expect("ended", READY_S)["ended"]
+        wait_until(lambda: len(poses) > 5, 5.0, "a visitor sees poses")
+    assert report["delivered"], f"agent pid {agent.pid}, sim pid {sim.pid}"
+    assert report["samples"] > 20
+    assert sim.wait(10.0) == 0
+
+
+def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
+    with connect(guarded.endpoint, SITE, keys=guarded.keys / "guest") as client:
+        assert client.info()["site"]["name"] == SITE
+        with pytest.raises(LinkError, match="or these keys may not ask this"):
+            client.distrust("loader-1", "because")
+        guest = client.session
+        assert answers(guest, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == []
+        assert answers(guest, keys.ingest(SITE, "guest"), guarded.batch("guest")) == []
+        with guarded.session("boss") as boss, listening(boss, keys.poses_all(SITE)) as heard:
+            guest.put(keys.pose(SITE, "loader-1"), b"forged")
+            guest.put(keys.pose(SITE, "guest"), b"forged")
+            assert answers(guest, keys.map_query(SITE, "info"))  # what was put before it has been judged
+            with guarded.session("loader-1") as loader:
+                put_until(heard, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
+            assert set(heard) == {b"own"}
+
+
+def test_only_an_admin_commands(guarded: Guarded):
+    with connect(guarded.endpoint, SITE, keys=guarded.keys / "boss") as client:
+        assert client.trust("loader-1", "seen to")["trusted"]
+
+
+# --- who has no name that counts -------------------------------------------------------------------------------------
+
+
+def with_certificate(guarded: Guarded, folder: Path, authority: Any, days: float) -> Credentials:
+    """The name of a machine that is let in, with a certificate of another making."""
+    now = datetime.now(UTC)
+    pair = certificates.issue(authority, "loader-1", now - 2 * DAY, now + days * DAY)
+    shutil.copytree(guarded.keys / "loader-1", folder)
+    (folder / "cert.pem").write_bytes(pair.certificate)
+    (folder / "key.pem").write_bytes(pair.key)
+    return Credentials(folder, Identity(SITE, "loader-1", "machine", now + DAY))
+
+
+def own_authority(guarded: Guarded) -> Any:
+    place = guarded.keys / "authority"
+    return certificates.Pair((place / "cert.pem").read_bytes(), (place / "key.pem").read_bytes())
+
+
+def refusal(config: SessionConfig) -> str:
+    with pytest.raises(LinkError) as caught:
+        open_session(dataclasses.replace(config, wait_s=1.0)).close()
+    return str(caught.value)
+
+
+def test_a_foreign_authority_is_refused(guarded: Guarded, tmp_path: Path):
+    now = datetime.now(UTC)
+    foreign = certificates.make_authority(SITE, now, now + DAY)
+    credentials = with_certificate(guarded, tmp_path / "foreign", foreign, days=1)
+    assert "do not know each other" in refusal(SessionConfig(guarded.endpoint, credentials=credentials))
+    same = with_certificate(guarded, tmp_path / "same", own_authority(guarded), days=1)
+    with closing(open_session(SessionConfig(guarded.endpoint, credentials=same))) as session:
+        assert answers(session, keys.map_query(SITE, "info")), guarded.still_works()
+
+
+def test_an_expired_certificate_is_refused(guarded: Guarded, tmp_path: Path):
+    credentials = with_certificate(guarded, tmp_path / "old", own_authority(guarded), days=-1)
+    assert "do not know each other" in refusal(SessionConfig(guarded.endpoint, credentials=credentials))
+    assert guarded.still_works()
+
+
+def test_a_link_ends_when_its_certificate_does(guarded: Guarded, tmp_path: Path):
+    credentials = with_certificate(guarded, tmp_path / "short", own_authority(guarded), days=3 / 86400)
+    with closing(open_session(SessionConfig(guarded.endpoint, credentials=credentials))) as session:
+        assert answers(session, keys.map_query(SITE, "info"))
+        wait_until(lambda: not session.info.routers_zid(), 10.0, "link closed")
+        assert answers(session, keys.map_query(SITE, "info")) == [], guarded.still_works()
+
+
+class NoCertificate(Credentials):
+    """Knows the authority, shows no certificate."""
+
+    def tls(self, *, listens: bool) -> Mapping[str, object]:
+        return {"root_ca_certificate": str(self.folder / "ca.pem")}
+
+
+def test_without_a_certificate_nobody_gets_in(guarded: Guarded):
+    known = load_credentials(guarded.keys / "guest")
+    without = NoCertificate(known.folder, known.identity)
+    refusal(SessionConfig(guarded.endpoint, credentials=without))
+    assert "pass --keys" in refusal(SessionConfig(guarded.endpoint.replace("tls/", "tcp/")))
+    assert guarded.still_works()
+
+
+def test_a_name_that_is_not_in_the_register_may_nothing(guarded: Guarded, tmp_path: Path):
+    shutil.copytree(guarded.keys / "guest", tmp_path / "unknown")
+    pair = certificates.issue(own_authority(guarded), "unknown", datetime.now(UTC), datetime.now(UTC) + DAY)
+    (tmp_path / "unknown" / "cert.pem").write_bytes(pair.certificate)
+    (tmp_path / "unknown" / "key.pem").write_bytes(pair.key)
+    with closing(
+        open_session(SessionConfig(guarded.endpoint, credentials=load_credentials(tmp_path / "unknown")))
+    ) as session:
+        assert answers(session, keys.map_query(SITE, "info")) == [], guarded.still_works()
+
+
+def test_a_machine_cannot_pose_as_the_router(guarded: Guarded):
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    thief = SessionConfig(endpoint, "router", credentials=load_credentials(guarded.keys / "loader-2"))
+    with closing(open_session(thief)):
+        refusal(dataclasses.replace(guarded.settings("loader-1"), endpoint=endpoint))
+
+
+def test_the_router_is_refused_at_an_address_that_is_not_its_own(guarded: Guarded):
+    elsewhere = guarded.endpoint.replace("127.0.0.1", "127.0.0.2")
+    refusal(dataclasses.replace(guarded.settings("loader-1"), endpoint=elsewhere))
+
+
+# --- who has a name, and wants more ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["client", "router"])
+def test_a_machine_writes_only_under_its_own_name(guarded: Guarded, mode: str):
+    with as_machine(guarded, "loader-1", mode) as session:
+        own, other = keys.ingest(SITE, "loader-1"), keys.ingest(SITE, "loader-2")
+        assert acknowledged(session, own, guarded.batch("loader-1")) == [True]
+        for forged in (guarded.batch("loader-2"), guarded.batch("loader-1")):
+            assert answers(session, other, forged) == [], guarded.still_works()
+            assert answers(session, keys.ingest_all(SITE), forged) == []
+        assert answers(session, keys.admin(SITE, "trust")) == []
+
+
+@contextlib.contextmanager
+def as_machine(guarded: Guarded, name: str, mode: str) -> Iterator[zenoh.Session]:
+    """The session of a machine, or of one that comes as a router to be told more."""
+    settings = zenoh.Config()
+    tls = load_credentials(guarded.keys / name).tls(listens=False)
+    values = {"mode": mode, "connect/endpoints": [guarded.endpoint], "listen/endpoints": []}
+    for key, value in {**values, "scouting/multicast/enabled": False, "transport/link/tls": tls}.items():
+        settings.insert_json5(key, json.dumps(value))
+    with closing(zenoh.open(settings)) as session:
+        wait_until(lambda: bool(answers(session, keys.map_query(SITE, "info"))), 10.0, "connected")
+        yield session
+
+
+def test_a_forged_pose_reaches_nobody(guarded: Guarded):
+    with (
+        guarded.session("guest") as guest,
+        guarded.session("loader-1") as loader,
+        listening(guest, keys.poses_all(SITE)) as heard,
+    ):
+
+        def forge_first() -> None:
+            loader.put(keys.pose(SITE, "loader-2"), b"forged")
+            loader.put(f"sitegrid/{SITE}/machine/*/pose", b"forged")
+            loader.put(f"sitegrid/{SITE}/**", b"forged")
+            loader.delete(keys.pose(SITE, "loader-1"))
+            loader.put(keys.pose(SITE, "loader-1"), b"own")
+
+        put_until(heard, b"own", forge_first)
+        assert set(heard) == {b"own"}, guarded.still_works()
+
+
+def test_a_forged_change_of_the_map_reaches_nobody(guarded: Guarded):
+    with (
+        guarded.session("guest") as guest,
+        guarded.session("loader-1") as loader,
+        guarded.session("server") as server,
+        listening(guest, keys.changed(SITE)) as heard,
+    ):
+        loader.put(keys.changed(SITE), b"forged")
+        assert answers(loader, keys.map_query(SITE, "info"))
+        put_until(heard, b"true", lambda: server.put(keys.changed(SITE), b"true"))
+        assert set(heard) == {b"true"}, guarded.still_works()
+
+
+def test_nobody_listens_to_what_is_not_theirs(guarded: Guarded):
+    with guarded.session("loader-2") as loader, guarded.session("guest") as guest, guarded.session("sim") as sim:
+        with listening(loader, "**") as all_heard, listening(guest, keys.sensors(SITE, "loader-2")) as guest_heard:
+            with listening(loader, keys.sensors(SITE, "loader-2")) as own_heard:
+                put_until(own_heard, b"2", lambda: sim.put(keys.sensors(SITE, "loader-2"), b"2"))
+                sim.put(keys.sensors(SITE, "loader-1"), b"1")
+            assert b"1" not in all_heard
+            assert guest_heard == [], guarded.still_works()
+
+
+@pytest.mark.parametrize("mode", ["client", "router"])
+def test_a_fake_map_server_is_never_asked(guarded: Guarded, mode: str):
+    asked: list[str] = []
+
+    def lie(query: zenoh.Query) -> None:
+        with query:
+            asked.append(str(query.key_expr))
+            query.reply(query.key_expr, b"a lie")
+
+    with as_machine(guarded, "loader-2", mode) as fake, guarded.session("loader-1") as loader:
+        everything = (keys.map_queries_all(SITE), keys.ingest_all(SITE), keys.ingest(SITE, "loader-1"), "**")
+        lies = [fake.declare_queryable(key, lie, complete=True) for key in everything]
+        fake.get(keys.map_query(SITE, "point"), timeout=5.0)  # goes behind the declarations
+        asked.clear()
+        for target in (zenoh.QueryTarget.ALL, zenoh.QueryTarget.BEST_MATCHING):
+            found = answers(loader, keys.map_query(SITE, "info"), target=target)
+            assert len(found) == 1
+            assert b"a lie" not in found
+        assert acknowledged(loader, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
+        assert asked == [], guarded.still_works()
+        for queryable in lies:
+            queryable.undeclare()
+
+
+def test_oversize_payloads_stay_at_the_router(guarded: Guarded):
+    own = keys.ingest(SITE, "loader-1")
+    with guarded.session("loader-1") as loader, guarded.session("guest") as guest:
+        assert answers(loader, own, bytes(MAX_BATCH_BYTES)), "the map server itself says what is wrong with it"
+        assert answers(loader, own, bytes(MAX_BATCH_BYTES + SPARE_BYTES + 1)) == []
+        assert answers(guest, keys.map_query(SITE, "info"), bytes(2**20 + 1)) == []
+        with listening(guest, keys.poses_all(SITE)) as heard:
+            huge = bytes(MAX_SMALL_BYTES + 1)
+
+            def put() -> None:
+                loader.put(keys.pose(SITE, "loader-1"), huge)
+                loader.put(keys.health(SITE, "loader-1"), huge)
+                time.sleep(0.03)  # beyond the rate limit, which counts what is too large
+                loader.put(keys.pose(SITE, "loader-1"), b"small")
+
+            put_until(heard, b"small", put)
+            assert huge not in heard, guarded.still_works()
+
+
+def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
+    with guarded.session("guest") as guest, guarded.session("loader-1") as loader:
+        with listening(guest, keys.poses_all(SITE)) as heard:
+            put_until(heard, b"first", lambda: loader.put(keys.pose(SITE, "loader-1"), b"first"))
+            began = time.monotonic()
+            for _ in range(2000):
+                loader.put(keys.pose(SITE, "loader-1"), b"flood")
+            put_until(heard, b"last", lambda: loader.put(keys.pose(SITE, "loader-1"), b"last"))
+            most = 50 * (time.monotonic() - began) + 5
+        assert heard.count(b"flood") <= most, guarded.still_works()
+
+
+# --- revoked ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, children: Children):
+    site = Guarded(tmp_path, children)
+    stolen = tmp_path / "stolen"
+    shutil.copytree(site.keys / "loader-1", stolen)
+    with site.session("loader-1") as loader, site.session("loader-2") as other:
+        assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == [True]
+        site.make_keys("revoke", "loader-1")
+        assert site.router.expect("renewed", 10.0)["names"] == len(ROLES), f"router pid {site.router.pid}"
+        wait_until(
+            lambda: acknowledged(other, keys.ingest(SITE, "loader-2"), site.batch("loader-2")) == [True],
+            20.0,
+            "others go on",
+        )
+        wait_until(lambda: bool(loader.info.routers_zid()), 10.0, "the link is there again")
+        assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == []
+    site.make_keys("add", "loader-1")
+    site.router.expect("renewed", 10.0)
+    with site.session("loader-1") as repaired:
+        wait_until(
+            lambda: acknowledged(repaired, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == [True],
+            20.0,
+            "back under the same name",
+        )
+    old = SessionConfig(site.endpoint, credentials=load_credentials(stolen))
+    with closing(open_session(old)) as session:
+        assert answers(session, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == []
+        assert answers(session, keys.map_query(SITE, "info")) == []
+
+
+def test_a_broken_register_changes_nothing(tmp_path: Path, children: Children):
+    site = Guarded(tmp_path, children)
+    register = site.keys / "register.toml"
+    whole = register.read_bytes()
+    register.write_bytes(whole[: len(whole) // 2] + b"[[[")
+    log = tmp_path / "router.log"
+    wait_until(lambda: "the rules stay as they were" in log.read_text(), 10.0, "said so")
+    assert site.still_works()
+    assert site.router.code is None
+
+
+# --- without keys ----------------------------------------------------------------------------------------------------
+
+
+def test_without_keys_the_router_stays_on_this_host(children: Children):
+    port = free_endpoint().rpartition(":")[2]
+    words = ["router", "--listen", f"tcp/0.0.0.0:{port}"]
+    done = subprocess.run(
+        [sys.executable, "-m", "sitegrid.cli", *words], capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "--keys" in done.stderr
+    assert "--insecure" in done.stderr
+    open_router: Child = children.start("open", *words, "--insecure")
+    assert open_router.expect("ready", READY_S)["security"] == "none: open to everyone who gets here"
+    assert open_router.stop() == 0
+    router = children.start("router", "router", "--listen", f"tcp/127.0.0.1:{port}")
+    assert router.expect("ready", READY_S)["security"] == "none: this host only"
