@@ -24,6 +24,7 @@ from protocol.errors import StoreError
 from protocol.samples import SAMPLE_DTYPE, empty
 
 SCHEMA = 2
+LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
 KEPT_RUNS = 16  # earlier runs that are declared again: a server restored from a backup learns what it has lost
 _RUN = "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INTEGER, closed INTEGER)"
 _TABLES = (
@@ -273,7 +274,7 @@ class Spool:
                 self._audit.close()
 
     def _connect(self, path: Path) -> sqlite3.Connection:
-        return sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+        return sqlite3.connect(path, LOCK_WAIT_S, isolation_level=None, check_same_thread=False)
 
     def _open(self) -> None:
         """Make or read the file, and start a run."""

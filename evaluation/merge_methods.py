@@ -49,7 +49,8 @@ def soft_votes(deliveries: Sequence[Delivery], window: CellWindow) -> ServerMap:
     for delivery in deliveries:
         if delivery.machine not in bad:
             grid.fold(delivery.rows, delivery.machine)
-    values = read_cells(view_of(grid, window), window, SERVER_LAYERS, CELL_M, ServerConfig())
+    config = ServerConfig()
+    values = read_cells(view_of(grid, window, config), window, SERVER_LAYERS, CELL_M, config)
     return ServerMap({name: layer.astype(np.float64) for name, layer in values.items()}, bad)
 
 

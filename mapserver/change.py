@@ -18,6 +18,7 @@ from mapserver import evidence as ev
 from mapserver.ladder import TimedPage
 from protocol.arrays import AnyArray, Bools, Floats, Ints
 from protocol.config import require_positive
+from protocol.geometry import BLOCK_CELLS
 
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
 ALIKE_BINS = 1.0  # cells whose pages' means differ by less are not looked at any closer
@@ -92,7 +93,7 @@ def credible(changed: Bools, kind: Floats, now: Floats, cell_m: float, config: C
     is size_m wide and its new kind is not that of the ground around, or twice as wide. kind: after the change, as in
     Cuts; now: `kinds` of all cells, NaN where they are not known.
     """
-    edge = max(1, round(config.size_m / cell_m))
+    edge = _edge(cell_m, config)
     ground = np.where(changed, np.nan, now)
     near = np.zeros(changed.shape, np.bool_)
     for one in np.unique(np.rint(kind[changed & np.isfinite(kind)])):
@@ -101,6 +102,16 @@ def credible(changed: Bools, kind: Floats, now: Floats, cell_m: float, config: C
         near |= around & (np.rint(kind) == one)
     new = changed & np.isfinite(kind) & ~near
     return _opened(changed, 2 * edge) | _opened(new, edge)
+
+
+def reach_blocks(cell_m: float, config: ChangeConfig) -> int:
+    """How many blocks away the cells are that `credible` looks at."""
+    edge = _edge(cell_m, config)
+    return -(-(4 * edge - 2) // BLOCK_CELLS)  # a square of 2 edge cells that holds a cell, and neighbours in it
+
+
+def _edge(cell_m: float, config: ChangeConfig) -> int:
+    return max(1, round(config.size_m / cell_m))
 
 
 def _opened(cells: Bools, edge: int) -> Bools:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapserver import evidence as ev
 from mapserver.hot import FREE, Hot, code_of
@@ -17,19 +15,14 @@ from protocol.geometry import BLOCK_CELLS
 WEIGHT_SHIFT = 32  # shares of a weight are exact to 2**-32 before they are rounded down
 
 
-@dataclass(frozen=True)
-class Folded:
-    """What became of rows. missing: codes of blocks that have to be opened first, nothing was folded then."""
-
-    missing: list[int]
-    folded: int = 0
-
-
 class Kernel(Protocol):
-    """Adds samples of one machine to hot blocks, or says which blocks are missing."""
+    """Adds samples of one machine to hot blocks, and opens those that it needs."""
 
-    def __call__(self, rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> Folded:
-        """Fold the rows that know their place well enough, all or none."""
+    def __call__(self, rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> int:
+        """Fold the rows that know their place well enough; returns how many.
+
+        Raises NoRoom where more blocks would have to be opened than there is room for: nothing was folded then.
+        """
         ...
 
 
@@ -46,22 +39,23 @@ def kernel(name: str) -> Kernel:
     return fold_numba
 
 
-def fold_numpy(rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> Folded:
+def fold_numpy(rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> int:
     """Fold without numba: the same integers, one stencil cell at a time over all samples."""
     votes = prepare(rows[is_foldable(rows, config)], machine, cell_m, config)
     corner = (votes.middle - votes.reach[:, None]) // BLOCK_CELLS
     codes = _codes(votes, corner)
     unique, inverse = np.unique(codes, return_inverse=True)
     found = hot.slots_of(unique.tolist())
-    if missing := unique[found == FREE].tolist():
-        return Folded(missing)
+    if (found == FREE).any():
+        hot.open(unique[found == FREE].tolist())
+        found = hot.slots_of(unique.tolist())
     slots = found[inverse].reshape(codes.shape)
     for offset_y, offset_x, share in _stencils(votes):
         hit = np.flatnonzero(share)
         column, row = votes.middle[hit, 0] + offset_x, votes.middle[hit, 1] + offset_y
         slot = slots[hit, (row >> 4) - corner[hit, 1], (column >> 4) - corner[hit, 0]]
         _add_votes(votes, hit, slot, (row & 15) * 16 + (column & 15), share[hit], hot)
-    return Folded([], len(votes.weight))
+    return len(votes.weight)
 
 
 def _codes(votes: Votes, corner: Ints) -> Ints:
@@ -99,18 +93,18 @@ def _raw_weight(votes: Votes, dy: int, dx: int) -> Ints:
 
 def _add_votes(votes: Votes, hit: Ints, slot: Ints, cell: Ints, weight: Ints, hot: Hot) -> None:
     """Add the weights of the samples `hit` to one cell each."""
-    counts = hot.counts.astype(np.uint32, copy=False)
     for part, first in enumerate((ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start)):
         votes_for = votes.bins[hit, part] >= 0
         at, where, bins = slot[votes_for], cell[votes_for], first + votes.bins[hit, part][votes_for]
         upper = weight[votes_for] * votes.shares[hit, part][votes_for] // ev.SHARE_ONE
-        _add(counts, at, bins, where, weight[votes_for] - upper)
-        _add(counts, at, bins + 1, where, upper)
-    _add(counts, slot, ev.HEADING.start + votes.sector[hit], cell, weight)
+        _add(hot, at, bins, where, weight[votes_for] - upper)
+        _add(hot, at, bins + 1, where, upper)
+    _add(hot, slot, ev.HEADING.start + votes.sector[hit], cell, weight)
     for which in (ev.VISITS, ev.MACHINES):
         np.bitwise_or.at(hot.bitmaps, (slot, np.full_like(slot, which), cell), votes.bits[hit, which])
     np.maximum.at(hot.newest, (slot, cell), votes.stamp_ns[hit])
 
 
-def _add(counts: NDArray[np.uint32], slot: Ints, plane: Ints, cell: Ints, weight: Ints) -> None:
-    np.add.at(counts, (slot, plane, cell), weight.astype(np.uint32))
+def _add(hot: Hot, slot: Ints, plane: Ints, cell: Ints, weight: Ints) -> None:
+    np.add.at(hot.counts, (slot, plane, cell), weight.astype(np.uint32))
+    hot.planes[slot, plane] = True

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from mapserver import evidence as ev
-from mapserver.fold import WEIGHT_SHIFT, Folded
+from mapserver.fold import WEIGHT_SHIFT
 from mapserver.hot import CODE_BITS, CODE_HALF, FREE, Hot
 from mapserver.votes import (
     GRADE_LOW,
@@ -40,15 +40,16 @@ _UNITS, _ONE = ev.WEIGHT_UNITS_PER_M, ev.SHARE_ONE
 _HASH = np.uint64(HASH)
 
 
-def fold_numba(rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> Folded:
+def fold_numba(rows: Table, machine: str, cell_m: float, config: FoldConfig, hot: Hot) -> int:
     """Fold rows; see `fold.Kernel`."""
     limits = (cell_m, config.std_floor_m**2, config.std_cap_m**2)
-    places, slots, folded, missing = _locate(rows, limits, config.bucket_ns, hot.keys, hot.places, hot.shift)
-    if len(missing):
-        return Folded(list(dict.fromkeys(missing.tolist())))
-    arrays = (hot.counts.reshape(-1), hot.bitmaps.reshape(-1), hot.newest.reshape(-1))
+    places, slots, folded, gaps = _locate(rows, limits, config.bucket_ns, hot.keys, hot.places, hot.shift)
+    if len(gaps):
+        hot.open(dict.fromkeys(gaps[:, 1].tolist()))
+        _fill(slots, gaps, hot.keys, hot.places, hot.shift)
+    arrays = (hot.counts.reshape(-1), hot.planes, hot.bitmaps.reshape(-1), hot.newest.reshape(-1))
     _fold(rows, places, slots, np.uint64(name_hash(machine)), *arrays)
-    return Folded([], folded)
+    return int(folded)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -57,13 +58,14 @@ def _locate(
 ) -> tuple[Any, Any, int, Any]:
     """Where each row lies, and the slots of all blocks that its stencil touches, row by row.
 
-    place: (n, 6) position in cells, inverse covariance xx, 2 xy, yy, and reach, -1 where a row has no vote.
+    place: (n, 6) position in cells, inverse covariance xx, 2 xy, yy, and reach, -1 where a row has no vote. Then the
+    slots, how many rows vote, and gaps (m, 2): index in slots and code of each block that is not open.
     """
     n = len(rows)
     where = np.empty((n, 6))
     slots = np.empty(4 * n, np.int64)
-    missing = np.empty(0, np.int64)
-    used, folded, gaps = 0, 0, 0
+    gaps = np.empty((16, 2), np.int64)
+    used, folded, missing = 0, 0, 0
     for k in range(n):
         _place(rows[k], limits, where[k])
         if where[k, 5] < 0:
@@ -77,22 +79,22 @@ def _locate(
                 code = (bucket << 2 * CODE_BITS) | ((x + CODE_HALF) << CODE_BITS) | (y + CODE_HALF)
                 slot = _find(keys, places, shift, code)
                 if slot == FREE:
-                    if gaps == len(missing):
-                        missing = _grown(missing)
-                    missing[gaps] = code
-                    gaps += 1
+                    if missing == len(gaps):
+                        gaps = np.concatenate((gaps, np.empty_like(gaps)))
+                    gaps[missing, 0], gaps[missing, 1] = used, code
+                    missing += 1
                 if used == len(slots):
-                    slots = _grown(slots)
+                    slots = np.concatenate((slots, np.empty_like(slots)))
                 slots[used] = slot
                 used += 1
-    return where, slots, folded, missing[:gaps]
+    return where, slots, folded, gaps[:missing]
 
 
 @numba.njit(cache=True, nogil=True)
-def _grown(values: Any) -> Any:
-    more = np.empty(max(16, 2 * len(values)), np.int64)
-    more[: len(values)] = values
-    return more
+def _fill(slots: Any, gaps: Any, keys: Any, places: Any, shift: int) -> None:
+    """Fill in the slots that were missing, now that they are open."""
+    for i in range(len(gaps)):
+        slots[gaps[i, 0]] = _find(keys, places, shift, gaps[i, 1])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -117,7 +119,9 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> None:
         out[5] = -1.0
         return
     per_m2 = 1 / (cell_m * cell_m)
-    xx, yy, xy = (cov_xx + floor_m2) * per_m2, (cov_yy + floor_m2) * per_m2, cov_xy * per_m2
+    most = np.sqrt(cov_xx * cov_yy)
+    xx, yy = (cov_xx + floor_m2) * per_m2, (cov_yy + floor_m2) * per_m2
+    xy = min(max(cov_xy, -most), most) * per_m2
     scale = 1 / (xx * yy - xy * xy)
     out[0], out[1] = row.x_m / cell_m, row.y_m / cell_m
     out[2], out[3], out[4] = yy * scale, -2 * xy * scale, xx * scale
@@ -125,7 +129,7 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _fold(rows: Any, places: Any, slots: Any, name: Any, counts: Any, bitmaps: Any, newest: Any) -> None:
+def _fold(rows: Any, places: Any, slots: Any, name: Any, counts: Any, planes: Any, bitmaps: Any, newest: Any) -> None:
     edge = 2 * int(max(0.0, places[:, 5].max())) + 1 if len(rows) else 1
     raw = np.empty(edge * edge, np.int64)
     lanes = np.empty((edge // 16 + 2) * edge * 16, np.uint32)
@@ -154,13 +158,18 @@ def _fold(rows: Any, places: Any, slots: Any, name: Any, counts: Any, bitmaps: A
             for x in range(across):
                 lane = lanes[(x * n + top - first_y) * 16 :][:size]
                 at = slots[used] * (_COUNTS * _CELLS) + offset
+                written = planes[slots[used]]
                 if resistance >= 0:
                     _vote(counts, at + (_RESISTANCE + resistance) * _CELLS, lane, resistance_share)
+                    written[_RESISTANCE + resistance] = written[_RESISTANCE + resistance + 1] = True
                 if east >= 0:
                     _vote(counts, at + (_EAST + east) * _CELLS, lane, east_share)
+                    written[_EAST + east] = written[_EAST + east + 1] = True
                 if north >= 0:
                     _vote(counts, at + (_NORTH + north) * _CELLS, lane, north_share)
+                    written[_NORTH + north] = written[_NORTH + north + 1] = True
                 _add(counts, at + (_HEADING + sector) * _CELLS, lane)
+                written[_HEADING + sector] = True
                 _mark(bitmaps, slots[used] * 2 * _CELLS + offset, lane, visit_bit, machine_bit)
                 _stamp(newest, slots[used] * _CELLS + offset, lane, row.stamp_ns)
                 used += 1

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapserver import evidence as ev
 from mapserver.fold import kernel
-from mapserver.hot import Hot, of_code
+from mapserver.hot import Hot, NoRoom, of_code
 from mapserver.ladder import Block, Ladder, TimedPage, rungs
 from mapserver.pages import Page
 from mapserver.reading import evidence
@@ -139,29 +139,31 @@ class Grid:
         return grid
 
     def _fold_piece(self, rows: Table, machine: str) -> None:
-        """Fold what the hot blocks have room for; cut the rest by place, until it fits."""
+        """Fold rows; where the hot blocks have no room for all, first one half by place, then the other."""
         weight = int(rows["distance_m"].sum(dtype=np.float64) * ev.WEIGHT_UNITS_PER_M) + len(rows)
         if self._hot.load + weight > ev.COUNT_MAX:
             self._drain()
-        done = self._kernel(rows, machine, self.cell_m, self.config, self._hot)
-        if done.missing and len(done.missing) > self._hot.room:
+        try:
+            folded = self._kernel(rows, machine, self.cell_m, self.config, self._hot)
+        except NoRoom as error:
+            self._make_room(rows, machine, error.wanted)
+            return
+        self._hot.load += weight
+        self.folded += folded
+        self.skipped += len(rows) - folded
+
+    def _make_room(self, rows: Table, machine: str, wanted: int) -> None:
+        """Fold rows that touch more blocks than there is room for."""
+        if len(self._hot):
             self._drain()
-            done = self._kernel(rows, machine, self.cell_m, self.config, self._hot)
-        if len(done.missing) > self._hot.room:
-            if len(rows) == 1:  # one stencil is larger than all hot blocks
-                self._hot = Hot(len(done.missing))
-                self._fold_piece(rows, machine)
-                return
-            half, rows = len(rows) // 2, rows[np.lexsort((rows["x_m"], rows["y_m"]))]
+            self._fold_piece(rows, machine)
+        elif len(rows) == 1:  # its stencil alone is larger than all hot blocks
+            self._hot = Hot(wanted)
+            self._fold_piece(rows, machine)
+        else:
+            rows, half = rows[np.lexsort((rows["x_m"], rows["y_m"]))], len(rows) // 2
             self._fold_piece(rows[:half], machine)
             self._fold_piece(rows[half:], machine)
-            return
-        if done.missing:
-            self._hot.open(done.missing)
-            done = self._kernel(rows, machine, self.cell_m, self.config, self._hot)
-        self._hot.load += weight
-        self.folded += done.folded
-        self.skipped += len(rows) - done.folded
 
     def _drain(self) -> None:
         """Pack what is hot."""

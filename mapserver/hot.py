@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
 from mapserver import evidence as ev
 from mapserver.pages import Page, pack
 from mapserver.votes import HASH
-from protocol.arrays import Ints
+from protocol.arrays import Bools, Ints
 
 # Block columns and rows are packed as 18 bits each below the bucket, which has 27: enough for 5 cm cells 100 km away,
 # and for minutes until the year 2100.
@@ -19,17 +19,27 @@ FREE = -1
 _MASK = (1 << CODE_BITS) - 1
 
 
+class NoRoom(Exception):  # noqa: N818 - what it says is no error
+    """Not so many blocks can be opened. wanted: how many."""
+
+    def __init__(self, wanted: int) -> None:
+        super().__init__(wanted)
+        self.wanted = wanted
+
+
 class Hot:
     """A fixed number of block buckets, zero when they are opened.
 
-    counts: (slots, COUNTS, 256) uint32; bitmaps: (slots, 2, 256) uint64; newest: (slots, 256) int64. Nothing saturates
-    here: `load`, the weight of all votes since the last `drain`, stays within COUNT_MAX (see Grid.fold).
+    counts: (slots, COUNTS, 256) uint32; planes: (slots, COUNTS) which of them have been written to; bitmaps:
+    (slots, 2, 256) uint64; newest: (slots, 256) int64. Nothing saturates here: `load`, the weight of all votes since
+    the last `drain`, stays within COUNT_MAX (see Grid.fold).
     keys, places: open-addressed hash table from code to slot, of a power of two entries, for kernels; a code's search
     begins at code * HASH >> shift (modulo 2**64).
     """
 
     def __init__(self, slots: int) -> None:
         self.counts = np.zeros((slots, ev.COUNTS, ev.CELLS), np.uint32)
+        self.planes: Bools = np.zeros((slots, ev.COUNTS), np.bool_)
         self.bitmaps = np.zeros((slots, 2, ev.CELLS), np.uint64)
         self.newest = np.zeros((slots, ev.CELLS), np.int64)
         entries = 1 << (2 * slots).bit_length()
@@ -39,11 +49,6 @@ class Hot:
         self.shift = 64 - (entries.bit_length() - 1)
         self._slots: dict[int, int] = {}
 
-    @property
-    def room(self) -> int:
-        """How many more blocks can be opened."""
-        return len(self.counts) - len(self._slots)
-
     def __len__(self) -> int:
         return len(self._slots)
 
@@ -51,8 +56,10 @@ class Hot:
         """Slots of open blocks, FREE for those that are not open."""
         return np.array([self._slots.get(code, FREE) for code in codes], np.int64)
 
-    def open(self, codes: Iterable[int]) -> None:
-        """Give each of these blocks a slot; the caller sees to it that there is room."""
+    def open(self, codes: Collection[int]) -> None:
+        """Give each of these blocks a slot, or raise NoRoom before any has one."""
+        if len(codes) > len(self.counts) - len(self._slots):
+            raise NoRoom(len(codes))
         for code in codes:
             slot = self._slots[code] = len(self._slots)
             entry = ((code * HASH) & (2**64 - 1)) >> self.shift
@@ -64,7 +71,7 @@ class Hot:
         """Pack all blocks; afterwards none is open."""
         slots, self._slots = self._slots, {}
         for code, slot in slots.items():
-            page = pack(self.counts[slot], self.bitmaps[slot], self.newest[slot])
+            page = pack(self.counts[slot], self.planes[slot], self.bitmaps[slot], self.newest[slot])
             if len(page.cells):
                 yield code, page
         self.keys[:] = FREE

@@ -15,6 +15,7 @@ from typing import Any
 
 from mapserver import watch
 from mapserver.archive import FOLDER, archive
+from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.decisions import KIND, PERSON, Decision, Decisions
 from mapserver.grid import Grid
@@ -198,8 +199,9 @@ class Keeper:
 
     def _look(self) -> None:
         """Look for changes where something was folded since the last look."""
+        reach = reach_blocks(self._site.cell_m, self._config.change)
         while not self._ending:
-            blocks, pages = self._writer.read(_touched)
+            blocks, pages = self._writer.read(lambda store: _touched(store, reach))
             if not blocks:
                 return
             with self._state:
@@ -234,10 +236,10 @@ class Keeper:
         return True
 
 
-def _touched(store: Store) -> tuple[list[Block], dict[Block, list[TimedPage]]]:
+def _touched(store: Store, reach: int) -> tuple[list[Block], dict[Block, list[TimedPage]]]:
     """Some of the blocks in which something was folded since they were looked at, and pages of them and around."""
     blocks = store.grid.take_touched(LOOK_BLOCKS)
-    wide = sorted({near for block in blocks for near in around(block)})
+    wide = sorted({near for block in blocks for near in around(block, reach)})
     return blocks, {block: pages for block, pages in zip(wide, store.grid.pages(wide), strict=True) if pages}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver import evidence as ev
-from mapserver.change import ChangeConfig, credible, cuts, kinds
+from mapserver.change import ChangeConfig, credible, cuts, kinds, reach_blocks
 from mapserver.ladder import Block, TimedPage
 from protocol.arrays import AnyArray, Ints
 from protocol.geometry import BLOCK_CELLS
@@ -19,14 +19,15 @@ Pages = Mapping[Block, Sequence[TimedPage]]
 def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block, Ints]:
     """For each block, index (256,) of the first page that holds now in each of its cells, 0 where nothing changed.
 
-    Cells at the edge of the blocks see no further: give a ring of blocks more than are wanted.
+    Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted.
     """
     found = {block: cuts(of_block, config) for block, of_block in pages.items()}
     first = {block: cut.first for block, cut in found.items()}
     changed = [block for block, cut in found.items() if cut.first.any()]
     if not changed:
         return first
-    near = {block for one in changed for block in around(one) if block in found}
+    reach = reach_blocks(cell_m, config)
+    near = {block for one in changed for block in around(one, reach) if block in found}
     image, corner = image_of({block: first[block] > 0 for block in near}, False)
     kind, _ = image_of({block: found[block].kind for block in near}, np.nan)
     now, _ = image_of({block: kinds(pages[block]) for block in near}, np.nan)
@@ -36,10 +37,11 @@ def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block
     return first
 
 
-def around(block: Block) -> list[Block]:
-    """A block and its eight neighbours."""
+def around(block: Block, reach: int) -> list[Block]:
+    """A block and its neighbours, `reach` blocks to every side."""
     x, y = block
-    return [(x + dx, y + dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    steps = range(-reach, reach + 1)
+    return [(x + dx, y + dy) for dy in steps for dx in steps]
 
 
 def evidence(pages: Sequence[Sequence[TimedPage]], first: Sequence[Ints] | None = None) -> ev.Evidence:

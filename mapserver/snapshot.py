@@ -18,7 +18,7 @@ import numpy as np
 
 from mapserver import evidence as ev
 from mapserver.grid import Grid, GridState, Placed
-from mapserver.pages import CELL, NARROW, WIDE, Page
+from mapserver.pages import CELL, NARROW, WIDE, Page, frozen
 from mapserver.votes import FoldConfig
 from protocol.arrays import AnyArray
 
@@ -77,6 +77,8 @@ def load(path: Path, cell_m: float, config: FoldConfig, left_out: Collection[str
             if {key: header.get(key) for key in expected} != expected:
                 return None
             state = GridState(_pages(file), *(header[name] for name in _TOTALS))
+            if path.name != f"snapshot-{header['row']}.npz":
+                raise ValueError(f"it is true for row {header['row']}")
             return header["row"], Grid.from_state(cell_m, config, state)
     except Exception as error:  # zipfile and numpy answer damage with a dozen kinds of error
         log.warning("snapshot passed over path=%s error=%r", path, str(error))
@@ -121,10 +123,21 @@ def _pages(file: Mapping[str, AnyArray]) -> tuple[Placed, ...]:
     parts, cells, taken = (file["narrow"], file["wide"]), file["cells"], [0, 0, 0]
     found = []
     for x, y, rung, index, which, votes, k in file["pages"].tolist():
-        page = Page(parts[which][taken[which] :][:votes].copy(), cells[taken[2] :][:k].copy())
+        if min(rung, index, which, votes, k) < 0:
+            raise ValueError("a page of an impossible kind")
+        page = Page(frozen(parts[which][taken[which] :][:votes]), frozen(cells[taken[2] :][:k]))
+        _check(page)
         found.append(Placed(x, y, rung, index, page))
         taken[which] += votes
         taken[2] += k
     if taken != [len(parts[0]), len(parts[1]), len(cells)]:
         raise ValueError("parts of other lengths than its pages say")
     return tuple(found)
+
+
+def _check(page: Page) -> None:
+    """Refuse what no page can be: places in order and within a block, cells in order."""
+    place, cell = page.votes["place"].astype(np.int64), page.cells["cell"].astype(np.int64)
+    in_order = (np.diff(place) > 0).all() and (np.diff(cell) > 0).all()
+    if not in_order or (len(place) and place[-1] >= ev.COUNTS * ev.CELLS):
+        raise ValueError("votes or cells that no page can have")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mapserver import layers
+from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.grid import Grid, chunks
 from mapserver.journal import JournalReader, Wanted
@@ -44,9 +45,10 @@ class Past:
 
     def view(self, window: CellWindow, stamp_ns: int, without: frozenset[str]) -> View:
         """The map from samples stamped so or earlier; journal rows that are committed meanwhile may be in it."""
+        reach = reach_blocks(self.cell_m, self.config.change)
         with self._history() as (history, last_row):
-            grid = grid_as_of(history, stamp_ns, self.cell_m, self.config.fold, _surroundings(window), without)
-        return View(_pages(grid, window), last_row, stamp_ns)
+            grid = grid_as_of(history, stamp_ns, self.cell_m, self.config.fold, _surroundings(window, reach), without)
+        return View(_pages(grid, window, reach), last_row, stamp_ns)
 
     def moments(self, cell: tuple[int, int], wanted: Wanted, span_s: float) -> tuple[list[Moment], int]:
         """Evidence of a cell (column, row) span by span, and the journal row that it is true for."""
@@ -67,12 +69,13 @@ class Past:
 
 def view_now(store: Store, window: CellWindow) -> View:
     """The map as it is; on the thread that owns the store."""
-    return View(_pages(store.grid, window), store.merged, store.newest_ns)
+    reach = reach_blocks(store.site.cell_m, store.config.change)
+    return View(_pages(store.grid, window, reach), store.merged, store.newest_ns)
 
 
-def view_of(grid: Grid, window: CellWindow) -> View:
+def view_of(grid: Grid, window: CellWindow, config: ServerConfig) -> View:
     """The map that a grid makes, without a journal."""
-    return View(_pages(grid, window), 0, grid.newest_ns)
+    return View(_pages(grid, window, reach_blocks(grid.cell_m, config.change)), 0, grid.newest_ns)
 
 
 def read_cells(
@@ -100,16 +103,17 @@ def cropped(layer: Floats32, wide: CellWindow, window: CellWindow) -> Floats32:
     return layer[row : row + window.rows, column : column + window.columns]
 
 
-def _pages(grid: Grid, window: CellWindow) -> Pages:
-    blocks = grid.blocks_in(_surroundings(window))
+def _pages(grid: Grid, window: CellWindow, reach: int) -> Pages:
+    blocks = grid.blocks_in(_surroundings(window, reach))
     return dict(zip(blocks, grid.pages(blocks), strict=True))
 
 
-def _surroundings(window: CellWindow) -> CellWindow:
-    """All cells of the blocks that a window touches, and of those around them."""
+def _surroundings(window: CellWindow, reach: int) -> CellWindow:
+    """All cells of the blocks that a window touches, and of `reach` blocks to every side."""
     n = BLOCK_CELLS
-    left, bottom = window.column // n - 1, window.row // n - 1
-    right, top = (window.column + window.columns - 1) // n + 2, (window.row + window.rows - 1) // n + 2
+    left, bottom = window.column // n - reach, window.row // n - reach
+    right = (window.column + window.columns - 1) // n + 1 + reach
+    top = (window.row + window.rows - 1) // n + 1 + reach
     return CellWindow(left * n, bottom * n, (right - left) * n, (top - bottom) * n)
 
 

@@ -61,7 +61,6 @@ class FoldConfig:
         for name in ("keep_buckets", "keep_hours", "keep_days"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise ValueError(f"{name}: {getattr(self, name)} is not between 1 and 1000")
-        # the floor also keeps the covariance invertible: samples are checked in single precision
         if not 0.01 <= self.std_floor_m < self.std_cap_m <= 30:
             raise ValueError("std_floor_m must be at least 0.01 and below std_cap_m, std_cap_m at most 30")
         if not 1 <= self.hot_blocks <= 100_000:
@@ -115,7 +114,9 @@ def prepare(rows: Table, machine: str, cell_m: float, config: FoldConfig) -> Vot
     floor, per_m2 = config.std_floor_m**2, 1 / (cell_m * cell_m)
     xx = (rows["cov_xx_m2"].astype(np.float64) + floor) * per_m2
     yy = (rows["cov_yy_m2"].astype(np.float64) + floor) * per_m2
-    xy = rows["cov_xy_m2"].astype(np.float64) * per_m2
+    # samples are checked in single precision: what rounding lets pass must not make the covariance indefinite
+    most = np.sqrt(rows["cov_xx_m2"].astype(np.float64) * rows["cov_yy_m2"].astype(np.float64))
+    xy = np.clip(rows["cov_xy_m2"].astype(np.float64), -most, most) * per_m2
     scale = 1 / (xx * yy - xy * xy)
     pairs = [split_resistance(rows["c_rr"].astype(np.float64))]
     pairs += [split_grade(rows[name].astype(np.float64)) for name in ("grade_e", "grade_n")]

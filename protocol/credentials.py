@@ -15,6 +15,7 @@ from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, IDENTITY_FILE = "ca.pem", "cert.pem", "key.pem", "identity.toml"
+SIGNING_FILE = "sign.pem"  # machines only
 
 
 @dataclass(frozen=True)

@@ -23,13 +23,18 @@ ROLES = ("machine", "visitor", "server", "admin", "sim")
 
 @dataclass(frozen=True)
 class Entry:
-    """One name. serial: of its newest certificate, hex. issue: 1, and one more each time it comes back from revoked."""
+    """One name.
+
+    serial: of its newest certificate, hex. issue: 1, and one more each time it comes back from revoked. signing: the
+    public key that its batches are signed with, base64; none where it sends none.
+    """
 
     role: str
     serial: str
     expires: datetime
     issue: int = 1
     revoked: bool = False
+    signing: str = ""
 
     def __post_init__(self) -> None:
         if self.role not in (*ROLES, ROUTER):
@@ -51,6 +56,10 @@ class Register:
     def admitted(self) -> dict[str, Entry]:
         """Those that are let in: neither revoked nor the router itself."""
         return {name: entry for name, entry in self.names.items() if not entry.revoked and entry.role != ROUTER}
+
+    def signing_keys(self) -> dict[str, str]:
+        """Public keys of the machines whose batches are taken."""
+        return {name: entry.signing for name, entry in self.admitted().items() if entry.signing}
 
     def next_issue(self, name: str) -> int:
         """The issue that a new certificate of this name belongs to."""
@@ -93,7 +102,7 @@ def register_toml(register: Register) -> str:
     for name, entry in sorted(register.names.items()):
         lines += ["", f"[names.{name}]", *_plain(role=entry.role, serial=entry.serial)]
         lines += [f"expires = {entry.expires.astimezone(UTC):%Y-%m-%dT%H:%M:%SZ}"]
-        lines += _plain(issue=entry.issue, revoked=entry.revoked)
+        lines += _plain(issue=entry.issue, revoked=entry.revoked, signing=entry.signing)
     return "\n".join(lines) + "\n"
 
 

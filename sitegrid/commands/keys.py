@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from protocol.certificates import Pair, expires_at, issue, make_authority
-from protocol.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, IDENTITY_FILE, KEY_FILE
+from protocol.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, IDENTITY_FILE, KEY_FILE, SIGNING_FILE
 from protocol.errors import ConfigError
 from protocol.keys import check_name
+from protocol.signing import make_signing_key
 from sitegrid.process import say
 from sitegrid.register import (
     REGISTER_FILE,
@@ -133,10 +134,13 @@ def _certify(folder: Path, register: Register, name: str, role: str, expires: da
     number = register.next_issue(name)
     hosts = register.hosts if role == ROUTER else ()
     pair = issue(authority, common_name(name, number), now, expires, hosts)
-    entry = Entry(role, pair.serial, expires_at(pair), number)
+    signing_key, public = make_signing_key() if role == "machine" else (b"", "")
+    entry = Entry(role, pair.serial, expires_at(pair), number, signing=public)
     identity = f'site = "{register.site}"\nname = "{name}"\nrole = "{role}"\nexpires = {entry.expires.isoformat()}\n'
     _private_folder(folder / name)
     files = {AUTHORITY_FILE: authority.certificate, CERTIFICATE_FILE: pair.certificate, KEY_FILE: pair.key}
+    if signing_key:
+        files[SIGNING_FILE] = signing_key
     for file, data in {**files, IDENTITY_FILE: identity.encode()}.items():
         _write(folder / name / file, data)
     register = register.with_entry(name, entry)

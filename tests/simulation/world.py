@@ -167,7 +167,7 @@ class World:
     def note(self, text: str) -> None:
         """Trace what happens."""
         if self._say:
-            self._say(text)
+            self._say(text.replace(str(self._folder), "."))
 
     def close(self) -> None:
         """Let go of the server's files."""
@@ -319,7 +319,8 @@ class World:
             self._copies[agent.machine] = self._copy(agent.path, self._folder / f"copy-{next(self._numbers)}.db")
             self.note(f"{agent.name} copied")
         elif self.rng.random() < 0.5:
-            self._explained |= self._held(agent.path) - self._held(copy)  # gone with the disk that is thrown away
+            # Gone with the disk that is thrown away; what was put aside there is declared lost, the copy's too.
+            self._explained |= self._held(agent.path) - self._held(copy) | self._put_aside(agent.path)
             self._end(agent, orderly=False)
             agent.in_doubt = []
             self._copy(copy, agent.path)
@@ -392,7 +393,7 @@ class World:
         by_identity = Counter((one.machine, one.spool_id, one.seq) for one in taken)
         verdict.double = max(sum(n - 1 for n in found.values()) for found in (by_stamp, by_identity))
         for agent in self._agents:
-            self._explained |= _stamp_set(row for (row,) in self._query(agent.path, "SELECT row FROM aside"))
+            self._explained |= self._put_aside(agent.path)
         right = {_stamp(one.row) for one in taken if one.row in self._contents.get(_stamp(one.row), ())}
         missing = self._contents.keys() - right
         verdict.recorded, verdict.journalled = len(self._contents), len(right)
@@ -423,8 +424,11 @@ class World:
             if a.spool and (found := a.spool.counters())
             for name in ("dropped", "put_aside")
         )
-        if counted < self.verdict.explained:
-            self.verdict.problems.append(f"{self.verdict.explained} never arrived, {counted} are counted")
+        never = self.verdict.explained
+        if counted < never:
+            self.verdict.problems.append(f"{never} never arrived, {counted} are counted")
+        if (declared := sum(lost for _, lost in self._server.marks().values())) > never:
+            self.verdict.problems.append(f"{never} never arrived, {declared} were declared lost")
 
     # --- helpers -----------------------------------------------------------------------------------------------------
 
@@ -475,9 +479,10 @@ class World:
             return _stamp_set(row for (row,) in agent.spool._db.execute("SELECT row FROM sample"))
 
     def _held(self, path: Path) -> set[int]:
-        return _stamp_set(
-            row for table in ("sample", "aside") for (row,) in self._query(path, f"SELECT row FROM {table}")
-        )
+        return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM sample"))
+
+    def _put_aside(self, path: Path) -> set[int]:
+        return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM aside"))
 
     def _query(self, path: Path, statement: str) -> list[tuple[bytes]]:
         """Read a file, whoever has it open: a copy of it."""

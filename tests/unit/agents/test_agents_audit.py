@@ -1,3 +1,4 @@
+import contextlib
 from pathlib import Path
 
 import pytest
@@ -5,6 +6,7 @@ from agents_drives import made_up_samples
 
 from agents.audit import AuditLog, parse, read_audit
 from agents.spool import Spool, SpoolConfig
+from protocol.errors import StoreError
 from protocol.samples import content_hash
 
 ROWS = made_up_samples(20)
@@ -44,16 +46,24 @@ def test_renumbered_samples_lose_their_old_identity(path: Path) -> None:
     assert read_audit(path) == numbered(7, 1, HASHES[:3]) | numbered(8, 1, HASHES[3:5])
 
 
-def test_samples_that_a_crash_kept_from_the_spool_are_void(path: Path) -> None:
+def test_what_a_crash_kept_from_being_noted_is_added(path: Path) -> None:
     audit = AuditLog(path)
-    audit.recorded(7, 1, ROWS[:5])
-    audit.recorded(9, 1, ROWS[:5])
+    audit.recorded(7, 1, ROWS[:3])
     audit.close()
     again = AuditLog(path)
-    again.reconcile(7, 3)
-    again.recorded(7, 4, ROWS[10:11])
+    again.complete([(7, 3, ROWS[2]), (7, 4, ROWS[3]), (8, 1, ROWS[4])])
     again.close()
-    assert read_audit(path) == numbered(7, 1, [*HASHES[:3], HASHES[10]]) | numbered(9, 1, HASHES[:5])
+    assert read_audit(path) == numbered(7, 1, HASHES[:4]) | numbered(8, 1, HASHES[4:5])
+    assert path.read_text().count("\n") == 5, "what is known is not repeated"
+
+
+def test_sample_that_is_on_disk_with_another_content_is_noted_so(path: Path) -> None:
+    """It was pending when the process was killed: its final value never came to the disk, or was not noted."""
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.complete([(7, 2, ROWS[12])])
+    audit.close()
+    assert read_audit(path) == numbered(7, 1, [HASHES[0], HASHES[12], HASHES[2]])
 
 
 @pytest.mark.parametrize("cut", [1, 5, 10, 18])
@@ -64,10 +74,10 @@ def test_line_that_a_crash_cut_off_counts_for_nothing(path: Path, cut: int) -> N
     path.write_bytes(path.read_bytes()[:-cut])
     assert read_audit(path) == numbered(7, 1, HASHES[:2])
     again = AuditLog(path)
-    again.reconcile(7, 3)
+    again.complete([(7, 3, ROWS[2])])
     again.recorded(7, 4, ROWS[3:4])
     again.close()
-    assert read_audit(path) == numbered(7, 1, HASHES[:2]) | numbered(7, 4, HASHES[3:4])
+    assert read_audit(path) == numbered(7, 1, HASHES[:4])
 
 
 def test_void_line_that_was_cut_off_voids_no_other_sample(path: Path) -> None:
@@ -90,10 +100,36 @@ def test_spool_notes_what_it_records_finalises_and_numbers_anew(tmp_path: Path, 
     spool.record(ROWS[:2])
     spool.record(ROWS[2:4], final=False)
     spool.finalise(3, ROWS[12:14])
+    spool.finalise(1, ROWS[15:16])  # is final already
     assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14]])
-    spool.meet(99)
-    assert read_audit(path) == numbered(6, 1, [*HASHES[:2], *HASHES[12:14]])
+    spool.acknowledge(5, 1)
+    spool.fork()
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14]])
     spool.close()
+
+
+def test_sample_that_the_disk_did_not_take_is_not_in_the_audit(tmp_path: Path, path: Path) -> None:
+    spool = Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path))
+    spool._db.execute("PRAGMA query_only = ON")
+    with pytest.raises(StoreError):
+        spool.record(ROWS[:2])
+    assert read_audit(path) == {}
+    spool.close()
+
+
+def test_audit_on_a_full_disk_keeps_no_sample_from_the_spool(tmp_path: Path, path: Path) -> None:
+    audit = AuditLog(path)
+    audit._file.close()
+    with Path("/dev/full").open("w", encoding="ascii", buffering=1) as full:
+        audit._file = full
+        spool = Spool(tmp_path / "spool.db", SpoolConfig(), None, iter([5, 6]).__next__)
+        spool._audit = audit
+        assert spool.record(ROWS[:2]) == 1
+        spool._db.close()
+        with contextlib.suppress(OSError):
+            full.close()
+    Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([6]).__next__).close()
+    assert read_audit(path) == numbered(5, 1, HASHES[:2])
 
 
 def test_dropped_samples_stay_in_the_audit(tmp_path: Path, path: Path) -> None:

@@ -4,6 +4,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from agents_drives import SITE, made_up_samples
 
@@ -16,6 +17,8 @@ from protocol.messages import Ack, Refused, SampleBatch
 from protocol.samples import content_hash
 
 ROWS = made_up_samples(500)
+QUICK_S = 0.01  # an exchange over a good link
+TIMEOUT_S = UplinkConfig().timeout_s
 MEMORY = Path(":memory:")  # the spool's files have tests of their own
 
 
@@ -47,15 +50,27 @@ def uplink(n: int = 0, max_samples: int = 10_000, **options: Any) -> tuple[Uplin
     spool = Spool(MEMORY, SpoolConfig(max_samples))
     if n:
         spool.record(ROWS[:n])
-    return UplinkState("loader-1", SITE.frame, spool, UplinkConfig(**options)), spool
+    return UplinkState("loader-1", SITE.frame, spool, UplinkConfig(**options), np.random.default_rng(0)), spool
 
 
-def met(n: int = 0, **options: Any) -> tuple[UplinkState, Spool]:
-    """An uplink that has learnt the watermark."""
-    state, spool = uplink(n, **options)
+def met(n: int = 0, max_samples: int = 10_000, **options: Any) -> tuple[UplinkState, Spool]:
+    """An uplink that the server has answered once."""
+    state, spool = uplink(max_samples=max_samples, **options)
     assert state.next_payload()
-    assert state.on_reply(Ack(0, 0)) == 0
+    assert heard(state, Ack(0, 0)) == 0
+    if n:
+        spool.record(ROWS[:n])
     return state, spool
+
+
+def heard(state: UplinkState, reply: Ack | Refused | None) -> float:
+    """Hand in an answer that came at once, or none within the time-out; returns the pause."""
+    return state.on_reply(reply, TIMEOUT_S if reply is None else QUICK_S)
+
+
+def silence(state: UplinkState) -> float:
+    """Nothing came within the time-out."""
+    return heard(state, None)
 
 
 def next_batch(state: UplinkState) -> SampleBatch:
@@ -64,24 +79,37 @@ def next_batch(state: UplinkState) -> SampleBatch:
     return decode_batch(payload, 1e9)
 
 
-def test_first_payload_asks_for_the_watermark() -> None:
-    state, spool = uplink(5)
+def test_first_payload_of_an_empty_spool_is_a_question() -> None:
+    state, spool = uplink()
     batch = next_batch(state)
     assert (batch.machine, batch.spool_id, batch.frame) == ("loader-1", spool.spool_id, SITE.frame)
     assert (batch.first_seq, len(batch.rows), batch.lost_before) == (1, 0, 0)
-    state.on_reply(Ack(0, 0))
+    heard(state, Ack(0, 0))
+    assert state.next_payload() is None
+
+
+def test_samples_need_no_question() -> None:
+    state, _ = uplink(5)
     assert len(next_batch(state).rows) == 5
 
 
-def test_watermark_is_asked_for_until_somebody_answers() -> None:
-    state, _ = uplink(5)
+def test_question_is_asked_until_somebody_answers() -> None:
+    state, _ = uplink()
     for _ in range(3):
         assert len(next_batch(state).rows) == 0
-        state.on_reply(None)
-    assert state.problem == "no answer from the map server"
-    state.on_reply(Ack(0, 0))
-    assert len(next_batch(state).rows) > 0
+        silence(state)
+    assert state.problem == "no answer from the map server within 3 s"
+    heard(state, Ack(0, 0))
+    assert state.next_payload() is None
     assert state.problem == ""
+
+
+def test_held_uplink_sends_nothing() -> None:
+    state, _ = uplink(5)
+    state.held = "another agent has this name"
+    assert state.next_payload() is None
+    state.held = ""
+    assert len(next_batch(state).rows) == 5
 
 
 def test_empty_spool_has_nothing_to_send() -> None:
@@ -95,10 +123,10 @@ def test_nothing_is_deleted_before_the_acknowledgement() -> None:
     state, spool = met(5)
     for reply in (None, Refused(Refusal.OVERLOADED, ""), Refused(Refusal.STORE, "")):
         next_batch(state)
-        state.on_reply(reply)
+        heard(state, reply)
         assert spool.counters()["depth"] == 5
     next_batch(state)
-    state.on_reply(Ack(5, 1))
+    heard(state, Ack(5, 1))
     assert spool.counters()["depth"] == 0
     assert state.counters["batches"] == 1
 
@@ -109,7 +137,7 @@ def test_batch_is_halved_on_a_time_out_and_doubled_on_success() -> None:
     for reply in ("lost", "lost", "ok", "ok", "ok", "ok"):
         batch = next_batch(state)
         sizes.append(len(batch.rows))
-        state.on_reply(None if reply == "lost" else Ack(batch.last_seq, 1))
+        heard(state, None if reply == "lost" else Ack(batch.last_seq, 1))
     assert sizes == [64, 32, 16, 32, 64, 100]
     assert state.counters["timeouts"] == 2
 
@@ -118,7 +146,7 @@ def test_batch_is_never_less_than_one_sample() -> None:
     state, _ = met(500, batch_samples=4)
     for _ in range(20):
         state.next_payload()
-        state.on_reply(None)
+        silence(state)
     assert len(next_batch(state).rows) == 1
 
 
@@ -128,32 +156,112 @@ def test_pause_doubles_up_to_its_bound_and_starts_anew_after_success(reply: Refu
     pauses = []
     for _ in range(2000):
         state.next_payload()
-        pauses.append(state.on_reply(reply))
-    assert pauses[:5] == pytest.approx([0.2, 0.4, 0.8, 1.5, 1.5])
-    assert max(pauses) == 1.5
+        pauses.append(heard(state, reply))
+    for pause, most in zip(pauses, (0.2, 0.4, 0.8, *[1.5] * 1997), strict=True):
+        assert most / 2 <= pause <= most
     next_batch(state)
-    state.on_reply(Ack(0, 1))
+    heard(state, Ack(5, 1))
+    state._spool.record(ROWS[5:6])
     state.next_payload()
-    assert state.on_reply(None) == pytest.approx(0.2)
+    assert silence(state) <= 0.2
+
+
+def test_pauses_of_a_fleet_spread() -> None:
+    pauses = []
+    for seed in range(100):
+        state = UplinkState(
+            "loader-1", SITE.frame, Spool(MEMORY, SpoolConfig()), UplinkConfig(), np.random.default_rng(seed)
+        )
+        state.next_payload()
+        pauses.append(silence(state))
+    assert max(pauses) - min(pauses) > 0.4 * UplinkConfig().backoff_s
+    assert len(set(pauses)) == 100
+
+
+# --- the link --------------------------------------------------------------------------------------------------------
+
+
+def test_missing_server_leaves_the_batch_as_it_is() -> None:
+    state, _ = met(500, batch_samples=64)
+    for _ in range(10):
+        state.next_payload()
+        assert state.on_reply(None, 0.001) > 0
+    assert "is one running" in state.problem
+    assert state.counters["unanswered"] == 10
+    assert len(next_batch(state).rows) == 64
+
+
+@pytest.mark.parametrize(
+    ("rate_bps", "delay_s", "jitter_s"),
+    [(300e3, 0.05, 0.0), (300e3, 0.3, 0.2), (30e3, 0.1, 0.1), (1e6, 0.05, 0.1), (10e6, 0.02, 0.0), (300e3, 1.6, 0.0)],
+)
+def test_batch_fits_the_link(rate_bps: float, delay_s: float, jitter_s: float) -> None:
+    """The link is used well, an exchange takes about a third of the time-out, and few run into it."""
+    rng = np.random.default_rng(1)
+    state, spool = met(max_samples=100_000)
+    spool.record(made_up_samples(60_000))
+    took, sent, now_s = [], 0, 0.0
+    while now_s < 120 and (payload := state.next_payload()):
+        need_s = delay_s + rng.uniform(0, jitter_s) + 8 * len(payload) / rate_bps
+        batch = decode_batch(payload, 1e9)
+        if need_s < TIMEOUT_S:
+            sent += len(batch.rows)
+            took.append(need_s)
+            now_s += need_s + state.on_reply(Ack(batch.last_seq, 1), need_s)
+        else:
+            now_s += TIMEOUT_S + silence(state)
+    late = took[len(took) // 2 :]
+    assert state.counters["timeouts"] <= 3
+    # Smaller batches would not help where the delay alone takes that long, nor where the first one is small already.
+    assert np.median(late) < max(1.2, 1.2 * delay_s + 0.5) if rate_bps > 100e3 else max(late) < TIMEOUT_S
+    share = sent * 68 * 8 / rate_bps / now_s
+    assert sent == 60_000 or share > (0.6 if delay_s < 0.2 else 0.15)
+
+
+def test_link_that_gets_slower_costs_few_time_outs() -> None:
+    state, spool = met(max_samples=100_000)
+    spool.record(made_up_samples(60_000))
+    rates, timeouts = [10e6] * 8 + [100e3] * 20, 0
+    for rate_bps in rates:
+        payload = state.next_payload()
+        assert payload
+        need_s = 0.05 + 8 * len(payload) / rate_bps
+        if need_s < TIMEOUT_S:
+            state.on_reply(Ack(decode_batch(payload, 1e9).last_seq, 1), need_s)
+        else:
+            silence(state)
+            timeouts += 1
+    assert timeouts <= 5
+    assert need_s < TIMEOUT_S / 2
 
 
 def test_server_that_lost_samples_is_told_so() -> None:
     """It was restored from a backup after this agent had met it."""
-    state, spool = met(20, batch_samples=5)
-    state.on_reply(Ack(next_batch(state).last_seq, 1))
+    state, spool = met(20, batch_samples=5, max_batch_samples=5)
+    heard(state, Ack(next_batch(state).last_seq, 1))
     assert next_batch(state).first_seq == 6
-    assert state.on_reply(Refused(Refusal.GAP, "expected 3", 3)) == 0
+    assert heard(state, Refused(Refusal.GAP, "expected 3", 3)) == 0
     batch = next_batch(state)
     assert (batch.first_seq, batch.lost_before) == (6, 3)
     assert state.counters["refused_gap"] == 1
     assert spool.counters()["put_aside"] == 0
 
 
+@pytest.mark.parametrize("watermark", [0, 5])
+def test_ack_that_moves_nothing_is_no_reason_to_hurry(watermark: int) -> None:
+    state, spool = met(10, batch_samples=5)
+    heard(state, Ack(next_batch(state).last_seq, 1))
+    next_batch(state)
+    assert heard(state, Ack(watermark, 1)) > 0
+    assert f"acknowledges {watermark}" in state.problem
+    assert spool.counters()["depth"] == 5
+
+
 def test_gap_that_names_no_expected_sample_puts_nothing_aside() -> None:
     state, spool = met(1)
     for expected in (0, 99):
         next_batch(state)
-        assert state.on_reply(Refused(Refusal.GAP, "?", expected)) > 0
+        assert heard(state, Refused(Refusal.GAP, "?", expected)) > 0
     batch = next_batch(state)
     assert (batch.first_seq, batch.lost_before) == (1, 0)
     assert spool.counters()["put_aside"] == 0
@@ -170,7 +278,7 @@ def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
         payload = state.next_payload()
         if payload is None:
             break
-        assert state.on_reply(server.answer(payload)) == 0
+        assert heard(state, server.answer(payload)) == 0
     good = [content_hash(row) for i, row in enumerate(rows) if i != bad]
     assert sorted(h for _, _, h in server.taken) == sorted(good)
     assert set(server.taken.values()) == {1}
@@ -185,7 +293,7 @@ def test_bisection_halves() -> None:
     sizes = []
     for _ in range(4):
         sizes.append(len(next_batch(state).rows))
-        state.on_reply(Refused(Refusal.NOT_FINITE, "c_rr[0]"))
+        heard(state, Refused(Refusal.NOT_FINITE, "c_rr[0]"))
     assert sizes == [16, 8, 4, 2]
 
 
@@ -194,7 +302,7 @@ def test_what_is_no_sample_s_fault_puts_nothing_aside(reason: Refusal) -> None:
     state, spool = met(1)
     for _ in range(5):
         next_batch(state)
-        assert state.on_reply(Refused(reason, "as it is")) > 0
+        assert heard(state, Refused(reason, "as it is")) > 0
     assert state.problem == "as it is"
     assert state.counters[f"refused_{reason}"] == 5
     assert spool.counters()["put_aside"] == 0
@@ -202,32 +310,68 @@ def test_what_is_no_sample_s_fault_puts_nothing_aside(reason: Refusal) -> None:
 
 
 def test_question_that_is_refused_is_asked_again() -> None:
-    state, _ = uplink(5)
+    state, _ = uplink()
     state.next_payload()
-    assert state.on_reply(Refused(Refusal.FIRST_SEQ, "?")) > 0
+    assert heard(state, Refused(Refusal.FIRST_SEQ, "?")) > 0
     assert len(next_batch(state).rows) == 0
 
 
-def test_new_spool_id_is_counted_and_used() -> None:
-    state, spool = uplink(5)
+def test_numbers_that_somebody_else_has_used_move_to_a_new_identity() -> None:
+    """A virtual machine that was set back while it ran: the server knows more of this run than the run itself."""
+    state, spool = met(5)
+    heard(state, Ack(next_batch(state).last_seq, 1))
     old = spool.spool_id
-    spool._newest_at_open = 3  # as if the first three had been in a restored file
-    state.next_payload()
-    state.on_reply(Ack(9, 0))
+    spool.record(ROWS[5:8])
+    next_batch(state)
+    assert heard(state, Ack(50, 1, trimmed=3)) == 0
     batch = next_batch(state)
     assert state.counters["new_spool_ids"] == 1
-    assert (batch.spool_id, batch.first_seq) == (spool.spool_id, 1)
+    assert (batch.spool_id, batch.first_seq, batch.lost_before) == (spool.spool_id, 1, 0)
     assert spool.spool_id != old
-    assert [content_hash(r) for r in batch.rows] == [content_hash(r) for r in ROWS[3:5]]
+    assert [content_hash(r) for r in batch.rows] == [content_hash(r) for r in ROWS[5:8]]
+
+
+def reopened(tmp_path: Path, n: int = 0, acknowledged: int = 0) -> tuple[UplinkState, Spool, int]:
+    """An uplink whose spool had a run before: of n samples, some acknowledged; and that run's identity."""
+    spool = Spool(tmp_path / "spool.db", SpoolConfig())
+    earlier = spool.spool_id
+    spool.record(ROWS[:n])
+    spool.acknowledge(earlier, acknowledged)
+    spool.close()
+    spool = Spool(tmp_path / "spool.db", SpoolConfig())
+    return UplinkState("loader-1", SITE.frame, spool, UplinkConfig()), spool, earlier
+
+
+def test_earlier_run_is_sent_first_then_closed(tmp_path: Path) -> None:
+    state, spool, earlier = reopened(tmp_path, 5, acknowledged=2)
+    spool.record(ROWS[5:8])
+    batch = next_batch(state)
+    assert (batch.spool_id, batch.first_seq, len(batch.rows)) == (earlier, 3, 3)
+    heard(state, Ack(5, 1))
+    batch = next_batch(state)
+    assert (batch.spool_id, batch.first_seq, len(batch.rows)) == (spool.spool_id, 1, 3)
+    spool.close()
+
+
+@pytest.mark.parametrize("watermark", [0, 5, 9])
+def test_run_that_is_delivered_is_closed_with_one_empty_batch(tmp_path: Path, watermark: int) -> None:
+    """A server that was restored from a backup learns so what it has lost; one that knows it all changes nothing."""
+    state, spool, earlier = reopened(tmp_path, 5, acknowledged=5)
+    batch = next_batch(state)
+    assert (batch.spool_id, batch.first_seq, len(batch.rows), batch.lost_before) == (earlier, 6, 0, 5)
+    assert not spool.is_settled()
+    assert heard(state, Ack(watermark, 1)) == 0
+    assert spool.is_settled()
+    assert state.next_payload() is None
+    spool.close()
 
 
 def test_full_spool_declares_what_it_dropped() -> None:
     state, spool = uplink(5, max_samples=10)
     server = Server()
-    assert state.on_reply(server.answer(state.next_payload() or b"")) == 0
     spool.record(ROWS[5:20])
     while payload := state.next_payload():
-        state.on_reply(server.answer(payload))
+        heard(state, server.answer(payload))
     assert server.lost == 10
     assert sorted(seq for _, seq, _ in server.taken) == list(range(11, 21))
 
@@ -239,8 +383,8 @@ def exchange(state: UplinkState, server: Server, rng: random.Random, quality: fl
         return
     arrivals = [payload for _ in range(rng.choice((1, 1, 1, 2))) if rng.random() < quality]
     answers = [decode_reply(encode_reply(server.answer(arrival))) for arrival in arrivals]
-    heard = answers and rng.random() < quality
-    state.on_reply(rng.choice(answers) if heard else None)
+    is_heard = answers and rng.random() < quality
+    heard(state, rng.choice(answers) if is_heard else None)
 
 
 @pytest.mark.parametrize("first_seed", range(0, 200, 50))
@@ -281,7 +425,7 @@ def test_agent_that_is_killed_again_and_again_delivers_every_sample_exactly_once
         spool._db.close()  # without a checkpoint, as a kill leaves it
     spool = Spool(tmp_path / "spool.db", SpoolConfig())
     state = UplinkState("loader-1", SITE.frame, spool, UplinkConfig())
-    while spool.counters()["depth"]:
+    while not spool.is_settled():
         exchange(state, server, rng, quality=0.9)
     assert sorted(h for _, _, h in server.taken) == sorted(content_hash(r) for r in ROWS[:recorded]), f"seed={seed}"
     assert set(server.taken.values()) <= {1}, f"seed={seed}"
@@ -290,7 +434,7 @@ def test_agent_that_is_killed_again_and_again_delivers_every_sample_exactly_once
 
 def test_failing_disk_pauses_the_uplink_and_loses_nothing() -> None:
     state, spool = met(5)
-    assert state.on_disk_error(OSError("disk is full")) == UplinkConfig().backoff_s
+    assert 0 < state.on_disk_error(OSError("disk is full")) <= UplinkConfig().backoff_s
     assert "disk is full; look at the machine's disk" in state.problem
     assert state.counters["disk_errors"] == 1
     assert len(next_batch(state).rows) == 5
@@ -320,7 +464,7 @@ def trace(**options: Any) -> list[Any]:
     found: list[Any] = []
     for reply in ("ok", "ok", "lost", "ok", "lost", "lost", "lost"):
         batch = next_batch(state)
-        found.append((len(batch.rows), state.on_reply(Ack(batch.last_seq, 1) if reply == "ok" else None)))
+        found.append((len(batch.rows), heard(state, Ack(batch.last_seq, 1) if reply == "ok" else None)))
     return found
 
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from mapserver import evidence as ev
 from mapserver.fold_numba import _find
-from mapserver.hot import CODE_HALF, FREE, Hot, code_of, of_code
+from mapserver.hot import CODE_HALF, FREE, Hot, NoRoom, code_of, of_code
 from mapserver.votes import HASH
 
 MINUTES_TO_2100 = 4_102_444_800 // 60
@@ -39,7 +39,9 @@ def test_codes_of_neighbours_differ_where_the_sign_does():
 def test_a_full_table_finds_every_block_and_no_other(slots):
     hot, codes = Hot(slots), [int(code_of(np.int64(9), np.int64(i % 23 - 11), np.int64(-i))) for i in range(slots)]
     hot.open(codes)
-    assert hot.room == 0
+    with pytest.raises(NoRoom) as caught:
+        hot.open([-2])
+    assert caught.value.wanted == 1
     assert len(hot) == slots
     assert found(hot, codes) == hot.slots_of(codes).tolist() == list(range(slots))
     others = [code + (1 << 36) for code in codes]
@@ -59,19 +61,32 @@ def test_a_search_wraps_around_the_end_of_the_table(slots):
         assert hot.keys[0] == codes[1]
 
 
+def test_more_blocks_than_there_is_room_for_open_none():
+    hot = Hot(3)
+    hot.open([1])
+    with pytest.raises(NoRoom) as caught:
+        hot.open([2, 3, 4])
+    assert caught.value.wanted == 3
+    assert len(hot) == 1
+    assert found(hot, [1, 2, 3, 4]) == [0, FREE, FREE, FREE]
+    hot.open([2, 3])
+    assert found(hot, [1, 2, 3]) == [0, 1, 2]
+
+
 def test_draining_gives_what_was_written_and_forgets_it():
     hot = Hot(3)
     hot.open([11, 22, 33])
     slot = hot.slots_of([22])[0]
+    hot.planes[slot, 5] = True
     hot.counts[slot, 5, 7], hot.newest[slot, 7], hot.bitmaps[slot, 1, 7], hot.load = 9, 1000, 3, 9
     (code, page), *more = hot.drain()
     assert (code, more) == (22, [])  # blocks in which nothing was written are left out
     assert page.votes.tolist() == [(5 * ev.CELLS + 7, 9)]
     assert page.cells["newest_ns"].tolist() == [1000]
-    assert page.cells["bits"].tolist() == [[0, 3]]
-    assert (len(hot), hot.room, hot.load) == (0, 3, 0)
+    assert page.cells[["visits", "machines"]].tolist() == [(0, 3)]
+    assert (len(hot), hot.load) == (0, 0)
     assert found(hot, [11, 22, 33]) == [FREE] * 3
-    assert not any(array.any() for array in (hot.counts, hot.bitmaps, hot.newest))
+    assert not any(array.any() for array in (hot.counts, hot.planes, hot.bitmaps, hot.newest))
 
 
 def test_blocks_open_in_later_rounds_are_empty():
@@ -79,6 +94,7 @@ def test_blocks_open_in_later_rounds_are_empty():
     for round_ in range(3):
         hot.open([round_, round_ + 100])
         assert not hot.counts.any()
+        hot.planes[:, 0] = True
         hot.counts[:, 0, 0], hot.newest[:, 0] = 1 + round_, 1
         pages = dict(hot.drain())
         assert {code: int(page.votes["count"][0]) for code, page in pages.items()} == {

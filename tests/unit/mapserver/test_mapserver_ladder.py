@@ -23,7 +23,7 @@ def page(bucket: int, weight: int = 1) -> Page:
     newest_ns = np.zeros(ev.CELLS, np.int64)
     cell = bucket % ev.CELLS
     counts[bucket % ev.COUNTS, cell], bitmaps[:, cell], newest_ns[cell] = weight, 1, bucket * BUCKET_S * S + 7
-    return pack(counts, bitmaps, newest_ns)
+    return pack(counts, counts.any(axis=1), bitmaps, newest_ns)
 
 
 def ladder(buckets, **keeps: int) -> Ladder:

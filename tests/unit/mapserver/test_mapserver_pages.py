@@ -1,3 +1,4 @@
+from concurrent.futures import ThreadPoolExecutor
 from itertools import permutations
 
 import numpy as np
@@ -7,8 +8,7 @@ from hypothesis import strategies as st
 from mapserver_data import same_page
 
 from mapserver import evidence as ev
-from mapserver import pages as module
-from mapserver.pages import CELL, NARROW, WIDE, Page, add_numpy, merge, pack, take_numpy
+from mapserver.pages import CELL, NARROW, WIDE, Page, merge, merge_numpy, pack, pack_numpy
 
 PLACES = ev.COUNTS * ev.CELLS
 counts = st.one_of(st.integers(1, 2**17), st.integers(ev.COUNT_MAX - 3, ev.COUNT_MAX))
@@ -16,21 +16,26 @@ votes = st.dictionaries(st.integers(0, PLACES - 1) | st.integers(0, 5), counts, 
 cells = st.dictionaries(st.integers(0, 255), st.tuples(st.integers(0, 2**64 - 1), st.integers(1, 2**62)), max_size=5)
 
 
-def page(places: dict[int, int], stamps: dict[int, tuple[int, int]] | None = None) -> Page:
-    """A page from place -> count and cell -> (bits of both bitmaps, stamp)."""
-    bitmaps, newest_ns = np.zeros((2, ev.CELLS), np.uint64), np.zeros(ev.CELLS, np.int64)
+def written(places: dict[int, int], stamps: dict[int, tuple[int, int]] | None = None):
+    """Counts, planes, bitmaps, stamps as a kernel leaves them: every cell with a vote has a stamp, 1 if none is given.
+
+    places: place -> count; stamps: cell -> (bits of both bitmaps, stamp).
+    """
+    counts, bitmaps = np.zeros(PLACES, np.uint32), np.zeros((2, ev.CELLS), np.uint64)
+    newest_ns = np.zeros(ev.CELLS, np.int64)
+    counts[list(places)] = list(places.values())
+    newest_ns[[place % ev.CELLS for place in places]] = 1
     for cell, (bits, stamp_ns) in (stamps or {}).items():
-        bitmaps[:, cell], newest_ns[cell] = bits, stamp_ns
-    return pack(dense(places).reshape(ev.COUNTS, ev.CELLS), bitmaps, newest_ns)
+        bitmaps[:, cell], newest_ns[cell] = (bits, bits // 2), stamp_ns
+    counts = counts.reshape(ev.COUNTS, ev.CELLS)
+    return counts, counts.any(axis=1), bitmaps, newest_ns
+
+
+def page(places: dict[int, int], stamps: dict[int, tuple[int, int]] | None = None) -> Page:
+    return pack(*written(places, stamps))
 
 
 pages = st.builds(page, votes, cells)
-
-
-def dense(places: dict[int, int]) -> np.ndarray:
-    counts = np.zeros(PLACES, np.uint32)
-    counts[list(places)] = list(places.values())
-    return counts
 
 
 def unpacked(one: Page) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -42,47 +47,67 @@ def unpacked(one: Page) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @given(votes, cells)
 def test_what_is_packed_is_what_was_there(places, stamps):
-    counts, bitmaps, newest_ns = unpacked(page(places, stamps))
-    assert {int(i): int(counts[i]) for i in np.flatnonzero(counts)} == places
-    assert {int(i): (int(bitmaps[i, 0]), int(newest_ns[i])) for i in np.flatnonzero(newest_ns)} == stamps
-    assert np.array_equal(bitmaps[:, 0], bitmaps[:, 1])
+    found = unpacked(page(places, stamps))
+    counts, _, bitmaps, newest_ns = written(places, stamps)
+    assert np.array_equal(found[0], counts.ravel())
+    assert np.array_equal(found[1], bitmaps.T)
+    assert np.array_equal(found[2], newest_ns)
 
 
 def test_packing_leaves_nothing_behind():
-    counts, bitmaps = dense({3: 7, 300: 2}).reshape(ev.COUNTS, ev.CELLS), np.ones((2, ev.CELLS), np.uint64)
-    newest_ns = np.ones(ev.CELLS, np.int64)
-    pack(counts, bitmaps, newest_ns)
-    assert not any(array.any() for array in (counts, bitmaps, newest_ns))
+    for one in (pack, pack_numpy):
+        arrays = written({3: 7, 300: 2}, {3: (5, 9), 100: (1, 2)})
+        one(*arrays)
+        assert not any(array.any() for array in arrays)
+
+
+def test_a_page_cannot_be_written_to():
+    for one in (page({1: 5}), merge(page({1: 5}), page({2: 6}))):
+        for array in (one.votes, one.cells):
+            assert not array.flags.writeable
 
 
 @settings(max_examples=60)
-@given(votes)
-def test_both_ways_to_pack_agree_to_the_bit(places):
-    first, second = dense(places), dense(places)
-    one, other = module._take(first), take_numpy(second)
-    assert (one.dtype, one.tobytes()) == (other.dtype, other.tobytes())
-    assert not any(array.any() for array in (first, second))
+@given(votes, cells)
+def test_both_ways_to_pack_agree_to_the_bit(places, stamps):
+    assert same_page(pack(*written(places, stamps)), pack_numpy(*written(places, stamps)))
 
 
 @settings(max_examples=60)
-@given(votes, votes)
-def test_both_ways_to_add_agree_to_the_bit(one, other):
-    parts = [take_numpy(dense(places)) for places in (one, other)]
-    found, expected = module._add(*parts), add_numpy(*parts)
-    assert (found.dtype, found.tobytes()) == (expected.dtype, expected.tobytes())
+@given(pages, pages)
+def test_both_ways_to_merge_agree_to_the_bit(one, other):
+    assert same_page(merge(one, other), merge_numpy(one, other))
 
 
 def test_every_place_of_a_full_block_is_packed():
-    full = np.full(PLACES, ev.COUNT_MAX, np.uint32)
-    packed = module._take(full)
-    assert packed["place"].tolist() == list(range(PLACES))
-    assert (packed["count"] == ev.COUNT_MAX).all()
-    assert (module._add(packed, packed)["count"] == ev.COUNT_MAX).all()
+    full = page(dict.fromkeys(range(PLACES), int(ev.COUNT_MAX)), dict.fromkeys(range(256), (2**64 - 1, 5)))
+    assert full.votes["place"].tolist() == list(range(PLACES))
+    assert (full.votes["count"] == ev.COUNT_MAX).all()
+    assert full.cells["cell"].tolist() == list(range(256))
+    assert same_page(merge(full, full), full)
+
+
+def test_pages_that_were_packed_before_stay_when_the_next_are():
+    """The space in which pages are packed is used again."""
+    one = page({1: 5, 70_000 % PLACES: 2**20}, {1: (3, 9)})
+    before = one.votes.tobytes(), one.cells.tobytes()
+    page({2: 6, 9: 1}, {8: (7, 7)})
+    assert (one.votes.tobytes(), one.cells.tobytes()) == before
+
+
+def test_threads_pack_beside_each_other():
+    def work(seed: int) -> bool:
+        places = {(seed * 97 + i) % PLACES: seed * 1000 + i for i in range(1, 200)}
+        expected = pack_numpy(*written(places))
+        return all(same_page(pack(*written(places)), expected) for _ in range(20))
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(threads.map(work, range(1, 9)))
 
 
 def test_numba_is_at_work_where_it_is_installed():
-    assert module._take is not take_numpy
-    assert module._add is not add_numpy
+    assert pack is not pack_numpy
+    assert merge is not merge_numpy
 
 
 @pytest.mark.parametrize(("count", "dtype"), [(2**16 - 1, NARROW), (2**16, WIDE), (ev.COUNT_MAX, WIDE)])
@@ -90,7 +115,7 @@ def test_counts_that_fit_take_two_bytes(count, dtype):
     one = page({3: count, 7: 1})
     assert one.votes.dtype == dtype
     assert one.votes["count"].tolist() == [count, 1]
-    assert one.nbytes == 2 * dtype.itemsize
+    assert one.nbytes == 2 * dtype.itemsize + 2 * CELL.itemsize
 
 
 def test_a_cell_takes_25_bytes_and_its_votes_four_each():

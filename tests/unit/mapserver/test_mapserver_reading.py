@@ -87,6 +87,11 @@ def test_the_time_of_the_change_lies_between_the_last_old_and_the_first_new_samp
     assert (changed <= found.newest_ns[inside]).all()
 
 
+def test_after_a_pause_a_change_is_dated_where_the_first_new_bucket_begins():
+    found, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
+    assert (found.changed_ns[inside] == NOW_NS + (PASSES - 1) * HOUR_NS).all()
+
+
 @pytest.mark.parametrize("keep_buckets", [1, 2, 3])
 def test_a_change_is_dated_also_where_old_passes_are_summed(keep_buckets):
     found, inside = read(repaved(-5, 4, 10, keep_buckets=keep_buckets)), area(-5, 4, 10, -1)
@@ -220,7 +225,8 @@ def test_blocks_far_apart_are_read_in_one_image():
     assert not first[40, -40].any()
 
 
-def test_around_a_block_are_its_eight_neighbours_and_itself():
-    found = around((0, -1))
-    assert len(set(found)) == 9
-    assert {max(abs(x), abs(y + 1)) for x, y in found} == {0, 1}
+@pytest.mark.parametrize("reach", [0, 1, 3])
+def test_around_a_block_are_all_blocks_so_far(reach):
+    found = around((0, -1), reach)
+    assert len(found) == len(set(found)) == (2 * reach + 1) ** 2
+    assert {max(abs(x), abs(y + 1)) for x, y in found} == set(range(reach + 1))

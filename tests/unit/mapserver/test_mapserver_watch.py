@@ -24,7 +24,7 @@ def sweep(west: int, south: int, east: int, north: int, c_rr: float, hour: float
 def look(watch: ChangeWatch, grid: Grid, most: int = 1000) -> list[Change]:
     found, blocks = [], grid.take_touched(most)
     while blocks:
-        wide = sorted({near for block in blocks for near in around(block)})
+        wide = sorted({near for block in blocks for near in around(block, 1)})
         pages = {block: p for block, p in zip(wide, grid.pages(wide), strict=True) if p}
         found += watch.look(blocks, pages)
         blocks = grid.take_touched(most)

@@ -1,7 +1,13 @@
+from datetime import UTC, datetime
+from pathlib import Path
+
 import pytest
 
+from protocol.credentials import Credentials, Identity
 from protocol.errors import LinkError
 from protocol.session import SessionConfig, _settings, free_endpoint, open_session
+
+CREDENTIALS = Credentials(Path("/keys/a"), Identity("paper", "a", "machine", datetime(2100, 1, 1, tzinfo=UTC)))
 
 
 @pytest.mark.parametrize("mode", ["client", "router"])
@@ -48,7 +54,40 @@ def test_address_that_is_taken_is_a_link_error():
         router.close()
 
 
-@pytest.mark.parametrize(("fields", "words"), [({"mode": "peer"}, "mode"), ({"endpoint": "7447"}, "endpoint")])
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"mode": "peer"}, "mode"),
+        ({"endpoint": "7447"}, "endpoint"),
+        ({"endpoint": "tls/127.0.0.1:7447"}, "needs keys"),
+        ({"endpoint": "tcp/127.0.0.1:7447", "credentials": CREDENTIALS}, "proves no names"),
+        ({"endpoint": "quic/127.0.0.1:7447", "credentials": CREDENTIALS}, "proves no names"),
+    ],
+)
 def test_wrong_settings_are_named(fields, words):
     with pytest.raises(ValueError, match=words):
         SessionConfig(**fields)
+
+
+@pytest.mark.parametrize(("mode", "end"), [("client", "connect"), ("router", "listen")])
+def test_both_ends_prove_their_names(mode, end):
+    """Without enable_mtls at the client it would show no certificate; without it at the router none is asked for."""
+    tls = _settings(SessionConfig("tls/127.0.0.1:1", mode, credentials=CREDENTIALS))["transport/link/tls"]
+    assert tls["enable_mtls"] is tls["verify_name_on_connect"] is tls["close_link_on_expiration"] is True
+    assert tls["root_ca_certificate"] == "/keys/a/ca.pem"
+    assert (tls[f"{end}_certificate"], tls[f"{end}_private_key"]) == ("/keys/a/cert.pem", "/keys/a/key.pem")
+    assert "transport/link/tls" not in _settings(SessionConfig(mode=mode))
+
+
+def test_only_a_router_takes_rules():
+    guard = {"access_control": {"enabled": True}}
+    assert _settings(SessionConfig(mode="router", guard=guard))["access_control"] == {"enabled": True}
+    assert "access_control" not in _settings(SessionConfig(guard=guard))
+
+
+def test_with_keys_a_router_that_is_not_there_may_be_one_that_refuses(tmp_path):
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    for name in ("ca.pem", "cert.pem", "key.pem"):
+        (tmp_path / name).write_text("no certificate")
+    with pytest.raises(LinkError, match="do not know each other"):
+        open_session(SessionConfig(endpoint, wait_s=0.2, credentials=Credentials(tmp_path, CREDENTIALS.identity)))

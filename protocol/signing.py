@@ -1,0 +1,77 @@
+"""Signed batches (Ed25519): who carries a batch, be it the router, can neither make one up nor alter it.
+
+The signature goes beside the batch, as the attachment of the query: the batch's own bytes stay what they are, and a
+server that asks for no signatures reads past it. Signed are the key expression and the payload, so that a batch holds
+for one machine of one site. Sending it once more does no harm: identity is the sample's. Needs `cryptography`.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Mapping
+
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from protocol.errors import ConfigError, MessageError, Refusal
+
+SIGNATURE_BYTES = 64
+_CONTEXT = b"sitegrid batch 1\0"  # a signature of anything else is none of a batch
+
+
+class Signer:
+    """Signs in the name of one machine. private_key: PEM; ConfigError where it is none of Ed25519."""
+
+    def __init__(self, private_key: bytes) -> None:
+        try:
+            key = serialization.load_pem_private_key(private_key, None)
+        except (ValueError, TypeError, UnsupportedAlgorithm):
+            key = None
+        if not isinstance(key, Ed25519PrivateKey):
+            raise ConfigError("signing key", "is no Ed25519 key; make new keys with `sitegrid keys add --renew`")
+        self._key = key
+
+    def sign(self, key_expression: str, payload: bytes) -> bytes:
+        """The signature of a batch that is sent to a key, 64 bytes."""
+        return self._key.sign(_signed(key_expression, payload))
+
+
+class Verifier:
+    """Knows the machines' public keys: base64 of 32 bytes each, as the register has them."""
+
+    def __init__(self, public_keys: Mapping[str, str]) -> None:
+        self._keys = {machine: _public_key(machine, text) for machine, text in public_keys.items()}
+
+    def check(self, machine: str, key_expression: str, payload: bytes, signature: bytes) -> None:
+        """MessageError unless the machine has signed this payload for this key."""
+        known = self._keys.get(machine)
+        if known is None:
+            raise MessageError(Refusal.WRONG_MACHINE, f"no signing key of {machine!r} is in the register")
+        if not signature:
+            raise MessageError(Refusal.WRONG_MACHINE, "the batch is not signed, and this server asks for it")
+        try:
+            known.verify(signature, _signed(key_expression, payload))
+        except InvalidSignature:
+            problem = f"the signature is not that of {machine!r}; compare its keys with the register"
+            raise MessageError(Refusal.WRONG_MACHINE, problem) from None
+
+
+def make_signing_key() -> tuple[bytes, str]:
+    """A new key: the private part as PEM, the public part as the register keeps it."""
+    key = Ed25519PrivateKey.generate()
+    form, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    private = key.private_bytes(serialization.Encoding.PEM, form, plain)
+    return private, base64.b64encode(key.public_key().public_bytes_raw()).decode()
+
+
+def _public_key(machine: str, text: str) -> Ed25519PublicKey:
+    try:
+        return Ed25519PublicKey.from_public_bytes(base64.b64decode(text, validate=True))
+    except (ValueError, binascii.Error):
+        raise ConfigError(f"signing key of {machine}", f"{text!r} is no public key of Ed25519") from None
+
+
+def _signed(key_expression: str, payload: bytes) -> bytes:
+    return _CONTEXT + key_expression.encode() + b"\0" + payload

@@ -1,0 +1,292 @@
+"""One machine's name, and a machine that catches up: over Zenoh, in one process."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from agents.agent import Agent, Places
+from agents.config import AgentConfig
+from agents.localisation.belief import PoseBelief
+from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake, wait_for_link
+from agents.spool import Spool, SpoolConfig
+from agents.uplink import Uplink, UplinkConfig, UplinkState
+from mapserver.config import ServerConfig
+from mapserver.server import Server
+from protocol import keys
+from protocol.codec import decode_health, decode_pose
+from protocol.errors import LinkError
+from protocol.machine import MachineConfig, SensorConfig
+from protocol.samples import SAMPLE_DTYPE
+from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.site import SiteConfig
+from sitegrid.commands.agent import _claim_name
+from sitegrid.processes import wait_until
+
+SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
+MACHINE = MachineConfig("loader-1", sensors=(SensorConfig("imu", "imu"), SensorConfig("wheels", "encoder")))
+START_NS = 1_767_225_600_000_000_000
+WAIT_S = 20.0
+
+Opened = Callable[..., zenoh.Session]
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    found = free_endpoint()
+    router: Any = open_session(SessionConfig(found, mode="router"))
+    yield found
+    router.close()
+
+
+@pytest.fixture
+def opened(endpoint: str) -> Iterator[Opened]:
+    """Sessions as agents have them, closed with the test."""
+    with contextlib.ExitStack() as stack:
+
+        def session(where: str = endpoint) -> zenoh.Session:
+            found: Any = open_session(SessionConfig(where, wait_s=-1))
+            stack.callback(found.close)
+            assert wait_for_link(found, WAIT_S)
+            return found
+
+        yield session
+
+
+def made_up(n: int) -> np.ndarray:
+    rows = np.zeros(n, SAMPLE_DTYPE)
+    rows["stamp_ns"] = START_NS + np.arange(n) * 100_000_000
+    rows["x_m"] = np.arange(n) % 200
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0
+    rows["c_rr"], rows["c_rr_var"], rows["distance_m"] = 0.05, 1e-4, 0.5
+    return rows
+
+
+# --- one machine's name ----------------------------------------------------------------------------------------------
+
+
+def test_second_live_agent_of_a_name_is_refused_and_named(endpoint: str, opened: Opened) -> None:
+    first = Presence(opened(), SITE.name, "loader-1")
+    host, pid = socket.gethostname(), first.owner.pid
+    with pytest.raises(LinkError, match=rf"an agent of loader-1 runs already, pid {pid} on host {host}; stop it"):
+        _claim_name(opened(), endpoint, SITE.name, "loader-1")
+    assert _claim_name(opened(), endpoint, SITE.name, "loader-2") > first.owner
+    first.close()
+    _claim_name(opened(), endpoint, SITE.name, "loader-1")
+
+
+def test_agent_without_a_router_starts(opened: Opened) -> None:
+    nowhere = free_endpoint()
+    session: Any = open_session(SessionConfig(nowhere, wait_s=-1))
+    assert _claim_name(session, nowhere, SITE.name, "loader-1").pid > 0
+    session.close()
+
+
+def test_dead_predecessor_keeps_nobody_from_starting(endpoint: str, opened: Opened) -> None:
+    """Until its lease ends, a router still shows its token and hands it queries, which nobody answers."""
+    dead, held = opened(), []
+    token = dead.liveliness().declare_token(keys.alive(SITE.name, "loader-1"))
+    queryable = dead.declare_queryable(keys.alive(SITE.name, "loader-1"), held.append)
+    start_s = time.monotonic()
+    _claim_name(opened(), endpoint, SITE.name, "loader-1")
+    assert time.monotonic() - start_s < ANSWER_S + 2
+    assert held, "it was asked"
+    for query in held:
+        query.drop()
+    queryable.undeclare()
+    token.undeclare()
+
+
+def test_later_one_of_two_agents_yields_until_the_other_is_gone(opened: Opened) -> None:
+    """They met only after both had started, say without a link."""
+    first = Presence(opened(), SITE.name, "loader-1")
+    second = Presence(opened(), SITE.name, "loader-1")
+    wait_until(lambda: second.look_around() == first.owner, WAIT_S, "the later one sees the earlier one")
+    assert first.look_around() is None
+    first.close()
+    looks = itertools.count(1)
+    wait_until(lambda: next(looks) and second.look_around() is None, WAIT_S, "the name is free")
+    assert next(looks) > PATIENCE
+    second.close()
+
+
+def test_namesake_of_another_site_is_none(opened: Opened) -> None:
+    first = Presence(opened(), "other", "loader-1")
+    assert find_namesake(opened(), SITE.name, "loader-1") is None
+    first.close()
+
+
+class Silent:
+    """A driver without readings that ends after a while."""
+
+    def __init__(self, reads: int) -> None:
+        self.left = reads
+
+    def read(self, timeout_s: float) -> list[Any] | None:
+        self.left -= 1
+        time.sleep(0.01)
+        return [] if self.left else None
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        return
+
+
+def test_agent_holds_its_samples_while_another_has_its_name(opened: Opened, tmp_path: Path) -> None:
+    first = Presence(opened(), SITE.name, "loader-1")
+    agent = Agent(opened(), SITE, MACHINE, AgentConfig(), Places(tmp_path / "spool.db"))
+    agent._spool.record(made_up(3))
+    wait_until(lambda: agent._yield_name() or bool(agent._uplink.state.held), WAIT_S, "it yields")
+    problem = agent.report(Silent(1))["uplink"]["problem"]
+    assert f"runs as {first.owner}: it sends, this one waits" in problem
+    assert agent._uplink.state.next_payload() is None
+    agent.close()
+    first.close()
+
+
+# --- the disk --------------------------------------------------------------------------------------------------------
+
+
+def test_agent_goes_on_while_its_disk_takes_nothing(opened: Opened, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("agents.agent.MOST_UNSAVED", 8)
+    agent = Agent(opened(), SITE, MACHINE, AgentConfig(linger_s=0), Places(tmp_path / "spool.db"))
+    agent._spool._db.execute("PRAGMA query_only = ON")
+    for _ in range(5):
+        agent._deliver(made_up(2))
+    report = agent.report(Silent(1))
+    assert (report["samples"], report["spool"]["unsaved"], report["spool"]["given_up"]) == (0, 8, 2)
+    assert "look at the machine's disk" in report["spool_problem"]
+    assert not agent._is_delivered()
+    agent._spool._db.execute("PRAGMA query_only = OFF")
+    report = agent.run(Silent(3), lambda: False)
+    assert (report["samples"], report["spool"]["unsaved"], report["spool_problem"]) == (8, 0, "")
+    assert report["host"] == socket.gethostname()
+    agent.close()
+
+
+# --- a machine that was off for a week -------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def uplink_of(session: zenoh.Session, path: Path, n: int) -> Iterator[Spool]:
+    spool = Spool(path, SpoolConfig())
+    for first in range(0, n, 50_000):
+        spool.record(made_up(n)[first : first + 50_000])
+    state = UplinkState("loader-1", SITE.frame, spool, UplinkConfig())
+    uplink = Uplink(session, SITE.name, "loader-1", state, UplinkConfig().timeout_s)
+    yield spool
+    uplink.close()
+    spool.close()
+
+
+@contextlib.contextmanager
+def server_at(endpoint: str, folder: Path) -> Iterator[None]:
+    session: Any = open_session(SessionConfig(endpoint))
+    server = Server(session, folder, SITE, ServerConfig(), time.time_ns)
+    yield
+    server.close()
+    session.close()
+
+
+def test_machine_catches_up_at_the_speed_of_the_server(endpoint: str, opened: Opened, tmp_path: Path) -> None:
+    n = 60_000
+    with server_at(endpoint, tmp_path / "store"), uplink_of(opened(), tmp_path / "spool.db", n) as spool:
+        wait_until(lambda: spool.counters()["depth"] < n, WAIT_S, "first batch")
+        start_s, left = time.monotonic(), spool.counters()["depth"]
+        wait_until(spool.is_settled, 60.0, "everything delivered")
+        rate = left / (time.monotonic() - start_s)
+    print(f"caught up at {rate:.0f} samples/s")
+    assert rate > 5000  # a week of work is half a million
+
+
+class SlowLink:
+    """A TCP proxy that passes so many bytes per second to the router, with as small a buffer as the kernel allows."""
+
+    def __init__(self, router: str, bytes_per_s: float) -> None:
+        self._host, port = router.removeprefix("tcp/").split(":")
+        self._port = int(port)
+        self._bytes_per_s = bytes_per_s
+        self._listener = socket.socket()
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        self._listener.bind(("127.0.0.1", 0))
+        self._listener.listen()
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self._sockets = [self._listener]
+        self._threads = [threading.Thread(target=self._accept, daemon=True)]
+        self._threads[0].start()
+
+    def close(self) -> None:
+        """Cut it."""
+        for one in self._sockets:
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+        for thread in list(self._threads):
+            thread.join()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                far = socket.create_connection((self._host, self._port))
+                self._sockets += [near, far]
+                for ends in ((near, far, self._bytes_per_s), (far, near, 1e9)):
+                    self._threads.append(threading.Thread(target=self._pass, args=ends, daemon=True))
+                    self._threads[-1].start()
+
+    def _pass(self, source: socket.socket, target: socket.socket, bytes_per_s: float) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(1024):
+                target.sendall(data)
+                time.sleep(len(data) / bytes_per_s)
+        for end in (source, target):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+
+def test_pose_and_health_stay_live_while_a_machine_catches_up(endpoint: str, opened: Opened, tmp_path: Path) -> None:
+    """Over 300 kbit/s, with more in the spool than the link can pass during the test."""
+    link = SlowLink(endpoint, 300e3 / 8)
+    delays: dict[str, list[float]] = {"pose": [], "health": []}
+
+    def heard(kind: str, stamp_ns: int) -> None:
+        delays[kind].append((time.time_ns() - stamp_ns) * 1e-9)
+
+    listener = opened()
+    decoders = {"pose": decode_pose, "health": decode_health}
+    for kind, decode in decoders.items():
+        key = f"sitegrid/{SITE.name}/machine/*/{kind}"
+        listener.declare_subscriber(key, lambda s, k=kind, d=decode: heard(k, d(s.payload.to_bytes()).stamp_ns))
+    session = opened(link.endpoint)
+    presence = Presence(session, SITE.name, "loader-1")
+    with server_at(endpoint, tmp_path / "store"), uplink_of(session, tmp_path / "spool.db", 20_000) as spool:
+        wait_until(lambda: spool.acknowledged > 400, WAIT_S, "it catches up")
+        start_s, before = time.monotonic(), spool.acknowledged
+        for i in range(40):
+            now_ns = time.time_ns()
+            presence.show_pose(PoseBelief(now_ns, 1.0, 2.0, 0.0, 0.0, np.eye(2)))
+            if i % 5 == 0:
+                presence.show_health(now_ns, {"spool": spool.counters()})
+            time.sleep(0.2)
+        rate = (spool.acknowledged - before) / (time.monotonic() - start_s)
+        assert spool.counters()["depth"] > 0, "it was busy all the time"
+    presence.close()
+    print(f"{rate:.0f} samples/s; pose {np.median(delays['pose']):.2f} s, at most {max(delays['pose']):.2f} s")
+    assert len(delays["pose"]) > 30
+    assert len(delays["health"]) >= 6
+    assert np.median(delays["pose"]) < 0.5
+    assert np.median(delays["health"]) < 0.5
+    assert rate > 250  # of 550 that the link can carry
+    link.close()

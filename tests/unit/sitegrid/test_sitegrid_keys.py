@@ -1,0 +1,496 @@
+"""Keys, the register, and the rules that the router makes from it."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import stat
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from protocol import keys
+from protocol.codec import MAX_BATCH_BYTES
+from protocol.credentials import check_valid, load_credentials
+from protocol.errors import ConfigError
+from protocol.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
+from sitegrid.access import access_control, router_settings
+from sitegrid.cli import build_parser, main
+from sitegrid.register import ROLES, Entry, Register, common_name, load_register, register_toml
+from sitegrid.security import is_loopback, join
+
+x509 = pytest.importorskip("cryptography.x509", reason="cryptography is not installed")
+
+NOW = datetime(2026, 1, 31, tzinfo=UTC)
+SITE = "paper"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder of keys of a site."""
+    found = tmp_path / "keys"
+    assert main(["keys", "init", "--dir", str(found), "--site", SITE, "--host", "10.0.0.5", "router.site"]) == 0
+    return found
+
+
+def act(folder: Path, action: str, *words: str) -> int:
+    return main(["keys", action, *words, "--dir", str(folder)])
+
+
+def certificate(folder: Path, name: str) -> x509.Certificate:
+    return x509.load_pem_x509_certificate((folder / name / "cert.pem").read_bytes())
+
+
+def refused(capsys: pytest.CaptureFixture[str], folder: Path, action: str, *words: str) -> str:
+    """The one line of an error."""
+    capsys.readouterr()
+    assert act(folder, action, *words) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    return error
+
+
+# --- certificates ----------------------------------------------------------------------------------------------------
+
+
+def test_only_the_owner_reads_keys(folder: Path):
+    assert act(folder, "add", "loader-1") == 0
+    for path in (folder, *folder.rglob("*")):
+        assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
+    assert not list(folder.rglob("*.part"))
+    assert (folder / ".gitignore").read_text() == "*\n"
+    assert not (folder / "loader-1" / "authority").exists()
+    assert (folder / "loader-1" / "ca.pem").read_bytes() == (folder / "authority" / "cert.pem").read_bytes()
+
+
+def test_certificates_say_who_and_what_for(folder: Path):
+    assert act(folder, "add", "loader-1") == 0
+    for name, purpose in (("router", "serverAuth"), ("server", "clientAuth"), ("loader-1", "clientAuth")):
+        found = certificate(folder, name)
+        assert found.subject.rfc4514_string() == f"CN={name}"
+        assert found.public_key().curve.name == "secp256r1"
+        assert [use._name for use in found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value] == [purpose]
+        assert not found.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        found.verify_directly_issued_by(certificate(folder, "authority"))
+    hosts = certificate(folder, "router").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert hosts.get_values_for_type(x509.DNSName) == ["localhost", "router.site"]
+    assert [str(ip) for ip in hosts.get_values_for_type(x509.IPAddress)] == ["127.0.0.1", "10.0.0.5"]
+    with pytest.raises(x509.ExtensionNotFound):
+        certificate(folder, "loader-1").extensions.get_extension_for_class(x509.SubjectAlternativeName)
+
+
+def test_validity_is_ten_years_one_year_or_as_asked(folder: Path):
+    assert act(folder, "add", "loader-1", "--days", "5") == 0
+    days = {name: lifetime(certificate(folder, name)).days for name in ("authority", "router", "server", "loader-1")}
+    assert days == {"authority": 3650, "router": 365, "server": 365, "loader-1": 5}
+    assert load_register(folder).names["loader-1"].expires == certificate(folder, "loader-1").not_valid_after_utc
+    assert load_credentials(folder / "loader-1").identity.expires == certificate(folder, "loader-1").not_valid_after_utc
+
+
+def test_init_takes_the_days_of_router_and_server(tmp_path: Path):
+    assert act(tmp_path, "init", "--days", "7") == 0
+    assert lifetime(certificate(tmp_path, "router")).days == lifetime(certificate(tmp_path, "server")).days == 7
+
+
+def lifetime(of: x509.Certificate) -> timedelta:
+    return of.not_valid_after_utc - of.not_valid_before_utc
+
+
+def test_no_certificate_outlives_its_authority():
+    from protocol.certificates import expires_at, issue, make_authority
+
+    authority = make_authority(SITE, NOW, NOW + timedelta(days=10))
+    assert expires_at(issue(authority, "loader-1", NOW, NOW + timedelta(days=99))) == NOW + timedelta(days=10)
+
+
+def test_serial_numbers_are_random(folder: Path):
+    for name in ("a", "b", "c"):
+        assert act(folder, "add", name) == 0
+    serials = {certificate(folder, name).serial_number for name in ("a", "b", "c", "router", "server")}
+    assert len(serials) == 5
+    assert min(serials) > 2**100
+    assert load_register(folder).names["a"].serial == f"{certificate(folder, 'a').serial_number:x}"
+
+
+# --- commands --------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]):
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert "is not empty" in refused(capsys, folder, "init")
+    assert "--renew makes it a new one" in refused(capsys, folder, "add", "server")
+    assert "--renew makes it a new one" in refused(capsys, folder, "add", "router")
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("name", ["Loader", "a.2", "a/b", "*", "", "a b", "ä"])
+def test_odd_names_are_refused(folder: Path, name: str, capsys: pytest.CaptureFixture[str]):
+    assert "is not a name" in refused(capsys, folder, "add", name)
+
+
+def test_the_authority_is_no_machine(folder: Path, capsys: pytest.CaptureFixture[str]):
+    assert "choose another name" in refused(capsys, folder, "add", "authority")
+
+
+@pytest.mark.parametrize("host", ["bad host", "a..b", "-x", "höst", "x" * 64, ""])
+def test_an_odd_host_is_refused_before_anything_is_written(
+    tmp_path: Path, host: str, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["keys", "init", "--dir", str(tmp_path / "keys"), f"--host={host}"]) == 1
+    assert "neither the name of a host" in capsys.readouterr().err
+    assert not (tmp_path / "keys").exists()
+
+
+def test_renewed_keys_keep_name_and_role(folder: Path, capsys: pytest.CaptureFixture[str]):
+    assert act(folder, "add", "guest", "--role", "visitor") == 0
+    before = load_register(folder).names["guest"]
+    assert act(folder, "add", "guest", "--renew", "--days", "9") == 0
+    after = load_register(folder).names["guest"]
+    assert (after.role, after.issue) == ("visitor", 1)
+    assert after.serial != before.serial
+    assert after.expires < before.expires
+    assert "is a visitor" in refused(capsys, folder, "add", "guest", "--renew", "--role", "admin")
+    assert "leave out --renew" in refused(capsys, folder, "add", "nobody", "--renew")
+    assert act(folder, "add", "router", "--renew") == 0
+    assert load_register(folder).names["router"].role == "router"
+    hosts = certificate(folder, "router").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert "router.site" in hosts.get_values_for_type(x509.DNSName)
+
+
+def test_a_revoked_name_comes_back_as_another(folder: Path, capsys: pytest.CaptureFixture[str]):
+    assert act(folder, "add", "loader-1") == 0
+    for issue in (2, 3):
+        assert act(folder, "revoke", "loader-1") == 0
+        assert "loader-1" not in load_register(folder).admitted()
+        assert "leave out --renew" in refused(capsys, folder, "add", "loader-1", "--renew")
+        assert act(folder, "add", "loader-1", "--role", "visitor") == 0
+        assert load_register(folder).admitted()["loader-1"].issue == issue
+        assert certificate(folder, "loader-1").subject.rfc4514_string() == f"CN=loader-1.{issue}"
+    assert load_register(folder).names["loader-1"].role == "visitor"
+
+
+def test_revoke_says_what_cannot_be(folder: Path, capsys: pytest.CaptureFixture[str]):
+    assert "not in the register" in refused(capsys, folder, "revoke", "nobody")
+    assert "make a new folder" in refused(capsys, folder, "revoke", "router")
+    assert act(folder, "revoke", "server") == 0
+    assert "takes that up by itself" in capsys.readouterr().out
+
+
+def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys: pytest.CaptureFixture[str]):
+    assert act(folder, "add", "loader-1") == 0
+    assert act(folder, "revoke", "loader-1") == 0
+    register = load_register(folder)
+    old = Entry("visitor", "1", NOW - timedelta(days=1))
+    (folder / "register.toml").write_text(register_toml(register.with_entry("old", old)))
+    capsys.readouterr()
+    assert act(folder, "list", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["site"] == SITE
+    rows = {row["name"]: row for row in found["names"]}
+    states = {name: (row["role"], row["state"], row["revoked"]) for name, row in rows.items()}
+    assert states == {
+        "loader-1": ("machine", "revoked", True),
+        "old": ("visitor", "expired", False),
+        "router": ("router", "valid", False),
+        "server": ("server", "valid", False),
+    }
+    assert rows["old"]["expires"] == "2026-01-30T00:00:00+00:00"
+    assert act(folder, "list") == 0
+    assert "old                      visitor  2026-01-30  expired" in capsys.readouterr().out
+
+
+def test_a_folder_without_register_or_authority_says_what_to_do(folder: Path, capsys: pytest.CaptureFixture[str]):
+    (folder / "authority" / "key.pem").unlink()
+    assert "lies where `sitegrid keys init` ran" in refused(capsys, folder, "add", "loader-1")
+    assert "loader-1" not in load_register(folder).names
+    (folder / "register.toml").unlink()
+    for words in (("list",), ("add", "x"), ("revoke", "x")):
+        assert "sitegrid keys init --dir" in refused(capsys, folder, *words)
+
+
+def test_wrong_usage_exits_with_2():
+    for words in (["keys"], ["keys", "add", "x", "--days", "0"], ["keys", "add", "x", "--days", "3651"]):
+        with pytest.raises(SystemExit, match="2"):
+            main(words)
+    with pytest.raises(SystemExit, match="2"):
+        main(["router", "--keys", "x", "--insecure"])
+    for role in ROLES:
+        assert build_parser().parse_args(["keys", "add", "x", "--role", role]).role == role
+
+
+def test_without_cryptography_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    for name in ("protocol.certificates", "sitegrid.commands.keys"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    assert act(tmp_path, "list") == 1
+    assert "pip install 'sitegrid[security]'" in capsys.readouterr().err
+
+
+def test_whoever_only_has_keys_needs_no_cryptography():
+    code = "import sys, sitegrid.client, sitegrid.security, sitegrid.commands.router; print(*sorted(sys.modules))"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "cryptography" not in modules
+    assert "sitegrid.access" in modules
+
+
+# --- the register ----------------------------------------------------------------------------------------------------
+
+
+def test_the_register_is_read_as_it_was_written(tmp_path: Path):
+    names = {"b": Entry("admin", "ff", NOW, 3, True, "key"), "a-1": Entry("machine", "0", NOW)}
+    register = Register("north", ("localhost", "::1"), names)
+    (tmp_path / "register.toml").write_text(register_toml(register))
+    assert load_register(tmp_path) == register
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ('role = "server"', 'role = "king"', "'king' is none of"),
+        ("revoked = false", "revoked = 0", "bool is expected"),
+        ("issue = 1", "issue = 0", "issue: 0 is not positive"),
+        ("Z\n", "\n", "no time zone"),
+        ("[names.server]", '[names."a*"]', "is not a name"),
+        ('site = "paper"', 'site = "**"', "is not a name"),
+        ("site =", "sight =", "unknown key `sight`"),
+    ],
+)
+def test_a_wrong_register_is_refused(folder: Path, old: str, new: str, problem: str):
+    path = folder / "register.toml"
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ConfigError, match=r"register\.toml") as caught:
+        load_register(folder)
+    assert problem in str(caught.value)
+
+
+def test_only_machines_have_signing_keys_and_the_register_knows_them(folder: Path):
+    from protocol.signing import Signer, Verifier
+
+    for name, role in (("loader-1", "machine"), ("guest", "visitor")):
+        assert act(folder, "add", name, "--role", role) == 0
+    register = load_register(folder)
+    assert set(register.signing_keys()) == {"loader-1"}
+    assert not (folder / "guest" / "sign.pem").exists()
+    signature = Signer((folder / "loader-1" / "sign.pem").read_bytes()).sign("a", b"b")
+    Verifier(register.signing_keys()).check("loader-1", "a", b"b", signature)
+    assert register.without("loader-1").signing_keys() == {}
+
+
+def test_common_names_never_meet():
+    found = {common_name(name, issue) for name in ("a", "a-2", "a2", "a_2") for issue in (1, 2, 3)}
+    assert len(found) == 12
+
+
+# --- rules -----------------------------------------------------------------------------------------------------------
+
+NAMES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim"}
+REGISTER = Register(SITE, (), {n: Entry(r, "1", NOW) for n, r in {**NAMES, "server": "server"}.items()})
+
+
+def may(name: str, message: str, key: str, flow: str = "ingress", register: Register = REGISTER) -> bool:
+    """Whether the rules of a name let a message pass, by Zenoh's own comparison of keys."""
+    control = access_control(register)
+    assert (control["enabled"], control["default_permission"]) == (True, "deny")
+    mine = {rule for policy in control["policies"] if name in policy["subjects"] for rule in policy["rules"]}
+    return any(
+        message in rule["messages"] and flow in rule["flows"] and zenoh.KeyExpr(expression).includes(key)
+        for rule in control["rules"]
+        if rule["id"] in mine
+        for expression in rule["key_exprs"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("message", "key", "who"),
+    [
+        ("query", keys.ingest(SITE, "loader-1"), {"loader-1"}),
+        ("query", keys.ingest_all(SITE), set()),
+        ("query", keys.map_query(SITE, "info"), {"loader-1", "loader-2", "guest", "boss"}),
+        ("query", keys.map_queries_all(SITE), {"loader-1", "loader-2", "guest", "boss"}),
+        ("query", keys.admin(SITE, "trust"), {"boss"}),
+        ("query", keys.ingest("north", "loader-1"), set()),
+        ("put", keys.pose(SITE, "loader-1"), {"loader-1"}),
+        ("put", keys.health(SITE, "loader-1"), {"loader-1"}),
+        ("put", keys.sensors(SITE, "loader-1"), {"loader-1", "sim"}),
+        ("put", keys.poses_all(SITE), set()),
+        ("put", keys.changed(SITE), {"server"}),
+        ("put", f"sitegrid/{SITE}/map/tile/1/2", {"server"}),
+        ("delete", keys.pose(SITE, "loader-1"), set()),
+        ("declare_subscriber", keys.sensors(SITE, "loader-1"), {"loader-1"}),
+        ("declare_subscriber", keys.poses_all(SITE), {"guest", "boss", "server"}),
+        ("declare_subscriber", keys.health_all(SITE), {"guest", "boss", "server"}),
+        ("declare_subscriber", keys.changed(SITE), {"loader-1", "loader-2", "guest", "boss"}),
+        ("declare_subscriber", f"sitegrid/{SITE}/base/b1/correction", {"loader-1", "loader-2"}),
+        ("declare_subscriber", "**", set()),
+        ("declare_queryable", keys.ingest_all(SITE), {"server"}),
+        ("declare_queryable", keys.map_queries_all(SITE), {"server"}),
+        ("declare_queryable", keys.admin_all(SITE), {"server"}),
+        ("declare_queryable", keys.ingest(SITE, "loader-1"), {"server"}),
+        ("reply", keys.map_query(SITE, "info"), {"server"}),
+        ("liveliness_token", keys.alive(SITE, "loader-1"), {"loader-1"}),
+        ("declare_liveliness_subscriber", keys.alive_all(SITE), {"guest", "boss", "server"}),
+        ("liveliness_query", keys.alive(SITE, "loader-1"), {"loader-1", "guest", "boss", "server"}),
+    ],
+)
+def test_who_may_what(message: str, key: str, who: set[str]):
+    assert {name for name in REGISTER.names if may(name, message, key)} == who
+
+
+def test_answers_and_events_go_only_to_whom_they_are_for():
+    def sent(message: str, key: str) -> set[str]:
+        return {name for name in REGISTER.names if may(name, message, key, "egress")}
+
+    assert sent("query", keys.ingest(SITE, "loader-1")) == {"server"}
+    assert sent("reply", keys.ingest(SITE, "loader-1")) == {"loader-1"}
+    assert sent("reply", keys.admin(SITE, "trust")) == {"boss"}
+    assert sent("put", keys.sensors(SITE, "loader-1")) == {"loader-1"}
+    assert sent("put", keys.pose(SITE, "loader-1")) == {"guest", "boss", "server"}
+    assert sent("declare_queryable", keys.map_queries_all(SITE)) == set(REGISTER.names)
+
+
+def test_every_key_that_exists_is_granted_to_somebody():
+    for name, build in inspect.getmembers(keys, inspect.isfunction):
+        wanted = list(inspect.signature(build).parameters)
+        if build.__module__ != keys.__name__ or name.startswith("_") or wanted[:1] != ["site"]:
+            continue
+        values = {"site": SITE, "machine": "loader-1", "query": "info", "command": "trust"}
+        key = build(**{parameter: values[parameter] for parameter in wanted})
+        messages = ("put", "query", "declare_subscriber", "liveliness_token", "liveliness_query", "declare_queryable")
+        assert any(may(who, message, key) for who in REGISTER.names for message in messages), f"{name}: {key}"
+
+
+def test_rules_follow_the_certificate_and_end_with_it():
+    register = REGISTER.without("loader-2").with_entry("loader-1", Entry("machine", "2", NOW, issue=2))
+    subjects = {s["id"]: s["cert_common_names"] for s in access_control(register)["subjects"]}
+    assert subjects["loader-1"] == ["loader-1.2"]
+    assert "loader-2" not in subjects
+    assert not may("loader-2", "query", keys.map_query(SITE, "info"), register=register)
+    assert "router" not in {
+        s["id"] for s in access_control(REGISTER.with_entry("router", Entry("router", "3", NOW)))["subjects"]
+    }
+
+
+def test_limits_never_touch_what_is_acknowledged():
+    settings = router_settings(REGISTER)
+    for item in settings["downsampling"]:
+        assert item["messages"] == ["put"]
+        for rule in item["rules"]:
+            assert rule["key_expr"] in (keys.poses_all(SITE), keys.health_all(SITE))
+    sizes = {key: item["size_limit"] for item in settings["low_pass_filter"] for key in item["key_exprs"]}
+    assert sizes[keys.ingest_all(SITE)] > MAX_BATCH_BYTES
+    assert all("reply" not in item["messages"] for item in settings["low_pass_filter"])
+
+
+# --- joining ---------------------------------------------------------------------------------------------------------
+
+
+def test_with_keys_the_default_endpoint_has_tls(folder: Path):
+    config = join(DEFAULT_ENDPOINT, folder / "server", 3.0, role="server", name="server", site=SITE)
+    assert (config.endpoint, config.wait_s) == (DEFAULT_TLS_ENDPOINT, 3.0)
+    assert config.credentials == load_credentials(folder / "server")
+    assert join("tls/router.site:1", folder / "server").endpoint == "tls/router.site:1"
+    assert join("tcp/10.0.0.5:1").credentials is None
+
+
+def test_keys_that_do_not_fit_are_named(folder: Path):
+    keys_of = folder / "server"
+    for wanted, problem in (
+        ({"role": "machine"}, "for role 'server', 'machine' is needed"),
+        ({"name": "loader-1"}, "for name 'server', 'loader-1' is needed"),
+        ({"site": "north"}, "for site 'paper', 'north' is needed"),
+    ):
+        with pytest.raises(ConfigError, match=problem):
+            join(DEFAULT_ENDPOINT, keys_of, **wanted)
+    with pytest.raises(ConfigError, match="proves no names"):
+        join("tcp/10.0.0.5:7447", keys_of)
+    with pytest.raises(ConfigError, match="needs keys"):
+        join("tls/10.0.0.5:7447")
+    with pytest.raises(ConfigError, match=r"holds no identity.toml; name the folder of one certificate"):
+        join(DEFAULT_ENDPOINT, folder)
+    (keys_of / "key.pem").unlink()
+    with pytest.raises(ConfigError, match=r"holds no key.pem"):
+        join(DEFAULT_ENDPOINT, keys_of)
+
+
+def test_an_expired_certificate_is_named_before_the_router_refuses_it(folder: Path):
+    credentials = load_credentials(folder / "server")
+    check_valid(credentials, credentials.identity.expires)
+    with pytest.raises(ConfigError, match=r"expired on .*; make a new one with `sitegrid keys add server --renew`"):
+        check_valid(credentials, credentials.identity.expires + timedelta(seconds=1))
+    identity = folder / "server" / "identity.toml"
+    identity.write_text(identity.read_text().replace(str(credentials.identity.expires.year), "2020"))
+    with pytest.raises(ConfigError, match="expired on 2020"):
+        join(DEFAULT_ENDPOINT, folder / "server")
+    identity.write_text(identity.read_text().replace("+00:00", ""))
+    with pytest.raises(ConfigError, match="no time zone"):
+        load_credentials(folder / "server")
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (("server", "--site-file", "config/site.toml", "--store", "x"), "for role 'machine', 'server' is needed"),
+        (("sim", "--site", SITE), "for role 'machine', 'sim' is needed"),
+        (
+            (
+                "agent",
+                "--site-file",
+                "config/site.toml",
+                "--config",
+                "config/agent.toml",
+                "--name",
+                "b",
+                "--spool",
+                "x",
+            ),
+            "for name 'a', 'b' is needed",
+        ),
+        (("query", "--site", "north", "info"), "for site 'paper', 'north' is needed"),
+        (("plot", "--site", "north"), "for site 'paper', 'north' is needed"),
+        (("trust", "a", "--site", "north"), "for site 'paper', 'north' is needed"),
+    ],
+)
+def test_every_command_looks_at_its_keys(
+    folder: Path, root: Path, words: tuple[str, ...], problem: str, monkeypatch, capsys: pytest.CaptureFixture[str]
+):
+    assert act(folder, "add", "a") == 0
+    monkeypatch.chdir(root)
+    assert main([words[0], "--keys", str(folder / "a"), *words[1:]]) == 1
+    assert problem in capsys.readouterr().err
+    assert not (root / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "is_so"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/127.9.9.9:0", True),
+        ("tcp/localhost:7447", True),
+        ("tcp/[::1]:7447", True),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:7447", False),
+        ("tcp/10.0.0.5:7447", False),
+        ("tcp/router:7447", False),
+        ("tcp/localhost.evil.org:7447", False),
+        ("udp/127.0.0.1:7447", False),
+        ("tcp/127.0.0.1:7447#bind=0.0.0.0:7447", False),
+        ("tcp/", False),
+    ],
+)
+def test_what_counts_as_this_host(endpoint: str, is_so: bool):
+    assert is_loopback(endpoint) == is_so
+
+
+def test_the_router_needs_keys_or_this_host(folder: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["router", "--listen", "tcp/0.0.0.0:0"]) == 1
+    assert "or say --insecure" in capsys.readouterr().err
+    assert main(["router", "--keys", str(folder), "--listen", "tcp/0.0.0.0:0"]) == 1
+    assert "proves no names" in capsys.readouterr().err
+    assert main(["router", "--keys", str(folder / "router")]) == 1
+    assert "holds no register.toml" in capsys.readouterr().err
