@@ -26,6 +26,7 @@ check: venv
 
 bench: venv
 	$(BIN)/python -m benchmarks merge
+	$(BIN)/python -m benchmarks memory
 	$(BIN)/python -m benchmarks ingest
 	$(BIN)/python -m benchmarks sim
 	$(BIN)/python -m benchmarks filter

@@ -139,5 +139,5 @@ def _check(page: Page) -> None:
     """Refuse what no page can be: places in order and within a block, cells in order."""
     place, cell = page.votes["place"].astype(np.int64), page.cells["cell"].astype(np.int64)
     in_order = (np.diff(place) > 0).all() and (np.diff(cell) > 0).all()
-    if not in_order or (len(place) and place[-1] >= ev.COUNTS * ev.CELLS):
+    if not in_order or not len(cell) or (len(place) and place[-1] >= ev.COUNTS * ev.CELLS):
         raise ValueError("votes or cells that no page can have")

@@ -426,6 +426,15 @@ def test_every_admitted_option_keeps_every_admitted_covariance_invertible():
     assert (a * c > b * b / 4).all()
 
 
+def test_both_kernels_agree_on_covariances_that_only_rounding_lets_pass():
+    xx = np.linspace(1.0, 449.9, 20)
+    rows = samples(20, cov_xx_m2=xx, cov_yy_m2=xx, cov_xy_m2=xx * (1 + 4e-7))
+    options = {"cell_m": 7.3, "std_floor_m": 0.01, "std_cap_m": 30.0}
+    numpy = folded(rows, kernel="numpy", **options)
+    assert total(numpy)[ev.HEADING].sum() == 20 * UNITS
+    assert same(numpy, folded(rows, kernel="numba", **options))
+
+
 @pytest.mark.parametrize("name", KERNELS)
 @pytest.mark.parametrize("column", ["cov_xx_m2", "cov_xy_m2", "cov_yy_m2"])
 def test_a_covariance_that_is_no_number_has_no_vote(name, column):
