@@ -2,7 +2,8 @@
 
 The token tells that an agent is there, for as long as the router believes so (up to the lease after a broken link). Who
 asks on the same key gets an answer from a live agent only: so a machine that restarts never takes its own dead
-predecessor for another agent.
+predecessor for another agent. (A router passes nothing between two sessions in peer mode: of two agents that both
+started without a router, neither sees the other. Their samples have different identities all the same, see spool.py.)
 """
 
 from __future__ import annotations
@@ -52,16 +53,6 @@ def this_process(now_ns: Callable[[], int] = time.time_ns) -> Owner:
     return Owner(now_ns(), secrets.randbits(62), socket.gethostname(), os.getpid())
 
 
-def wait_for_link(session: zenoh.Session, wait_s: float) -> bool:
-    """Wait until the session has reached a router, at most wait_s; returns whether it has."""
-    end_s = time.monotonic() + wait_s
-    while not session.info.routers_zid():
-        if time.monotonic() >= end_s:
-            return False
-        time.sleep(0.02)
-    return True
-
-
 def find_namesake(session: zenoh.Session, site: str, machine: str, wait_s: float = ANSWER_S) -> Owner | None:
     """Ask for a live agent of this name elsewhere; None if none answers."""
     asked = session.get(keys.alive(site, machine), timeout=wait_s, **EVERY_OTHER)
@@ -71,7 +62,8 @@ def find_namesake(session: zenoh.Session, site: str, machine: str, wait_s: float
 class Presence:
     """Publishes pose and health; both may be dropped on the way, the next one replaces them.
 
-    Their priority is above that of samples: a machine that catches up stays live.
+    While a machine catches up they wait for at most one batch of samples, which uplink.py keeps to about a second:
+    Zenoh's priorities change nothing there, because a batch lies in the socket's buffer already.
     """
 
     def __init__(self, session: zenoh.Session, site: str, machine: str, owner: Owner | None = None) -> None:
@@ -79,9 +71,9 @@ class Presence:
         self._machine = machine
         self._owner = owner or this_process()
         self._key = keys.alive(site, machine)
-        drop, first = zenoh.CongestionControl.DROP, zenoh.Priority.INTERACTIVE_HIGH
-        self._pose = session.declare_publisher(keys.pose(site, machine), congestion_control=drop, priority=first)
-        self._health = session.declare_publisher(keys.health(site, machine), congestion_control=drop, priority=first)
+        drop = zenoh.CongestionControl.DROP
+        self._pose = session.declare_publisher(keys.pose(site, machine), congestion_control=drop)
+        self._health = session.declare_publisher(keys.health(site, machine), congestion_control=drop)
         self._answer = session.declare_queryable(self._key, self._on_query)
         self._token = session.liveliness().declare_token(self._key)
         self._pose_ns = 0

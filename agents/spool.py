@@ -19,29 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from agents.audit import AuditLog
+from agents.spool_file import checksum, connect, make_or_check, problem, transaction
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.samples import SAMPLE_DTYPE, empty
 
-SCHEMA = 2
-LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
 KEPT_RUNS = 16  # earlier runs that are declared again: a server restored from a backup learns what it has lost
-_RUN = "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INTEGER, closed INTEGER)"
-_TABLES = (
-    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
-    "CREATE TABLE sample (number INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL)",
-    "CREATE TABLE aside (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL)",
-    _RUN,
-    f"PRAGMA user_version={SCHEMA}",
-)
-_FROM_SCHEMA_1 = (
-    _RUN,
-    "INSERT INTO run SELECT 0, value, 0, 0 FROM meta WHERE key = 'spool_id'",
-    "UPDATE run SET acknowledged = (SELECT value FROM meta WHERE key = 'acknowledged')",
-    "DELETE FROM meta WHERE key IN ('spool_id', 'acknowledged')",
-    "ALTER TABLE sample RENAME COLUMN seq TO number",
-    f"PRAGMA user_version={SCHEMA}",
-)
 
 
 @dataclass(frozen=True)
@@ -118,12 +101,11 @@ class Spool:
             try:
                 self._db = self._connect(path)
                 opened.callback(self._db.close)
-                self._db.execute("PRAGMA locking_mode=EXCLUSIVE")  # two agents on one file would send under one name
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._open()
             except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
-                raise StoreError(path, _problem(error)) from None
+                raise StoreError(path, problem(error)) from None
             opened.pop_all()
 
     @property
@@ -176,9 +158,10 @@ class Spool:
         with self._lock:
             base = self._runs[-1].base
             kept = [i for i in range(len(rows)) if self._is_pending(base + first_seq + i)]
-            with _transaction(self._db):
-                values = [(rows[i].tobytes(), base + first_seq + i) for i in kept]
-                self._db.executemany("UPDATE sample SET row = ?, final = 1 WHERE number = ?", values)
+            with transaction(self._db):
+                data = {base + first_seq + i: rows[i].tobytes() for i in kept}
+                values = [(row, checksum(number, row), number) for number, row in data.items()]
+                self._db.executemany("UPDATE sample SET row = ?, crc32 = ?, final = 1 WHERE number = ?", values)
             for i in kept:
                 self._note(first_seq + i, rows[i : i + 1])
 
@@ -209,7 +192,7 @@ class Spool:
             upto = max(run.acknowledged, min(watermark, end))
             is_earlier = at < len(self._runs) - 1
             new = replace(run, acknowledged=upto, closed=run.closed or (is_earlier and watermark >= end))
-            with _transaction(self._db):
+            with transaction(self._db):
                 span = (run.base, run.base + upto)
                 deleted = self._db.execute("DELETE FROM sample WHERE number > ? AND number <= ?", span).rowcount
                 self._save_run(new)
@@ -229,7 +212,7 @@ class Spool:
             if watermark >= run.acknowledged:
                 return False
             new = replace(run, acknowledged=watermark)
-            with _transaction(self._db):
+            with transaction(self._db):
                 self._save_run(new)
             self._runs[at], self._at = new, 0
             return True
@@ -241,7 +224,7 @@ class Spool:
             new = Run(old.base + old.acknowledged, self._draw_id())
             found = self._db.execute("SELECT number, row FROM sample WHERE number > ?", (new.base,)).fetchall()
             kept = [replace(old, closed=True)] if old.acknowledged else []
-            with _transaction(self._db):
+            with transaction(self._db):
                 self._db.execute("DELETE FROM run WHERE base = ?", (old.base,))
                 for run in (*kept, new):
                     self._save_run(run)
@@ -258,7 +241,7 @@ class Spool:
             base = self._runs[self._index(head.spool_id)].base
             seqs = range(head.first_seq, head.first_seq + len(head.rows))
             values = [(f"{head.spool_id:016x}", s, r.tobytes(), problem) for s, r in zip(seqs, head.rows, strict=True)]
-            with _transaction(self._db):
+            with transaction(self._db):
                 self._db.executemany("INSERT INTO aside VALUES (?, ?, ?, ?)", values)
                 self._db.executemany("DELETE FROM sample WHERE number = ?", [(base + seq,) for seq in seqs])
             self._aside += len(values)
@@ -274,18 +257,12 @@ class Spool:
                 self._audit.close()
 
     def _connect(self, path: Path) -> sqlite3.Connection:
-        return sqlite3.connect(path, LOCK_WAIT_S, isolation_level=None, check_same_thread=False)
+        return connect(path)
 
     def _open(self) -> None:
         """Make or read the file, and start a run."""
-        with _transaction(self._db):  # all together: a kill leaves all or nothing
-            if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
-                self._run_all(_TABLES)
-                self._save(_Meta(0, 0, 0))
-            elif self._schema() == 1:
-                self._run_all(_FROM_SCHEMA_1)
-            if (schema := self._schema()) != SCHEMA:
-                raise ValueError(f"schema {schema}, this agent knows {SCHEMA}")
+        with transaction(self._db):  # all together: a kill leaves all or nothing
+            make_or_check(self._db)
             # After a crash pending samples are sent as they are: a coarse place is better than none.
             self._db.execute("UPDATE sample SET final = 1 WHERE final = 0")
             self._meta = _Meta(**{k: int(v) for k, v in self._db.execute("SELECT key, value FROM meta")})
@@ -311,13 +288,6 @@ class Spool:
             self._save_run(run)
         return runs
 
-    def _run_all(self, statements: tuple[str, ...]) -> None:
-        for statement in statements:
-            self._db.execute(statement)
-
-    def _schema(self) -> int:
-        return int(self._db.execute("PRAGMA user_version").fetchone()[0])
-
     def _identified(self) -> Iterator[tuple[int, int, Table]]:
         """All samples of the file as (spool_id, seq, row)."""
         for i, run in enumerate(self._runs):
@@ -337,10 +307,13 @@ class Spool:
 
     def _insert(self, rows: Table, *, final: bool) -> None:
         old, n = self._meta, len(rows)
-        values = [(old.newest + 1 + i, row.tobytes(), int(final)) for i, row in enumerate(rows)]
+        values = [
+            (number, data, int(final), checksum(number, data))
+            for number, data in enumerate((row.tobytes() for row in rows), old.newest + 1)
+        ]
         excess = max(0, self._depth + n - self._config.max_samples)
-        with _transaction(self._db):
-            self._db.executemany("INSERT INTO sample VALUES (?, ?, ?)", values)
+        with transaction(self._db):
+            self._db.executemany("INSERT INTO sample VALUES (?, ?, ?, ?)", values)
             if excess:
                 oldest = "SELECT number FROM sample ORDER BY number LIMIT ?"
                 self._db.execute(f"DELETE FROM sample WHERE number IN ({oldest})", (excess,))  # noqa: S608 - no input
@@ -368,29 +341,5 @@ class Spool:
         self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?)", values)
 
 
-class _transaction:  # noqa: N801 - used like a keyword
-    """All or nothing; an error rolls back and goes on up, also one of the commit itself."""
-
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
-
-    def __enter__(self) -> None:
-        self._db.execute("BEGIN IMMEDIATE")
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        try:
-            if not kind:
-                self._db.execute("COMMIT")
-        finally:
-            if self._db.in_transaction:  # SQLite itself has rolled back after some errors of the disk
-                self._db.execute("ROLLBACK")
-
-
 def _table(rows: Iterable[bytes]) -> Table:
     return np.frombuffer(b"".join(rows), SAMPLE_DTYPE)
-
-
-def _problem(error: Exception) -> str:
-    if "locked" in str(error):
-        return "another agent is using this spool; stop it, or choose another --spool"
-    return f"is no usable spool: {error}"

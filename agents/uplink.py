@@ -227,10 +227,7 @@ class Uplink:
 
     def _ask(self, payload: bytes) -> Ack | Refused | None:
         try:
-            replies = self._session.get(
-                self._key, payload=payload, timeout=self._timeout_s, priority=zenoh.Priority.DATA_LOW
-            )
-            for reply in replies:
+            for reply in self._session.get(self._key, payload=payload, timeout=self._timeout_s):
                 if reply.ok is not None:
                     return decode_reply(reply.ok.payload.to_bytes())
         except (zenoh.ZError, MessageError) as error:

@@ -1,8 +1,9 @@
 """The pages of one block by time: the newest buckets apart, older ones summed into hours, days and all before.
 
-What is kept apart goes by rank, not by age: ground that is driven once a day keeps its last passes apart as well as a
-haul road, and a block never takes more than a fixed number of pages. The newest buckets of a set of buckets do not
-depend on the order in which they came, and summing commutes, so that a ladder is a function of the samples alone.
+What is kept apart goes by rank, cell by cell, not by age: ground that is driven once a day keeps its last passes apart
+as well as the haul road beside it, and a cell never takes more than a fixed number of places. The newest buckets of a
+set of buckets do not depend on the order in which they came, and summing commutes, so that a ladder is a function of the
+samples alone.
 """
 
 from __future__ import annotations
@@ -10,8 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from mapserver.pages import Page, merge
+import numpy as np
+
+from mapserver import evidence as ev
+from mapserver.pages import Page, merge, pick
 from mapserver.votes import FoldConfig
+from protocol.arrays import Bools
 
 HOUR_S, DAY_S = 3600, 86_400
 Block = tuple[int, int]  # column and row
@@ -19,7 +24,7 @@ Block = tuple[int, int]  # column and row
 
 @dataclass(frozen=True)
 class Rung:
-    """Spans of one length [ns], of which the newest `keep` stay apart; keep 0: all of them are one."""
+    """Spans of one length [ns], of which the newest `keep` of each cell stay apart; keep 0: all of them are one."""
 
     span_ns: int
     keep: int
@@ -68,8 +73,8 @@ class Ladder:
     def timed(self) -> list[TimedPage]:
         """Pages in the order of time.
 
-        A page of a coarser rung may begin before one of a finer rung ends: both have evidence of the same hour. The
-        finer one is newer.
+        A page of a coarser rung may begin before one of a finer rung ends: both have evidence of the same hour. In each
+        cell, the finer one is newer.
         """
         found = []
         for rung, index, page in self.items():
@@ -80,15 +85,26 @@ class Ladder:
 
     def _put(self, rung: int, index: int, page: Page) -> None:
         pages, keep = self._pages[rung], self._rungs[rung].keep
-        if index in pages:
-            pages[index] = merge(pages[index], page)
-        elif not keep or len(pages) < keep:
-            pages[index] = page
-        else:
-            oldest = min(pages)
-            if index > oldest:
-                pages[index], page, index = page, pages.pop(oldest), oldest
-            self._put(rung + 1, self._above(rung, index), page)
+        pages[index] = merge(pages[index], page) if index in pages else page
+        if keep and len(pages) > keep:
+            self._thin(rung)
+
+    def _thin(self, rung: int) -> None:
+        """Hand on what cells have beyond their newest `keep` spans."""
+        pages = self._pages[rung]
+        order = sorted(pages, reverse=True)
+        held: Bools = np.zeros((len(order), ev.CELLS), np.bool_)
+        for i, index in enumerate(order):
+            held[i, pages[index].cells["cell"]] = True
+        beyond = held & (held.cumsum(axis=0) > self._rungs[rung].keep)
+        for i in np.flatnonzero(beyond.any(axis=1)).tolist():
+            index = order[i]
+            page = pages.pop(index)
+            if not (kept := held[i] & ~beyond[i]).any():
+                self._put(rung + 1, self._above(rung, index), page)
+                continue
+            pages[index] = pick(page, kept)
+            self._put(rung + 1, self._above(rung, index), pick(page, beyond[i]))
 
     def _above(self, rung: int, index: int) -> int:
         """Index of the coarser span that holds this one."""

@@ -48,6 +48,30 @@ def take_cells(bitmaps: Any, newest_ns: Any, out: Any) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
+def pick_votes(votes: Any, wanted: Any, narrow: Any, wide: Any) -> tuple[int, int]:
+    """Votes of the cells (256,) that are wanted; returns how many there are, and the largest count."""
+    found, largest = 0, np.uint32(0)
+    for i in range(len(votes)):
+        if wanted[votes[i].place % CELLS]:
+            narrow[found].place, narrow[found].count = votes[i].place, votes[i].count
+            wide[found].place, wide[found].count = votes[i].place, votes[i].count
+            largest = max(largest, np.uint32(votes[i].count))
+            found += 1
+    return found, int(largest)
+
+
+@numba.njit(cache=True, nogil=True)
+def pick_cells(cells: Any, wanted: Any, out: Any) -> int:
+    """Cells that are wanted; returns how many there are."""
+    found = 0
+    for i in range(len(cells)):
+        if wanted[cells[i].cell]:
+            out[found] = cells[i]
+            found += 1
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
 def add_votes(one: Any, other: Any, narrow: Any, wide: Any) -> tuple[int, int]:
     """Merge votes in the order of places, saturated; returns how many there are, and the largest count."""
     i, j, found, largest = 0, 0, 0, np.uint64(0)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mapserver import evidence as ev
 from mapserver.change import ChangeConfig, credible, cuts, kinds, reach_blocks
 from mapserver.ladder import Block, TimedPage
+from mapserver.pages import pick
 from protocol.arrays import AnyArray, Ints
 from protocol.geometry import BLOCK_CELLS
 
@@ -63,7 +64,7 @@ def _sum(
 ) -> None:
     last = int(start.max(initial=0))
     for index, timed in enumerate(pages):
-        page = timed.page if index >= last else timed.page.of_cells(start <= index)
+        page = timed.page if index >= last else pick(timed.page, start <= index)
         page.add_to(counts, bitmaps, newest_ns)
 
 

@@ -40,7 +40,7 @@ class FoldConfig:
     """How samples become evidence.
 
     bucket_s: length of a time bucket, a whole part of an hour. keep_buckets, keep_hours, keep_days: so many of the
-    newest buckets, hours and days with evidence stay apart in each block of 16 x 16 cells, older ones are summed.
+    newest buckets, hours and days with evidence stay apart in each cell, older ones are summed.
     std_floor_m: added to every position's standard deviation, in squares. std_cap_m: samples less sure of their place
     than this are journalled, not folded. hot_blocks: so many blocks are unpacked at a time, 115 kB each. kernel:
     "numba", "numpy", or "auto" for numba where it is installed.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import logging
 import re
 import sys
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from typing import TypeAlias
 
 from protocol.errors import SitegridError
 from protocol.session import DEFAULT_ENDPOINT
+from sitegrid.logs import start_logging
 from sitegrid.times import HELP as TIME_HELP
 from sitegrid.times import parse_time
 
@@ -38,7 +38,7 @@ EXTRA = {
 def main(words: Sequence[str] | None = None) -> int:
     """Run the command; errors in one line."""
     arguments = build_parser().parse_args(words)
-    _start_logging(verbose=arguments.verbose)
+    start_logging(verbose=arguments.verbose)
     try:
         module = importlib.import_module(arguments.module)
         return int(module.run(arguments))
@@ -421,13 +421,6 @@ def _withhold(text: str) -> tuple[float, float]:
 def _fail(problem: str, as_json: bool) -> int:  # noqa: FBT001 - the user's own flag
     print(json.dumps({"error": problem}) if as_json else f"sitegrid: {problem}", file=sys.stderr)
     return 1
-
-
-def _start_logging(*, verbose: bool) -> None:
-    style = "%(asctime)s level=%(levelname)s logger=%(name)s %(message)s"
-    if not sys.stderr.isatty():
-        style = '{"t": "%(asctime)s", "level": "%(levelname)s", "logger": "%(name)s", "event": "%(message)s"}'
-    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format=style, stream=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -14,11 +14,11 @@ from agents.config import AgentConfig, load_agent
 from agents.drivers import Driver
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
-from agents.presence import Owner, find_namesake, this_process, wait_for_link
+from agents.presence import Owner, find_namesake, this_process
 from protocol.errors import ConfigError, LinkError
 from protocol.logfolder import LogFolder, open_log
 from protocol.machine import MachineConfig
-from protocol.session import open_session
+from protocol.session import SessionConfig, open_session
 from protocol.site import SiteConfig, load_site
 from sitegrid.process import note, plain, say, stop_flag
 from sitegrid.security import join
@@ -31,9 +31,7 @@ def run(arguments: Namespace) -> int:
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
     site, machine, config = _configure(arguments, log)
-    session = open_session(
-        join(arguments.endpoint, arguments.keys, wait_s=-1, role="machine", name=machine.name, site=site.name)
-    )
+    session = _open(join(arguments.endpoint, arguments.keys, role="machine", name=machine.name, site=site.name))
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
@@ -45,10 +43,18 @@ def run(arguments: Namespace) -> int:
     return 0 if report["delivered"] or stop.is_set() else 1
 
 
+def _open(settings: SessionConfig) -> zenoh.Session:
+    """Open a session; without a router one that goes on looking for it, so that the machine drives and records."""
+    try:
+        return open_session(dataclasses.replace(settings, wait_s=LINK_S))
+    except LinkError:
+        return open_session(dataclasses.replace(settings, wait_s=-1))
+
+
 def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) -> Owner:
-    """Refuse to start beside a live agent of the same name; without a router that shows later, and this one waits."""
+    """Refuse to start beside a live agent of the same name."""
     owner = this_process()
-    if wait_for_link(session, LINK_S) and (other := find_namesake(session, site, machine)):
+    if other := find_namesake(session, site, machine):
         problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"
         raise LinkError(endpoint, problem)
     return owner

@@ -76,14 +76,23 @@ def test_plot_follows_machines_live(site_run: SiteRun, tmp_path: Path):
     site_run.start_server()
     site_run.start_agents()
     out = tmp_path / "live.png"
-    words = ("--endpoint", site_run.endpoint, "--out", out, "--follow", "--every", 0.5, "--pictures", 6, "--json")
+    words = ("--endpoint", site_run.endpoint, "--out", out, "--follow", "--every", 0.5, "--json")
     plot = site_run.children.start("plot", "plot", *words)
     wait_until(out.exists, 40.0, "first picture")
     first = out.read_bytes()
     site_run.start_sim()
-    line = plot.expect("picture", 60.0)
-    assert line["drawn"] == 6
-    assert out.read_bytes() != first
+    wait_until(lambda: out.read_bytes() != first, 60.0, "a picture of more than there was at first")
+    plot.send(signal.SIGTERM)
+    assert plot.expect("picture", 10.0)["drawn"] > 1
+    assert plot.wait(10.0) == 0
+
+
+def test_plot_ends_after_as_many_pictures_as_were_asked_for(site_run: SiteRun, tmp_path: Path):
+    site_run.start_router()
+    site_run.start_server()
+    words = ("--endpoint", site_run.endpoint, "--out", tmp_path / "live.png", "--follow", "--every", 0.1)
+    plot = site_run.children.start("plot", "plot", *words, "--pictures", 3, "--json")
+    assert plot.expect("picture", 60.0)["drawn"] == 3
     assert plot.wait(10.0) == 0
     site_run.end_of_agents()
 

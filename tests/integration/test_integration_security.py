@@ -259,9 +259,17 @@ def test_a_machine_cannot_pose_as_the_router(guarded: Guarded):
         refusal(dataclasses.replace(guarded.settings("loader-1"), endpoint=endpoint))
 
 
-def test_the_router_is_refused_at_an_address_that_is_not_its_own(guarded: Guarded):
-    elsewhere = guarded.endpoint.replace("127.0.0.1", "127.0.0.2")
-    refusal(dataclasses.replace(guarded.settings("loader-1"), endpoint=elsewhere))
+def test_a_router_is_believed_only_at_the_hosts_of_its_certificate(guarded: Guarded):
+    port = free_endpoint().rpartition(":")[2]
+    for host, is_listed in (("127.0.0.1", True), ("127.0.0.2", False)):
+        endpoint = f"tls/{host}:{port}"
+        router = SessionConfig(endpoint, "router", credentials=load_credentials(guarded.keys / "router"))
+        with closing(open_session(router)):
+            machine = dataclasses.replace(guarded.settings("loader-1"), endpoint=endpoint)
+            if is_listed:
+                open_session(machine).close()
+            else:
+                assert "do not know each other" in refusal(machine)
 
 
 # --- who has a name, and wants more ----------------------------------------------------------------------------------

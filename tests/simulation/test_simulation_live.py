@@ -18,7 +18,7 @@ import zenoh
 from agents.agent import Agent, Places
 from agents.config import AgentConfig
 from agents.localisation.belief import PoseBelief
-from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake, wait_for_link
+from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
 from agents.spool import Spool, SpoolConfig
 from agents.uplink import Uplink, UplinkConfig, UplinkState
 from mapserver.config import ServerConfig
@@ -30,7 +30,7 @@ from protocol.machine import MachineConfig, SensorConfig
 from protocol.samples import SAMPLE_DTYPE
 from protocol.session import SessionConfig, free_endpoint, open_session
 from protocol.site import SiteConfig
-from sitegrid.commands.agent import _claim_name
+from sitegrid.commands.agent import _claim_name, _open
 from sitegrid.processes import wait_until
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
@@ -55,9 +55,8 @@ def opened(endpoint: str) -> Iterator[Opened]:
     with contextlib.ExitStack() as stack:
 
         def session(where: str = endpoint) -> zenoh.Session:
-            found: Any = open_session(SessionConfig(where, wait_s=-1))
+            found: Any = _open(SessionConfig(where))
             stack.callback(found.close)
-            assert wait_for_link(found, WAIT_S)
             return found
 
         yield session
@@ -87,7 +86,7 @@ def test_second_live_agent_of_a_name_is_refused_and_named(endpoint: str, opened:
 
 def test_agent_without_a_router_starts(opened: Opened) -> None:
     nowhere = free_endpoint()
-    session: Any = open_session(SessionConfig(nowhere, wait_s=-1))
+    session: Any = _open(SessionConfig(nowhere))
     assert _claim_name(session, nowhere, SITE.name, "loader-1").pid > 0
     session.close()
 
