@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.audit import AuditLog
-from agents.spool_file import checksum, connect, make_or_check, problem, transaction
+from agents.spool_file import checksum, connect, make_or_check, transaction, why_unusable
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.samples import SAMPLE_DTYPE, empty
@@ -73,6 +73,9 @@ class _Meta:
     recorded: int
 
 
+_Row = tuple[int, bytes, int, int | None]  # number, sample, whether it is final, checksum
+
+
 def random_id() -> int:
     """A run's identity: 64 random bits, never zero."""
     return secrets.randbits(64) or 1
@@ -105,7 +108,7 @@ class Spool:
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._open()
             except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
-                raise StoreError(path, problem(error)) from None
+                raise StoreError(path, why_unusable(error)) from None
             opened.pop_all()
 
     @property
@@ -172,17 +175,15 @@ class Spool:
         """
         with self._lock:
             run, end = self._runs[self._at], self._end(self._at)
-            query = "SELECT number, row, final FROM sample WHERE number > ? AND number <= ? ORDER BY number LIMIT ?"
-            found = self._db.execute(query, (run.base, run.base + end, limit)).fetchall()
+            while damaged := _damaged(found := self._oldest(limit)):
+                self._move_aside(run, damaged, "damaged on the machine's disk")
             if not found:
                 is_earlier = self._at < len(self._runs) - 1
                 return Head(run.spool_id, end + 1, empty(), end) if is_earlier else None
             first = found[0][0]
-            n = next((i for i, (number, _, final) in enumerate(found) if not final or number != first + i), len(found))
-            if n == 0:
-                return None
-            seq = first - run.base
-            return Head(run.spool_id, seq, _table(row for _, row, _ in found[:n]), seq - 1 - run.acknowledged)
+            n = next((i for i, (number, _, final, _) in enumerate(found) if not final or number != first + i), None)
+            seq, rows = first - run.base, _table(row for _, row, _, _ in found[:n])
+            return Head(run.spool_id, seq, rows, seq - 1 - run.acknowledged) if len(rows) else None
 
     def acknowledge(self, spool_id: int, watermark: int) -> None:
         """Delete what the server has on disk, of one run."""
@@ -238,14 +239,9 @@ class Spool:
     def put_aside(self, head: Head, problem: str) -> None:
         """Keep samples that the server will never take out of the way, for a person to look at."""
         with self._lock:
-            base = self._runs[self._index(head.spool_id)].base
-            seqs = range(head.first_seq, head.first_seq + len(head.rows))
-            values = [(f"{head.spool_id:016x}", s, r.tobytes(), problem) for s, r in zip(seqs, head.rows, strict=True)]
-            with transaction(self._db):
-                self._db.executemany("INSERT INTO aside VALUES (?, ?, ?, ?)", values)
-                self._db.executemany("DELETE FROM sample WHERE number = ?", [(base + seq,) for seq in seqs])
-            self._aside += len(values)
-            self._depth -= len(values)
+            run = self._runs[self._index(head.spool_id)]
+            first = run.base + head.first_seq
+            self._move_aside(run, [(first + i, row.tobytes()) for i, row in enumerate(head.rows)], problem)
 
     def close(self) -> None:
         """Fold the write-ahead log into the file and close."""
@@ -322,6 +318,20 @@ class Spool:
         self._meta = new
         self._depth += n - excess
 
+    def _oldest(self, limit: int) -> list[_Row]:
+        """Rows of the run that is being sent."""
+        base, end = self._runs[self._at].base, self._end(self._at)
+        query = "SELECT * FROM sample WHERE number > ? AND number <= ? ORDER BY number LIMIT ?"
+        return self._db.execute(query, (base, base + end, limit)).fetchall()
+
+    def _move_aside(self, run: Run, rows: list[tuple[int, bytes]], why: str) -> None:
+        values = [(f"{run.spool_id:016x}", number - run.base, row, why) for number, row in rows]
+        with transaction(self._db):
+            self._db.executemany("INSERT INTO aside VALUES (?, ?, ?, ?)", values)
+            self._db.executemany("DELETE FROM sample WHERE number = ?", [(number,) for number, _ in rows])
+        self._aside += len(values)
+        self._depth -= len(values)
+
     def _note(self, first_seq: int, rows: Table) -> None:
         """Write the audit, if there is one: what a full disk keeps from it is added at the next opening."""
         if self._audit:
@@ -339,6 +349,11 @@ class Spool:
     def _save_run(self, run: Run) -> None:
         values = (run.base, f"{run.spool_id:016x}", run.acknowledged, int(run.closed))
         self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?)", values)
+
+
+def _damaged(rows: list[_Row]) -> list[tuple[int, bytes]]:
+    """Those that are not what was written."""
+    return [(number, row) for number, row, _, crc32 in rows if crc32 not in (None, checksum(number, row))]
 
 
 def _table(rows: Iterable[bytes]) -> Table:

@@ -50,7 +50,7 @@ def checksum(number: int, row: bytes) -> int:
     return zlib.crc32(row, number & 0xFFFFFFFF)
 
 
-def problem(error: Exception) -> str:
+def why_unusable(error: Exception) -> str:
     """Say why a file cannot be used."""
     if "locked" in str(error):
         return "another agent is using this spool; stop it, or choose another --spool"

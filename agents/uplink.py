@@ -123,6 +123,12 @@ class UplinkState:
         self.problem = f"the spool cannot be used: {error}; look at the machine's disk"
         return self._back_off()
 
+    def on_bug(self, error: Exception) -> float:
+        """Take in that an exchange failed in a way that was not foreseen; returns the pause before the next try [s]."""
+        self.counters["bugs"] += 1
+        self.problem = f"the uplink failed: {error!r}; its log has more"
+        return self._back_off()
+
     def _on_silence(self, took_s: float) -> float:
         """No server answers at once with nothing; a link that is too slow for the batch uses up the time-out."""
         if took_s < self._config.timeout_s / 2:
@@ -198,6 +204,7 @@ class Uplink:
         self._timeout_s = timeout_s
         self._wake = threading.Event()
         self._stop = threading.Event()
+        self._cancel = zenoh.CancellationToken()
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
         self._thread.start()
 
@@ -206,9 +213,10 @@ class Uplink:
         self._wake.set()
 
     def close(self) -> None:
-        """Stop after the exchange that is under way."""
+        """Stop, and wait for no answer: what it would say, the next start learns again."""
         self._stop.set()
         self._wake.set()
+        self._cancel.cancel()  # type: ignore[no-untyped-call]
         self._thread.join()
 
     def _run(self) -> None:
@@ -220,6 +228,9 @@ class Uplink:
                 pause_s = self.state.on_reply(self._ask(payload), time.monotonic() - start_s) if payload else None
             except sqlite3.Error as error:  # a full or failing disk: the samples wait, the agent goes on
                 pause_s = self.state.on_disk_error(error)
+            except Exception as error:  # a bug must not end the thread, and with it all delivery, without a word
+                log.exception("uplink failed")
+                pause_s = self.state.on_bug(error)
             if pause_s is None:
                 self._wake.wait(0.5)
             elif pause_s > 0:
@@ -227,7 +238,10 @@ class Uplink:
 
     def _ask(self, payload: bytes) -> Ack | Refused | None:
         try:
-            for reply in self._session.get(self._key, payload=payload, timeout=self._timeout_s):
+            replies = self._session.get(
+                self._key, payload=payload, timeout=self._timeout_s, cancellation_token=self._cancel
+            )
+            for reply in replies:
                 if reply.ok is not None:
                     return decode_reply(reply.ok.payload.to_bytes())
         except (zenoh.ZError, MessageError) as error:

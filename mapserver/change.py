@@ -16,12 +16,13 @@ import numpy as np
 
 from mapserver import evidence as ev
 from mapserver.ladder import TimedPage
-from protocol.arrays import AnyArray, Bools, Floats, Ints
+from mapserver.pages import moments
+from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_positive
 from protocol.geometry import BLOCK_CELLS
 
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
-ALIKE_BINS = 1.0  # cells whose pages' means differ by less are not looked at any closer
+ALIKE_BINS = 1.0  # kinds of ground nearer to each other are the same; cells whose pages are nearer did not change
 _PARTS = (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH)
 
 
@@ -42,7 +43,9 @@ class ChangeConfig:
     size_m: float = 5.0
 
     def __post_init__(self) -> None:
-        require_positive(self, ("bins", "weight_m", "size_m"))
+        require_positive(self, ("weight_m", "size_m"))
+        if not self.bins >= 1:
+            raise ValueError(f"bins: {self.bins} is below 1: medians of votes are no finer")
         if not 0 < self.variation < 1:
             raise ValueError(f"variation: {self.variation} is not between 0 and 1")
 
@@ -64,24 +67,26 @@ def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
     found = Cuts(np.zeros(ev.CELLS, np.int64), np.full(ev.CELLS, np.nan))
     if len(pages) < 2 or not config.detect:
         return found
-    histograms = _histograms(pages)
     for part in _PARTS:
-        votes = histograms[:, part]
-        cells = np.flatnonzero(_may_differ(votes, config.weight_m))
+        cells = np.flatnonzero(_may_differ(pages, part, config))
+        if not len(cells):
+            continue
+        votes = _histograms(pages, part, cells)
+        left = np.arange(len(cells))
         for _ in range(MOST_CHANGES):
-            if not len(cells):
+            cut, kind = _best_cut(votes[:, :, left], found.first[cells[left]], config)
+            changed = cut > found.first[cells[left]]
+            left, cut, kind = left[changed], cut[changed], kind[changed]
+            found.first[cells[left]] = cut
+            found.kind[cells[left]] = kind if part == ev.RESISTANCE else np.nan
+            if not len(left):
                 break
-            cut, kind = _best_cut(votes[:, :, cells], found.first[cells], config)
-            changed = cut > found.first[cells]
-            cells = cells[changed]
-            found.first[cells] = cut[changed]
-            found.kind[cells] = kind[changed] if part == ev.RESISTANCE else np.nan
     return found
 
 
 def kinds(pages: Sequence[TimedPage]) -> Floats:
     """Median (256,) of all c_rr votes of each cell, in bins; NaN where there are none."""
-    votes = _histograms(pages)[:, ev.RESISTANCE].sum(axis=0)
+    votes = _histograms(pages, ev.RESISTANCE, np.arange(ev.CELLS)).sum(axis=0)
     weight = votes.sum(axis=0)
     return np.where(weight > 0, _median(votes / np.maximum(weight, 1e-9)), np.nan)
 
@@ -122,23 +127,27 @@ def _opened(cells: Bools, edge: int) -> Bools:
     return np.asarray(cv2.dilate(corners, square, anchor=(last, last), borderValue=0) > 0, np.bool_)
 
 
-def _histograms(pages: Sequence[TimedPage]) -> AnyArray:
-    """Votes (pages, COUNTS, 256) in metres."""
-    counts = np.zeros((len(pages), ev.COUNTS * ev.CELLS), np.float32)
+def _histograms(pages: Sequence[TimedPage], part: slice, cells: Ints) -> Floats:
+    """Votes (pages, bins, cells) of some cells in metres."""
+    counts = np.zeros((len(pages), (part.stop - part.start) * ev.CELLS))
     for i, timed in enumerate(pages):
-        votes = timed.page.votes
-        counts[i][votes["place"]] = votes["count"]
-    metres = counts.reshape(len(pages), ev.COUNTS, ev.CELLS) / np.float32(ev.WEIGHT_UNITS_PER_M)
-    return np.asarray(metres)
+        first, end = np.searchsorted(timed.page.votes["place"], (part.start * ev.CELLS, part.stop * ev.CELLS))
+        votes = timed.page.votes[first:end]
+        counts[i][votes["place"] - part.start * ev.CELLS] = votes["count"]
+    metres: Floats = counts.reshape(len(pages), part.stop - part.start, ev.CELLS)[:, :, cells] / ev.WEIGHT_UNITS_PER_M
+    return metres
 
 
-def _may_differ(votes: Floats, weight_m: float) -> Bools:
-    """Cells whose pages' mean bins differ at all: most do not, and are not looked at any closer."""
-    weight = votes.sum(axis=1)
-    mean = np.tensordot(np.arange(votes.shape[1], dtype=np.float32), votes, (0, 1)) / np.maximum(weight, 1e-9)
-    seen = weight > 0.1 * weight_m
-    spread = np.where(seen, mean, -np.inf).max(axis=0) - np.where(seen, mean, np.inf).min(axis=0)
-    return np.asarray(spread > ALIKE_BINS, np.bool_)
+def _may_differ(pages: Sequence[TimedPage], part: slice, config: ChangeConfig) -> Bools:
+    """Cells whose pages differ at all, by the mean of their votes or by the spread: most do not."""
+    sums = np.stack([moments(timed.page, part) for timed in pages])
+    weight = sums[:, 0]
+    mean, square = sums[:, 1] / np.maximum(weight, 1e-9), sums[:, 2] / np.maximum(weight, 1e-9)
+    spread = np.sqrt(np.maximum(square - mean**2, 0))
+    seen = weight > 0.1 * config.weight_m * ev.WEIGHT_UNITS_PER_M
+    alike = min(ALIKE_BINS, config.bins / 2)
+    ranges = [np.where(seen, v, -np.inf).max(axis=0) - np.where(seen, v, np.inf).min(axis=0) for v in (mean, spread)]
+    return np.asarray(np.maximum(*ranges) > alike, np.bool_)
 
 
 def _best_cut(votes: Floats, first: Ints, config: ChangeConfig) -> tuple[Ints, Floats]:

@@ -1,8 +1,8 @@
 """The pages of one block by time: the newest buckets apart, older ones summed into hours, days and all before.
 
 What is kept apart goes by rank, cell by cell, not by age: ground that is driven once a day keeps its last passes apart
-as well as the haul road beside it, and a cell never takes more than a fixed number of places. The newest buckets of a
-set of buckets do not depend on the order in which they came, and summing commutes, so that a ladder is a function of the
+as well as the haul road beside it, and a cell never takes more than a fixed number of places. The newest buckets of
+a set do not depend on the order in which they came, and summing commutes, so that a ladder is a function of the
 samples alone.
 """
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver import evidence as ev
-from protocol.arrays import AnyArray, Bools, Ints, Table
+from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 
 # place: bin * 256 + cell. Counts of a few passes fit into 16 bits; a page with one that does not is a wide one.
 NARROW = np.dtype([("place", "<u2"), ("count", "<u2")])
@@ -51,6 +51,7 @@ def frozen(records: Table) -> Table:
 Pack = Callable[[NDArray[np.uint32], Bools, NDArray[np.uint64], Ints], Page]
 Merge = Callable[[Page, Page], Page]
 Pick = Callable[[Page, Bools], Page]
+Moments = Callable[[Page, slice], Floats]
 
 
 def pack_numpy(counts: NDArray[np.uint32], planes: Bools, bitmaps: NDArray[np.uint64], newest_ns: Ints) -> Page:
@@ -92,6 +93,14 @@ def pick_numpy(page: Page, wanted: Bools) -> Page:
     return Page(_votes(votes["place"], votes["count"]), frozen(page.cells[wanted[page.cells["cell"]]]))
 
 
+def moments_numpy(page: Page, part: slice) -> Floats:
+    """Sums (3, 256) of counts, counts times bin and counts times bin squared, of one part of the counts."""
+    plane, cell = np.divmod(page.votes["place"].astype(np.int64), ev.CELLS)
+    wanted = (plane >= part.start) & (plane < part.stop)
+    bins, count = plane[wanted] - part.start, page.votes["count"][wanted].astype(np.float64)
+    return np.stack([np.bincount(cell[wanted], count * bins**power, ev.CELLS) for power in range(3)])
+
+
 def _votes(place: AnyArray, count: AnyArray) -> Table:
     votes = np.empty(len(place), _kind(int(count.max(initial=0))))
     votes["place"], votes["count"] = place, count
@@ -102,7 +111,7 @@ def _kind(largest: int) -> np.dtype[np.void]:
     return NARROW if largest <= np.iinfo(np.uint16).max else WIDE
 
 
-def _with_numba() -> tuple[Pack, Merge, Pick]:
+def _with_numba() -> tuple[Pack, Merge, Pick, Moments]:
     """The same in numba, several times faster."""
     from mapserver import pages_numba as kernels
 
@@ -133,10 +142,15 @@ def _with_numba() -> tuple[Pack, Merge, Pick]:
         found = kernels.pick_votes(of.votes, wanted, narrow, wide)
         return page((narrow, wide), cells, found, kernels.pick_cells(of.cells, wanted, cells))
 
-    return pack, merge, pick
+    def moments(of: Page, part: slice) -> Floats:
+        out = np.zeros((3, ev.CELLS))
+        kernels.moments(of.votes, part.start, part.stop, out)
+        return out
+
+    return pack, merge, pick, moments
 
 
 try:
-    pack, merge, pick = _with_numba()
+    pack, merge, pick, moments = _with_numba()
 except ImportError:
-    pack, merge, pick = pack_numpy, merge_numpy, pick_numpy
+    pack, merge, pick, moments = pack_numpy, merge_numpy, pick_numpy, moments_numpy

@@ -114,3 +114,15 @@ def add_cells(one: Any, other: Any, out: Any) -> int:
             j += 1
         found += 1
     return found
+
+
+@numba.njit(cache=True, nogil=True)
+def moments(votes: Any, start: int, stop: int, out: Any) -> None:
+    """Add to out (3, 256) sums of counts, counts times bin and counts times bin squared, of planes start to stop."""
+    for i in range(len(votes)):
+        plane, cell = votes[i].place // CELLS, votes[i].place % CELLS
+        if start <= plane < stop:
+            bin_, count = plane - start, np.float64(votes[i].count)
+            out[0, cell] += count
+            out[1, cell] += count * bin_
+            out[2, cell] += count * bin_ * bin_

@@ -94,11 +94,13 @@ class Store:
         """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
         if self.merged <= self.snapshot_row:
             return None
-        row, state, left_out = self.merged, self.grid.state(), self.left_out
+        row, grid, left_out = self.merged, self.grid, self.left_out
+        state = grid.state()
 
         def write() -> None:
             snapshot.save(self._folder, row, state, self.site.cell_m, self.config.fold, left_out)
-            self.snapshot_row = row
+            if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
+                self.snapshot_row = row
 
         return write
 

@@ -170,6 +170,8 @@ def _written(write: Callable[[], None]) -> None:
         write()
     except OSError as error:  # the journal is the truth; a missing snapshot only makes the next start longer
         log.error("snapshot failed error=%r", str(error))
+    except Exception:  # a bug; it must not pass unseen, nor keep the last snapshot from being tried
+        log.exception("snapshot failed")
 
 
 def _answer(item: _Read, store: Store) -> None:

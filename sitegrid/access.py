@@ -6,7 +6,7 @@ Everything is denied that is not granted. Zenoh compares by inclusion: a granted
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from protocol import keys
@@ -125,7 +125,7 @@ def _rules(name: str, site: str, granted: Grant) -> list[dict[str, Any]]:
 
 def _machine(site: str, name: str) -> Grant:
     return Grant(
-        puts=(f"{_whole(site, 'machine', name)}",),
+        puts=(_whole(site, "machine", name),),
         hears=(keys.sensors(site, name), _whole(site, "map"), _whole(site, "base")),
         asks=(keys.ingest(site, name), keys.map_queries_all(site)),
         alive=(keys.alive(site, name),),
@@ -141,9 +141,9 @@ def _visitor(site: str, _: str) -> Grant:
     )
 
 
-def _admin(site: str, _: str) -> Grant:
-    seen = _visitor(site, _)
-    return Grant(hears=seen.hears, asks=(*seen.asks, keys.admin_all(site)), watches=seen.watches)
+def _admin(site: str, name: str) -> Grant:
+    visitor = _visitor(site, name)
+    return replace(visitor, asks=(*visitor.asks, keys.admin_all(site)))
 
 
 def _server(site: str, _: str) -> Grant:

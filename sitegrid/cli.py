@@ -22,6 +22,7 @@ from sitegrid.logs import start_logging
 from sitegrid.times import HELP as TIME_HELP
 from sitegrid.times import parse_time
 
+METRICS_PORT = 9464
 EXTRA = {
     "numba": "server",
     "cv2": "server",
@@ -76,6 +77,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_sim,
         _add_agent,
         _add_query,
+        _add_doctor,
         _add_trust,
         _add_plot,
         _add_eval,
@@ -145,6 +147,14 @@ def _add_server(nouns: Nouns, common: Parent, network: Parent) -> None:
     )
     server.add_argument("--store", type=Path, required=True, help="folder of the journal and its snapshots")
     server.add_argument("--config", type=Path, help="options (config/server.toml)")
+    server.add_argument(
+        "--metrics",
+        type=_address,
+        nargs="?",
+        const=("127.0.0.1", METRICS_PORT),
+        metavar="[HOST:]PORT",
+        help=f"show metrics for Prometheus over HTTP, to this host unless HOST is given (port {METRICS_PORT})",
+    )
 
 
 def _add_sim(nouns: Nouns, common: Parent, network: Parent) -> None:
@@ -183,6 +193,15 @@ def _add_agent(nouns: Nouns, common: Parent, network: Parent) -> None:
     agent.add_argument(
         "--withhold", action="store_true", help="withhold GPS ([holdout]) and report the error against it"
     )
+
+
+def _add_doctor(nouns: Nouns, common: Parent, network: Parent) -> None:
+    doctor = _noun(nouns, "doctor", "what is wrong with this host's part of a site, and what to do", [common, network])
+    doctor.add_argument("--site", help="name of the site (default: that of the site file or the keys, else paper)")
+    doctor.add_argument("--site-file", type=Path, help="the site, to compare with that of the map server (site.toml)")
+    doctor.add_argument("--machine", help="name to ask for its watermark under (default: that of the keys)")
+    doctor.add_argument("--spool", type=Path, help="file of an agent's spool")
+    doctor.add_argument("--store", type=Path, help="folder of a map server's store")
 
 
 def _add_query(nouns: Nouns, common: Parent, network: Parent) -> None:
@@ -392,6 +411,14 @@ def _seed(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")
     return value
+
+
+def _address(text: str) -> tuple[str, int]:
+    """`9464`, of this host alone, or `0.0.0.0:9464`; port 0 takes a free one."""
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdecimal() and int(port) < 2**16):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither PORT nor HOST:PORT")
+    return host or "127.0.0.1", int(port)
 
 
 def _instant(text: str) -> int:

@@ -52,8 +52,10 @@ def _end_in_time(stop: threading.Event, handler: Callable[..., None], end_s: flo
             stop.set()
             time.sleep(end_s)
             if signal.getsignal(signal.SIGTERM) is handler:  # not where a test goes on
-                log.warning("ended without waiting seconds=%g", end_s)
-                sys.stdout.flush()
+                # beside it, for standard error may be a pipe that nobody empties
+                told = threading.Thread(target=log.warning, args=("ended in mid-work seconds=%g", end_s), daemon=True)
+                told.start()
+                told.join(0.2)
                 os._exit(0)
 
     threading.Thread(target=watch, name="signals", daemon=True).start()

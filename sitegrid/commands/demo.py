@@ -61,7 +61,7 @@ class Plan:
 
 def run(arguments: Namespace) -> int:
     """Run the demo; returns 1 if a sample was lost or counted twice, or a child failed."""
-    stop = stop_flag()
+    stop = stop_flag(None)  # it has children to end
     began_s = time.monotonic()
     plan = _plan(arguments)
     with Children(plan.work) as children:

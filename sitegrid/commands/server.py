@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import zenoh
 
 from mapserver.config import ServerConfig
+from mapserver.exporter import Exporter, HealthEar, text_of
 from mapserver.server import Server
 from protocol.config import from_table, load_toml
 from protocol.session import open_session
 from protocol.site import load_site
+from protocol.version import package_version
 from sitegrid.process import say, stop_flag
 from sitegrid.security import join
 
@@ -20,12 +26,26 @@ def run(arguments: Namespace) -> int:
     site = load_site(arguments.site_file)
     table = load_toml(arguments.config) if arguments.config else {}
     config = from_table(ServerConfig, table, str(arguments.config))
-    session = open_session(join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name))
-    server = Server(session, arguments.store, site, config, time.time_ns)
-    say({"ready": "server", "site": site.name, "store": str(arguments.store)})
-    while not stop.wait(0.5):
-        if server.failed:
-            break
-    server.close()
-    session.close()  # type: ignore[no-untyped-call]
+    with ExitStack() as opened:
+        session = open_session(join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name))
+        opened.callback(session.close)
+        server = opened.enter_context(closing(Server(session, arguments.store, site, config, time.time_ns)))
+        ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
+        if arguments.metrics:
+            ready["metrics"] = _export(opened, session, server, site.name, arguments)
+        say(ready)
+        while not stop.wait(0.5):
+            if server.failed:
+                break
     return 1 if server.failed else 0
+
+
+def _export(opened: ExitStack, session: zenoh.Session, server: Server, site: str, arguments: Namespace) -> str:
+    """Show metrics for as long as the server runs; returns where."""
+    store: Path = arguments.store
+    ear = opened.enter_context(closing(HealthEar(session, site)))
+
+    def text() -> str:
+        return text_of(server.answers.info, ear.heard, store, package_version())
+
+    return opened.enter_context(closing(Exporter(arguments.metrics, text))).url

@@ -12,7 +12,7 @@ from protocol.machine import machine_toml, plain_lines
 from sim.config import SimConfig, load_sim, resolve
 from sim.publisher import run as publish
 from sim.recorder import record
-from sitegrid.process import note, say, stop_flag
+from sitegrid.process import END_S, note, say, stop_flag
 from sitegrid.progress import Display
 from sitegrid.security import join
 
@@ -22,7 +22,7 @@ ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
 def run(arguments: Namespace) -> int:
     """Publish, record, draw, or write the configurations that go with the simulation."""
-    stop = stop_flag()
+    stop = stop_flag(None if arguments.record else END_S)  # a recording is written at its end, whole
     config = _config(arguments)
     if arguments.write_configs:
         write_configs(config, arguments.write_configs)

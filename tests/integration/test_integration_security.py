@@ -312,6 +312,20 @@ def test_a_forged_pose_reaches_nobody(guarded: Guarded):
         assert set(heard) == {b"own"}, guarded.still_works()
 
 
+def test_nobody_shows_presence_in_anothers_name(guarded: Guarded):
+    with guarded.session("guest") as guest, guarded.session("loader-2") as loader:
+        tokens = [loader.liveliness().declare_token(keys.alive(SITE, name)) for name in ("loader-1", "loader-2")]
+
+        def present() -> set[str]:
+            replies = guest.liveliness().get(keys.alive_all(SITE), timeout=5.0)
+            return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+        wait_until(lambda: bool(present()), 10.0, "presence seen")
+        assert present() == {keys.alive(SITE, "loader-2")}, guarded.still_works()
+        for token in tokens:
+            token.undeclare()
+
+
 def test_a_forged_change_of_the_map_reaches_nobody(guarded: Guarded):
     with (
         guarded.session("guest") as guest,

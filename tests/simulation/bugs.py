@@ -123,7 +123,7 @@ def failed_commit_stays_open(patch: pytest.MonkeyPatch) -> None:
     def leave(self: Any, kind: object, *_: object) -> None:
         self._db.execute("ROLLBACK" if kind else "COMMIT")
 
-    patch.setattr("agents.spool._transaction.__exit__", leave)
+    patch.setattr("agents.spool_file.transaction.__exit__", leave)
 
 
 def drops_are_silent(patch: pytest.MonkeyPatch) -> None:

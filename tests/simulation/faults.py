@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.spool import Spool
+from agents.spool_file import connect
 
 
 class Killed(BaseException):
@@ -107,7 +108,8 @@ class FaultySpool(Spool):
         self._db.close()
 
     def _connect(self, path: Path) -> sqlite3.Connection:
-        found = sqlite3.connect(path, isolation_level=None, check_same_thread=False, factory=FaultyConnection)
+        found = connect(path, FaultyConnection)
+        assert isinstance(found, FaultyConnection)
         found.execute("PRAGMA wal_autocheckpoint=0")  # files that are copied and thrown away: no need for it
         found.plan = self.plan
         return found

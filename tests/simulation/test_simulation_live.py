@@ -155,6 +155,39 @@ def test_agent_holds_its_samples_while_another_has_its_name(opened: Opened, tmp_
     first.close()
 
 
+def test_uplink_ends_at_once_while_a_server_does_not_answer(opened: Opened, tmp_path: Path) -> None:
+    held: list[zenoh.Query] = []
+    server = opened()
+    queryable = server.declare_queryable(keys.ingest(SITE.name, "loader-1"), held.append)
+    with uplink_of(opened(), tmp_path / "spool.db", 5):
+        wait_until(lambda: bool(held), WAIT_S, "a batch is on its way")
+        start_s = time.monotonic()
+    assert time.monotonic() - start_s < 1.0
+    for query in held:
+        query.drop()
+    queryable.undeclare()
+
+
+def test_bug_does_not_end_delivery_silently(
+    endpoint: str, opened: Opened, tmp_path: Path, monkeypatch: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    states: list[UplinkState] = []
+
+    def fail(self: UplinkState) -> bytes:
+        states.append(self)
+        raise RuntimeError("nobody thought of this")
+
+    with monkeypatch.context() as patch, server_at(endpoint, tmp_path / "store"):
+        patch.setattr(UplinkState, "next_payload", fail)
+        with uplink_of(opened(), tmp_path / "spool.db", 5) as spool:
+            wait_until(lambda: len(states) > 1, WAIT_S, "it tries again")
+            assert "nobody thought of this" in states[0].problem
+            assert states[0].counters["bugs"] >= 1
+            patch.undo()
+            wait_until(spool.is_settled, WAIT_S, "everything delivered")
+    assert "uplink failed" in caplog.text
+
+
 # --- the disk --------------------------------------------------------------------------------------------------------
 
 
@@ -273,7 +306,7 @@ def test_pose_and_health_stay_live_while_a_machine_catches_up(endpoint: str, ope
     with server_at(endpoint, tmp_path / "store"), uplink_of(session, tmp_path / "spool.db", 20_000) as spool:
         wait_until(lambda: spool.acknowledged > 400, WAIT_S, "it catches up")
         start_s, before = time.monotonic(), spool.acknowledged
-        for i in range(40):
+        for i in range(25):
             now_ns = time.time_ns()
             presence.show_pose(PoseBelief(now_ns, 1.0, 2.0, 0.0, 0.0, np.eye(2)))
             if i % 5 == 0:
@@ -283,8 +316,8 @@ def test_pose_and_health_stay_live_while_a_machine_catches_up(endpoint: str, ope
         assert spool.counters()["depth"] > 0, "it was busy all the time"
     presence.close()
     print(f"{rate:.0f} samples/s; pose {np.median(delays['pose']):.2f} s, at most {max(delays['pose']):.2f} s")
-    assert len(delays["pose"]) > 30
-    assert len(delays["health"]) >= 6
+    assert len(delays["pose"]) >= 20
+    assert len(delays["health"]) >= 4
     assert np.median(delays["pose"]) < 0.5
     assert np.median(delays["health"]) < 0.5
     assert rate > 250  # of 550 that the link can carry

@@ -27,6 +27,7 @@ from protocol.messages import Ack, Refused
 from protocol.samples import SAMPLE_DTYPE
 from protocol.site import SiteConfig
 from tests.simulation.faults import Fault, FaultySpool, Killed, Plan
+from tests.simulation.rates import draw_rates
 from tests.simulation.servers import MapServer, ModelServer, RealServer
 
 START_NS = 1_767_225_600_000_000_000
@@ -44,50 +45,6 @@ _WEIGHTS = {
     "server": 4,
     "copy": 2,
 }
-
-
-@dataclass(frozen=True)
-class Rates:
-    """How likely each fault is, and what kind of site this is; drawn from the seed."""
-
-    lost: float
-    late: float
-    twice: float
-    reply_lost: float
-    server_fault: float
-    spool_fault: float
-    bad_sample: float
-    pending: bool
-    copies: bool
-    server_backups: bool
-    max_samples: int
-    wall_clock: bool
-    machines: int
-    steps: int
-
-
-def draw_rates(rng: random.Random) -> Rates:
-    """Every kind of fault is absent in some worlds, so that those that remain are met alone."""
-
-    def some(most: float) -> float:
-        return rng.choice((0.0, rng.uniform(0, most)))
-
-    return Rates(
-        lost=some(0.5),
-        late=some(0.5),
-        twice=some(0.4),
-        reply_lost=some(0.5),
-        server_fault=some(0.4),
-        spool_fault=some(0.3),
-        bad_sample=some(0.15),
-        pending=rng.random() < 0.3,
-        copies=rng.random() < 0.5,
-        server_backups=rng.random() < 0.3,
-        max_samples=rng.choice((10_000, 10_000, 20, 6)),
-        wall_clock=rng.random() < 0.2,
-        machines=rng.choice((1, 1, 2)),
-        steps=rng.randint(20, 80),
-    )
 
 
 class Agent:
@@ -367,6 +324,13 @@ class World:
         for agent in self._agents:
             self._start(agent)
             self._finalise(agent)
+        self._deliver_all()
+        for agent in self._agents:  # the next start declares what was put aside or dropped at the end of a run
+            self._end(agent, orderly=True)
+            self._start(agent)
+        self._deliver_all()
+
+    def _deliver_all(self) -> None:
         for _ in range(MOST_ROUNDS):
             waiting = [a for a in self._agents if a.spool and not a.spool.is_settled()]
             if not waiting:

@@ -11,6 +11,7 @@ from agents_drives import made_up_samples
 
 from agents.audit import AuditLog, read_audit
 from agents.spool import KEPT_RUNS, Spool, SpoolConfig
+from agents.spool_file import connect
 from protocol.errors import StoreError
 from protocol.samples import content_hash
 
@@ -78,7 +79,7 @@ def test_every_opening_has_an_identity_of_its_own(tmp_path: Path) -> None:
 
 
 def test_openings_that_record_nothing_leave_nothing(tmp_path: Path) -> None:
-    for _ in range(50):
+    for _ in range(5):
         spool = opened(tmp_path)
         assert spool.head(9) is None
         assert spool.is_settled()
@@ -104,7 +105,7 @@ def test_runs_come_out_one_after_the_other_and_are_closed(tmp_path: Path) -> Non
 
 
 def test_runs_that_are_closed_are_declared_again_at_each_opening_and_forgotten_in_the_end(tmp_path: Path) -> None:
-    for _ in range(2 * KEPT_RUNS):
+    for _ in range(KEPT_RUNS + 2):
         spool = opened(tmp_path)
         closing = 0
         while head := spool.head(9):
@@ -287,6 +288,26 @@ def test_full_spool_drops_the_oldest_counts_them_and_declares_them_lost(tmp_path
     again.close()
 
 
+def test_damaged_samples_are_put_aside_and_never_sent(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:10])
+    for number in (1, 2, 3, 6):
+        spool._db.execute("UPDATE sample SET row = zeroblob(68) WHERE number = ?", (number,))
+    first = spool.head(2)
+    assert first
+    assert (first.first_seq, first.lost_before) == (4, 3)
+    assert hashes(first.rows) == hashes(ROWS[3:5])
+    spool.acknowledge(spool.spool_id, 5)
+    rest = spool.head(99)
+    assert rest
+    assert (rest.first_seq, rest.lost_before) == (7, 1)
+    assert hashes(rest.rows) == hashes(ROWS[6:10])
+    assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10}
+    aside = spool._db.execute("SELECT seq, problem FROM aside ORDER BY seq").fetchall()
+    assert aside == [(seq, "damaged on the machine's disk") for seq in (1, 2, 3, 6)]
+    spool.close()
+
+
 # --- servers and files that are set back ------------------------------------------------------------------------------
 
 
@@ -440,7 +461,7 @@ def test_spool_that_has_lost_its_numbers_is_a_store_error(tmp_path: Path) -> Non
 def test_failed_record_changes_nothing(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:2])
-    spool._db.execute("INSERT INTO sample VALUES (4, x'00', 1)")  # in the way
+    spool._db.execute("INSERT INTO sample VALUES (4, x'00', 1, NULL)")  # in the way
     with pytest.raises(StoreError, match="UNIQUE"):
         spool.record(ROWS[2:5])
     spool._db.execute("DELETE FROM sample WHERE number = 4")
@@ -470,7 +491,7 @@ def test_failed_commit_leaves_no_transaction_open(
 ) -> None:
     class OnFull(Spool):
         def _connect(self, path: Path) -> sqlite3.Connection:
-            return sqlite3.connect(path, isolation_level=None, check_same_thread=False, factory=Full)
+            return connect(path, Full)
 
     monkeypatch.setattr(Full, "rolls_back", rolls_back)
     spool = OnFull(tmp_path / "spool.db", SpoolConfig())

@@ -148,8 +148,8 @@ def test_position_in_a_cell_decides_where_the_votes_go():
 
 
 def spread_in_time(n: int, seed: int):
-    """Samples of a small site over nine days, so that buckets, hours and days are all summed."""
-    rows = random_samples(n, seed, half_m=20.0)
+    """Samples of a few cells over nine days, so that buckets, hours and days are all summed."""
+    rows = random_samples(n, seed, half_m=4.0)
     rows["stamp_ns"] += np.random.default_rng(seed).integers(0, 9 * 24, n) * HOUR_NS
     return rows
 

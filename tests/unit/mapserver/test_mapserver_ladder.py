@@ -17,12 +17,12 @@ PER_HOUR, PER_DAY = HOUR_S // BUCKET_S, DAY_S // BUCKET_S
 START = 1_767_225_600 // BUCKET_S  # midnight
 
 
-def page(bucket: int, weight: int = 1) -> Page:
-    """A page of one cell, with the bucket's own stamp and a vote of this weight."""
+def page(bucket: int, weight: int = 1, cells: tuple[int, ...] = (5,)) -> Page:
+    """A page of these cells, with the bucket's own stamp and a vote of this weight in each."""
     counts, bitmaps = np.zeros((ev.COUNTS, ev.CELLS), np.uint32), np.zeros((2, ev.CELLS), np.uint64)
     newest_ns = np.zeros(ev.CELLS, np.int64)
-    cell = bucket % ev.CELLS
-    counts[bucket % ev.COUNTS, cell], bitmaps[:, cell], newest_ns[cell] = weight, 1, bucket * BUCKET_S * S + 7
+    for cell in cells:
+        counts[bucket % ev.COUNTS, cell], bitmaps[:, cell], newest_ns[cell] = weight, 1, bucket * BUCKET_S * S + 7
     return pack(counts, counts.any(axis=1), bitmaps, newest_ns)
 
 
@@ -67,6 +67,27 @@ def test_any_order_of_buckets_gives_the_same_ladder(buckets, a, b, c, random):
     found = ladder(buckets, **keeps)
     assert same(found, ladder(shuffled, **keeps))
     assert set(places(found)) == by_definition(buckets, (a, b, c))
+
+
+@settings(max_examples=100)
+@given(
+    st.lists(st.tuples(bucket, st.sets(st.integers(0, 3), min_size=1).map(tuple)), min_size=1, max_size=30),
+    st.tuples(keep, keep, keep),
+    st.randoms(use_true_random=False),
+)
+def test_what_stays_apart_is_decided_cell_by_cell(driven, keeps, random):
+    named = dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True))
+    found = Ladder(rungs(FoldConfig(**named)))
+    for bucket_, cells in driven:
+        found.add(bucket_, page(bucket_, cells=cells))
+    for cell in range(4):
+        of_cell = {(rung, index) for rung, index, one in found.items() if cell in one.cells["cell"]}
+        assert of_cell == by_definition([b for b, cells in driven if cell in cells], keeps)
+    again = Ladder(rungs(FoldConfig(**named)))
+    random.shuffle(driven)
+    for bucket_, cells in driven:
+        again.add(bucket_, page(bucket_, cells=cells))
+    assert same(found, again)
 
 
 @pytest.mark.parametrize("keeps", [(1, 2, 4), (4, 1, 2), (2, 4, 1)])

@@ -8,7 +8,20 @@ from hypothesis import strategies as st
 from mapserver_data import same_page
 
 from mapserver import evidence as ev
-from mapserver.pages import CELL, NARROW, WIDE, Page, merge, merge_numpy, pack, pack_numpy
+from mapserver.pages import (
+    CELL,
+    NARROW,
+    WIDE,
+    Page,
+    merge,
+    merge_numpy,
+    moments,
+    moments_numpy,
+    pack,
+    pack_numpy,
+    pick,
+    pick_numpy,
+)
 
 PLACES = ev.COUNTS * ev.CELLS
 counts = st.one_of(st.integers(1, 2**17), st.integers(ev.COUNT_MAX - 3, ev.COUNT_MAX))
@@ -161,9 +174,10 @@ def test_nothing_merged_with_a_page_is_the_page():
 def test_a_part_of_the_cells_and_the_rest_are_the_page(one, chosen):
     wanted = np.zeros(ev.CELLS, np.bool_)
     wanted[list(chosen)] = True
-    part, rest = one.of_cells(wanted), one.of_cells(~wanted)
+    part, rest = pick(one, wanted), pick(one, ~wanted)
     assert set(part.cells["cell"].tolist()) <= chosen
     assert not set((part.votes["place"] % ev.CELLS).tolist()) - chosen
+    assert same_page(part, pick_numpy(one, wanted))
     together = unpacked(part)
     rest.add_to(*together)
     assert all(np.array_equal(a, b) for a, b in zip(together, unpacked(one), strict=True))
@@ -174,3 +188,12 @@ def test_reading_adds_many_full_pages_without_wrapping():
     for _ in range(3):
         page({2: ev.COUNT_MAX}).add_to(counts, bitmaps, newest_ns)
     assert counts[2] == 4 * int(ev.COUNT_MAX)
+
+
+@given(pages, st.sampled_from([ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH, ev.HEADING]))
+def test_moments_are_those_of_the_histograms(one, part):
+    counts = unpacked(one)[0].reshape(ev.COUNTS, ev.CELLS)[part].astype(float)
+    bins = np.arange(len(counts))[:, None]
+    expected = [(counts * bins**power).sum(axis=0) for power in range(3)]
+    assert np.allclose(moments(one, part), expected)
+    assert np.allclose(moments_numpy(one, part), expected)

@@ -167,13 +167,10 @@ def test_of_two_changes_the_last_counts_and_dates():
     "days",
     [
         0,
-        pytest.param(
-            1, marks=pytest.mark.xfail(strict=True, reason="old and new evidence of one day are summed into one page")
-        ),
+        1,
     ],
 )
 def test_a_change_stays_found_where_the_rest_of_its_block_is_driven_on(days):
-    """Pages are summed by what the block has seen since, not by what the cell has."""
     grid = Grid(1.0, FoldConfig())
     for hour, c_rr in [(0, OLD), (1, OLD), (2, OLD), (5, NEW)]:
         grid.fold(lane(hour, 0, 0, 10, 10, c_rr=c_rr), "a")

@@ -53,7 +53,7 @@ def test_an_empty_folder_gives_an_empty_grid(tmp_path):
 
 
 def test_a_snapshot_reads_back_to_the_bit(tmp_path):
-    rows = random_samples(100, 6, half_m=10.0, std_m=4.0)
+    rows = random_samples(100, 6, half_m=2.0, std_m=4.0)
     rows["stamp_ns"] += np.arange(100) % 9 * 86_400 * 10**9
     wide = samples(30, distance_m=100.0)
     grid = folded(np.concatenate([rows, wide]))
@@ -138,9 +138,6 @@ def test_an_empty_grid_is_kept_too(tmp_path):
 
 # Columns of the table of pages: x, y, rung, index, wide, votes, cells. What is not caught makes a grid whose reads fail
 # later, or a map with less in it; a checksum catches all that happens to a file by itself.
-LATER = pytest.mark.xfail(strict=True, reason="a page without cells has no newest stamp: reading its ladder fails")
-
-
 @pytest.mark.parametrize(
     ("column", "value"),
     [
@@ -171,7 +168,7 @@ def test_pages_of_impossible_parts_are_passed_over(tmp_path, column, value):
         ("pages", lambda pages: pages[:0]),
         ("pages", lambda pages: pages[:, :-1]),
         ("pages", lambda pages: pages.ravel()),
-        pytest.param("pages", lambda pages: np.concatenate([pages, [[9, 9, 3, 0, 0, 0, 0]]]), marks=LATER),
+        ("pages", lambda pages: np.concatenate([pages, [[9, 9, 3, 0, 0, 0, 0]]])),
         ("narrow", lambda votes: votes[:-1]),
         ("cells", lambda cells: cells[1:]),
         ("narrow", lambda votes: votes["place"]),
@@ -234,7 +231,7 @@ snapshot.save(folder, 1, grid.state(), 1.0, config)
 
 def test_parts_folded_in_processes_of_their_own_are_the_fold_of_everything(tmp_path):
     """Three processes, hashing strings in three ways, on different kernels with different space."""
-    rows = {machine: random_samples(90, seed, half_m=20.0) for seed, machine in enumerate("ab")}
+    rows = {machine: random_samples(90, seed, half_m=3.0) for seed, machine in enumerate("ab")}
     for machine, of_machine in rows.items():
         of_machine["stamp_ns"] += np.arange(90) % 30 * 9 * 3600 * 10**9
         np.save(tmp_path / f"{machine}.npy", of_machine)

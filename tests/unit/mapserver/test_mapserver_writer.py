@@ -294,7 +294,6 @@ def test_a_snapshot_that_fails_is_tried_again_only_when_due(start, tmp_path, mon
     assert tries == [3, 6, 7]
 
 
-@pytest.mark.xfail(strict=True, reason="only OSError is told; anything else waits in a Future until the end")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_bug_in_the_snapshot_is_told(start, monkeypatch, caplog):
     monkeypatch.setattr(snapshot, "save", lambda *_: 1 // 0)

@@ -1,0 +1,281 @@
+"""A construction site of real processes that can be killed, frozen and cut off, and is counted at the end."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from evaluation.audit import audit_store
+from mapserver.config import ServerConfig
+from mapserver.journal import JournalReader
+from mapserver.past import History, history_rows
+from mapserver.store import JOURNAL_FILE
+from protocol.errors import StoreError
+from protocol.logfolder import open_log
+from protocol.machine import plain_lines
+from protocol.session import free_endpoint
+from protocol.site import load_site
+from tests.chaos.outcome import Outcome, Span, Told, longest_pause
+from tests.chaos.recordings import SECONDS, SPEED, Recordings
+
+READY_S = 60.0
+RESUME_S = 60.0
+END_S = 10.0
+ROUTER, SERVER = "router", "server"
+# The kernel kills the children of a suite that was itself killed.
+LEASH = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
+COMMAND = ("-m", "sitegrid.cli")
+HOUR_S = 3600
+ALL_STOPPED = (signal.SIGCONT, signal.SIGTERM)
+
+
+class Process:
+    """One child, its output in files."""
+
+    def __init__(self, log: Path, command: Sequence[str], env: dict[str, str]) -> None:
+        self.log = log
+        with log.with_suffix(".out").open("wb") as out, log.with_suffix(".err").open("wb") as errors:
+            self._process = subprocess.Popen(
+                [*LEASH, *command],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=errors,
+                start_new_session=True,
+                env={**os.environ, "OMP_NUM_THREADS": "1", **env},
+            )
+        self.pid = self._process.pid
+
+    @property
+    def code(self) -> int | None:
+        """Exit code, None while it runs."""
+        return self._process.poll()
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal, if it still runs."""
+        if self.code is None:
+            self._process.send_signal(number)
+
+    def said(self, key: str) -> bool:
+        """Whether a line with this key was printed."""
+        return f'"{key}":' in self.log.with_suffix(".out").read_text(encoding="utf-8")
+
+    def last_words(self) -> str:
+        """The last line on standard error."""
+        lines = self.log.with_suffix(".err").read_text(encoding="utf-8", errors="replace").splitlines()
+        return lines[-1][:300] if lines else ""
+
+    def end(self, *numbers: signal.Signals) -> int:
+        """End it by signals, in the end by SIGKILL; returns the exit code."""
+        for number in numbers:
+            self.send(number)
+        try:
+            return self._process.wait(END_S if numbers else 0.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+
+
+class Site:
+    """Router, map server and agents. Leaving the block ends them all.
+
+    clock: the site's clock. server_toml: options of the map server. first_ns: when the first drives begin.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        recordings: Recordings,
+        told: Told,
+        *,
+        clock: str = "data",
+        server_toml: str = "",
+        first_ns: int = HOUR_S * 10**9,
+    ) -> None:
+        for name in ("log", "spool", "audit", "store"):
+            (folder / name).mkdir(parents=True)
+        self.folder, self.told = folder, told
+        self.machines = recordings.machines
+        self.endpoints = dict.fromkeys((ROUTER, SERVER, *self.machines), free_endpoint())
+        self.prefix: dict[str, tuple[str, ...]] = {}
+        self.env: dict[str, dict[str, str]] = {}
+        self.options: dict[str, tuple[str, ...]] = {}
+        self.command = (sys.executable, *COMMAND)
+        self.outcome = Outcome("")
+        self.faults: list[Span] = []
+        self._recordings, self._first_ns = recordings, first_ns
+        self._running: dict[str, Process] = {}
+        self._starts = 0
+        site = open_log(recordings.data(self.machines[0])).site
+        lines = [f'clock = "{clock}"' if line.startswith("clock") else line for line in plain_lines(site)]
+        (folder / "site.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        (folder / "server.toml").write_text(server_toml, encoding="utf-8")
+
+    def __enter__(self) -> Site:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._running.values():
+            process.end()
+
+    # --- what runs ---------------------------------------------------------------------------------------------------
+
+    def start_all(self) -> None:
+        """Start everything, and wait until every machine has samples in the journal."""
+        for role in (ROUTER, SERVER, *self.machines):
+            self.start(role)
+            if role in (ROUTER, SERVER):
+                self.wait_ready(role)
+        self._wait(lambda: self.progress().keys() >= set(self.machines), READY_S, "no samples from every machine")
+
+    def start(self, role: str, *, idle: bool = False) -> Process:
+        """Start a router, a server, or a machine's agent; idle: one that only delivers what is left."""
+        self._starts += 1
+        words = self._words(role, idle)
+        env = {"PYTHONUNBUFFERED": "1", **self.env.get(role, {})}
+        log = self.folder / "log" / f"{self._starts:04d}-{role}"
+        self._running[role] = Process(log, [*self.prefix.get(role, ()), *self.command, *words], env)
+        self.outcome.pids.append(self._running[role].pid)
+        return self._running[role]
+
+    def send(self, role: str, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._running[role].send(number)
+
+    def kill(self, role: str) -> None:
+        """Kill a process, and start it again."""
+        with self.fault():
+            self._running[role].end(signal.SIGKILL)
+            self.start(role)
+
+    def wait_ready(self, role: str) -> None:
+        """Wait until a process says that it is ready."""
+        self._wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
+
+    def tend(self) -> None:
+        """Start again what has ended by itself; only the end of a drive is no problem."""
+        for role, process in list(self._running.items()):
+            if process.code is not None:
+                if not process.said("ended"):
+                    self.problem(f"{role} ended with {process.code}: {process.last_words()}")
+                self.start(role)
+
+    @contextmanager
+    def fault(self) -> Iterator[None]:
+        """Note how long a fault lasts."""
+        began_s = time.time()
+        try:
+            yield
+        finally:
+            self.faults.append((began_s, time.time()))
+
+    def linger(self, seconds: float) -> None:
+        """Let time pass, and tend."""
+        end_s = time.monotonic() + seconds
+        while (left_s := end_s - time.monotonic()) > 0:
+            self.told.wait(min(left_s, 0.25))
+            self.tend()
+
+    def problem(self, text: str) -> None:
+        """Note what should not be."""
+        self.outcome.problems.append(text)
+
+    # --- the end -----------------------------------------------------------------------------------------------------
+
+    def finish(self, fault: str, count: int) -> Outcome:
+        """Wait until every machine is served again, have everything delivered, end it, and count."""
+        self.outcome.fault, self.outcome.count = fault, count
+        ended_s = time.time()
+        self._resume()
+        resumed_s = time.time()
+        for machine in self.machines:
+            self._end(machine)
+        for machine in self.machines:
+            self.start(machine, idle=True)
+        drained = [self._running[machine] for machine in self.machines]
+        self._wait(lambda: all(p.code is not None for p in drained), RESUME_S, "left-over samples are not delivered")
+        for process in drained:
+            if process.code:
+                self.problem(f"{process.log.name} could not deliver: {process.last_words()}")
+        self._end(SERVER)
+        self._end(ROUTER)
+        self._count(ended_s, resumed_s)
+        return self.outcome
+
+    def progress(self) -> dict[str, int]:
+        """How many samples of each machine are in the journal."""
+        found: dict[str, int] = {}
+        try:
+            with JournalReader(self.folder / "store" / JOURNAL_FILE) as reader:
+                for (machine, _), mark in reader.marks().items():
+                    found[machine] = found.get(machine, 0) + mark.seq
+        except StoreError:  # being made, or recovered
+            return {}
+        return found
+
+    def _resume(self) -> None:
+        before = self.progress()
+        self._wait(
+            lambda: all(self.progress().get(m, 0) > before.get(m, 0) for m in self.machines),
+            RESUME_S,
+            "service does not resume",
+        )
+
+    def _end(self, role: str) -> None:
+        began_s = time.monotonic()
+        code = self._running[role].end(*ALL_STOPPED)
+        took_s = time.monotonic() - began_s
+        self.outcome.notes["slowest end [s]"] = round(max(took_s, self.outcome.notes.get("slowest end [s]", 0)), 1)
+        if code:
+            self.problem(f"{role} ended with {code} on SIGTERM: {self._running[role].last_words()}")
+
+    def _count(self, ended_s: float, resumed_s: float) -> None:
+        audits = {machine: self.folder / "audit" / machine for machine in self.machines}
+        store, site = self.folder / "store", load_site(self.folder / "site.toml")
+        result = audit_store(audits, store, site, ServerConfig())
+        with JournalReader(store / JOURNAL_FILE) as reader:
+            rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(History.of(reader))]
+            declared = sum(mark.lost for mark in reader.marks().values())
+        out = self.outcome
+        out.recorded, out.merged, out.double = result.recorded, result.merged, result.double
+        out.lost = result.lost - min(declared, result.lost)
+        out.notes |= {"declared": declared, "unrecorded": result.unrecorded, "rows": len(rows)}
+        if result.unrecorded:
+            self.problem(f"{result.unrecorded} samples in the journal that nobody recorded")
+        commits = {m: [_true_s(s, ended_s) for name, s in rows if name == m] for m in self.machines}
+        out.longest_pause_s = max(
+            longest_pause([s for s in found if s < resumed_s], self.faults, resumed_s) for found in commits.values()
+        )
+
+    def _wait(self, is_so: Callable[[], bool], timeout_s: float, problem: str) -> None:
+        end_s = time.monotonic() + timeout_s
+        while not is_so():
+            if time.monotonic() > end_s:
+                self.problem(f"{problem} within {timeout_s:g} s")
+                return
+            self.told.wait(0.05)
+
+    def _words(self, role: str, idle: bool) -> list[str]:
+        where, site = ("--endpoint", self.endpoints[role]), ("--site-file", str(self.folder / "site.toml"))
+        if role == ROUTER:
+            return ["router", "--listen", self.endpoints[role], *self.options.get(role, ())]
+        if role == SERVER:
+            files = ("--store", str(self.folder / "store"), "--config", str(self.folder / "server.toml"))
+            return ["server", *where, *site, *files]
+        start_ns = self._first_ns + self._starts * SECONDS * 10**9
+        manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, start_ns, idle=idle)
+        replay = ("--driver", "replay", "--log", manifest, "--data", self._recordings.data(role), "--speed", SPEED)
+        files = ("--spool", self.folder / "spool" / f"{role}.db", "--audit", self.folder / "audit" / role)
+        config = ("--config", self._recordings.agent_file)
+        return [str(word) for word in ("agent", *where, *site, *config, *replay, *files, "--json")]
+
+
+def _true_s(received_s: float, now_s: float) -> float:
+    """Undo the server's clock having been an hour off: no scenario lasts that long."""
+    return received_s - round((received_s - now_s) / HOUR_S) * HOUR_S

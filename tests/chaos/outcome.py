@@ -1,0 +1,109 @@
+"""What a fault did: counts, the longest pause, and whether that is what was promised."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+Span = tuple[float, float]  # [s] of one clock
+
+COLUMNS = ("fault", "count", "recorded", "merged", "lost", "double", "longest pause", "")
+
+
+class Interrupted(Exception):
+    """The suite is to end now."""
+
+
+@dataclass
+class Outcome:
+    """Result of one fault.
+
+    count: how often it struck; recorded: samples in the audit files; declared: those of the lost that the server was
+    told are lost. longest_pause_s: between two commits of one machine, without the time that faults lasted; None where
+    nothing runs meanwhile. skipped: why it did not run.
+    """
+
+    fault: str
+    count: int = 0
+    recorded: int = 0
+    merged: int = 0
+    lost: int = 0
+    double: int = 0
+    longest_pause_s: float | None = None
+    skipped: str = ""
+    problems: list[str] = field(default_factory=list)
+    pids: list[int] = field(default_factory=list)
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_good(self) -> bool:
+        """Nothing lost, nothing double, and nothing else that should not be."""
+        return self.lost == self.double == 0 and not self.problems
+
+    def plain(self) -> dict[str, Any]:
+        """Values for JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Told:
+    """How a scenario speaks, and how it is told to end."""
+
+    line: Any = print
+    stop: threading.Event = field(default_factory=threading.Event)
+
+    def say(self, text: str) -> None:
+        """Print a line at once."""
+        self.line(text, flush=True)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass; Interrupted if the suite is to end."""
+        if self.stop.wait(max(0.0, seconds)):
+            raise Interrupted
+
+    def stop_on_signals(self) -> None:
+        """Ctrl-C and SIGTERM end the suite in order: what it started is ended, what it made is removed."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: self.stop.set())
+
+
+def longest_pause(commits: Sequence[float], faults: Iterable[Span], end_s: float) -> float:
+    """The longest time without a commit, from the first one to end_s, without what faults lasted meanwhile."""
+    times = [*sorted(commits), end_s]
+    spans = _united(faults)
+    return max((b - a - _covered((a, b), spans) for a, b in zip(times, times[1:], strict=False)), default=0.0)
+
+
+def _united(spans: Iterable[Span]) -> list[Span]:
+    found: list[Span] = []
+    for begin, end in sorted(spans):
+        if found and begin <= found[-1][1]:
+            found[-1] = (found[-1][0], max(end, found[-1][1]))
+        else:
+            found.append((begin, end))
+    return found
+
+
+def _covered(gap: Span, spans: Iterable[Span]) -> float:
+    return sum(max(0.0, min(gap[1], end) - max(gap[0], begin)) for begin, end in spans)
+
+
+def table(outcomes: Iterable[Outcome]) -> str:
+    """Lay results out for people."""
+    rows = [COLUMNS, *(_row(outcome) for outcome in outcomes)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
+    lines = [[row[0].ljust(widths[0]), *(v.rjust(w) for v, w in zip(row[1:-1], widths[1:-1], strict=True)), row[-1]]
+             for row in rows]  # fmt: skip
+    return "\n".join("  ".join(line).rstrip() for line in lines)
+
+
+def _row(outcome: Outcome) -> tuple[str, ...]:
+    if outcome.skipped:
+        return (outcome.fault, *("-",) * 6, f"skipped: {outcome.skipped}")
+    pause = "-" if outcome.longest_pause_s is None else f"{outcome.longest_pause_s:.1f} s"
+    counts = (outcome.count, outcome.recorded, outcome.merged, outcome.lost, outcome.double)
+    verdict = "ok" if outcome.is_good else "FAILED: " + "; ".join(outcome.problems or ["lost or double"])
+    return (outcome.fault, *map(str, counts), pause, verdict)

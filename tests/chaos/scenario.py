@@ -1,0 +1,49 @@
+"""What every scenario is given, and what it draws from the seed."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tests.chaos.chaos_site import Site
+from tests.chaos.outcome import Told
+from tests.chaos.recordings import Recordings
+
+# Snapshots every few seconds, so that they are written under faults too; audits of trust would leave machines out.
+SERVER_TOML = """
+[store]
+snapshot_rows = 50
+snapshot_s = 2.0
+[keep]
+distrusts = false
+"""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One fault's run. seconds: how long faults strike; folder: its own; scale: how much of the whole suite, 0 to 1."""
+
+    fault: str
+    folder: Path
+    recordings: Recordings
+    told: Told
+    seed: int
+    seconds: float
+    scale: float = 1.0
+    site_options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def rng(self) -> random.Random:
+        """Random numbers of this fault alone: the same whatever else runs."""
+        return random.Random(f"{self.seed} {self.fault}")
+
+    def site(self, **options: Any) -> Site:
+        """Return a site, not yet started."""
+        return Site(self.folder, self.recordings, self.told, server_toml=SERVER_TOML, **options)
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        self.told.say(f"{self.fault}: {text}")
