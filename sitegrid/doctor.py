@@ -57,12 +57,11 @@ def skipped(check: str, reason: str) -> Finding:
 
 @dataclass(frozen=True)
 class Link:
-    """The way to the router. listens: somebody takes TCP connections there, None where that is not known."""
+    """The way to the router. took_s: to open a session, None if there is none. listens: somebody takes connections."""
 
     endpoint: str
     took_s: float | None
-    listens: bool | None = None
-    problem: str = ""
+    listens: bool = False
     has_keys: bool = False
 
 

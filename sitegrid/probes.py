@@ -18,10 +18,6 @@ import numpy as np
 import zenoh
 
 from agents.spool_file import SCHEMA as SPOOL_SCHEMA
-from mapserver import snapshot
-from mapserver.journal import SCHEMA as STORE_SCHEMA
-from mapserver.journal import JournalReader
-from mapserver.store import JOURNAL_FILE
 from protocol import keys
 from protocol.codec import decode_health, decode_reply, encode_batch
 from protocol.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, SIGNING_FILE, load_credentials
@@ -44,12 +40,14 @@ T = TypeVar("T")
 
 def open_link(config: SessionConfig) -> tuple[Link, zenoh.Session | None]:
     """Open a session, and tell how that went."""
-    start_s = time.perf_counter()
     has_keys = config.credentials is not None
+    if not _listens(config.endpoint):  # else Zenoh tries until the time is up
+        return Link(config.endpoint, None, has_keys=has_keys), None
+    start_s = time.perf_counter()
     try:
         session = open_session(config)
-    except LinkError as error:
-        return Link(config.endpoint, None, _listens(config.endpoint), str(error), has_keys), None
+    except LinkError:
+        return Link(config.endpoint, None, listens=True, has_keys=has_keys), None
     return Link(config.endpoint, time.perf_counter() - start_s, has_keys=has_keys), session
 
 
@@ -128,7 +126,7 @@ def _signature(folder: Path | None, key: str, payload: bytes) -> bytes | None:
     return Signer((folder / SIGNING_FILE).read_bytes()).sign(key, payload)
 
 
-def _listens(endpoint: str) -> bool | None:
+def _listens(endpoint: str) -> bool:
     """Whether somebody takes TCP connections at an endpoint."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:
@@ -207,6 +205,10 @@ def read_spool(path: Path) -> SpoolState:
 
 def read_store(folder: Path, now_s: float) -> StoreState:
     """The state of a store, also while a server uses it; StoreError where it cannot be used."""
+    from mapserver import snapshot  # imported here: needs the `server` extra, which a machine's host does not have
+    from mapserver.journal import SCHEMA, JournalReader
+    from mapserver.store import JOURNAL_FILE
+
     if not (folder / JOURNAL_FILE).is_file():
         raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")
     with JournalReader(folder / JOURNAL_FILE) as journal:
@@ -216,7 +218,7 @@ def read_store(folder: Path, now_s: float) -> StoreState:
         site, frame = journal.site, journal.frame
     newest = next(iter(snapshot.rows_on_disk(folder)), 0)
     age_s = now_s - (folder / f"snapshot-{newest}.npz").stat().st_mtime if newest else math.inf
-    return StoreState(site, frame, STORE_SCHEMA, last_row, archived, len(machines), newest, age_s)
+    return StoreState(site, frame, SCHEMA, last_row, archived, len(machines), newest, age_s)
 
 
 def _read(folder: Path, what: Callable[[], T]) -> T:

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from evaluation.audit import audit_store
@@ -25,7 +26,7 @@ from protocol.site import load_site
 from tests.chaos.outcome import Outcome, Span, Told, longest_pause
 from tests.chaos.recordings import SECONDS, SPEED, Recordings
 
-READY_S = 60.0
+READY_S = 40.0
 RESUME_S = 60.0
 END_S = 10.0
 ROUTER, SERVER = "router", "server"
@@ -34,6 +35,10 @@ LEASH = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
 COMMAND = ("-m", "sitegrid.cli")
 HOUR_S = 3600
 ALL_STOPPED = (signal.SIGCONT, signal.SIGTERM)
+
+
+class StartError(Exception):
+    """The site did not come to life, before any fault."""
 
 
 class Process:
@@ -106,15 +111,14 @@ class Site:
         self.prefix: dict[str, tuple[str, ...]] = {}
         self.env: dict[str, dict[str, str]] = {}
         self.options: dict[str, tuple[str, ...]] = {}
-        self.command = (sys.executable, *COMMAND)
+        self.modules: dict[str, tuple[str, ...]] = {}
         self.outcome = Outcome("")
         self.faults: list[Span] = []
         self._recordings, self._first_ns = recordings, first_ns
         self._running: dict[str, Process] = {}
         self._starts = 0
-        site = open_log(recordings.data(self.machines[0])).site
-        lines = [f'clock = "{clock}"' if line.startswith("clock") else line for line in plain_lines(site)]
-        (folder / "site.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        site = replace(open_log(recordings.data(self.machines[0])).site, clock=clock)
+        (folder / "site.toml").write_text("\n".join(plain_lines(site)) + "\n", encoding="utf-8")
         (folder / "server.toml").write_text(server_toml, encoding="utf-8")
 
     def __enter__(self) -> Site:
@@ -133,6 +137,9 @@ class Site:
             if role in (ROUTER, SERVER):
                 self.wait_ready(role)
         self._wait(lambda: self.progress().keys() >= set(self.machines), READY_S, "no samples from every machine")
+        ended = [f"{role}: {p.last_words()}" for role, p in self._running.items() if p.code is not None]
+        if ended or self.outcome.problems:
+            raise StartError("; ".join([*self.outcome.problems, *ended]))
 
     def start(self, role: str, *, idle: bool = False) -> Process:
         """Start a router, a server, or a machine's agent; idle: one that only delivers what is left."""
@@ -140,7 +147,7 @@ class Site:
         words = self._words(role, idle)
         env = {"PYTHONUNBUFFERED": "1", **self.env.get(role, {})}
         log = self.folder / "log" / f"{self._starts:04d}-{role}"
-        self._running[role] = Process(log, [*self.prefix.get(role, ()), *self.command, *words], env)
+        self._running[role] = Process(log, [*self.prefix.get(role, ()), sys.executable, *self.modules.get(role, COMMAND), *words], env)
         self.outcome.pids.append(self._running[role].pid)
         return self._running[role]
 

@@ -253,11 +253,16 @@ class World:
         rng = np.random.default_rng(0)
         agent.state = UplinkState(agent.machine, self._frame, agent.spool, UPLINK, rng)
         present = self._present(agent)
-        if _stamp_set(agent.in_doubt) & present:  # the transaction had been done
+        self._end_doubt(agent, present)
+        agent.pending = (0, [])
+        self.note(f"{agent.name} started with {len(present)} samples, spool_id={agent.spool.spool_id:x}")
+
+    def _end_doubt(self, agent: Agent, present: set[int]) -> None:
+        """See whether the transaction in which a process was killed had been done."""
+        if _stamp_set(agent.in_doubt) & present:
             self._is_recorded(agent.in_doubt)
             self._explained |= agent.before_drop - present
-        agent.in_doubt, agent.before_drop, agent.pending = [], set(), (0, [])
-        self.note(f"{agent.name} started with {len(present)} samples, spool_id={agent.spool.spool_id:x}")
+        agent.in_doubt, agent.before_drop = [], set()
 
     def _end(self, agent: Agent, orderly: bool | None = None) -> None:
         if agent.spool:
@@ -279,7 +284,7 @@ class World:
             # Gone with the disk that is thrown away; what was put aside there is declared lost, the copy's too.
             self._explained |= self._held(agent.path) - self._held(copy) | self._put_aside(agent.path)
             self._end(agent, orderly=False)
-            agent.in_doubt = []
+            self._end_doubt(agent, self._held(agent.path))
             self._copy(copy, agent.path)
             self.verdict.events["spool_restores"] += 1
             self.note(f"{agent.name} restored from a copy")

@@ -1,0 +1,115 @@
+"""A TCP proxy on loopback with weather: cuts, black holes, slow spells, replies that are held back.
+
+TCP itself neither repeats nor reorders bytes, so a reply that comes late is what can happen to delivery: it is held
+back for longer than the sender waits, who then sends the same batch again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from dataclasses import dataclass
+
+CHUNK = 16384
+
+
+@dataclass(frozen=True)
+class Weather:
+    """What happens to links. cut: none stands, none comes up; hold_there, hold_back: no bytes to, or from, the router.
+
+    bytes_per_s: so many a second and direction, 0 for any number.
+    """
+
+    cut: bool = False
+    hold_there: bool = False
+    hold_back: bool = False
+    bytes_per_s: float = 0.0
+
+
+FAIR = Weather()
+
+
+class Proxy:
+    """Forwards connections to a port on loopback. Leaving the block ends its threads and links."""
+
+    def __init__(self, port: int) -> None:
+        self.weather = FAIR
+        self._port = port
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._links: list[socket.socket] = []
+        self._threads: list[threading.Thread] = []
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._start(self._accept)
+
+    @property
+    def endpoint(self) -> str:
+        """Where to connect to."""
+        return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+
+    def set(self, weather: Weather) -> None:
+        """Change the weather."""
+        self.weather = weather
+        if weather.cut:
+            self._drop_links()
+
+    def __enter__(self) -> Proxy:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed.set()
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._drop_links()
+        for thread in self._threads:
+            thread.join(5.0)
+
+    def _start(self, work: object, *args: object) -> None:
+        thread = threading.Thread(target=work, args=args, daemon=True)  # type: ignore[arg-type]
+        self._threads.append(thread)
+        thread.start()
+
+    def _drop_links(self) -> None:
+        with self._lock:
+            links, self._links = self._links, []
+        for link in links:
+            with contextlib.suppress(OSError):
+                link.shutdown(socket.SHUT_RDWR)
+            link.close()
+
+    def _accept(self) -> None:
+        while not self._closed.is_set():
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            try:
+                if self.weather.cut:
+                    raise ConnectionRefusedError
+                far = socket.create_connection(("127.0.0.1", self._port), timeout=2.0)
+            except OSError:
+                near.close()
+                continue
+            far.settimeout(None)
+            with self._lock:
+                self._links += [near, far]
+            self._start(self._pump, near, far, "hold_there")
+            self._start(self._pump, far, near, "hold_back")
+
+    def _pump(self, source: socket.socket, sink: socket.socket, held_by: str) -> None:
+        """Move bytes until either end is gone; what was read before a cut is lost with it."""
+        try:
+            while data := source.recv(CHUNK):
+                while getattr(self.weather, held_by) and not self._closed.is_set():
+                    time.sleep(0.02)
+                if rate := self.weather.bytes_per_s:
+                    time.sleep(len(data) / rate)
+                sink.sendall(data)
+        except OSError:
+            pass
+        for end in (source, sink):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)

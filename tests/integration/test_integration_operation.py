@@ -1,0 +1,345 @@
+"""Real processes in the hands of an operator: SIGTERM in the worst moments, metrics, doctor, logs, memory."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from site_run import READY_S, SiteRun  # beside this file
+
+from agents.spool import Spool, SpoolConfig
+from mapserver.config import ServerConfig
+from mapserver.journal import JournalReader
+from mapserver.store import JOURNAL_FILE, Incoming, Store
+from protocol import keys
+from protocol.codec import decode_reply, encode_batch
+from protocol.messages import Ack, SampleBatch
+from protocol.samples import SAMPLE_DTYPE
+from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.site import SiteConfig, load_site
+from sim.config import SimConfig
+from sitegrid.processes import Child, Children, wait_until
+
+pytestmark = pytest.mark.processes
+
+END_S = 3.0
+NOW_NS = 1_767_225_600_000_000_000
+
+
+@pytest.fixture
+def site(tmp_path: Path, children: Children) -> SiteRun:
+    return SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
+
+
+def end(child: Child) -> None:
+    """Ask it to end; it has to have ended, in peace, in time."""
+    begin_s = time.monotonic()
+    child.send(signal.SIGTERM)
+    assert child.wait(END_S + 5) == 0
+    took_s = time.monotonic() - begin_s
+    assert took_s < END_S, f"{child.name} took {took_s:.1f} s to end"
+
+
+@contextlib.contextmanager
+def session_of(endpoint: str) -> Iterator[zenoh.Session]:
+    session = open_session(SessionConfig(endpoint))
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+def drive(n: int, seed: int, first_s: int = 0) -> np.ndarray:
+    """Samples of a machine all over 200 x 200 m, one a second."""
+    draw = np.random.default_rng(seed)
+    rows = np.zeros(n, SAMPLE_DTYPE)
+    rows["stamp_ns"] = NOW_NS + (first_s + np.arange(n)) * 10**9
+    rows["x_m"], rows["y_m"] = draw.uniform(0, 200, (2, n))
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0
+    rows["distance_m"], rows["c_rr"], rows["c_rr_var"] = 1.0, 0.04, 1e-5
+    return rows
+
+
+class Sender:
+    """Sends batches as fast as they are acknowledged, on a thread, and keeps the last acknowledged sample."""
+
+    def __init__(self, session: zenoh.Session, site: SiteConfig, machine: str, n: int = 200) -> None:
+        self.machine, self.watermark = machine, 0
+        self._session, self._site, self._rows = session, site, drive(n, seed=len(machine))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            batch = SampleBatch(self.machine, 7, self.watermark + 1, self._rows, self._site.frame)
+            key = keys.ingest(self._site.name, self.machine)
+            for reply in self._session.get(key, payload=encode_batch(batch), timeout=1.0):
+                if reply.ok is not None and isinstance(ack := decode_reply(reply.ok.payload.to_bytes()), Ack):
+                    self.watermark = ack.watermark
+
+
+def committed(store: Path) -> dict[str, int]:
+    with JournalReader(store / JOURNAL_FILE) as journal:
+        return {machine: mark.seq for (machine, _), mark in journal.marks().items()}
+
+
+# --- SIGTERM ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_router_with_many_sessions_ends_in_time(site: SiteRun):
+    router = site.start_router()
+    with contextlib.ExitStack() as opened:
+        sessions = [opened.enter_context(session_of(site.endpoint)) for _ in range(10)]
+        for session in sessions:
+            session.declare_queryable("sitegrid/paper/map/*", lambda query: None)
+        replies = [session.get("sitegrid/paper/map/info", timeout=0.5) for session in sessions]
+        end(router)
+        for reply in replies:
+            list(reply)
+
+
+def old_rows(store: Path, site: SiteConfig) -> None:
+    """Fill a store with what has to be archived at once."""
+    with closing(Store(store, site, ServerConfig(), lambda: NOW_NS)) as opened:
+        for i in range(200):
+            batch = SampleBatch("old", 7, 1 + 1000 * i, drive(1000, seed=i, first_s=100 * i), site.frame)
+            assert isinstance(opened.take([Incoming("old", encode_batch(batch))])[0], Ack)
+        opened.save_snapshot()
+
+
+def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committed(site: SiteRun):
+    options = site.folder / "server.toml"
+    options.write_text("[keep]\nturn_s = 0.1\narchive_after_h = 0.01\n[store]\nsnapshot_rows = 50\n")
+    config = load_site(site.site_file)
+    old_rows(site.folder / "store", config)
+    site.start_router()
+    server = site.start_server("--config", str(options))
+    with session_of(site.endpoint) as session, contextlib.ExitStack() as senders:
+        sent = [senders.enter_context(closing(Sender(session, config, f"machine{'x' * i}"))) for i in range(3)]
+        wait_until(lambda: min(s.watermark for s in sent) > 5000, READY_S, "samples taken")
+        asked = f"sitegrid/{site.site}/map/region?bounds=0,0,200,200;as_of={NOW_NS + 10**11}"
+        questions = [session.get(asked, timeout=3.0) for _ in range(8)]
+        wait_until((site.folder / "store" / "archive").exists, READY_S, "something archived")
+        end(server)
+        for question in questions:
+            list(question)
+    marks = committed(site.folder / "store")
+    assert marks["old"] == 200 * 1000
+    assert all(marks[s.machine] >= s.watermark for s in sent), "what was acknowledged is on disk"
+
+
+def test_a_server_that_waits_for_a_router_ends_in_time(site: SiteRun, children: Children):
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "store", "--verbose")
+    server = children.start("server", "server", *words)
+    wait_for_handlers(server)
+    end(server)
+
+
+def wait_for_handlers(child: Child) -> None:
+    """Until it catches SIGTERM; before, that ends it at once, with nothing begun."""
+
+    def catches() -> bool:
+        status = dict(line.split(":", 1) for line in Path(f"/proc/{child.pid}/status").read_text().splitlines())
+        return bool(int(status["SigCgt"], 16) >> (signal.SIGTERM - 1) & 1)
+
+    wait_until(catches, READY_S, f"{child.name} catches SIGTERM")
+
+
+def start_agent(site: SiteRun, *options: object) -> tuple[Child, Path]:
+    spool = site.folder / "spool.db"
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--config", site.configs[0], "--spool", spool)
+    agent = site.children.start("agent", "agent", *words, "--json", *map(str, options))
+    return agent, spool
+
+
+def fill(spool: Path, n: int) -> None:
+    with closing(Spool(spool, SpoolConfig())) as opened:
+        opened.record(drive(n, seed=1))
+
+
+def depth(spool: Path) -> int:
+    with closing(Spool(spool, SpoolConfig())) as opened:
+        return opened.counters()["depth"]
+
+
+def test_an_agent_with_a_full_spool_and_no_router_ends_in_time(site: SiteRun):
+    fill(site.folder / "spool.db", 100_000)
+    agent, spool = start_agent(site)
+    agent.expect("ready", READY_S)
+    end(agent)
+    assert depth(spool) == 100_000
+
+
+def test_an_agent_in_the_middle_of_an_exchange_with_a_dead_server_ends_in_time(site: SiteRun):
+    site.start_router()
+    fill(site.folder / "spool.db", 1000)
+    asked = threading.Event()
+    kept: list[zenoh.Query] = []
+
+    def never_answer(query: zenoh.Query) -> None:
+        kept.append(query)
+        asked.set()
+
+    with session_of(site.endpoint) as session:
+        queryable = session.declare_queryable(keys.ingest_all(site.site), never_answer)
+        agent, spool = start_agent(site)
+        agent.expect("ready", READY_S)
+        assert asked.wait(READY_S)
+        end(agent)
+        for query in kept:
+            query.drop()
+        queryable.undeclare()
+    assert depth(spool) == 1000
+
+
+@contextlib.contextmanager
+def paused(child: Child) -> Iterator[None]:
+    """As a process that hangs: its sockets stay open, nothing is read."""
+    child.send(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        child.send(signal.SIGCONT)
+
+
+def test_a_simulator_whose_router_hangs_ends_in_time(site: SiteRun):
+    router = site.start_router()
+    agent, _ = start_agent(site)
+    agent.expect("ready", READY_S)
+    sim = site.start_sim()
+    sim.expect("simulated_s", READY_S)
+    with paused(router):
+        end(sim)
+
+
+def test_plot_and_query_that_follow_end_in_time_also_while_the_server_hangs(site: SiteRun, children: Children):
+    site.start_router()
+    server = site.start_server()
+    where = ("--endpoint", site.endpoint, "--site", site.site)
+    picture = site.folder / "live.png"
+    plot = children.start("plot", "plot", *where, "--follow", "--every", 0.05, "--out", picture)
+    query = children.start("query", "query", *where, "changes", "--follow")
+    wait_until(picture.exists, READY_S, "first picture")
+    wait_for_handlers(query)
+    with paused(server):
+        end(plot)
+        end(query)
+
+
+# --- metrics, logs, doctor -------------------------------------------------------------------------------------------
+
+
+def scrape(url: str) -> dict[str, float]:
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        lines = answer.read().decode().splitlines()
+    return {line.rsplit(" ", 1)[0]: float(line.rsplit(" ", 1)[1]) for line in lines if not line.startswith("#")}
+
+
+def test_the_server_tells_prometheus_of_itself_and_of_the_agents(site: SiteRun):
+    site.start_router()
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "store")
+    server = site.children.start("server", "server", *words, "--metrics", "0")
+    url = server.expect("ready", READY_S)["metrics"]
+    assert url.startswith("http://127.0.0.1:")
+    fill(site.folder / "spool.db", 500)
+    agent, _ = start_agent(site)
+    agent.expect("ready", READY_S)
+    machine = f'{{machine="{site.configs[0].stem}"}}'
+    wait_until(lambda: scrape(url).get(f"sitegrid_machine_samples_total{machine}") == 500, READY_S, "samples counted")
+    wait_until(lambda: scrape(url).get(f"sitegrid_agent_spool_samples{machine}") == 0, READY_S, "health heard")
+    found = scrape(url)
+    assert found["sitegrid_map_samples"] == 500
+    assert found["sitegrid_journal_rows"] == found["sitegrid_merged_rows"] > 0
+    assert found["process_resident_memory_bytes"] > 20 * 2**20
+    end(agent)
+    end(server)
+
+
+def test_without_being_asked_the_server_listens_nowhere(site: SiteRun):
+    site.start_router()
+    server = site.children.start(
+        "server", "server", *("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "s")
+    )
+    assert "metrics" not in server.expect("ready", READY_S)
+    sockets = {link.readlink().name for link in Path(f"/proc/{server.pid}/fd").iterdir() if link.is_symlink()}
+    listening = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    assert not [row for row in listening if row[3] == "0A" and f"socket:[{row[9]}]" in sockets]
+
+
+def test_what_a_server_logs_is_one_json_object_per_line(site: SiteRun):
+    site.start_router()
+    server = site.start_server("--verbose")
+    with session_of(site.endpoint) as session:
+        batch = SampleBatch("loader-1", 7, 1, drive(1, seed=1), 'a "frame"\n')
+        list(session.get(keys.ingest(site.site, "loader-1"), payload=encode_batch(batch), timeout=10.0))
+    end(server)
+    lines = (site.folder / "server.log").read_text().splitlines()
+    events = [json.loads(line) for line in lines if line.startswith("{")]
+    assert len(events) == len(lines)
+    refused = next(event for event in events if event["event"] == "refused")
+    assert (refused["machine"], refused["reason"], refused["level"]) == ("loader-1", "wrong_frame", "WARNING")
+    assert '"frame"' in refused["problem"] or "frame" in refused["problem"]
+
+
+def run_doctor(capsys: Any, *words: object) -> tuple[int, dict[str, dict[str, str]]]:
+    from sitegrid.cli import main
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    code = main(["doctor", "--json", *map(str, words)])
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    return code, {f["check"]: f for f in json.loads(capsys.readouterr().out.splitlines()[-1])["findings"]}
+
+
+@pytest.fixture
+def guarded(tmp_path: Path, children: Children, capsys) -> Callable[..., tuple[int, dict[str, dict[str, str]]]]:
+    """A site with keys; asks the doctor with the keys of one name."""
+    pytest.importorskip("cryptography")
+    from sitegrid.cli import main
+
+    folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
+    assert main(["keys", "init", "--dir", str(folder)]) == 0
+    for name, role in {"loader-1": "machine", "guest": "visitor", "sim": "sim", "gone": "machine"}.items():
+        assert main(["keys", "add", name, "--role", role, "--dir", str(folder)]) == 0
+    assert main(["keys", "revoke", "gone", "--dir", str(folder)]) == 0
+    router = children.start("router", "router", "--keys", folder, "--listen", endpoint)
+    router.expect("ready", READY_S)
+    site_file = Path("config/site.toml").absolute()
+    files = ("--site-file", site_file, "--store", tmp_path / "store")
+    server = children.start("server", "server", "--endpoint", endpoint, "--keys", folder / "server", *files)
+    server.expect("ready", READY_S)
+    return lambda name, *words: run_doctor(capsys, "--endpoint", endpoint, "--keys", folder / name, *words)
+
+
+def test_the_doctor_tells_denials_from_absence(guarded: Callable[..., tuple[int, dict[str, dict[str, str]]]]):
+    code, machine = guarded("loader-1")
+    assert code == 0, machine
+    passed = ("certificate", "name", "authority", "router", "server", "permission")
+    assert {check: machine[check]["level"] for check in passed} == dict.fromkeys(passed, "PASS")
+    code, other = guarded("loader-1", "--machine", "loader-2")
+    assert code == 1
+    assert other["server"]["level"] == "PASS"
+    assert "under the name of its keys alone" in other["permission"]["advice"]
+    code, visitor = guarded("guest")
+    assert (code, visitor["server"]["level"], visitor["permission"]["level"]) == (0, "PASS", "-")
+    code, sim = guarded("sim")
+    assert (code, sim["router"]["level"], sim["server"]["level"]) == (0, "PASS", "-")
+    code, revoked = guarded("gone", "--site-file", "config/site.toml")
+    assert code == 1
+    assert "revoked" in revoked["server"]["advice"] + revoked["router"]["advice"]

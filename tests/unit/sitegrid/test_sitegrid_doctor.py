@@ -1,0 +1,499 @@
+"""The doctor: each check by itself, and the whole on a router and a map server in this process."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.spool import Spool, SpoolConfig
+from mapserver.config import ServerConfig
+from mapserver.server import Server
+from mapserver.store import Incoming, Store
+from protocol import keys
+from protocol.codec import encode_batch, encode_health
+from protocol.credentials import Identity
+from protocol.errors import Refusal, StoreError
+from protocol.messages import Ack, Health, Refused, SampleBatch
+from protocol.queries import InfoQuery, encode_info
+from protocol.samples import SAMPLE_DTYPE
+from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.site import SiteConfig
+from sitegrid import doctor, probes
+from sitegrid.cli import main
+from sitegrid.doctor import Certificate, Finding, Level, Link, SpoolState, StoreState
+
+NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
+NOW_NS = 1_767_225_600_000_000_000
+SITE = SiteConfig("pit", 48.0, 11.0)
+WALL = replace(SITE, clock="wall", clock_tolerance_s=5.0)
+INFO = {
+    "site": {"name": "pit", "frame": SITE.frame},
+    "samples_merged": 300,
+    "cells": 250,
+    "journalled": 12,
+    "merged": 12,
+}
+SITE_TOML = 'name = "pit"\norigin_lat_deg = 48.0\norigin_lon_deg = 11.0\n'
+
+
+def samples(n: int) -> np.ndarray:
+    rows = np.zeros(n, SAMPLE_DTYPE)
+    rows["stamp_ns"] = NOW_NS + np.arange(n) * 10**9
+    rows["distance_m"] = 1.0
+    return rows
+
+
+# --- network ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("link", "level", "words"),
+    [
+        (Link("tcp/a:1", 0.012), Level.PASS, "answers in 12 ms"),
+        (Link("tcp/a:1", None, listens=False), Level.FAIL, "nothing listens at tcp/a:1; start `sitegrid router`"),
+        (Link("tcp/a:1", None, listens=True), Level.FAIL, "pass --keys"),
+        (Link("tls/a:1", None, listens=True, has_keys=True), Level.FAIL, "these keys may be of another site"),
+    ],
+)
+def test_router(link: Link, level: Level, words: str):
+    found = doctor.check_link(link)
+    assert (found.level, words in str(found)) == (level, True)
+
+
+def test_an_empty_answer_of_the_server_is_told_apart():
+    assert doctor.check_server("pit", INFO, is_there=True).level is Level.PASS
+    behind = doctor.check_server("pit", {**INFO, "merged": 10}, is_there=True)
+    assert "2 rows not merged yet" in behind.found
+    denied = doctor.check_server("pit", None, is_there=True, role="visitor")
+    assert denied.level is Level.FAIL
+    assert "the router denies the question" in denied.advice
+    absent = doctor.check_server("pit", None, is_there=False)
+    assert "start `sitegrid server`" in absent.advice
+    assert "revoked" not in absent.advice
+    assert "revoked" in doctor.check_server("pit", None, is_there=False, role="machine").advice
+
+
+def test_site_files_are_compared():
+    assert doctor.check_site(SITE, INFO).level is Level.PASS
+    moved = doctor.check_site(replace(SITE, origin_lat_deg=48.1), INFO)
+    assert moved.level is Level.FAIL
+    assert SITE.frame in moved.found
+    assert doctor.check_site(replace(SITE, name="hill"), INFO).level is Level.FAIL
+
+
+@pytest.mark.parametrize(
+    ("answer", "is_there", "has_keys", "level", "words"),
+    [
+        (Ack(0, 0, 0), True, False, Level.PASS, "batches of loader-1 are taken"),
+        (Refused(Refusal.WRONG_FRAME, "compare"), True, False, Level.FAIL, "(wrong_frame): compare"),
+        (None, False, False, Level.FAIL, "start `sitegrid server`"),
+        (None, True, True, Level.FAIL, "under the name of its keys alone"),
+        (None, True, False, Level.FAIL, "denies it, or the server hangs"),
+    ],
+)
+def test_permission(answer: Any, is_there: bool, has_keys: bool, level: Level, words: str):
+    found = doctor.check_permission("loader-1", answer, is_there=is_there, has_keys=has_keys)
+    assert (found.level, words in str(found)) == (level, True)
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "error_s", "site", "level", "words"),
+    [
+        (0.4, 0.01, None, Level.PASS, "0.40 s ahead of"),
+        (-0.4, 0.01, None, Level.PASS, "0.40 s behind"),
+        (1.2, 0.1, None, Level.WARN, "NTP"),
+        (1.2, 0.3, None, Level.PASS, "+-0.30"),
+        (-90.0, 0.1, WALL, Level.WARN, "90.00 s behind"),
+        (6.0, 0.1, WALL, Level.FAIL, "refused beyond 5 s"),
+        (6.0, 0.1, SITE, Level.WARN, "6.00 s ahead"),
+        (5.05, 0.1, WALL, Level.WARN, "5.05 s ahead"),
+    ],
+)
+def test_clock(offset_s: float, error_s: float, site: SiteConfig | None, level: Level, words: str):
+    found = doctor.check_clock(offset_s, error_s, site)
+    assert (found.level, words in str(found)) == (level, True)
+
+
+def test_the_offset_is_taken_at_the_middle_of_the_question():
+    asked_ns = (10 * 10**9, 12 * 10**9)
+    assert probes.offset_of({"wall_ns": 8 * 10**9}, asked_ns) == (3.0, 1.0)
+    assert probes.offset_of({}, asked_ns) is None
+
+
+def test_versions():
+    assert doctor.check_version("1.0", "1.0").level is Level.PASS
+    assert doctor.check_version("1.0", "1.1").level is Level.WARN
+    assert doctor.check_version("1.0", "unknown").level is Level.SKIP
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+GOOD = Certificate(
+    Identity("pit", "loader-1", "machine", NOW + timedelta(days=90)),
+    "loader-1",
+    NOW - timedelta(days=1),
+    NOW + timedelta(days=90),
+    signed=True,
+    fits=True,
+    mode=0o100600,
+)
+
+
+def level_of(found: Certificate, check: str, **given: str) -> tuple[Level, str]:
+    finding = next(f for f in doctor.check_certificate(found, NOW, **given) if f.check == check)
+    return finding.level, str(finding)
+
+
+def test_a_good_certificate_passes():
+    findings = doctor.check_certificate(GOOD, NOW, "pit", "loader-1")
+    assert [f.level for f in findings] == [Level.PASS] * 3
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "words"),
+    [
+        ({"expires": NOW + timedelta(days=30, hours=1)}, Level.PASS, "valid until"),
+        ({"expires": NOW + timedelta(days=29)}, Level.WARN, "29 days more; make a new one with `sitegrid keys add"),
+        ({"expires": NOW - timedelta(seconds=1)}, Level.FAIL, "expired on 2026-06-01"),
+        ({"begins": NOW + timedelta(minutes=1)}, Level.FAIL, "set this host's clock"),
+    ],
+)
+def test_validity(change: dict[str, Any], level: Level, words: str):
+    found, text = level_of(replace(GOOD, **change), "certificate")
+    assert (found, words in text) == (level, True)
+
+
+@pytest.mark.parametrize(
+    ("common_name", "given", "level"),
+    [
+        ("loader-1.2", {}, Level.PASS),
+        ("loader-1.x", {}, Level.FAIL),
+        ("loader-2", {}, Level.FAIL),
+        ("loader-1", {"site": "hill"}, Level.FAIL),
+        ("loader-1", {"machine": "loader-2"}, Level.FAIL),
+    ],
+)
+def test_names(common_name: str, given: dict[str, str], level: Level):
+    assert level_of(replace(GOOD, common_name=common_name), "name", **given)[0] is level
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "words"),
+    [
+        ({"signed": False}, Level.FAIL, "ca.pem has not signed cert.pem"),
+        ({"fits": False}, Level.FAIL, "key.pem is not the key of cert.pem"),
+        ({"mode": 0o100640}, Level.WARN, "mode 640"),
+    ],
+)
+def test_chain(change: dict[str, Any], level: Level, words: str):
+    found, text = level_of(replace(GOOD, **change), "authority")
+    assert (found, words in text) == (level, True)
+
+
+@pytest.fixture(scope="module")
+def key_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("cryptography")
+    folder = tmp_path_factory.mktemp("made") / "keys"
+    assert main(["keys", "init", "--site", "pit", "--dir", str(folder)]) == 0
+    for name in ("loader-1", "loader-2"):
+        assert main(["keys", "add", name, "--dir", str(folder), "--days", "20"]) == 0
+    return folder
+
+
+def test_a_folder_of_keys_is_read(key_folder: Path):
+    found = probes.read_certificate(key_folder / "loader-1")
+    assert (found.common_name, found.signed, found.fits, found.mode & 0o777) == ("loader-1", True, True, 0o600)
+    assert found.identity.expires == found.expires
+
+
+def copied(folder: Path, name: str, to: Path, **files: bytes) -> Path:
+    to.mkdir()
+    for path in (folder / name).iterdir():
+        (to / path.name).write_bytes(files.get(path.stem, path.read_bytes()))
+    return to
+
+
+def test_files_of_different_folders_are_noticed(key_folder: Path, tmp_path: Path):
+    other = (key_folder / "loader-2" / "key.pem").read_bytes()
+    assert not probes.read_certificate(copied(key_folder, "loader-1", tmp_path / "a", key=other)).fits
+    cert = (key_folder / "loader-2" / "cert.pem").read_bytes()
+    assert not probes.read_certificate(copied(key_folder, "loader-1", tmp_path / "b", ca=cert)).signed
+
+
+@pytest.mark.parametrize("broken", ["cert", "ca"])
+def test_what_is_no_certificate_is_one_line(key_folder: Path, tmp_path: Path, broken: str, capsys):
+    folder = copied(key_folder, "loader-1", tmp_path / "a", **{broken: b"nonsense"})
+    words = ["doctor", "--endpoint", free_endpoint().replace("tcp", "tls"), "--keys", str(folder)]
+    assert main(words) == 1
+    assert "FAIL  certificate" in (text := capsys.readouterr().out)
+    assert "copy the whole folder again" in text.splitlines()[0]
+    assert "these keys cannot be used" in text
+
+
+def test_keys_that_soon_expire_are_told_of_and_their_name_is_used(key_folder: Path, capsys):
+    endpoint = free_endpoint().replace("tcp", "tls")
+    assert main(["doctor", "--endpoint", endpoint, "--keys", str(key_folder / "loader-1"), "--site", "hill"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("WARN  certificate   machine loader-1 of site pit is valid until")
+    assert lines[1].startswith("FAIL  name          the keys are for site pit, not hill")
+    assert lines[3].startswith("FAIL  router        nothing listens at tls/")
+
+
+# --- disk ------------------------------------------------------------------------------------------------------------
+
+
+def test_free_space(tmp_path: Path):
+    levels = [doctor.check_disk("spool", free).level for free in (2**25, 2**29, 2**31)]
+    assert levels == [Level.FAIL, Level.WARN, Level.PASS]
+    assert probes.free_bytes(tmp_path / "not" / "there" / "yet.db") > 0
+
+
+@pytest.mark.parametrize(
+    ("state", "age_s", "level", "words"),
+    [
+        (SpoolState(0, 0, 0, 0), 0, Level.PASS, "0 samples wait; 0 were dropped, 0 put aside"),
+        (SpoolState(5, 0, 0, NOW_NS), 600, Level.PASS, "the oldest is of 10 min ago"),
+        (SpoolState(5, 0, 0, NOW_NS), 4 * 3600, Level.WARN, "4 h ago; 0 were dropped, 0 put aside; start its agent"),
+        (SpoolState(0, 3, 0, 0), 0, Level.WARN, "raise max_samples"),
+        (SpoolState(0, 0, 2, 0), 0, Level.WARN, "table `aside`"),
+    ],
+)
+def test_spool(state: SpoolState, age_s: int, level: Level, words: str):
+    found = doctor.check_spool(state, NOW_NS + age_s * 10**9)
+    assert (found.level, words in str(found)) == (level, True)
+
+
+def test_an_agent_that_runs_is_taken_at_its_word():
+    good = {"spool": {"depth": 3, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
+    assert doctor.check_health("loader-1", good).level is Level.PASS
+    stuck = doctor.check_health("loader-1", {**good, "uplink": {"problem": "no answer"}})
+    assert (stuck.level, stuck.advice) == (Level.WARN, "no answer")
+    lost = doctor.check_health("loader-1", {**good, "spool": {"depth": 3, "dropped": 1}})
+    assert lost.level is Level.WARN
+    assert doctor.check_health("loader-1", {}).level is Level.PASS, "whatever it says, no crash"
+
+
+STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
+
+
+@pytest.mark.parametrize(
+    ("state", "site", "level", "words"),
+    [
+        (STORE, SITE, Level.PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
+        (replace(STORE, snapshot_row=0, snapshot_age_s=math.inf), None, Level.PASS, "no snapshot"),
+        (replace(STORE, last_row=30_000), None, Level.WARN, "a restart folds 26000 rows"),
+        (replace(STORE, frame="0"), SITE, Level.FAIL, "choose another --store"),
+        (replace(STORE, site="hill"), SITE, Level.FAIL, "choose another --store"),
+    ],
+)
+def test_store(state: StoreState, site: SiteConfig | None, level: Level, words: str):
+    found = doctor.check_store(state, site)
+    assert (found.level, words in str(found)) == (level, True)
+
+
+def test_a_spool_is_read_without_a_trace(tmp_path: Path):
+    with pytest.raises(StoreError, match="no such file"):
+        probes.read_spool(tmp_path / "spool.db")
+    with closing(Spool(tmp_path / "spool.db", SpoolConfig(max_samples=4))) as spool:
+        spool.record(samples(6))
+        head = spool.head(1)
+        assert head
+        spool.put_aside(head, "bad")
+        with pytest.raises(probes.InUseError, match="an agent has it open"):
+            probes.read_spool(tmp_path / "spool.db")
+    before = sorted(tmp_path.iterdir())
+    state = probes.read_spool(tmp_path / "spool.db")
+    assert state == SpoolState(depth=3, dropped=2, put_aside=1, oldest_ns=NOW_NS + 3 * 10**9)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_spool_that_was_killed_is_read_with_its_log(tmp_path: Path):
+    code = (
+        "import os, sys; from pathlib import Path; from agents.spool import Spool, SpoolConfig\n"
+        "import numpy as np; from protocol.samples import SAMPLE_DTYPE\n"
+        "Spool(Path(sys.argv[1]), SpoolConfig()).record(np.ones(7, SAMPLE_DTYPE)); os._exit(0)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "spool.db")], check=True)
+    assert (tmp_path / "spool.db-wal").stat().st_size > 0
+    assert probes.read_spool(tmp_path / "spool.db").depth == 7
+
+
+@pytest.mark.parametrize("broken", ["bytes", "schema"])
+def test_a_spool_that_cannot_be_used_is_a_finding(tmp_path: Path, broken: str, capsys):
+    path = tmp_path / "spool.db"
+    if broken == "bytes":
+        path.write_bytes(b"nonsense" * 1000)
+    else:
+        with closing(sqlite3.connect(path)) as db:
+            db.execute("PRAGMA user_version = 99")
+    assert main(["doctor", "--endpoint", free_endpoint(), "--spool", str(path), "--json"]) == 1
+    findings = json.loads(capsys.readouterr().out)["findings"]
+    found = next(f for f in findings if f["check"] == "spool")
+    assert found["level"] == "FAIL"
+    assert ("schema 99" if broken == "schema" else "no usable spool") in found["found"]
+
+
+def filled_store(folder: Path) -> None:
+    with closing(Store(folder, SITE, ServerConfig(), time.time_ns)) as store:
+        payload = encode_batch(SampleBatch("loader-1", 5, 1, samples(4), SITE.frame))
+        assert isinstance(store.take([Incoming("loader-1", payload)])[0], Ack)
+        store.save_snapshot()
+        payload = encode_batch(SampleBatch("loader-1", 5, 5, samples(4), SITE.frame))
+        store.take([Incoming("loader-1", payload)])
+
+
+def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
+    with pytest.raises(StoreError, match=r"holds no journal\.db"):
+        probes.read_store(tmp_path, time.time())
+    filled_store(tmp_path)
+    with closing(Store(tmp_path, SITE, ServerConfig(), time.time_ns)):
+        state = probes.read_store(tmp_path, time.time() + 100)
+    assert state == StoreState("pit", SITE.frame, 2, 2, 0, 1, 1, state.snapshot_age_s)
+    assert 99 < state.snapshot_age_s < 160
+
+
+def test_a_damaged_store_is_a_finding(tmp_path: Path, capsys):
+    (tmp_path / "journal.db").write_bytes(b"nonsense" * 1000)
+    assert main(["doctor", "--endpoint", free_endpoint(), "--store", str(tmp_path)]) == 1
+    assert "FAIL  store" in capsys.readouterr().out
+
+
+# --- the whole -------------------------------------------------------------------------------------------------------
+
+
+class Site:
+    def __init__(self, endpoint: str, folder: Path) -> None:
+        self.endpoint, self.folder = endpoint, folder
+        self.site_file = folder / "site.toml"
+        self.site_file.write_text(SITE_TOML)
+        self.session = open_session(SessionConfig(endpoint, mode="router"))
+
+    def doctor(self, capsys: Any, *words: str | Path) -> tuple[int, dict[str, Finding]]:
+        code = main(["doctor", "--endpoint", self.endpoint, "--json", *map(str, words)])
+        findings = [Finding(**f) for f in json.loads(capsys.readouterr().out)["findings"]]
+        return code, {f.check: f for f in findings}
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    made = Site(free_endpoint(), tmp_path)
+    yield made
+    made.session.close()
+
+
+def test_a_healthy_site_passes_and_nothing_is_left_behind(site: Site, capsys):
+    filled_store(site.folder / "store")
+    with closing(Spool(site.folder / "spool.db", SpoolConfig())):
+        pass
+    with closing(Server(site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)) as server:
+        files = ("--site-file", site.site_file, "--store", site.folder / "store", "--spool", site.folder / "spool.db")
+        code, found = site.doctor(capsys, *files)
+        info = server.answers.info()
+    assert code == 0
+    passed = ("router", "server", "site", "permission", "spool", "spool disk", "store", "store disk")
+    assert {name: found[name].level for name in passed} == dict.fromkeys(passed, Level.PASS)
+    assert found["certificate"].level == Level.SKIP
+    assert found["permission"].found == "batches of doctor are taken"
+    assert set(info["machines"]) == {"loader-1"}
+    assert info["journalled"] == 2
+
+
+def test_the_wrong_site_file_is_found_out(site: Site, capsys):
+    site.site_file.write_text(SITE_TOML.replace("48.0", "47.0"))
+    with closing(Server(site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)):
+        code, found = site.doctor(capsys, "--site-file", site.site_file, "--machine", "loader-7")
+    assert code == 1
+    assert found["site"].level == Level.FAIL
+    assert found["permission"].level == Level.FAIL
+    assert "loader-7 (wrong_frame)" in found["permission"].found
+
+
+def test_a_router_without_a_server_is_found_out(site: Site, capsys):
+    code, found = site.doctor(capsys, "--site", "hill")
+    assert code == 1
+    assert found["router"].level == Level.PASS
+    assert found["server"].found == "site hill: the router knows of no map server"
+    assert found["permission"].level == Level.SKIP
+    _, found = site.doctor(capsys, "--site-file", site.site_file)
+    assert found["permission"].found == "nobody takes batches of doctor"
+
+
+@contextlib.contextmanager
+def answering(site: Site, key: str, data: bytes) -> Iterator[None]:
+    """Somebody who answers on a key; with nothing where there are no data, as where a router denies."""
+
+    def reply(query: Any) -> None:
+        with query:
+            if data:
+                query.reply(query.key_expr, data)
+
+    queryable = site.session.declare_queryable(key, reply)
+    yield
+    queryable.undeclare()
+
+
+def test_silence_of_a_server_that_is_there_is_called_a_denial(site: Site, capsys):
+    with answering(site, keys.map_queries_all("pit"), b""), answering(site, keys.ingest_all("pit"), b""):
+        code, found = site.doctor(capsys, "--site-file", site.site_file)
+    assert code == 1
+    assert found["server"].found == "site pit: a map server is there, but does not answer"
+    assert found["permission"].found == "a map server is there, but gives no answer to batches of doctor"
+
+
+def test_clock_and_version_of_the_server_are_compared(site: Site, capsys, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sitegrid.commands.doctor.package_version", lambda: "1.0")
+    info = {**INFO, "wall_ns": time.time_ns() - 3600 * 10**9, "version": "0.9"}
+    with answering(site, keys.map_query("pit", InfoQuery.name), encode_info(info)):
+        _, found = site.doctor(capsys, "--site", "pit")
+    assert found["clock"].level == Level.WARN
+    assert "s ahead of the map server's clock" in found["clock"].found
+    assert found["version"].found == "here 1.0, map server 0.9"
+
+
+def test_a_running_agent_is_heard(site: Site, capsys):
+    health = encode_health(Health("loader-1", NOW_NS, {"spool": {"depth": 9}, "uplink": {"problem": "no answer"}}))
+    done = threading.Event()
+
+    def tell() -> None:
+        while not done.wait(0.05):
+            site.session.put(keys.health("pit", "loader-1"), health)
+
+    teller = threading.Thread(target=tell)
+    words = ("--site", "pit", "--spool", site.folder / "spool.db")
+    with closing(Spool(site.folder / "spool.db", SpoolConfig())):
+        _, unnamed = site.doctor(capsys, *words)
+        teller.start()
+        _, heard = site.doctor(capsys, *words, "--machine", "loader-1")
+        done.set()
+        teller.join()
+    assert "give --machine NAME" in unnamed["spool"].found
+    assert heard["spool"].found.startswith("loader-1 runs: 9 samples wait")
+    assert heard["spool"].advice == "no answer"
+
+
+def test_people_read_one_line_each(capsys):
+    assert main(["doctor", "--endpoint", free_endpoint()]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["-", "FAIL", "-", "-", "-", "-", "-", "-"]
+    assert lines[1].startswith("FAIL  router        nothing listens at tcp/127.0.0.1:")
+
+
+@pytest.mark.parametrize("words", [["--machine", "no/name"], ["--site", "*"]])
+def test_names_that_are_none_are_refused(words: list[str], capsys):
+    assert main(["doctor", *words]) == 1
+    assert "is not a name" in capsys.readouterr().err
