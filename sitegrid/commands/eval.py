@@ -124,7 +124,8 @@ def _lines(result: Tables) -> list[str]:
     lines = []
     for name, value in result.items():
         if isinstance(value, list) and value and isinstance(value[0], dict):
-            rows = [{k: v for k, v in row.items() if not isinstance(v, SHOWN)} for row in value]
+            shown = [k for k in value[0] if not any(isinstance(row[k], SHOWN) for row in value)]
+            rows = [{k: row[k] for k in shown} for row in value]
             lines.append(table(_turned(rows) if len(rows[0]) > MOST_COLUMNS else rows))
         elif value not in ([], {}):
             lines.append(f"{name}: {value}")
