@@ -137,7 +137,7 @@ class Site:
             if role in (ROUTER, SERVER):
                 self.wait_ready(role)
         self._wait(lambda: self.progress().keys() >= set(self.machines), READY_S, "no samples from every machine")
-        ended = [f"{role}: {p.last_words()}" for role, p in self._running.items() if p.code is not None]
+        ended = [f"{role}: {p.code} {p.last_words()}" for role, p in self._running.items() if p.code is not None]
         if ended or self.outcome.problems:
             raise StartError("; ".join([*self.outcome.problems, *ended]))
 

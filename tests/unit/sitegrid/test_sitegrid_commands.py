@@ -116,7 +116,7 @@ def test_server_refuses_an_unknown_option(files: Path, capsys: pytest.CaptureFix
 
 
 def test_router_says_where_it_cannot_listen(capsys: pytest.CaptureFixture[str]):
-    assert main(["router", "--listen", "tcp/192.0.2.1:7447"]) == 1
+    assert main(["router", "--insecure", "--listen", "tcp/192.0.2.1:7447"]) == 1
     assert "tcp/192.0.2.1:7447: cannot listen here" in capsys.readouterr().err
 
 

@@ -52,7 +52,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> tuple[list[tuple[Any, ...]], Stop]
     pictures: list[tuple[Any, ...]] = []
     stop = Stop()
     monkeypatch.setattr(plot, "stop_flag", lambda: stop)
-    monkeypatch.setattr(plot, "connect", lambda *_: Nothing())
+    monkeypatch.setattr(plot, "connect", lambda *_, **__: Nothing())
     monkeypatch.setattr(plot, "TrackRecorder", lambda *_: Nothing())
     monkeypatch.setattr(plot, "draw", lambda _, *rest: pictures.append(rest))
     return pictures, stop

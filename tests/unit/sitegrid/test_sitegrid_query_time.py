@@ -86,7 +86,7 @@ class Reply:
 @pytest.fixture
 def session(monkeypatch: pytest.MonkeyPatch) -> Session:
     session = Session()
-    monkeypatch.setattr(query, "connect", lambda endpoint, site: Client(session, endpoint, site))  # type: ignore[arg-type]
+    monkeypatch.setattr(query, "connect", lambda endpoint, site, **_: Client(session, endpoint, site))  # type: ignore[arg-type]
     return session
 
 
