@@ -55,12 +55,13 @@ def parse(payload: bytes, machine: str, site: SiteConfig, now_ns: Callable[[], i
 def admit(batch: SampleBatch, watermark: int) -> Admission:
     """Trim what is at or below the watermark; GapError if samples between it and the batch are missing.
 
-    An empty batch asks for the watermark: it is admitted with nothing in it.
+    An empty batch asks for the watermark, and may declare samples lost that no later ones follow; it is never a gap.
     """
     expected = watermark + 1
-    if not len(batch.rows):
-        return Admission(replace(batch, first_seq=expected), trimmed=0, lost=0)
     missing = batch.first_seq - expected
+    if not len(batch.rows):
+        lost = missing if 0 < missing <= batch.lost_before else 0
+        return Admission(replace(batch, first_seq=expected + lost), trimmed=0, lost=lost)
     if missing > batch.lost_before:
         raise GapError(batch.first_seq, expected)
     if missing >= 0:

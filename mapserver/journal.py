@@ -13,7 +13,7 @@ import sqlite3
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -272,6 +272,14 @@ class Journal(JournalReads):
         self.put_mark(batch.machine, batch.spool_id, mark)
         self.last_row = row
         return row
+
+    def declare_lost(self, admission: Admission) -> None:
+        """Write a watermark alone into the open transaction: samples at a spool's end that will never come."""
+        batch = admission.batch
+        before = self.mark(batch.machine, batch.spool_id)
+        self.put_mark(
+            batch.machine, batch.spool_id, replace(before, seq=admission.watermark, lost=before.lost + admission.lost)
+        )
 
     def put_mark(self, machine: str, spool_id: int, mark: Mark) -> None:
         """Write a watermark into the open transaction."""

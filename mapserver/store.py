@@ -170,6 +170,8 @@ class Store:
             return Refused(error.reason, str(error), expected), None
         new = len(admission.batch.rows) > 0
         row = self._journal.append(admission, self._now_ns()) if new else self.journalled
+        if admission.lost and not new:
+            self._journal.declare_lost(admission)
         return Ack(admission.watermark, row, admission.trimmed), admission
 
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:

@@ -127,7 +127,8 @@ def _machine(site: str, name: str) -> Grant:
     return Grant(
         puts=(_whole(site, "machine", name),),
         hears=(keys.sensors(site, name), _whole(site, "map"), _whole(site, "base")),
-        asks=(keys.ingest(site, name), keys.map_queries_all(site)),
+        asks=(keys.ingest(site, name), keys.map_queries_all(site), keys.alive(site, name)),
+        answers=(keys.alive(site, name),),  # who holds the name, if a second one comes
         alive=(keys.alive(site, name),),
         watches=(keys.alive(site, name),),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from contextlib import ExitStack
 
 from tests.chaos.chaos_site import SERVER
@@ -16,7 +17,8 @@ def disks(scenario: Scenario) -> Outcome:
     with scenario.site() as site:
         if not (library := build(site.folder)):
             return Outcome(scenario.fault, skipped="no C compiler for the shim")
-        found = {name: FailingDisk(library, site.folder / name, site.folder / f"{name}.bin") for name in ("store", "spool")}
+        top = site.folder
+        found = {name: FailingDisk(library, top / name, top / f"{name}.bin") for name in ("store", "spool")}
         site.env = {SERVER: found["store"].env, **dict.fromkeys(site.machines, found["spool"].env)}
         site.start_all()
         while left_s > 0:
@@ -28,7 +30,9 @@ def disks(scenario: Scenario) -> Outcome:
             with site.fault(), ExitStack() as broken:
                 broken.enter_context(found[name].failing(error))
                 site.linger(lasts_s)
-                count += min(found[name].failed, 10**6)
+                count += found[name].failed
+                if is_killed:
+                    site.send(victim, signal.SIGKILL)
             if is_killed:
                 site.kill(victim)
             left_s -= pause_s + lasts_s

@@ -5,10 +5,8 @@ A service's host name becomes a free port on loopback, a volume a folder, the im
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-import socket
 import subprocess
 import sys
 import time
@@ -19,9 +17,9 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
+from protocol.session import free_endpoint
 from sitegrid.processes import Child, Children, ProcessError
 
-_PLACE = re.compile(r"\b(?P<host>[a-z][a-z0-9-]*|0\.0\.0\.0|127\.0\.0\.1):(?P<port>\d+)\b")
 _ENV = re.compile(r"^ENV (?P<pairs>(?:.*\\\n)*.*)$", re.MULTILINE)
 CHECK_S = 0.5  # between two health checks, in place of the file's own
 
@@ -48,10 +46,12 @@ class ComposeRun:
     services: Mapping[str, Any]
     folder: Path
     children: Children
-    environment: Mapping[str, str]
     started: dict[str, Child] = field(default_factory=dict)
     health: dict[str, list[int]] = field(default_factory=dict)
     ports: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.ports |= {port: free_port() for port in listened_on(self.services)}
 
     def up(self) -> None:
         """Start every service once what it depends on is as it has to be."""
@@ -91,7 +91,7 @@ class ComposeRun:
                 self._wait_healthy(other)
             else:
                 assert wanted["condition"] == "service_started"
-        self._environment(service)
+        assert "environment" not in service, "it would have to be set here"
         self.started[name] = self.children.start(name, *self.words(name, service["command"]))
 
     def _wait_healthy(self, name: str) -> None:
@@ -99,37 +99,31 @@ class ComposeRun:
         health = self.services[name]["healthcheck"]
         patience_s = _seconds(health["start_period"]) + health["retries"] * _seconds(health["interval"])
         end_s = time.monotonic() + patience_s
-        while not self.check(name):
+        while self.health.get(name, [1])[-1] != 0 and not self.check(name):
             if time.monotonic() >= end_s or self.started[name].code is not None:
                 raise ProcessError(name, f"is not healthy, checks gave {self.health[name]}")
             time.sleep(CHECK_S)
 
-    def _environment(self, service: Mapping[str, Any]) -> None:
-        """Children take over this process's environment."""
-        own = {**self.environment, **service.get("environment", {})}
-        os.environ.update({name: value.replace("/tmp/", f"{self.folder}/tmp/") for name, value in own.items()})
-
     def _here(self, name: str, word: str) -> str:
-        word = _PLACE.sub(self._loopback, word)
         for volume in self.services[name].get("volumes", []):
             source, target = volume.split(":")
             place = self.folder / "volumes" / source
             place.mkdir(parents=True, exist_ok=True)
             if word == target or word.startswith(f"{target}/"):
                 return str(place) + word[len(target) :]
-        return word.replace("7447)", f"{self._port('7447')})").replace("'127.0.0.1', 7447", "")
+        word = re.sub(rf"\b({'|'.join(self.services)}|0\.0\.0\.0)(?=:\d)", "127.0.0.1", word)
+        return re.sub(r"\d+", lambda match: str(self.ports.get(match[0], match[0])), word)
 
-    def _loopback(self, match: re.Match[str]) -> str:
-        host = match["host"]
-        assert host in self.services or host[0].isdigit(), f"{host} is no service"
-        return f"127.0.0.1:{self._port(match['port'])}"
 
-    def _port(self, inside: str) -> int:
-        if inside not in self.ports:
-            with socket.socket() as probe:
-                probe.bind(("127.0.0.1", 0))
-                self.ports[inside] = probe.getsockname()[1]
-        return self.ports[inside]
+def listened_on(services: Mapping[str, Any]) -> set[str]:
+    """Ports that services listen on."""
+    words = [word for service in services.values() for word in service["command"]]
+    return {match[1] for word in words if (match := re.fullmatch(r"(?:tcp/)?0\.0\.0\.0:(\d+)", word))}
+
+
+def free_port() -> int:
+    """A port of loopback that is free now."""
+    return int(free_endpoint().rsplit(":", 1)[1])
 
 
 def _seconds(text: str) -> float:

@@ -396,7 +396,7 @@ class World:
         never = self.verdict.explained
         if counted < never:
             self.verdict.problems.append(f"{never} never arrived, {counted} are counted")
-        if (declared := sum(lost for _, lost in self._server.marks().values())) > never:
+        if (declared := sum(lost for _, lost in self._server.marks().values())) != never:
             self.verdict.problems.append(f"{never} never arrived, {declared} were declared lost")
 
     # --- helpers -----------------------------------------------------------------------------------------------------

@@ -145,3 +145,19 @@ def test_a_stamp_ahead_of_the_wall_clock_is_refused_where_the_site_says_so():
 
 def test_an_empty_batch_passes_a_wall_clock():
     assert len(judge(batch(samples(0)), site=replace(SITE, clock="wall")).rows) == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "lost_before", "watermark", "expected"),
+    [
+        (8, 4, 3, (7, 4)),  # samples 4 to 7 will never come, and none after them
+        (8, 9, 3, (7, 4)),  # some of them came before
+        (8, 3, 3, (3, 0)),  # 4 is not declared: it may still come
+        (4, 3, 3, (3, 0)),
+        (2, 1, 3, (3, 0)),
+    ],
+)
+def test_an_empty_batch_declares_samples_lost_that_none_follow(first, lost_before, watermark, expected):
+    admission = admit(numbered(first, 0, lost_before=lost_before), watermark)
+    assert (admission.watermark, admission.lost) == expected
+    assert len(admission.batch.rows) == 0

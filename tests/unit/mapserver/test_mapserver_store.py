@@ -281,3 +281,15 @@ def test_a_replay_of_any_part_of_the_journal_after_a_snapshot_gives_the_same_bit
     assert same(again.grid, store.grid)
     assert same(again.grid, folded(rows))
     store.close(), again.close()
+
+
+def test_samples_at_the_end_of_a_spool_are_declared_lost_without_a_row(tmp_path):
+    store = open_store(tmp_path)
+    store.take([incoming(samples(3))])
+    (answer,) = store.take([incoming(samples(0), 8, lost_before=4)])
+    assert (answer.watermark, answer.row) == (7, 1)
+    assert store.counters["samples_lost"] == 4
+    store.close()
+    store = open_store(tmp_path)
+    assert store.machines()["a"] == {"spools": 1, "samples": 3, "lost": 4, "newest_ns": NOW_NS + 2 * 10**9}
+    store.close()

@@ -1,0 +1,163 @@
+"""Power cuts: the real spool and the real store, on a disk that loses or tears what was not synced."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from agents.spool import Spool, SpoolConfig
+from mapserver.config import ServerConfig
+from mapserver.grid import Grid
+from mapserver.past import History, history_rows
+from mapserver.store import Incoming, Store
+from protocol.codec import encode_batch
+from protocol.errors import StoreError
+from protocol.messages import Ack, SampleBatch
+from protocol.samples import content_hash, empty
+from tests.chaos import power_worker as work
+from tests.chaos.disk_model import Disk, Kind, Operation, read_trace
+from tests.chaos.disk_shim import FailingDisk, build
+from tests.chaos.outcome import Outcome
+from tests.chaos.scenario import Scenario
+
+CUTS = 2000  # of the whole suite, half of them of the spool
+STEPS = {"spool": 400, "store": 200}
+IN_MEMORY = Path("/dev/shm")
+Identity = tuple[int, int]  # spool_id, seq
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is there after a cut. contents: of each identity, as often as it is found."""
+
+    contents: dict[Identity, list[str]]
+    problem: str = ""
+
+
+def power(scenario: Scenario) -> Outcome:
+    """Cut the power of a spool and of a store at random moments of their work, and open them again."""
+    total = Outcome(scenario.fault)
+    scenario.folder.mkdir(parents=True)
+    if not (library := build(scenario.folder)):
+        return Outcome(scenario.fault, skipped="no C compiler for the shim")
+    for what in ("spool", "store"):
+        operations = trace(library, scenario.folder / what, what, scenario.seed)
+        cuts = max(100, round(CUTS / 2 * scenario.scale))
+        _add(total, cut(operations, what, cuts, scenario.rng, scenario.told.wait))
+    return total
+
+
+def trace(library: Path, folder: Path, what: str, seed: int, *options: str) -> list[Operation]:
+    """Operations of a worker on an empty folder."""
+    folder.mkdir(parents=True)
+    disk, log = folder / "disk", folder / "trace"
+    disk.mkdir()
+    env = {**os.environ, **FailingDisk(library, disk, folder / "fault").env, "CHAOS_TRACE": str(log)}
+    words = [sys.executable, "-m", "tests.chaos.power_worker", what, str(disk), str(seed), str(STEPS[what])]
+    subprocess.run([*words, *options], env=env, check=True, timeout=300)
+    return [operation for operation in read_trace(log) if not operation.name.endswith("-shm")]
+
+
+def cut(
+    operations: list[Operation], what: str, cuts: int, rng: random.Random, wait: Callable[[float], None] = lambda _: None
+) -> Outcome:
+    """Cut at random points; every cut is judged against what was promised before it."""
+    points = sorted(rng.choices(range(1, len(operations)), k=cuts))
+    outcome, disk, promises, done = Outcome("power", count=cuts), Disk(), "", 0
+    for point in points:
+        for operation in operations[done:point]:
+            if operation.name == work.PROMISES:
+                promises += operation.data.decode() if operation.kind == Kind.WRITE else ""
+            else:
+                disk.do(operation)
+        done = point
+        wait(0)
+        folder = Path(tempfile.mkdtemp(prefix="chaos-", dir=IN_MEMORY if IN_MEMORY.is_dir() else None))
+        try:
+            disk.cut(rng, folder)
+            _judge(outcome, promises, LOOK[what](folder))
+        finally:
+            shutil.rmtree(folder)
+    return outcome
+
+
+def _judge(outcome: Outcome, promises: str, found: Found) -> None:
+    promised = _promised(promises)
+    outcome.recorded += len(promised)
+    kept = sum(content in found.contents.get(identity, ()) for identity, content in promised.items())
+    outcome.merged += kept
+    outcome.lost += len(promised) - kept
+    outcome.double += sum(len(contents) - 1 for contents in found.contents.values())
+    if found.problem and len(outcome.problems) < 5:
+        outcome.problems.append(found.problem)
+
+
+def _promised(promises: str) -> dict[Identity, str]:
+    promised: dict[Identity, str] = {}
+    for sign, spool_id, seq, *content in (line.split() for line in promises.splitlines()):
+        if sign == "+":
+            promised[int(spool_id, 16), int(seq)] = content[0]
+        else:
+            promised = {at: c for at, c in promised.items() if at[0] != int(spool_id, 16) or at[1] > int(seq)}
+    return promised
+
+
+def _look_at_spool(folder: Path) -> Found:
+    """Open what is left, and take everything out of it."""
+    contents: dict[Identity, list[str]] = {}
+    try:
+        spool = Spool(folder / work.SPOOL_FILE, SpoolConfig())
+    except StoreError as error:
+        return Found({}, f"spool does not open: {error}")
+    while head := spool.head(1000):
+        for i, row in enumerate(head.rows):
+            contents.setdefault((head.spool_id, head.first_seq + i), []).append(content_hash(row))
+        spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
+    is_settled = spool.is_settled()
+    spool.close()
+    return Found(contents, "" if is_settled else "spool does not settle")
+
+
+def _look_at_store(folder: Path) -> Found:
+    """Open what is left, read it, fold it anew, and send one more batch."""
+    contents: dict[Identity, list[str]] = {}
+    config = ServerConfig()
+    try:
+        store = Store(folder / work.STORE_FOLDER, work.SITE, config, lambda: 10**18)
+    except StoreError as error:
+        return Found({}, f"store does not open: {error}")
+    refolded = Grid(work.SITE.cell_m, config.fold)
+    for row in history_rows(History.of(store._journal)):
+        refolded.fold(row.rows, row.machine)
+        for i, sample in enumerate(row.rows):
+            contents.setdefault((row.spool_id, row.first_seq + i), []).append(content_hash(sample))
+    problem = "" if refolded.folded == store.grid.folded else "grid and journal differ"
+    watermark = store._journal.mark(work.MACHINE, work.SPOOL_ID).seq
+    rows = empty(1)
+    rows["stamp_ns"] = 1
+    payload = encode_batch(SampleBatch(work.MACHINE, work.SPOOL_ID, watermark + 1, rows, work.SITE.frame, 0))
+    if not isinstance(store.take([Incoming(work.MACHINE, payload)])[0], Ack):
+        problem = "store takes nothing more"
+    store.close()
+    return Found(contents, problem)
+
+
+LOOK = {"spool": _look_at_spool, "store": _look_at_store}
+
+
+def _add(total: Outcome, part: Outcome) -> None:
+    for name in ("count", "recorded", "merged", "lost", "double"):
+        setattr(total, name, getattr(total, name) + getattr(part, name))
+    total.problems += part.problems
+
+
+def sums(outcomes: Iterable[Outcome], name: str) -> int:
+    """Sum of one count."""
+    return sum(getattr(outcome, name) for outcome in outcomes)

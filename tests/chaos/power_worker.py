@@ -1,0 +1,105 @@
+"""`python -m tests.chaos.power_worker spool|store FOLDER SEED`: work on one file store, saying what is promised.
+
+Runs under the disk shim. FOLDER/promises gets a line before and after each promise, which the shim puts in order with
+the writes: `+ <spool_id> <seq> <hash>` is on disk, `- <spool_id> <seq>` may be deleted from here on.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from agents.spool import Spool, SpoolConfig
+from mapserver.config import ServerConfig
+from mapserver.store import Incoming, Store
+from protocol.arrays import Table
+from protocol.codec import encode_batch
+from protocol.errors import StoreError
+from protocol.messages import Ack, SampleBatch
+from protocol.samples import content_hash, empty
+from protocol.site import SiteConfig
+
+PROMISES, SPOOL_FILE, STORE_FOLDER = "promises", "spool.db", "store"
+MACHINE, SPOOL_ID = "loader-1", 7
+SITE = SiteConfig(name="paper", origin_lat_deg=49.01, origin_lon_deg=8.4)
+
+
+class Promises:
+    """The file of promises; it is not part of what the power cut hits."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = (folder / PROMISES).open("ab", buffering=0)
+
+    def kept(self, spool_id: int, first_seq: int, rows: Table) -> None:
+        """Say that samples are on disk."""
+        self._write(f"+ {spool_id:x} {first_seq + i} {content_hash(row)}\n" for i, row in enumerate(rows))
+
+    def given_up(self, spool_id: int, upto: int) -> None:
+        """Say that samples are going to be deleted."""
+        self._write([f"- {spool_id:x} {upto}\n"])
+
+    def _write(self, lines: Iterator[str] | list[str]) -> None:
+        self._file.write("".join(lines).encode())
+
+
+def drive(rng: np.random.Generator, n: int, first_ns: int) -> Table:
+    """Samples that no other batch has."""
+    rows = empty(n)
+    rows["stamp_ns"] = first_ns + np.arange(n)
+    rows["x_m"], rows["y_m"] = rng.uniform(0, 60, (2, n))
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.5
+    rows["distance_m"], rows["c_rr"], rows["c_rr_var"] = 0.5, rng.uniform(0.01, 0.2, n), 1e-4
+    return rows
+
+
+def use_spool(folder: Path, seed: int, steps: int, *, careless: bool = False) -> None:
+    """Record and acknowledge by chance. careless: with the setting that EVIDENCE says loses rows."""
+    rng, promises, chance = np.random.default_rng(seed), Promises(folder), random.Random(seed)
+    spool = _open_spool(folder, careless=careless)
+    for step in range(steps):
+        with suppress(StoreError):
+            rows = drive(rng, chance.randint(1, 12), step * 1000)
+            promises.kept(spool.spool_id, spool.record(rows), rows)
+        if chance.random() < 0.3 and (head := spool.head(chance.randint(1, 30))):
+            promises.given_up(head.spool_id, head.first_seq + len(head.rows) - 1)
+            spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
+        if chance.random() < 0.02:
+            spool.close()
+            spool = _open_spool(folder, careless=careless)
+
+
+def _open_spool(folder: Path, *, careless: bool) -> Spool:
+    spool = Spool(folder / SPOOL_FILE, SpoolConfig())
+    if careless:
+        spool._db.execute("PRAGMA synchronous=NORMAL")
+    return spool
+
+
+def use_store(folder: Path, seed: int, steps: int, *, careless: bool = False) -> None:
+    """Send batches, some twice, with a snapshot now and then. careless: as above."""
+    rng, promises, chance = np.random.default_rng(seed), Promises(folder), random.Random(seed)
+    store = Store(folder / STORE_FOLDER, SITE, ServerConfig(), lambda: 10**18)
+    if careless:
+        store._journal._db.execute("PRAGMA synchronous=NORMAL")
+    waiting, done = empty(), 0
+    for step in range(steps):
+        if chance.random() > 0.2:
+            waiting = np.concatenate([waiting, drive(rng, chance.randint(1, 40), 1 + step * 1000)])
+        payload = encode_batch(SampleBatch(MACHINE, SPOOL_ID, done + 1, waiting, SITE.frame, 0))
+        answers = store.take([Incoming(MACHINE, payload)] * chance.randint(1, 2))
+        if isinstance(answers[0], Ack) and len(waiting):
+            promises.kept(SPOOL_ID, done + 1, waiting)
+            waiting, done = empty(), done + len(waiting)
+        if chance.random() < 0.05:
+            with suppress(OSError):
+                store.save_snapshot()
+
+
+if __name__ == "__main__":
+    WORK = {"spool": use_spool, "store": use_store}
+    WORK[sys.argv[1]](Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]), careless="careless" in sys.argv)

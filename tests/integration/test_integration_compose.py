@@ -1,0 +1,64 @@
+"""compose.yaml does what it says: its very commands run as local processes, and machines draw a map."""
+
+from __future__ import annotations
+
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from sitegrid import connect
+from sitegrid.processes import Children, wait_until
+
+compose_run = pytest.importorskip("compose_run", reason="needs ruamel.yaml, which comes with check-jsonschema")
+pytestmark = pytest.mark.processes
+SERVED_S = 60.0
+
+
+def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
+    tmp_path: Path, children: Children, root: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(root)
+    for name, value in compose_run.image_environment(root / "Dockerfile").items():
+        monkeypatch.setenv(name, value.replace("/tmp/", f"{tmp_path}/tmp/"))
+    services = compose_run.load(root / "compose.yaml")
+    run = compose_run.ComposeRun(services, tmp_path, children)
+    run.up()
+    order = list(run.started)
+    assert order[:2] == ["router", "server"]
+    assert order.index("sim") > max(order.index(f"loader-{i}") for i in (1, 2, 3))
+    assert sorted(order) == sorted(services)
+    with connect(f"tcp/127.0.0.1:{run.ports['7447']}", "paper") as client:
+        machines = {"loader-1", "loader-2", "loader-3"}
+        wait_until(lambda: set(client.info()["machines"]) == machines, SERVED_S, "samples of every machine merged")
+        assert client.info()["samples_merged"] > 0
+    with urllib.request.urlopen(f"http://127.0.0.1:{run.ports['9464']}/metrics", timeout=10) as answer:
+        text = answer.read().decode()
+    assert all(f'sitegrid_machine_samples_total{{machine="{name}"}}' in text for name in machines)
+    checked = [name for name, service in services.items() if "healthcheck" in service]
+    assert checked == ["router", "server"]
+    assert all(run.check(name) for name in checked)
+    assert {name: child.code for name, child in run.started.items()} == dict.fromkeys(services), "none has ended"
+    assert set(run.down().values()) == {0}
+
+
+def test_a_health_check_fails_without_its_service(
+    tmp_path: Path, children: Children, root: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(root)
+    run = compose_run.ComposeRun(compose_run.load(root / "compose.yaml"), tmp_path, children)
+    assert not run.check("router")
+    assert not run.check("server")
+
+
+def test_a_service_that_ends_at_once_is_not_waited_for(
+    tmp_path: Path, children: Children, root: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(root)
+    services = compose_run.load(root / "compose.yaml")
+    services["router"]["command"].remove("--insecure")
+    services["router"]["command"][2] = "tcp/256.0.0.1:7447"
+    run = compose_run.ComposeRun(services, tmp_path, children)
+    with pytest.raises(Exception, match="router: is not healthy"):
+        run.up()
+    assert list(run.started) == ["router"]

@@ -1,0 +1,207 @@
+"""Soak: an hour of a site at work, compressed in time, against a real map server; its memory has to stay flat.
+
+python -m tests.soak --minutes 60 --speed 30
+
+Machines drive laps and send batches as agents do, stamped as in that hour; visitors ask for the map all along.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from protocol import keys
+from protocol.arrays import Table
+from protocol.codec import decode_reply, encode_batch
+from protocol.errors import QueryError
+from protocol.messages import Ack, SampleBatch
+from protocol.samples import SAMPLE_DTYPE
+from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.site import SiteConfig, load_site
+from sitegrid.client import Client, connect
+from sitegrid.processes import Child, Children
+
+START_NS = 1_767_225_600_000_000_000
+SITE_TOML = 'name = "soak"\norigin_lat_deg = 49.01\norigin_lon_deg = 8.4\n'
+BATCH_S, RATE_HZ = 4.0, 2.5  # of a machine: one batch so often, so many samples a second (5 m/s, one each 2 m)
+ASK_S, PAST_S, LOOK_S = 10.0, 300.0, 60.0  # site time between two questions, two about the past, two looks
+MOST_GROWTH_PCT = 5.0
+READY_S = 60.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """The site after so many minutes, and resident memory [MiB]."""
+
+    minute: float
+    samples: int
+    server_mib: float
+    router_mib: float
+
+
+@dataclass(frozen=True)
+class Soak:
+    """How a soak went. late_s: by how much the machines fell behind the pace, of site time."""
+
+    looks: tuple[Look, ...]
+    sent: int
+    late_s: float
+
+    def growth_pct(self, first: float = 0.5) -> float:
+        """Growth of the server from a share of the run to its end; medians of the tenths before them."""
+        memory = [look.server_mib for look in self.looks]
+        span = max(1, len(memory) // 10)
+        middle = max(span, round(first * len(memory)))
+        return 100 * (float(np.median(memory[-span:]) / np.median(memory[middle - span : middle])) - 1)
+
+
+class Machine:
+    """One machine on laps of its own around the site; positions err slowly, as those of GPS do."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        self.name = name
+        self._draw = np.random.default_rng(seed)
+        self._centre_m, self._radius_m = self._draw.uniform(80, 220, 2), self._draw.uniform(20, 70)
+        self._spool_id, self._seq = seed + 1, 0
+        self._error_m = np.zeros(2)
+
+    def drive(self, from_s: float, frame: str) -> bytes:
+        """The batch of the next BATCH_S."""
+        rows = self._samples(from_s + np.arange(round(BATCH_S * RATE_HZ)) / RATE_HZ)
+        batch = SampleBatch(self.name, self._spool_id, self._seq + 1, rows, frame)
+        self._seq += len(rows)
+        return encode_batch(batch)
+
+    def _samples(self, at_s: np.ndarray) -> Table:
+        self._error_m = 0.9 * self._error_m + self._draw.normal(0, 0.4, 2)
+        angle = at_s * 5.0 / self._radius_m
+        rows = np.zeros(len(at_s), SAMPLE_DTYPE)
+        rows["stamp_ns"] = START_NS + np.round(at_s * 1e9).astype(np.int64)
+        rows["x_m"] = self._centre_m[0] + self._radius_m * np.cos(angle) + self._error_m[0]
+        rows["y_m"] = self._centre_m[1] + self._radius_m * np.sin(angle) + self._error_m[1]
+        rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0
+        rows["heading_rad"] = np.mod(angle + math.pi / 2, 2 * math.pi)
+        rows["speed_mps"], rows["distance_m"] = 5.0, 5.0 / RATE_HZ
+        rows["c_rr"] = 0.03 + 0.02 * (rows["x_m"] > 150) + self._draw.normal(0, 0.002, len(at_s))
+        rows["c_rr_var"] = rows["grade_var"] = 1e-4
+        return rows
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run a soak and print its table; 1 where the memory grows."""
+    parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=60.0, help="site time (default %(default)s)")
+    parser.add_argument("--speed", type=float, default=30.0, help="times real time (default %(default)s)")
+    parser.add_argument("--machines", type=int, default=10, help="default %(default)s")
+    parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
+    arguments = parser.parse_args(words)
+    with tempfile.TemporaryDirectory() as folder:
+        result = soak(Path(folder), arguments.minutes, arguments.speed, arguments.machines)
+    growth_pct = result.growth_pct()
+    report(result, growth_pct)
+    if arguments.json:
+        last = result.looks[-1]
+        print(json.dumps({"samples": last.samples, "server_mib": last.server_mib, "growth_pct": round(growth_pct, 2)}))
+    return 0 if growth_pct < MOST_GROWTH_PCT else 1
+
+
+def report(result: Soak, growth_pct: float) -> None:
+    """Print the table."""
+    print(" minute   samples   server MiB   router MiB")
+    step = max(1, len(result.looks) // 12)
+    for look in [*result.looks[step - 1 :: step]]:
+        print(f"{look.minute:7.0f} {look.samples:9d} {look.server_mib:12.1f} {look.router_mib:12.1f}")
+    print(f"second half: {growth_pct:+.1f} % of resident memory; sent {result.sent}, late {result.late_s:.0f} s")
+
+
+def soak(folder: Path, minutes: float, speed: float, machines: int) -> Soak:
+    """Run router and map server, let machines drive and visitors ask; returns what was seen each minute."""
+    (folder / "site.toml").write_text(SITE_TOML)
+    site, endpoint = load_site(folder / "site.toml"), free_endpoint()
+    with Children(folder) as children:
+        router = children.start("router", "router", "--listen", endpoint)
+        router.expect("ready", READY_S)
+        files = ("--site-file", folder / "site.toml", "--store", folder / "store")
+        server = children.start("server", "server", "--endpoint", endpoint, *files)
+        server.expect("ready", READY_S)
+        over = threading.Event()
+        asker = threading.Thread(target=_ask, args=(endpoint, speed, over))
+        asker.start()
+        try:
+            return _drive(site, endpoint, (server, router), (minutes * 60, speed, machines))
+        finally:
+            over.set()
+            asker.join()
+
+
+def _drive(site: SiteConfig, endpoint: str, watched: tuple[Child, Child], run: tuple[float, float, int]) -> Soak:
+    """Send what all machines drive, one batch after the other, and look at the processes every minute of the site."""
+    end_s, speed, count = run
+    machines = [Machine(f"machine-{i}", seed=i) for i in range(count)]
+    session = open_session(SessionConfig(endpoint))
+    looks: list[Look] = []
+    begin_s, sent, late_s = time.monotonic(), 0, 0.0
+    with connect(endpoint, site.name) as client:
+        for at_s in np.arange(0.0, end_s, BATCH_S):
+            early_s = begin_s + at_s / speed - time.monotonic()
+            late_s = max(late_s, -early_s * speed)
+            time.sleep(max(0.0, early_s))
+            for machine in machines:
+                _send(session, keys.ingest(site.name, machine.name), machine.drive(at_s, site.frame))
+            sent += len(machines) * round(BATCH_S * RATE_HZ)
+            if at_s + BATCH_S >= LOOK_S * (len(looks) + 1):
+                looks.append(_look(client, watched, (at_s + BATCH_S) / 60))
+    session.close()  # type: ignore[no-untyped-call]
+    return Soak(tuple(looks), sent, late_s)
+
+
+def _send(session: zenoh.Session, key: str, payload: bytes) -> None:
+    """Send until it is acknowledged."""
+    while True:
+        for reply in session.get(key, payload=payload, timeout=10.0):
+            if reply.ok is not None and isinstance(decode_reply(reply.ok.payload.to_bytes()), Ack):
+                return
+
+
+def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
+    """Ask as a live map does, and from time to time for the past."""
+    with connect(endpoint, "soak") as client:
+        next_past_s = PAST_S
+        begin_s = time.monotonic()
+        while not over.wait(ASK_S / speed):
+            client.region((0, 0, 300, 300), ["resistance", "grade", "confidence"])
+            client.point(150, 150)
+            client.machines()
+            if (at_s := (time.monotonic() - begin_s) * speed) >= next_past_s:
+                next_past_s = at_s + PAST_S
+                client.history(150, 150, ["resistance"], span_s=300)
+                try:
+                    client.point(120, 0, as_of_ns=START_NS + round(at_s * 0.5e9))
+                except QueryError as error:
+                    print(error, file=sys.stderr)
+
+
+def _look(client: Client, watched: tuple[Child, Child], minute: float) -> Look:
+    server_mib, router_mib = (_resident_mib(child.pid) for child in watched)
+    return Look(minute, client.info()["samples_merged"], server_mib, router_mib)
+
+
+def _resident_mib(pid: int) -> float:
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+if __name__ == "__main__":
+    sys.exit(main())
