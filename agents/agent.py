@@ -20,7 +20,7 @@ from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Owner, Presence
 from agents.spool import Spool
-from agents.uplink import Uplink, UplinkState, linger
+from agents.uplink import linger, Sign, Uplink, UplinkState
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine import MachineConfig
@@ -53,6 +53,7 @@ class Agent:
         *,
         withhold: bool = False,
         owner: Owner | None = None,
+        sign: Sign | None = None,
     ) -> None:
         self._config = config
         self._machine, self._calibration_file = machine.name, places.calibration
@@ -63,7 +64,7 @@ class Agent:
         self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
         self._presence = Presence(session, site.name, machine.name, owner)
         state = UplinkState(machine.name, site.frame, self._spool, config.uplink)
-        self._uplink = Uplink(session, site.name, machine.name, state, config.uplink.timeout_s)
+        self._uplink = Uplink(session, site.name, machine.name, state, config.uplink.timeout_s, sign)
         self._unsaved, self._given_up, self._spool_problem = empty(), 0, ""
         self._readings = 0
         self._samples = 0

@@ -194,11 +194,24 @@ class UplinkState:
         return float(pause_s * self._rng.uniform(0.5, 1.0))
 
 
+Sign = Callable[[str, bytes], bytes]  # key expression and payload to signature
+
+
 class Uplink:
     """Runs an UplinkState over Zenoh on a thread of its own."""
 
-    def __init__(self, session: zenoh.Session, site: str, machine: str, state: UplinkState, timeout_s: float) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        site: str,
+        machine: str,
+        state: UplinkState,
+        timeout_s: float,
+        sign: Sign | None = None,
+    ) -> None:
+        """sign: makes the signature that goes beside each batch."""
         self.state = state
+        self._sign = sign
         self._session = session
         self._key = keys.ingest(site, machine)
         self._timeout_s = timeout_s
@@ -239,7 +252,11 @@ class Uplink:
     def _ask(self, payload: bytes) -> Ack | Refused | None:
         try:
             replies = self._session.get(
-                self._key, payload=payload, timeout=self._timeout_s, cancellation_token=self._cancel
+                self._key,
+                payload=payload,
+                attachment=self._sign(self._key, payload) if self._sign else None,
+                timeout=self._timeout_s,
+                cancellation_token=self._cancel,
             )
             for reply in replies:
                 if reply.ok is not None:

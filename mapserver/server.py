@@ -16,7 +16,7 @@ import zenoh
 from mapserver.answers import Answers, reads_past
 from mapserver.config import ServerConfig
 from mapserver.keeper import Keeper
-from mapserver.store import JOURNAL_FILE, Incoming
+from mapserver.store import Incoming, JOURNAL_FILE, Verify
 from mapserver.writer import Writer
 from protocol import keys
 from protocol.codec import encode_reply
@@ -39,8 +39,10 @@ class Server:
         site: SiteConfig,
         config: ServerConfig,
         now_ns: Callable[[], int],
+        verify: Verify | None = None,
     ) -> None:
-        self._writer = Writer(folder, site, config, now_ns)
+        """verify: of signed batches, see Store; without it signatures are not asked for."""
+        self._writer = Writer(folder, site, config, now_ns, verify)
         self._changed = session.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
@@ -90,7 +92,8 @@ class Server:
                 except zenoh.ZError as error:  # the asker is gone; it will ask again
                     log.info("reply failed machine=%s error=%r", machine, str(error))
 
-        self._writer.submit(Incoming(machine, payload), reply)
+        signature = query.attachment.to_bytes() if query.attachment else b""
+        self._writer.submit(Incoming(machine, payload, signature), reply)
 
     def _on_query(self, query: zenoh.Query) -> None:
         name, parameters = _asked(query)

@@ -20,6 +20,7 @@ from mapserver.grid import Grid
 from mapserver.ingest import Admission, GapError
 from mapserver.journal import Journal, Wanted
 from mapserver.past import History, history_rows
+from protocol import keys
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.messages import Ack, Refused, SampleBatch
 from protocol.site import SiteConfig
@@ -28,19 +29,32 @@ JOURNAL_FILE = "journal.db"
 LOCK_FILE = "lock"
 
 
+Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
+
+
 @dataclass(frozen=True)
 class Incoming:
-    """A batch as it came in: the machine of its key, and its bytes."""
+    """A batch as it came in: the machine of its key, its bytes, and the signature beside it, if there is one."""
 
     machine: str
     payload: bytes
+    signature: bytes = b""
 
 
 class Store:
     """Journal, grid, watermarks and counters of one site."""
 
-    def __init__(self, folder: Path, site: SiteConfig, config: ServerConfig, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        site: SiteConfig,
+        config: ServerConfig,
+        now_ns: Callable[[], int],
+        verify: Verify | None = None,
+    ) -> None:
+        """verify: raises MessageError unless a batch is signed by its machine."""
         self.site = site
+        self._verify = verify
         self.config = config
         self.counters: Counter[str] = Counter()
         self.newest_ns = 0
@@ -163,6 +177,8 @@ class Store:
 
     def _take_one(self, incoming: Incoming) -> tuple[Ack | Refused, Admission | None]:
         try:
+            if self._verify:
+                self._check_signature(self._verify, incoming)
             batch = ingest.parse(incoming.payload, incoming.machine, self.site, self._now_ns)
             admission = ingest.admit(batch, self._journal.mark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
@@ -173,6 +189,12 @@ class Store:
         if admission.lost and not new:
             self._journal.declare_lost(admission)
         return Ack(admission.watermark, row, admission.trimmed), admission
+
+    def _check_signature(self, verify: Verify, incoming: Incoming) -> None:
+        if not incoming.machine:
+            raise MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
+        key = keys.ingest(self.site.name, incoming.machine)
+        verify(incoming.machine, key, incoming.payload, incoming.signature)
 
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count what became of a batch, once it is certain."""

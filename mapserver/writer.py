@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mapserver.config import ServerConfig
-from mapserver.store import Incoming, Store
+from mapserver.store import Incoming, Store, Verify
 from protocol.errors import QueryError, Refusal
 from protocol.messages import Ack, Refused
 from protocol.site import SiteConfig
@@ -37,9 +37,16 @@ class Writer:
     `submit` and `read` may be called from any thread; both return at once or wait for the owner, never touch the store.
     """
 
-    def __init__(self, folder: Path, site: SiteConfig, config: ServerConfig, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        site: SiteConfig,
+        config: ServerConfig,
+        now_ns: Callable[[], int],
+        verify: Verify | None = None,
+    ) -> None:
         self._config = config.store
-        self._store = Store(folder, site, config, now_ns)
+        self._store = Store(folder, site, config, now_ns, verify)
         self._batches: queue.Queue[tuple[Incoming, Reply] | _Read | None] = queue.Queue()
         self._waiting = threading.Semaphore(config.store.queue_batches)
         self._overloaded = 0

@@ -148,6 +148,9 @@ def _add_server(nouns: Nouns, common: Parent, network: Parent) -> None:
     server.add_argument("--store", type=Path, required=True, help="folder of the journal and its snapshots")
     server.add_argument("--config", type=Path, help="options (config/server.toml)")
     server.add_argument(
+        "--signed", type=Path, metavar="KEYS", help="take only batches that are signed, by the register in this folder"
+    )
+    server.add_argument(
         "--metrics",
         type=_address,
         nargs="?",

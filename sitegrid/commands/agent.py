@@ -6,6 +6,7 @@ import dataclasses
 import time
 from argparse import Namespace
 from contextlib import ExitStack
+from pathlib import Path
 
 import zenoh
 
@@ -15,6 +16,8 @@ from agents.drivers import Driver
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
 from agents.presence import Owner, find_namesake, this_process
+from agents.uplink import Sign
+from protocol.credentials import SIGNING_FILE
 from protocol.errors import ConfigError, LinkError
 from protocol.logfolder import LogFolder, open_log
 from protocol.machine import MachineConfig
@@ -35,7 +38,16 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
-        agent = Agent(session, site, machine, config, _places(arguments), withhold=arguments.withhold, owner=owner)
+        agent = Agent(
+            session,
+            site,
+            machine,
+            config,
+            _places(arguments),
+            withhold=arguments.withhold,
+            owner=owner,
+            sign=_signer(arguments.keys),
+        )
         opened.callback(agent.close)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
         report = agent.run(_driver(arguments, log, session, site, machine), stop.is_set, wait=stop.wait)
@@ -58,6 +70,16 @@ def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) 
         problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"
         raise LinkError(endpoint, problem)
     return owner
+
+
+def _signer(keys: Path | None) -> Sign | None:
+    """What signs the machine's batches, if its folder of keys has a signing key."""
+    file = keys / SIGNING_FILE if keys else None
+    if not file or not file.is_file():
+        return None
+    from protocol.signing import Signer  # imported here: only machines with keys need `cryptography`
+
+    return Signer(file.read_bytes()).sign
 
 
 def _places(arguments: Namespace) -> Places:

@@ -12,11 +12,13 @@ import zenoh
 from mapserver.config import ServerConfig
 from mapserver.exporter import Exporter, HealthEar, text_of
 from mapserver.server import Server
+from mapserver.store import Verify
 from protocol.config import from_table, load_toml
 from protocol.session import open_session
 from protocol.site import load_site
 from protocol.version import package_version
 from sitegrid.process import say, stop_flag
+from sitegrid.register import load_register
 from sitegrid.security import join
 
 
@@ -29,7 +31,9 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         session = open_session(join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name))
         opened.callback(session.close)
-        server = opened.enter_context(closing(Server(session, arguments.store, site, config, time.time_ns)))
+        server = opened.enter_context(
+            closing(Server(session, arguments.store, site, config, time.time_ns, _verifier(arguments.signed)))
+        )
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:
             ready["metrics"] = _export(opened, session, server, site.name, arguments)
@@ -38,6 +42,15 @@ def run(arguments: Namespace) -> int:
             if server.failed:
                 break
     return 1 if server.failed else 0
+
+
+def _verifier(keys: Path | None) -> Verify | None:
+    """What checks signatures by the register in a folder of keys, as it is now."""
+    if keys is None:
+        return None
+    from protocol.signing import Verifier  # imported here: only a server that asks for signatures needs `cryptography`
+
+    return Verifier(load_register(keys).signing_keys()).check
 
 
 def _export(opened: ExitStack, session: zenoh.Session, server: Server, site: str, arguments: Namespace) -> str:

@@ -24,7 +24,7 @@ from protocol.machine import plain_lines
 from protocol.session import free_endpoint
 from protocol.site import load_site
 from tests.chaos.outcome import Outcome, Span, Told, longest_pause
-from tests.chaos.recordings import SECONDS, SPEED, Recordings
+from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings
 
 READY_S = 40.0
 RESUME_S = 60.0
@@ -101,7 +101,7 @@ class Site:
         *,
         clock: str = "data",
         server_toml: str = "",
-        first_ns: int = HOUR_S * 10**9,
+        first_ns: int = START_NS,
     ) -> None:
         for name in ("log", "spool", "audit", "store"):
             (folder / name).mkdir(parents=True)
@@ -275,8 +275,8 @@ class Site:
         if role == SERVER:
             files = ("--store", str(self.folder / "store"), "--config", str(self.folder / "server.toml"))
             return ["server", *where, *site, *files]
-        start_ns = self._first_ns + self._starts * SECONDS * 10**9
-        manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, start_ns, idle=idle)
+        first_ns = self._first_ns + self._starts * SECONDS * 10**9
+        manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, first_ns, idle=idle)
         replay = ("--driver", "replay", "--log", manifest, "--data", self._recordings.data(role), "--speed", SPEED)
         files = ("--spool", self.folder / "spool" / f"{role}.db", "--audit", self.folder / "audit" / role)
         config = ("--config", self._recordings.agent_file)

@@ -49,9 +49,14 @@ class FailingDisk:
             os.pwrite(file.fileno(), _CONTROL.pack(error, after, times), 0)
 
     @property
+    def left(self) -> int:
+        """How many operations of those asked for have not failed yet."""
+        return int(_CONTROL.unpack(self._control.read_bytes())[2])
+
+    @property
     def failed(self) -> int:
-        """How many operations have failed since the last `set`."""
-        return _ALL - _CONTROL.unpack(self._control.read_bytes())[2]
+        """How many operations have failed since the last `set` without a number."""
+        return _ALL - self.left
 
     @contextmanager
     def failing(self, error: DiskError) -> Iterator[None]:

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,7 +50,7 @@ def power(scenario: Scenario) -> Outcome:
     for what in ("spool", "store"):
         operations = trace(library, scenario.folder / what, what, scenario.seed)
         cuts = max(100, round(CUTS / 2 * scenario.scale))
-        _add(total, cut(operations, what, cuts, scenario.rng, scenario.told.wait))
+        add(total, cut(operations, what, cuts, scenario.rng, scenario.told.wait))
     return total
 
 
@@ -82,13 +82,14 @@ def cut(
         folder = Path(tempfile.mkdtemp(prefix="chaos-", dir=IN_MEMORY if IN_MEMORY.is_dir() else None))
         try:
             disk.cut(rng, folder)
-            _judge(outcome, promises, LOOK[what](folder))
+            judge(outcome, promises, LOOK[what](folder))
         finally:
             shutil.rmtree(folder)
     return outcome
 
 
-def _judge(outcome: Outcome, promises: str, found: Found) -> None:
+def judge(outcome: Outcome, promises: str, found: Found) -> None:
+    """Compare what is there with what was promised, and add to the counts."""
     promised = _promised(promises)
     outcome.recorded += len(promised)
     kept = sum(content in found.contents.get(identity, ()) for identity, content in promised.items())
@@ -152,12 +153,8 @@ def _look_at_store(folder: Path) -> Found:
 LOOK = {"spool": _look_at_spool, "store": _look_at_store}
 
 
-def _add(total: Outcome, part: Outcome) -> None:
+def add(total: Outcome, part: Outcome) -> None:
     for name in ("count", "recorded", "merged", "lost", "double"):
         setattr(total, name, getattr(total, name) + getattr(part, name))
     total.problems += part.problems
 
-
-def sums(outcomes: Iterable[Outcome], name: str) -> int:
-    """Sum of one count."""
-    return sum(getattr(outcome, name) for outcome in outcomes)

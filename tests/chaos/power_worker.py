@@ -1,12 +1,13 @@
-"""`python -m tests.chaos.power_worker spool|store FOLDER SEED`: work on one file store, saying what is promised.
+"""`python -m tests.chaos.power_worker spool|store FOLDER SEED STEPS`: work on one file store, saying what is promised.
 
-Runs under the disk shim. FOLDER/promises gets a line before and after each promise, which the shim puts in order with
-the writes: `+ <spool_id> <seq> <hash>` is on disk, `- <spool_id> <seq>` may be deleted from here on.
+Runs under the disk shim. FOLDER/promises gets a line after each promise, which the shim puts in order with the writes:
+`+ <spool_id> <seq> <hash>` is on disk, `- <spool_id> <seq>` says that samples up to there may be deleted from here on.
 """
 
 from __future__ import annotations
 
 import random
+import sqlite3
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -30,10 +31,14 @@ SITE = SiteConfig(name="paper", origin_lat_deg=49.01, origin_lon_deg=8.4)
 
 
 class Promises:
-    """The file of promises; it is not part of what the power cut hits."""
+    """The file of promises; it is not part of what is hit."""
 
-    def __init__(self, folder: Path) -> None:
-        self._file = (folder / PROMISES).open("ab", buffering=0)
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("ab", buffering=0)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
     def kept(self, spool_id: int, first_seq: int, rows: Table) -> None:
         """Say that samples are on disk."""
@@ -57,20 +62,42 @@ def drive(rng: np.random.Generator, n: int, first_ns: int) -> Table:
     return rows
 
 
-def use_spool(folder: Path, seed: int, steps: int, *, careless: bool = False) -> None:
+def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
     """Record and acknowledge by chance. careless: with the setting that EVIDENCE says loses rows."""
-    rng, promises, chance = np.random.default_rng(seed), Promises(folder), random.Random(seed)
-    spool = _open_spool(folder, careless=careless)
+    rng, chance, spool = np.random.default_rng(seed), random.Random(seed), None
     for step in range(steps):
-        with suppress(StoreError):
+        with suppress(StoreError, sqlite3.Error):  # a disk that fails: nothing was promised
+            spool = spool or _open_spool(folder, careless=careless)
             rows = drive(rng, chance.randint(1, 12), step * 1000)
             promises.kept(spool.spool_id, spool.record(rows), rows)
-        if chance.random() < 0.3 and (head := spool.head(chance.randint(1, 30))):
-            promises.given_up(head.spool_id, head.first_seq + len(head.rows) - 1)
-            spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
-        if chance.random() < 0.02:
+            if chance.random() < 0.3 and (head := spool.head(chance.randint(1, 30))):
+                promises.given_up(head.spool_id, head.first_seq + len(head.rows) - 1)
+                spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
+        if spool and chance.random() < 0.02:
             spool.close()
-            spool = _open_spool(folder, careless=careless)
+            spool = None
+    if spool:
+        spool._db.close()  # as a kill leaves it
+
+
+def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
+    """Send batches, some twice, with a snapshot now and then. careless: as above."""
+    rng, chance, store = np.random.default_rng(seed), random.Random(seed), None
+    waiting, done = empty(), 0
+    for step in range(steps):
+        if chance.random() > 0.2:
+            waiting = np.concatenate([waiting, drive(rng, chance.randint(1, 40), 1 + step * 1000)])
+        with suppress(StoreError, sqlite3.Error, OSError):
+            store = store or _open_store(folder, careless=careless)
+            payload = encode_batch(SampleBatch(MACHINE, SPOOL_ID, done + 1, waiting, SITE.frame, 0))
+            answers = store.take([Incoming(MACHINE, payload)] * chance.randint(1, 2))
+            if isinstance(answers[0], Ack) and len(waiting):
+                promises.kept(SPOOL_ID, done + 1, waiting)
+                waiting, done = empty(), done + len(waiting)
+            if chance.random() < 0.05:
+                store.save_snapshot()
+    if store:
+        store._journal._db.close()
 
 
 def _open_spool(folder: Path, *, careless: bool) -> Spool:
@@ -80,26 +107,17 @@ def _open_spool(folder: Path, *, careless: bool) -> Spool:
     return spool
 
 
-def use_store(folder: Path, seed: int, steps: int, *, careless: bool = False) -> None:
-    """Send batches, some twice, with a snapshot now and then. careless: as above."""
-    rng, promises, chance = np.random.default_rng(seed), Promises(folder), random.Random(seed)
+def _open_store(folder: Path, *, careless: bool) -> Store:
     store = Store(folder / STORE_FOLDER, SITE, ServerConfig(), lambda: 10**18)
     if careless:
         store._journal._db.execute("PRAGMA synchronous=NORMAL")
-    waiting, done = empty(), 0
-    for step in range(steps):
-        if chance.random() > 0.2:
-            waiting = np.concatenate([waiting, drive(rng, chance.randint(1, 40), 1 + step * 1000)])
-        payload = encode_batch(SampleBatch(MACHINE, SPOOL_ID, done + 1, waiting, SITE.frame, 0))
-        answers = store.take([Incoming(MACHINE, payload)] * chance.randint(1, 2))
-        if isinstance(answers[0], Ack) and len(waiting):
-            promises.kept(SPOOL_ID, done + 1, waiting)
-            waiting, done = empty(), done + len(waiting)
-        if chance.random() < 0.05:
-            with suppress(OSError):
-                store.save_snapshot()
+    return store
 
+
+USE = {"spool": use_spool, "store": use_store}
 
 if __name__ == "__main__":
-    WORK = {"spool": use_spool, "store": use_store}
-    WORK[sys.argv[1]](Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]), careless="careless" in sys.argv)
+    FOLDER = Path(sys.argv[2])
+    USE[sys.argv[1]](
+        FOLDER, Promises(FOLDER / PROMISES), int(sys.argv[3]), int(sys.argv[4]), careless="careless" in sys.argv
+    )

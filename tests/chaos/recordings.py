@@ -16,6 +16,7 @@ from sim.recorder import record
 SECONDS = 120
 SPEED = 2.0  # times real time: about 15 samples a second and machine
 IDLE = "idle"
+START_NS = SimConfig().start_ns  # what stamps of recordings begin with
 AGENT = """
 linger_s = 20.0
 [pipeline.localisation]
@@ -42,11 +43,11 @@ class Recordings:
         """Folder of a machine's CSV files."""
         return self.folder / machine
 
-    def manifest(self, path: Path, machine: str, start_ns: int, *, idle: bool = False) -> Path:
-        """Write a manifest of a drive that begins at start_ns; idle: of a machine that reads nothing."""
+    def manifest(self, path: Path, machine: str, first_ns: int, *, idle: bool = False) -> Path:
+        """Write a manifest of a drive that begins at first_ns; idle: of a machine that reads nothing."""
         text = (self.data(machine) / "log.toml").read_text(encoding="utf-8")
         head, rest = text.split("\n[site]", 1)
-        text = f"{head}start_ns = {start_ns}\n\n[site]{rest}"
+        text = f"{head}start_ns = {first_ns - START_NS}\n\n[site]{rest}"
         path.write_text(text.replace(".csv", f".csv.{IDLE}") if idle else text, encoding="utf-8")
         return path
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from protocol.site import load_site
+from sitegrid.process import END_S
 
 ROOT = Path(__file__).parents[2]
 COMPOSE, DOCKERFILE = ROOT / "compose.yaml", ROOT / "Dockerfile"
@@ -93,6 +94,17 @@ def test_services_restart_and_need_no_privileges():
         assert service["cap_drop"] == ["ALL"], name
         assert service["read_only"] is True, name
     assert re.search(r"^USER (?!root)", DOCKERFILE.read_text(), re.MULTILINE)
+
+
+def test_only_this_host_gets_in_while_there_are_no_keys():
+    for name, service in services().items():
+        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", [])), name
+    assert ("--insecure" in commands()[0]) != ("--keys" in commands()[0])
+
+
+def test_processes_get_the_time_that_they_take_to_end():
+    for name, service in services().items():
+        assert float(service["stop_grace_period"].removesuffix("s")) >= END_S + 2, name
 
 
 def test_image_holds_every_package():

@@ -1,0 +1,97 @@
+"""The end of a process: asked for by a signal, and in time whatever it is doing; and addresses of metrics."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from sitegrid.cli import build_parser
+
+STUBBORN = """
+import sys, time
+from sitegrid.logs import start_logging
+from sitegrid.process import stop_flag
+start_logging(verbose=False)
+stop = stop_flag({end_s})
+print("ready", flush=True)
+stop.wait(20)
+time.sleep({late_s})
+print("done", flush=True)
+sys.exit(3)
+"""
+# A lock that is never released, waited for in C: handlers of Python do not run, as inside of Zenoh.
+STUCK = """
+import ctypes, os
+from sitegrid.process import stop_flag
+stop_flag(0.3)
+print("ready", flush=True)
+mutex = ctypes.create_string_buffer(256)
+pthread = ctypes.CDLL(None)
+pthread.pthread_mutex_lock(mutex)
+pthread.pthread_mutex_lock(mutex)
+"""
+
+
+def ended(code: str, number: signal.Signals = signal.SIGTERM) -> tuple[int, str, str, float]:
+    """Exit code, output, errors, and how long the end took."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
+        try:
+            assert process.stdout.readline() == "ready\n"
+            begin_s = time.monotonic()
+            process.send_signal(number)
+            output, errors = process.communicate(timeout=20)
+        finally:
+            process.kill()
+    return process.returncode, output, errors, time.monotonic() - begin_s
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_who_ends_in_time_ends_as_it_likes(number: signal.Signals):
+    code, output, errors, _ = ended(STUBBORN.format(end_s=15, late_s=0), number)
+    assert (code, output, errors) == (3, "done\n", "")
+
+
+def test_who_does_not_end_is_ended_and_that_is_logged():
+    code, output, errors, took_s = ended(STUBBORN.format(end_s=0.3, late_s=60))
+    assert (code, output) == (0, "")
+    assert json.loads(errors)["event"] == "ended in mid-work"
+    assert 0.3 <= took_s < 10
+
+
+def test_who_needs_time_gets_it():
+    code, output, errors, _ = ended(STUBBORN.format(end_s=None, late_s=0.5))
+    assert (code, output, errors) == (3, "done\n", "")
+
+
+def test_a_process_that_is_stuck_outside_of_python_is_ended_too():
+    code, _, _, took_s = ended(STUCK)
+    assert code == 0
+    assert took_s < 10
+
+
+@pytest.mark.parametrize(
+    ("words", "address"),
+    [
+        ([], None),
+        (["--metrics"], ("127.0.0.1", 9464)),
+        (["--metrics", "9000"], ("127.0.0.1", 9000)),
+        (["--metrics", ":9000"], ("127.0.0.1", 9000)),
+        (["--metrics", "0.0.0.0:9000"], ("0.0.0.0", 9000)),
+    ],
+)
+def test_metrics_are_for_this_host_unless_told(words: list[str], address: tuple[str, int] | None):
+    arguments = build_parser().parse_args(["server", "--site-file", "s", "--store", "x", *words])
+    assert arguments.metrics == address
+
+
+@pytest.mark.parametrize("text", ["", "http", "host:", "1.2.3.4:65536", "-1", "9464/metrics"])
+def test_what_is_no_address_is_a_usage_error(text: str):
+    with pytest.raises(SystemExit) as end:
+        build_parser().parse_args(["server", "--site-file", "s", "--store", "x", f"--metrics={text}"])
+    assert end.value.code == 2
