@@ -20,7 +20,7 @@ from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Owner, Presence
 from agents.spool import Spool
-from agents.uplink import linger, Sign, Uplink, UplinkState
+from agents.uplink import Sign, Uplink, UplinkState, linger
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine import MachineConfig

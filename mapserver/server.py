@@ -16,7 +16,7 @@ import zenoh
 from mapserver.answers import Answers, reads_past
 from mapserver.config import ServerConfig
 from mapserver.keeper import Keeper
-from mapserver.store import Incoming, JOURNAL_FILE, Verify
+from mapserver.store import JOURNAL_FILE, Incoming, Verify
 from mapserver.writer import Writer
 from protocol import keys
 from protocol.codec import encode_reply

@@ -161,6 +161,21 @@ class Site:
             self._running[role].end(signal.SIGKILL)
             self.start(role)
 
+    def stop(self, role: str) -> None:
+        """End a process with SIGTERM; it is to obey within a few seconds."""
+        process, began_s = self._running.pop(role), time.monotonic()
+        code = process.end(*ALL_STOPPED)
+        took_s = time.monotonic() - began_s
+        self.outcome.notes["slowest end [s]"] = round(max(took_s, self.outcome.notes.get("slowest end [s]", 0)), 1)
+        if code:
+            self.problem(f"{role} ended with {code} on SIGTERM: {process.last_words()}")
+
+    def expect_end(self, role: str) -> tuple[int | None, str]:
+        """Start what cannot run; returns its exit code, None if it does run, and its last words."""
+        process = self.start(role)
+        self._wait(lambda: process.code is not None, READY_S, f"{role} runs on")
+        return self._running.pop(role).code, process.last_words()
+
     def wait_ready(self, role: str) -> None:
         """Wait until a process says that it is ready."""
         self._wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
@@ -201,17 +216,20 @@ class Site:
         ended_s = time.time()
         self._resume()
         resumed_s = time.time()
+        self.outcome.notes["resumed after [s]"] = round(resumed_s - ended_s, 1)
         for machine in self.machines:
-            self._end(machine)
+            self.stop(machine)
         for machine in self.machines:
             self.start(machine, idle=True)
         drained = [self._running[machine] for machine in self.machines]
         self._wait(lambda: all(p.code is not None for p in drained), RESUME_S, "left-over samples are not delivered")
-        for process in drained:
+        for machine, process in zip(self.machines, drained, strict=True):
+            self._running.pop(machine)
+            process.end()
             if process.code:
                 self.problem(f"{process.log.name} could not deliver: {process.last_words()}")
-        self._end(SERVER)
-        self._end(ROUTER)
+        self.stop(SERVER)
+        self.stop(ROUTER)
         self._count(ended_s, resumed_s)
         return self.outcome
 
@@ -233,14 +251,6 @@ class Site:
             RESUME_S,
             "service does not resume",
         )
-
-    def _end(self, role: str) -> None:
-        began_s = time.monotonic()
-        code = self._running[role].end(*ALL_STOPPED)
-        took_s = time.monotonic() - began_s
-        self.outcome.notes["slowest end [s]"] = round(max(took_s, self.outcome.notes.get("slowest end [s]", 0)), 1)
-        if code:
-            self.problem(f"{role} ended with {code} on SIGTERM: {self._running[role].last_words()}")
 
     def _count(self, ended_s: float, resumed_s: float) -> None:
         audits = {machine: self.folder / "audit" / machine for machine in self.machines}

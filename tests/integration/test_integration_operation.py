@@ -228,6 +228,17 @@ def test_a_simulator_whose_router_hangs_ends_in_time(site: SiteRun):
         end(sim)
 
 
+def wait_until_still(file: Path, still_s: float = 0.5) -> None:
+    seen: list[tuple[int, float]] = []
+
+    def is_still() -> bool:
+        seen.append((file.stat().st_mtime_ns, time.monotonic()))
+        since_s = next(at_s for mtime, at_s in seen if mtime == seen[-1][0])
+        return seen[-1][1] - since_s > still_s
+
+    wait_until(is_still, READY_S, f"{file.name} is drawn no more")
+
+
 def test_plot_and_query_that_follow_end_in_time_also_while_the_server_hangs(site: SiteRun, children: Children):
     site.start_router()
     server = site.start_server()
@@ -238,6 +249,7 @@ def test_plot_and_query_that_follow_end_in_time_also_while_the_server_hangs(site
     wait_until(picture.exists, READY_S, "first picture")
     wait_for_handlers(query)
     with paused(server):
+        wait_until_still(picture)  # it asks, and gets no answer
         end(plot)
         end(query)
 

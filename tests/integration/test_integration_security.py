@@ -20,11 +20,12 @@ import zenoh
 
 from protocol import keys
 from protocol.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
-from protocol.credentials import Credentials, Identity, load_credentials
+from protocol.credentials import SIGNING_FILE, Credentials, Identity, load_credentials
 from protocol.errors import LinkError
 from protocol.messages import Ack, SampleBatch
 from protocol.samples import SAMPLE_DTYPE
 from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.signing import Signer
 from protocol.site import load_site
 from sim.config import SimConfig
 from sitegrid import connect
@@ -45,7 +46,7 @@ DAY = timedelta(days=1)
 class Guarded:
     """Router and map server of a site with keys."""
 
-    def __init__(self, folder: Path, children: Children) -> None:
+    def __init__(self, folder: Path, children: Children, *, signed: bool = False) -> None:
         self.keys, self.children = folder / "keys", children
         self.make_keys("init", "--site", SITE)
         for name, role in ROLES.items():
@@ -56,7 +57,8 @@ class Guarded:
         self.router = children.start("router", "router", "--keys", self.keys, "--listen", self.endpoint)
         assert self.router.expect("ready", READY_S)["security"] == "mutual TLS"
         files = ("--site-file", self.site_file, "--store", folder / "store")
-        self.server = children.start("server", "server", *self.network("server"), *files)
+        asks = ("--signed", self.keys) if signed else ()
+        self.server = children.start("server", "server", *self.network("server"), *files, *asks)
         self.server.expect("ready", READY_S)
 
     def make_keys(self, action: str, *words: str) -> None:
@@ -154,6 +156,28 @@ def test_agent_and_simulator_work_with_keys_as_without(guarded: Guarded, tmp_pat
     assert report["delivered"], f"agent pid {agent.pid}, sim pid {sim.pid}"
     assert report["samples"] > 20
     assert sim.wait(10.0) == 0
+
+
+def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_path: Path, children: Children):
+    site = Guarded(tmp_path, children, signed=True)
+    key, batch = keys.ingest(SITE, "loader-1"), site.batch("loader-1")
+    mine, others = (
+        Signer((site.keys / name / SIGNING_FILE).read_bytes()).sign(key, batch) for name in ("loader-1", "loader-2")
+    )
+    with site.session("loader-1") as session:
+        for signature in (None, others):
+            (reply,) = answers(session, key, batch, attachment=signature)
+            assert decode_reply(reply).reason == "wrong_machine", site.still_works()
+        (reply,) = answers(session, key, batch, attachment=mine)
+        assert isinstance(decode_reply(reply), Ack)
+    files = ("--spool", tmp_path / "spool.db", "--site-file", site.site_file, "--config", site.configs[0])
+    agent = site.children.start("agent", "agent", *site.network("loader-1"), *files, "--json")
+    agent.expect("ready", READY_S)
+    words = ("--machines", 1, "--seed", 1, "--world", "fast", "--seconds", 10, "--speed", 10, "--json")
+    site.children.start("sim", "sim", *site.network("sim"), *words)
+    report = agent.expect("ended", READY_S)["ended"]
+    assert report["delivered"], f"agent pid {agent.pid}, server pid {site.server.pid}"
+    assert report["samples"] > 10
 
 
 def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
