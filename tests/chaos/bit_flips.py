@@ -42,7 +42,8 @@ def flips(scenario: Scenario) -> Outcome:
                 site.problem(f"{served} of {n} flips in {path.name} are served as data")
             if unnamed := found["unnamed"]:
                 site.problem(f"{unnamed} of {n} flips in {path.name} end in an error that does not name the file")
-            verdicts += found
+            for verdict in Verdict:
+                verdicts[verdict] += found[verdict]
         _damage_and_restore(site)
         site.start_all()
         outcome = site.finish(scenario.fault, verdicts.total())

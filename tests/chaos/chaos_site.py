@@ -132,14 +132,15 @@ class Site:
 
     def start_all(self) -> None:
         """Start everything, and wait until every machine has samples in the journal."""
+        before = len(self.outcome.problems)
         for role in (ROUTER, SERVER, *self.machines):
             self.start(role)
             if role in (ROUTER, SERVER):
                 self.wait_ready(role)
         self._wait(lambda: self.progress().keys() >= set(self.machines), READY_S, "no samples from every machine")
         ended = [f"{role}: {p.code} {p.last_words()}" for role, p in self._running.items() if p.code is not None]
-        if ended or self.outcome.problems:
-            raise StartError("; ".join([*self.outcome.problems, *ended]))
+        if wrong := [*self.outcome.problems[before:], *ended]:
+            raise StartError("; ".join(wrong))
 
     def start(self, role: str, *, idle: bool = False) -> Process:
         """Start a router, a server, or a machine's agent; idle: one that only delivers what is left."""
