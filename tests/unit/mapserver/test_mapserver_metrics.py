@@ -145,6 +145,15 @@ def test_the_writer_is_told_of_where_it_tells_of_itself():
     assert "commit" not in render(metrics_of(INFO, {}, HOST, "1"))
 
 
+def test_the_operators_page_names_every_metric_with_its_labels(root: Path):
+    writer = {"waiting": 3, "commits": 20, "commit_s": 0.5}
+    metrics = metrics_of({**INFO, "writer": writer}, {"loader-1": Heard(HEALTH, 1e9)}, HOST, "1")
+    told = {(metric.name, ",".join(metric.rows[0][0])) for metric in metrics}
+    page = (root / "docs" / "operation.md").read_text().split("## Metrics")[1].split("\nCounters")[0]
+    named = set(re.findall(r"`((?:sitegrid|process)_\w+)(?:\{(.*?)\})?`", page))
+    assert named == told
+
+
 def test_labels_and_helps_of_any_text_are_escaped():
     text = 'a "b"\\n\n\\'
     metric = Metric("one_total", "counter", 'back\\slash\nand "line"', (({"what": text, "more": ""}, 1.0),))
