@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import random
+import re
 import shutil
 import signal
 import sqlite3
 from collections import Counter
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,16 @@ from protocol.site import load_site
 from tests.chaos.chaos_site import ROUTER, SERVER, Site
 from tests.chaos.outcome import Outcome
 from tests.chaos.scenario import Scenario
+
+
+class Verdict(StrEnum):
+    """What became of a bit."""
+
+    DETECTED = "detected"
+    HARMLESS = "harmless"  # or found and made good, as a snapshot that is passed over
+    SERVED = "served"
+    UNNAMED = "unnamed"  # an error, but none that names the file
+
 
 FLIPS = 400  # of each file, in the whole suite
 Content = dict[Any, Any]
@@ -38,10 +50,11 @@ def flips(scenario: Scenario) -> Outcome:
         for path, look in _files(site):
             found = _flip_all(path, look, scenario.rng, n, site.folder / "flipped")
             scenario.say(f"{path.name} " + ", ".join(f"{what} {k}" for what, k in sorted(found.items())))
-            if served := found["served"]:
+            if served := found[Verdict.SERVED]:
                 site.problem(f"{served} of {n} flips in {path.name} are served as data")
-            if unnamed := found["unnamed"]:
-                site.problem(f"{unnamed} of {n} flips in {path.name} end in an error that does not name the file")
+            if unnamed := found[Verdict.UNNAMED]:
+                kinds = ", ".join(sorted(set(found) - set(Verdict)))
+                site.problem(f"{unnamed} of {n} flips in {path.name} end in {kinds}, which does not name the file")
             for verdict in Verdict:
                 verdicts[verdict] += found[verdict]
         _damage_and_restore(site)
@@ -83,7 +96,7 @@ def read_store(folder: Path, definition: Any) -> Content:
 
 def read_spool(path: Path) -> Content:
     """All that an agent would send: contents by identity, and what it says is lost."""
-    spool, found, named = Spool(path, SpoolConfig()), {}, 0
+    spool, found = Spool(path, SpoolConfig()), {}
     try:
         while head := spool.head(1000):
             for i, row in enumerate(head.rows):
@@ -92,6 +105,8 @@ def read_spool(path: Path) -> Content:
         counters = spool.counters()
         named = sum(counters.get(name, 0) for name in ("put_aside", "damaged"))
         return {"contents": found, "named": named}
+    except sqlite3.Error as error:
+        raise StoreError(path, str(error)) from None  # the uplink reports it as the spool's, and sends nothing
     finally:
         spool._db.close()
 
@@ -99,35 +114,44 @@ def read_spool(path: Path) -> Content:
 def _flip_all(path: Path, look: Callable[[Path], Content], rng: random.Random, n: int, folder: Path) -> Counter[str]:
     """Flip one bit in each of n copies of a file's folder, and compare what is read with what was there."""
     truth, verdicts = look(_copy(path, folder)), Counter[str]()
-    for _ in range(n):
+    hot = _near_identities(path.read_bytes(), truth)
+    for i in range(n):
         copy = _copy(path, folder)
-        flip(copy, rng)
-        try:
-            found = look(copy)
-        except (StoreError, sqlite3.Error) as error:
-            verdicts["detected" if isinstance(error, StoreError) and str(copy) in str(error) else "unnamed"] += 1
-            continue
-        except Exception as error:
-            verdicts[f"unnamed"] += 1
-            verdicts[f"as {type(error).__name__}"] += 1
-            continue
-        verdicts[_verdict(truth, found)] += 1
+        flip(copy, rng, hot if i % 4 == 0 else None)
+        verdict, error = judge(copy, look, truth)
+        verdicts[verdict] += 1
+        if error:
+            verdicts[error] += 1
     shutil.rmtree(folder)
     return verdicts
 
 
-def _verdict(truth: Content, found: Content) -> str:
+def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[Verdict, str]:
+    """Return what became of a damaged file, and the kind of an error that is not what a person should see."""
+    try:
+        found = look(path)
+    except StoreError as error:
+        return (Verdict.DETECTED, "") if str(path) in str(error) else (Verdict.UNNAMED, str(error))
+    except Exception as error:  # whatever damage can raise
+        return Verdict.UNNAMED, type(error).__name__
     if found == truth:
-        return "harmless"
+        return Verdict.HARMLESS, ""
     if found.get("named") and found["contents"].items() <= truth["contents"].items():
-        return "detected"  # the damaged samples are named, the others sent
-    return "served"
+        return Verdict.DETECTED, ""  # the damaged samples are named, the others sent
+    return Verdict.SERVED, ""
 
 
-def flip(path: Path, rng: random.Random) -> None:
-    """Flip one bit."""
+def _near_identities(content: bytes, truth: Content) -> list[int]:
+    """Where a journal keeps identities, watermarks and counts: few bytes, which chance would rarely hit."""
+    ids = {spool_id.to_bytes(8, "big") for _, spool_id in truth.get("marks", ())}
+    found = [match.start() for each in ids for match in re.finditer(re.escape(each), content)]
+    return [at for start in found for at in range(max(0, start - 12), min(len(content), start + 16))]
+
+
+def flip(path: Path, rng: random.Random, among: list[int] | None = None) -> None:
+    """Flip one bit; among: in one of these bytes."""
     content = bytearray(path.read_bytes())
-    content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    content[rng.choice(among or range(len(content)))] ^= 1 << rng.randrange(8)
     path.write_bytes(content)
 
 
@@ -141,7 +165,10 @@ def _damage_and_restore(site: Site) -> None:
     """With files that are damaged for sure, server and agent must not start, and say which file it is."""
     machine = site.machines[0]
     site.start(ROUTER)
-    for role, path in ((SERVER, site.folder / "store" / JOURNAL_FILE), (machine, site.folder / "spool" / f"{machine}.db")):
+    for role, path in (
+        (SERVER, site.folder / "store" / JOURNAL_FILE),
+        (machine, site.folder / "spool" / f"{machine}.db"),
+    ):
         backup = path.read_bytes()
         path.write_bytes(bytes([backup[0] ^ 1]) + backup[1:])
         code, words = site.expect_end(role)

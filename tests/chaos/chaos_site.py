@@ -148,7 +148,9 @@ class Site:
         words = self._words(role, idle)
         env = {"PYTHONUNBUFFERED": "1", **self.env.get(role, {})}
         log = self.folder / "log" / f"{self._starts:04d}-{role}"
-        self._running[role] = Process(log, [*self.prefix.get(role, ()), sys.executable, *self.modules.get(role, COMMAND), *words], env)
+        self._running[role] = Process(
+            log, [*self.prefix.get(role, ()), sys.executable, *self.modules.get(role, COMMAND), *words], env
+        )
         self.outcome.pids.append(self._running[role].pid)
         return self._running[role]
 

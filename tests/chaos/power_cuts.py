@@ -49,7 +49,7 @@ def power(scenario: Scenario) -> Outcome:
         return Outcome(scenario.fault, skipped="no C compiler for the shim")
     for what in ("spool", "store"):
         operations = trace(library, scenario.folder / what, what, scenario.seed)
-        cuts = max(100, round(CUTS / 2 * scenario.scale))
+        cuts = (scenario.strikes or round(CUTS * scenario.scale)) // 2
         add(total, cut(operations, what, cuts, scenario.rng, scenario.told.wait))
     return total
 
@@ -66,7 +66,11 @@ def trace(library: Path, folder: Path, what: str, seed: int, *options: str) -> l
 
 
 def cut(
-    operations: list[Operation], what: str, cuts: int, rng: random.Random, wait: Callable[[float], None] = lambda _: None
+    operations: list[Operation],
+    what: str,
+    cuts: int,
+    rng: random.Random,
+    wait: Callable[[float], None] = lambda _: None,
 ) -> Outcome:
     """Cut at random points; every cut is judged against what was promised before it."""
     points = sorted(rng.choices(range(1, len(operations)), k=cuts))
@@ -157,4 +161,3 @@ def add(total: Outcome, part: Outcome) -> None:
     for name in ("count", "recorded", "merged", "lost", "double"):
         setattr(total, name, getattr(total, name) + getattr(part, name))
     total.problems += part.problems
-

@@ -24,7 +24,7 @@ def draw_kills(rng: random.Random, machines: tuple[str, ...], n: int, seconds: f
 
 def kills(scenario: Scenario) -> Outcome:
     """Kill -9 of agents, server and router in random order, also while they start."""
-    n = max(LEAST, round(KILLS * scenario.scale)) if scenario.scale > 0 else 5
+    n = scenario.strikes or max(LEAST, round(KILLS * scenario.scale))
     with scenario.site() as site:
         plan = draw_kills(scenario.rng, site.machines, n, scenario.seconds)
         scenario.say("order " + " ".join(f"{pause:.2f}s {victim}" for pause, victim in plan))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,11 @@ distrusts = false
 
 @dataclass(frozen=True)
 class Scenario:
-    """One fault's run. seconds: how long faults strike; folder: its own; scale: how much of the whole suite, 0 to 1."""
+    """One fault's run.
+
+    folder: its own. seconds: how long faults strike. scale: how much of the whole suite, 0 to 1. strikes: how often to
+    strike, where that can be said; 0 for what scale gives.
+    """
 
     fault: str
     folder: Path
@@ -33,7 +36,7 @@ class Scenario:
     seed: int
     seconds: float
     scale: float = 1.0
-    site_options: Mapping[str, Any] = field(default_factory=dict)
+    strikes: int = 0
 
     @property
     def rng(self) -> random.Random:

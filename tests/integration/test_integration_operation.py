@@ -19,11 +19,11 @@ import zenoh
 from site_run import READY_S, SiteRun  # beside this file
 
 from agents.spool import Spool, SpoolConfig
-from mapserver.archive import archive
+from mapserver.archive import HOUR_NS, archive
 from mapserver.config import ServerConfig
 from mapserver.journal import JournalReader
-from mapserver.store import JOURNAL_FILE, Incoming, Store
 from mapserver.past import History, history_rows
+from mapserver.store import JOURNAL_FILE, Incoming, Store
 from protocol import keys
 from protocol.codec import decode_reply, encode_batch
 from protocol.messages import Ack, SampleBatch
@@ -369,20 +369,20 @@ def test_a_backup_as_the_operators_page_has_it_is_a_whole_store(tmp_path: Path, 
     old_rows(store, site)
     text = (root / "docs" / "operation.md").read_text().split("## Backup")[1].split("```python\n")[1].split("```")[0]
     code = text.replace('"STORE', f'"{store}').replace('"BACKUP', f'"{backup}')
-    first, second = code.split("shutil.copytree")
+    first, second = code.split("if os.path")
     with closing(Store(store, site, ServerConfig(), lambda: NOW_NS)) as opened:
         late = SampleBatch("late", 7, 1, drive(10, seed=1), site.frame)
         assert isinstance(opened.take([Incoming("late", encode_batch(late))])[0], Ack)
         names: dict[str, Any] = {}
         exec(compile(first, "docs/operation.md", "exec"), names)
         with JournalReader(store / JOURNAL_FILE) as reader:  # rows move just in between
-            assert archive(store / "archive", reader, site, NOW_NS + 1, opened.forget)
-        exec(compile(f"shutil.copytree{second}", "docs/operation.md", "exec"), names)
+            assert archive(store / "archive", reader, site, NOW_NS + 3 * HOUR_NS, opened.forget)
+        exec(compile(f"if os.path{second}", "docs/operation.md", "exec"), names)
         folded = opened.grid.folded
     with closing(Store(backup, site, ServerConfig(), lambda: NOW_NS)) as restored:
         assert restored.machines()["late"]["samples"] == 10
         assert restored.grid.folded == folded == 50_010
         with JournalReader(backup / JOURNAL_FILE) as reader:
-            assert archive(backup / "archive", reader, site, NOW_NS + 1, restored.forget)
+            assert archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.forget)
             rows = [row.row for row in history_rows(History.of(reader))]
     assert rows == list(range(1, 52))
