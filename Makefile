@@ -1,9 +1,9 @@
-# make demo: everything from nothing to pictures. make check test: what CI runs.
+# make demo: everything from nothing to pictures. make check test: what CI runs. make chaos: faults (docs/guarantees.md).
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: venv demo test check bench
+.PHONY: venv demo test check chaos bench
 
 venv: $(VENV)/.installed
 
@@ -23,6 +23,9 @@ check: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+chaos: venv
+	$(BIN)/python -m tests.chaos
 
 bench: venv
 	$(BIN)/python -m benchmarks merge

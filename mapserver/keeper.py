@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mapserver import watch
-from mapserver.archive import FOLDER, archive
+from mapserver.archive import FOLDER, next_file, row_range
 from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.decisions import KIND, PERSON, Decision, Decisions
@@ -30,7 +30,7 @@ from protocol.errors import QueryError, Refusal, SitegridError
 from protocol.site import SiteConfig
 
 LOOK_BLOCKS = 256  # at a time
-FOLLOW_ROWS = 2000  # at a time
+ARCHIVE_S = 60.0  # between two looks for rows that are old enough
 log = logging.getLogger("mapserver.keeper")
 
 
@@ -211,16 +211,20 @@ class Keeper:
                 self._publish(change.values)
 
     def _archive(self) -> None:
-        """Move old rows to the archive."""
+        """Move the next hour of old rows to the archive; an hour a turn, so that the end need not wait."""
         keep = self._config.keep
-        if not keep.archive_after_h or not self._is_due("archive", 60.0):
+        if not keep.archive_after_h or not self._is_due("archive", ARCHIVE_S):
             return
         before_ns = self._now_ns() - round(keep.archive_after_h * 3600e9)
-        made = archive(self._folder / FOLDER, self._reader, self._site, before_ns, self._forget)
-        for path in made:
-            log.info("archived file=%s", path.name)
-        if made:
-            self._writer.read(lambda store: store.shrink())
+        path = next_file(self._folder / FOLDER, self._reader, self._site, before_ns)
+        if path is None:
+            return
+        _, last = row_range(path)
+        while not self._ending and self._forget(last) < last:
+            pass
+        self._writer.read(lambda store: store.shrink())
+        log.info("archived file=%s", path.name)
+        self._due_s["archive"] = 0.0  # there may be more hours
 
     def _remember(self, kind: str, stamp_ns: int, body: dict[str, Any]) -> None:
         self._writer.read(lambda store: store.remember(kind, stamp_ns, body))

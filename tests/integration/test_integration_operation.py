@@ -146,6 +146,21 @@ def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committe
     assert all(marks[s.machine] >= s.watermark for s in sent), "what was acknowledged is on disk"
 
 
+def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: SiteRun, children: Children):
+    store, options = site.folder / "store", site.folder / "server.toml"
+    old_rows(store, load_site(site.site_file))
+    for cache in store.glob("snapshot-*"):
+        cache.unlink()
+    options.write_text('[fold]\nkernel = "numpy"\n')  # slow
+    site.start_router()
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store, "--config", options)
+    server = children.start("server", "server", *words)
+    wait_until(lambda: (store / "journal.db-wal").exists(), READY_S, "the store is opened")
+    end(server)
+    assert not server.lines(), "it was not ready yet"
+    assert committed(store) == {"old": 50_000}
+
+
 def test_a_server_that_waits_for_a_router_ends_in_time(site: SiteRun, children: Children):
     words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "store", "--verbose")
     server = children.start("server", "server", *words)

@@ -1,0 +1,246 @@
+"""The fault suite in short, and the proof that it would see a loss."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from agents.spool import Spool, SpoolConfig
+from protocol.samples import empty
+from sitegrid.processes import wait_until
+from tests.chaos import __main__ as command
+from tests.chaos import bit_flips, power_cuts, process_faults, stepped_clock, write_faults
+from tests.chaos.disk_model import Disk, Kind, Operation
+from tests.chaos.disk_shim import build
+from tests.chaos.outcome import Outcome, Told, longest_pause, table
+from tests.chaos.recordings import make
+from tests.chaos.scenario import Scenario
+from tests.chaos.suite import FAULTS, Fault, run_suite, totals
+from tests.chaos.tcp_proxy import FAIR, Proxy, Weather
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> Path:
+    if not (found := build(tmp_path)):
+        pytest.skip("no C compiler for the shim")
+    return found
+
+
+def scenario(folder: Path, **options) -> Scenario:
+    values = {"fault": "short", "recordings": None, "seconds": 4.0, "scale": 0.02} | options
+    return Scenario(folder=folder, told=Told(line=lambda *_, **__: None), seed=3, **values)
+
+
+@pytest.mark.processes
+def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=60)
+    outcome = process_faults.kills(scenario(tmp_path / "run", recordings=recordings, strikes=6))
+    assert (outcome.lost, outcome.double, outcome.problems) == (0, 0, [])
+    assert outcome.count == 6
+    assert outcome.recorded == outcome.merged > 50
+    assert outcome.longest_pause_s is not None
+    assert len(set(outcome.pids)) >= 4 + 6 + 2, "a process of its own for every start"
+    assert not any(Path(f"/proc/{pid}").exists() for pid in outcome.pids)
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(sys.platform != "linux", reason="LD_PRELOAD")
+def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
+    outcome = power_cuts.power(scenario(tmp_path / "run", strikes=80))
+    assert (outcome.count, outcome.lost, outcome.double, outcome.problems) == (80, 0, 0, [])
+    assert outcome.recorded == outcome.merged > 1000
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("what", ["spool", "store"])
+def test_power_cuts_find_a_file_that_is_not_synced_at_every_commit(tmp_path, library, what):
+    operations = power_cuts.trace(library, tmp_path / "run", what, 3, "careless")
+    assert power_cuts.cut(operations, what, 20, random.Random(1)).lost > 0
+
+
+@pytest.mark.processes
+def test_writes_that_fail_one_after_the_other_lose_nothing(tmp_path, library):
+    outcome = write_faults.writes(scenario(tmp_path / "run", scale=0.05))
+    assert (outcome.lost, outcome.double, outcome.problems) == (0, 0, [])
+    assert outcome.count > 10
+
+
+def test_a_power_cut_keeps_what_was_synced_and_may_drop_the_rest(tmp_path):
+    disk, texts = Disk(), set()
+    for kind, offset, data in (
+        (Kind.CREATE, 0, b""),
+        (Kind.WRITE, 0, b"a" * 1024),
+        (Kind.SYNC, 0, b""),
+        (Kind.WRITE, 0, b"b" * 1024),
+        (Kind.TRUNCATE, 512, b""),
+    ):
+        disk.do(Operation(kind, "file", offset, data))
+    for seed in range(60):
+        disk.cut(random.Random(seed), tmp_path)
+        texts.add((tmp_path / "file").read_bytes())
+    a, b = b"a" * 512, b"b" * 512
+    assert {a + a, b + b, a + b, b + a, a, b} >= texts >= {a + a, a + b, b}
+
+
+def test_names_come_in_order_and_any_sync_makes_them_durable(tmp_path):
+    disk, found = Disk(), set()
+    disk.do(Operation(Kind.CREATE, "new", 0, b""))
+    disk.do(Operation(Kind.RENAME, "new", 0, b"named"))
+    for seed in range(30):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        disk.cut(random.Random(seed), folder)
+        found.add(tuple(path.name for path in folder.iterdir()))
+    assert found == {(), ("new",), ("named",)}
+    disk.do(Operation(Kind.SYNC, "named", 0, b""))
+    disk.cut(random.Random(1), tmp_path)
+    assert (tmp_path / "named").exists()
+
+
+def test_a_flipped_bit_that_is_served_is_called_so(tmp_path):
+    path, truth = tmp_path / "file", {"rows": 1}
+    path.write_bytes(bytes(100))
+    bit_flips.flip(path, random.Random(1), [7])
+    changed = path.read_bytes()
+    assert changed[7].bit_count() == 1
+    assert sum(changed) == changed[7]
+    assert bit_flips.judge(path, lambda _: {"rows": 2}, truth)[0] == bit_flips.Verdict.SERVED
+    assert bit_flips.judge(path, lambda _: {"rows": 1}, truth)[0] == bit_flips.Verdict.HARMLESS
+    assert bit_flips.judge(path, lambda _: [][0], truth) == (bit_flips.Verdict.UNNAMED, "IndexError")
+
+
+def test_a_spool_whose_header_is_damaged_is_detected(tmp_path):
+    spool = Spool(tmp_path / "spool.db", SpoolConfig())
+    spool.record(empty(3))
+    spool.close()
+    truth = bit_flips.read_spool(tmp_path / "spool.db")
+    assert len(truth["contents"]) == 3
+    bit_flips.flip(tmp_path / "spool.db", random.Random(1), [0])
+    verdict, _ = bit_flips.judge(tmp_path / "spool.db", bit_flips.read_spool, truth)
+    assert verdict == bit_flips.Verdict.DETECTED
+
+
+def test_the_proxy_forwards_holds_and_cuts():
+    with socket.create_server(("127.0.0.1", 0)) as far, Proxy(far.getsockname()[1]) as proxy:
+        host, port = proxy.endpoint.removeprefix("tcp/").split(":")
+        with socket.create_connection((host, int(port)), timeout=5.0) as near:
+            there, _ = far.accept()
+            near.sendall(b"there")
+            assert there.recv(10) == b"there"
+            proxy.set(Weather(hold_back=True))
+            there.sendall(b"late")
+            near.settimeout(0.1)
+            with pytest.raises(TimeoutError):
+                near.recv(10)
+            proxy.set(FAIR)
+            near.settimeout(5.0)
+            assert near.recv(10) == b"late"
+            proxy.set(Weather(cut=True))
+            assert near.recv(10) == b""
+            there.close()
+
+
+@pytest.mark.processes
+def test_the_wall_clock_of_a_child_is_stepped_and_its_waits_are_not(tmp_path):
+    stepped_clock.write(tmp_path / "clock", -3600 * 10**9)
+    code = (
+        "import sys, time; from pathlib import Path; from tests.chaos import stepped_clock as s;"
+        "true, start = time.time(), time.monotonic(); s._step_clocks(Path(sys.argv[1])); time.sleep(0.01);"
+        "print(round(time.time() - true), time.monotonic() - start < 5, time.time_ns() < true * 1e9)"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "clock")]
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout.split() == ["-3600", "True", "True"]
+
+
+def test_a_pause_leaves_out_what_the_fault_lasted():
+    commits = [0.0, 1.0, 9.0, 10.0]
+    assert longest_pause(commits, [], 11.0) == 8.0
+    assert longest_pause(commits, [(2.0, 7.0)], 11.0) == 3.0
+    assert longest_pause(commits, [(2.0, 5.0), (4.0, 7.0)], 11.0) == 3.0
+    assert longest_pause(commits, [(0.0, 9.0)], 15.0) == 5.0
+
+
+def test_the_order_of_kills_comes_from_the_seed(tmp_path):
+    drawn = [process_faults.draw_kills(scenario(tmp_path).rng, ("a", "b"), 200, 60.0) for _ in range(2)]
+    assert drawn[0] == drawn[1]
+    assert sum(pause for pause, _ in drawn[0]) == pytest.approx(60.0)
+    assert {victim for _, victim in drawn[0]} == {"a", "b", "router", "server"}
+
+
+def test_a_loss_fails_the_suite_and_an_error_in_one_fault_lets_the_others_run(tmp_path, monkeypatch, capsys):
+    def breaks(_: Scenario) -> Outcome:
+        raise RuntimeError("broke")
+
+    faults = (
+        Fault("kills", lambda s: Outcome("kills", count=7, recorded=9, merged=8, lost=1)),
+        Fault("power", breaks),
+        Fault("cable", lambda s: Outcome("cable", skipped="not permitted")),
+    )
+    monkeypatch.setattr(command, "run_suite", lambda _, *rest: run_suite(faults, *rest))
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr("logging.disable", lambda: None)
+    assert command.main(["--json", "--seconds", "1"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    result = json.loads(lines[-1])
+    assert {key: result[key] for key in ("kills", "recorded", "merged", "lost", "double", "ok")} == {
+        "kills": 7,
+        "recorded": 9,
+        "merged": 8,
+        "lost": 1,
+        "double": 0,
+        "ok": False,
+    }
+    assert "RuntimeError: broke" in result["faults"][1]["problems"][0]
+    assert any("skipped: not permitted" in line for line in lines)
+
+
+def test_a_skipped_fault_is_no_failure():
+    outcomes = [Outcome("kills", count=1), Outcome("cable", skipped="not permitted")]
+    assert totals(outcomes, 1)["ok"]
+    assert table(outcomes).splitlines()[1].endswith("ok")
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--faults", "kills,gold"], "no fault `gold`"),
+        (["--seconds", "0"], "between 0 and 3600"),
+        (["--keep", "."], "exists already"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(words, problem, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        command.main(words)
+    assert problem in capsys.readouterr().err
+
+
+@pytest.mark.processes
+def test_an_interrupted_suite_ends_everything(tmp_path):
+    work = tmp_path / "work"
+    words = [sys.executable, "-m", "tests.chaos", "--faults", "freezes", "--keep", str(work)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ) as suite:
+        wait_until(lambda: len(list(work.glob("freezes/log/*.out"))) >= 3, 60.0, "processes of the suite")
+        suite.send_signal(signal.SIGINT)
+        assert suite.communicate(timeout=30)[0].splitlines()[-1] == "interrupted; everything is ended"
+        assert suite.returncode == 130
+    assert not _commands_with(str(work))
+
+
+def _commands_with(text: str) -> list[str]:
+    lines = (path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists())
+    return [line.decode() for line in lines if text.encode() in line]
+
+
+def test_every_fault_of_the_suite_has_a_line_in_the_guarantees(root):
+    text = (root / "docs" / "guarantees.md").read_text(encoding="utf-8")
+    assert [fault.name for fault in FAULTS if f"`{fault.name}`" not in text] == []
+    assert threading.active_count() < 50, "no thread of a proxy is left"
