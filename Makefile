@@ -27,6 +27,9 @@ check: venv
 chaos: venv
 	$(BIN)/python -m tests.chaos
 
+soak: venv
+	$(BIN)/python -m tests.soak --minutes 60 --speed 30
+
 bench: venv
 	$(BIN)/python -m benchmarks merge
 	$(BIN)/python -m benchmarks memory

@@ -16,6 +16,7 @@ from mapserver.reading import evidence
 from mapserver.votes import FoldConfig
 from protocol.arrays import Table
 from protocol.geometry import BLOCK_CELLS, CellWindow
+from protocol.samples import SAMPLE_DTYPE
 
 PIECE = 4096  # samples that are folded at once; their weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
@@ -177,6 +178,16 @@ class Grid:
         if ladder is None:
             ladder = self._ladders[block] = Ladder(self._rungs)
         return ladder
+
+
+def warm_up(config: FoldConfig) -> None:
+    """Have the kernels compiled, or read from their cache, before anybody waits for them."""
+    row = np.zeros(1, SAMPLE_DTYPE)
+    grid = Grid(1.0, config)
+    for stamp_ns in (1, 1, 2 * config.bucket_ns * (config.keep_buckets + 1)):
+        row["stamp_ns"], row["distance_m"] = stamp_ns, 1.0
+        grid.fold(row, "")
+        grid.state()
 
 
 def chunks(blocks: list[Block]) -> Iterator[list[Block]]:

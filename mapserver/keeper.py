@@ -153,7 +153,8 @@ class Keeper:
 
     def _follow(self) -> None:
         """Hand new journal rows to the audit; a piece at a time, so that commands need not wait."""
-        for row in self._reader.read(after=max(self._followed, self._reader.archived_row)):
+        until = self._reader.last_row  # what comes in meanwhile waits for the next turn, or a busy site would have none
+        for row in self._reader.read(after=max(self._followed, self._reader.archived_row), until=until):
             self._auditor.add(row.machine, row.rows, row.received_ns)
             self._followed = row.row
             if self._ending or self._asked:

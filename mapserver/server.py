@@ -73,7 +73,7 @@ class Server:
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
         for threads in (self._threads, self._past_thread, self._command_thread):
-            threads.shutdown()
+            threads.shutdown(wait=False, cancel_futures=True)  # nobody waits for an answer longer than for the end
         self._keeper.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()

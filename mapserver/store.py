@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -24,6 +25,7 @@ from protocol import keys
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.messages import Ack, Refused, SampleBatch
 from protocol.site import SiteConfig
+from protocol.version import package_version
 
 JOURNAL_FILE = "journal.db"
 LOCK_FILE = "lock"
@@ -57,6 +59,7 @@ class Store:
         self._verify = verify
         self.config = config
         self.counters: Counter[str] = Counter()
+        self.commits, self.commit_s = 0, 0.0
         self.newest_ns = 0
         self._folder = folder
         self._now_ns = now_ns
@@ -88,7 +91,9 @@ class Store:
         try:
             self._journal.begin()
             taken = [self._take_one(incoming) for incoming in group]
+            began_s = time.monotonic()
             self._journal.commit()
+            self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
         except (sqlite3.Error, OSError) as error:
             self._journal.rollback()
             self.counters[f"refused_{Refusal.STORE}"] += len(group)
@@ -159,6 +164,8 @@ class Store:
             "cells": self.grid.known_cells(),
             "bounds": self.grid.bounds(),
             "stamp_ns": self.newest_ns,
+            "wall_ns": self._now_ns(),
+            "version": package_version(),
             "machines": self.machines(),
             "distrusted": sorted(self.left_out),
             "counters": dict(self.counters),

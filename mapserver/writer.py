@@ -86,6 +86,8 @@ class Writer:
     def info(self) -> dict[str, Any]:
         """State of the store."""
         info = self.read(Store.info)
+        commits, commit_s = self._store.commits, self._store.commit_s
+        info["writer"] = {"waiting": self._batches.qsize(), "commits": commits, "commit_s": commit_s}
         if self._overloaded:
             info["counters"][f"refused_{Refusal.OVERLOADED}"] = self._overloaded
         return info

@@ -50,6 +50,9 @@ from sitegrid.security import join
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
 
 
+TIMED_OUT = b"Timeout"  # what Zenoh says itself where nobody answered in time
+
+
 class Client:
     """Asks the map server of one site. Every call may raise QueryError (refused) or LinkError (no answer).
 
@@ -188,8 +191,8 @@ class Client:
         for reply in self.session.get(selector, timeout=self._timeout_s + wait_s):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
-            if reply.err is not None:
-                raise decode_error(reply.err.payload.to_bytes())
+            if reply.err is not None and (text := reply.err.payload.to_bytes()) != TIMED_OUT:
+                raise decode_error(text)
         problem = f"no map server answers for site {self.site!r}: start one with `sitegrid server`, or check the name"
         if self._endpoint.startswith("tls/"):
             problem += "; or these keys may not ask this (see docs/security.md)"

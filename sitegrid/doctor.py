@@ -47,6 +47,12 @@ class Finding:
         return f"{self.level:4}  {self.check:12}  {self.found}" + (f"; {self.advice}" if self.advice else "")
 
 
+def table_of(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """A table in what others sent, empty where there is none: they may be of another version."""
+    found = values.get(name)
+    return found if isinstance(found, Mapping) else {}
+
+
 def skipped(check: str, reason: str) -> Finding:
     """What was not looked at, and why."""
     return Finding(Level.SKIP, check, f"not checked: {reason}")
@@ -80,10 +86,10 @@ def check_link(link: Link) -> Finding:
 def check_server(site: str, info: Mapping[str, Any] | None, *, is_there: bool, role: str = "") -> Finding:
     """Whether the map server answers. is_there: whether the router knows of one, role: what the keys are for."""
     if info is not None:
-        counts = f"{info['samples_merged']} samples in {info['cells']} cells"
-        behind = info["journalled"] - info["merged"]
-        text = f"site {site}: {counts}, journal row {info['journalled']}"
-        return Finding(Level.PASS, "server", text + (f", {behind} rows not merged yet" if behind else ""))
+        samples, cells, row = (info.get(name, "?") for name in ("samples_merged", "cells", "journalled"))
+        merged = info.get("merged", row)
+        text = f"site {site}: {samples} samples in {cells} cells, journal row {row}"
+        return Finding(Level.PASS, "server", text + (f", merged only up to {merged}" if merged != row else ""))
     if is_there:
         problem = f"site {site}: a map server is there, but does not answer"
         advice = "the router denies the question (see `sitegrid keys list`), or the server hangs"
@@ -97,10 +103,10 @@ def check_server(site: str, info: Mapping[str, Any] | None, *, is_there: bool, r
 
 def check_site(site: SiteConfig, info: Mapping[str, Any]) -> Finding:
     """Whether a site file means the same ground as the server."""
-    other = info["site"]
-    if (site.name, site.frame) == (other["name"], other["frame"]):
+    name, frame = (table_of(info, "site").get(key) for key in ("name", "frame"))
+    if (site.name, site.frame) == (name, frame):
         return Finding(Level.PASS, "site", f"{site.name}, frame {site.frame}, as the map server has it")
-    found = f"this is {site.name} with frame {site.frame}, the map server has {other['name']} with {other['frame']}"
+    found = f"this is {site.name} with frame {site.frame}, the map server has {name} with {frame}"
     return Finding(Level.FAIL, "site", found, "compare name and origin in the site files")
 
 
@@ -262,7 +268,7 @@ def check_spool(state: SpoolState, now_ns: int) -> Finding:
 
 def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     """A running agent, by what it says of itself."""
-    spool, uplink = (dict(values.get(part) or {}) for part in ("spool", "uplink"))
+    spool, uplink = (table_of(values, part) for part in ("spool", "uplink"))
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
     found = f"{machine} runs: {counts[0]}; {counts[1]}, {spool.get('put_aside', '?')} put aside"
     problems = [uplink.get("problem"), values.get("spool_problem"), values.get("calibration_problem")]

@@ -45,20 +45,24 @@ def _end_in_time(stop: threading.Event, handler: Callable[..., None], end_s: flo
     woken.setblocking(False)
     signal.set_wakeup_fd(woken.fileno(), warn_on_full_buffer=False)
 
-    def watch() -> None:
-        with heard, woken:  # held open for as long as the process runs
-            while heard.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
-                pass
+    def watch(_: socket.socket) -> None:  # holds the other end open for as long as the process runs
+        while True:
+            if heard.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
+                continue
             stop.set()
             time.sleep(end_s)
             if signal.getsignal(signal.SIGTERM) is handler:  # not where a test goes on
-                # beside it, for standard error may be a pipe that nobody empties
-                told = threading.Thread(target=log.warning, args=("ended in mid-work seconds=%g", end_s), daemon=True)
-                told.start()
-                told.join(0.2)
-                os._exit(0)
+                _end_now(end_s)
 
-    threading.Thread(target=watch, name="signals", daemon=True).start()
+    threading.Thread(target=watch, args=(woken,), name="signals", daemon=True).start()
+
+
+def _end_now(after_s: float) -> None:
+    """End, and say so beside it: standard error may be a pipe that nobody empties."""
+    told = threading.Thread(target=log.warning, args=("ended in mid-work seconds=%g", after_s), daemon=True)
+    told.start()
+    told.join(0.2)
+    os._exit(0)
 
 
 def wait(stop: threading.Event) -> None:

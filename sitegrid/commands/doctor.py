@@ -126,7 +126,7 @@ def _compared(patient: Patient, info: Mapping[str, Any], asked_ns: tuple[int, in
 def _permission(patient: Patient, session: zenoh.Session, info: Mapping[str, Any] | None) -> Finding:
     if not patient.machine:
         return skipped("permission", "these keys send no samples")
-    frame = patient.site_file.frame if patient.site_file else info["site"]["frame"] if info else ""
+    frame = patient.site_file.frame if patient.site_file else doctor.table_of(info or {}, "site").get("frame")
     if not frame:
         return skipped("permission", "give --site-file FILE, for the server does not tell the site's frame")
     answer = probes.ask_permission(session, patient.site, patient.machine, frame, patient.keys)

@@ -11,6 +11,7 @@ import zenoh
 
 from mapserver.config import ServerConfig
 from mapserver.exporter import Exporter, HealthEar, text_of
+from mapserver.grid import warm_up
 from mapserver.server import Server
 from mapserver.store import Verify
 from protocol.config import from_table, load_toml
@@ -29,6 +30,7 @@ def run(arguments: Namespace) -> int:
     table = load_toml(arguments.config) if arguments.config else {}
     config = from_table(ServerConfig, table, str(arguments.config))
     with ExitStack() as opened:
+        warm_up(config.fold)
         session = open_session(join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name))
         opened.callback(session.close)
         server = opened.enter_context(

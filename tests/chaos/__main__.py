@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.chaos.outcome import Interrupted, Told, table
+from tests.chaos.outcome import InterruptError, Told, table
 from tests.chaos.suite import FAULTS, WHOLE_S, run_suite, totals
 
 
@@ -27,7 +27,7 @@ def main(words: list[str] | None = None) -> int:
         told.say(f"seed {arguments.seed}")
         try:
             outcomes = run_suite(faults, arguments.keep or Path(folder), told, arguments.seed, arguments.seconds)
-        except Interrupted:
+        except InterruptError:
             told.say("interrupted; everything is ended")
             return 130
     told.say(f"\n{table(outcomes)}\n")

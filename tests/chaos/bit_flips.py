@@ -7,6 +7,7 @@ import re
 import shutil
 import signal
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Callable
 from enum import StrEnum
@@ -23,6 +24,8 @@ from protocol.site import load_site
 from tests.chaos.chaos_site import ROUTER, SERVER, Site
 from tests.chaos.outcome import Outcome
 from tests.chaos.scenario import Scenario
+
+STUCK_S = 2.0  # reading a spool of the suite takes milliseconds
 
 
 class Verdict(StrEnum):
@@ -96,7 +99,8 @@ def read_store(folder: Path, definition: Any) -> Content:
 
 def read_spool(path: Path) -> Content:
     """All that an agent would send: contents by identity, and what it says is lost."""
-    spool, found = Spool(path, SpoolConfig()), {}
+    spool, found, end_s = Spool(path, SpoolConfig()), {}, time.monotonic() + STUCK_S
+    spool._db.set_progress_handler(lambda: time.monotonic() > end_s, 20)
     try:
         while head := spool.head(1000):
             for i, row in enumerate(head.rows):
@@ -106,6 +110,8 @@ def read_spool(path: Path) -> Content:
         named = sum(counters.get(name, 0) for name in ("put_aside", "damaged"))
         return {"contents": found, "named": named}
     except sqlite3.Error as error:
+        if time.monotonic() > end_s:
+            raise TimeoutError from None
         raise StoreError(path, str(error)) from None  # the uplink reports it as the spool's, and sends nothing
     finally:
         spool._db.close()
@@ -142,10 +148,11 @@ def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[
 
 
 def _near_identities(content: bytes, truth: Content) -> list[int]:
-    """Where a journal keeps identities, watermarks and counts: few bytes, which chance would rarely hit."""
-    ids = {spool_id.to_bytes(8, "big") for _, spool_id in truth.get("marks", ())}
-    found = [match.start() for each in ids for match in re.finditer(re.escape(each), content)]
-    return [at for start in found for at in range(max(0, start - 12), min(len(content), start + 16))]
+    """Where a file keeps identities, watermarks and counts: few bytes, which chance would rarely hit."""
+    ids = {spool_id for _, spool_id in truth.get("marks", ())} | {spool_id for spool_id, _ in truth.get("contents", ())}
+    texts = {spool_id.to_bytes(8, "big") for spool_id in ids} | {f"{spool_id:016x}".encode() for spool_id in ids}
+    found = [match.span() for text in texts for match in re.finditer(re.escape(text), content)]
+    return [at for begin, end in found for at in range(max(0, begin - 12), min(len(content), end + 8))]
 
 
 def flip(path: Path, rng: random.Random, among: list[int] | None = None) -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -23,15 +20,13 @@ from protocol.logfolder import open_log
 from protocol.machine import plain_lines
 from protocol.session import free_endpoint
 from protocol.site import load_site
+from tests.chaos.leashed import Process
 from tests.chaos.outcome import Outcome, Span, Told, longest_pause
 from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings
 
 READY_S = 40.0
 RESUME_S = 60.0
-END_S = 10.0
 ROUTER, SERVER = "router", "server"
-# The kernel kills the children of a suite that was itself killed.
-LEASH = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
 COMMAND = ("-m", "sitegrid.cli")
 HOUR_S = 3600
 ALL_STOPPED = (signal.SIGCONT, signal.SIGTERM)
@@ -39,52 +34,6 @@ ALL_STOPPED = (signal.SIGCONT, signal.SIGTERM)
 
 class StartError(Exception):
     """The site did not come to life, before any fault."""
-
-
-class Process:
-    """One child, its output in files."""
-
-    def __init__(self, log: Path, command: Sequence[str], env: dict[str, str]) -> None:
-        self.log = log
-        with log.with_suffix(".out").open("wb") as out, log.with_suffix(".err").open("wb") as errors:
-            self._process = subprocess.Popen(
-                [*LEASH, *command],
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=errors,
-                start_new_session=True,
-                env={**os.environ, "OMP_NUM_THREADS": "1", **env},
-            )
-        self.pid = self._process.pid
-
-    @property
-    def code(self) -> int | None:
-        """Exit code, None while it runs."""
-        return self._process.poll()
-
-    def send(self, number: signal.Signals) -> None:
-        """Send a signal, if it still runs."""
-        if self.code is None:
-            self._process.send_signal(number)
-
-    def said(self, key: str) -> bool:
-        """Whether a line with this key was printed."""
-        return f'"{key}":' in self.log.with_suffix(".out").read_text(encoding="utf-8")
-
-    def last_words(self) -> str:
-        """The last line on standard error."""
-        lines = self.log.with_suffix(".err").read_text(encoding="utf-8", errors="replace").splitlines()
-        return lines[-1][:300] if lines else ""
-
-    def end(self, *numbers: signal.Signals) -> int:
-        """End it by signals, in the end by SIGKILL; returns the exit code."""
-        for number in numbers:
-            self.send(number)
-        try:
-            return self._process.wait(END_S if numbers else 0.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            return self._process.wait()
 
 
 class Site:
@@ -112,6 +61,7 @@ class Site:
         self.env: dict[str, dict[str, str]] = {}
         self.options: dict[str, tuple[str, ...]] = {}
         self.modules: dict[str, tuple[str, ...]] = {}
+        self.excuses: tuple[str, ...] = ()  # last words with which a process may end, to be started again
         self.outcome = Outcome("")
         self.faults: list[Span] = []
         self._recordings, self._first_ns = recordings, first_ns
@@ -184,11 +134,12 @@ class Site:
         self._wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
 
     def tend(self) -> None:
-        """Start again what has ended by itself; only the end of a drive is no problem."""
+        """Start again what has ended by itself; only the end of a drive, or one with an excuse, is no problem."""
         for role, process in list(self._running.items()):
             if process.code is not None:
-                if not process.said("ended"):
-                    self.problem(f"{role} ended with {process.code}: {process.last_words()}")
+                words = process.last_words()
+                if not process.said("ended") and not any(excuse in words for excuse in self.excuses):
+                    self.problem(f"{role} ended with {process.code}: {words}")
                 self.start(role)
 
     @contextmanager
@@ -286,8 +237,8 @@ class Site:
         if role == ROUTER:
             return ["router", "--listen", self.endpoints[role], *self.options.get(role, ())]
         if role == SERVER:
-            files = ("--store", str(self.folder / "store"), "--config", str(self.folder / "server.toml"))
-            return ["server", *where, *site, *files]
+            store = ("--store", str(self.folder / "store"), "--config", str(self.folder / "server.toml"))
+            return ["server", *where, *site, *store]
         first_ns = self._first_ns + self._starts * SECONDS * 10**9
         manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, first_ns, idle=idle)
         replay = ("--driver", "replay", "--log", manifest, "--data", self._recordings.data(role), "--speed", SPEED)

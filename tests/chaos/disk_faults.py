@@ -10,6 +10,15 @@ from tests.chaos.disk_shim import DiskError, FailingDisk, build
 from tests.chaos.outcome import Outcome
 from tests.chaos.scenario import Scenario
 
+# What SQLite and the system say; a process that starts on such a disk has to end, and is started again.
+EXCUSES = (
+    "disk I/O error",
+    "database or disk is full",
+    "unable to open database file",
+    "No space left",
+    "Input/output",
+)
+
 
 def disks(scenario: Scenario) -> Outcome:
     """Every write of the store, or of all spools, fails for some seconds; sometimes the process is killed in it."""
@@ -21,6 +30,7 @@ def disks(scenario: Scenario) -> Outcome:
         found = {name: FailingDisk(library, top / name, top / f"{name}.bin") for name in ("store", "spool")}
         site.env = {SERVER: found["store"].env, **dict.fromkeys(site.machines, found["spool"].env)}
         site.start_all()
+        site.excuses = EXCUSES
         while left_s > 0:
             name, error, is_killed = rng.choice(tuple(found)), rng.choice(tuple(DiskError)), rng.random() < 0.3
             pause_s, lasts_s = rng.uniform(0.5, 1.5), rng.uniform(0.5, 4.0)

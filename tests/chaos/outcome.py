@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from typing import Any
 
 Span = tuple[float, float]  # [s] of one clock
@@ -13,7 +14,7 @@ Span = tuple[float, float]  # [s] of one clock
 COLUMNS = ("fault", "count", "recorded", "merged", "lost", "double", "longest pause", "")
 
 
-class Interrupted(Exception):
+class InterruptError(Exception):
     """The suite is to end now."""
 
 
@@ -60,9 +61,9 @@ class Told:
         self.line(text, flush=True)
 
     def wait(self, seconds: float) -> None:
-        """Let time pass; Interrupted if the suite is to end."""
+        """Let time pass; InterruptError if the suite is to end."""
         if self.stop.wait(max(0.0, seconds)):
-            raise Interrupted
+            raise InterruptError
 
     def stop_on_signals(self) -> None:
         """Ctrl-C and SIGTERM end the suite in order: what it started is ended, what it made is removed."""
@@ -74,7 +75,7 @@ def longest_pause(commits: Sequence[float], faults: Iterable[Span], end_s: float
     """The longest time without a commit, from the first one to end_s, without what faults lasted meanwhile."""
     times = [*sorted(commits), end_s]
     spans = _united(faults)
-    return max((b - a - _covered((a, b), spans) for a, b in zip(times, times[1:], strict=False)), default=0.0)
+    return max((b - a - _covered((a, b), spans) for a, b in pairwise(times)), default=0.0)
 
 
 def _united(spans: Iterable[Span]) -> list[Span]:

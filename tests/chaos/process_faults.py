@@ -15,9 +15,9 @@ FREEZES_S = (1.0, 3.5, 8.0, 13.0)  # shorter and longer than an ack's time-out (
 
 
 def draw_kills(rng: random.Random, machines: tuple[str, ...], n: int, seconds: float) -> list[tuple[float, str]]:
-    """Victims, and how long to wait before each [s]; together about `seconds`."""
+    """Victims, and how long to wait before each [s], together `seconds`: bursts, and calms in which work is done."""
     victims = [*machines, *(ROUTER, SERVER) * 2]
-    pauses = [rng.expovariate(1.0) for _ in range(n)]
+    pauses = [rng.expovariate(1.0) ** 2 for _ in range(n)]
     scale = seconds / sum(pauses)
     return [(pause * scale, rng.choice(victims)) for pause in pauses]
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 
 from protocol.logfolder import open_log, write_log
 from sim.config import SimConfig
 from sim.recorder import record
 
-SECONDS = 120
-SPEED = 2.0  # times real time: about 15 samples a second and machine
+SECONDS = 160
+SPEED = 4.0  # times real time: about 25 samples a second and machine
 IDLE = "idle"
 START_NS = SimConfig().start_ns  # what stamps of recordings begin with
 AGENT = """
@@ -52,10 +53,10 @@ class Recordings:
         return path
 
 
-def make(folder: Path, machines: int, seed: int, seconds: float = SECONDS) -> Recordings:
-    """Record machines that drive."""
+def make(folder: Path, machines: int, seed: int, seconds: float = SECONDS, stop: Event | None = None) -> Recordings:
+    """Record machines that drive; stop: once set, the recording ends with what it has."""
     folder.mkdir(parents=True, exist_ok=True)
-    simulator = record(SimConfig(world="fast", machines=machines, seconds=seconds, seed=seed), folder)
+    simulator = record(SimConfig(world="fast", machines=machines, seconds=seconds, seed=seed), folder, stop=stop)
     names = tuple(machine.name for machine in simulator.machines)
     for name in names:
         log = open_log(folder / name)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.chaos import bit_flips, clock_faults, disk_faults, link_faults, power_cuts, process_faults, write_faults
-from tests.chaos.outcome import Interrupted, Outcome, Told
+from tests.chaos.outcome import InterruptError, Outcome, Told
 from tests.chaos.recordings import make
 from tests.chaos.scenario import Scenario
 
@@ -43,9 +43,9 @@ FAULTS = (
 
 
 def run_suite(faults: Iterable[Fault], folder: Path, told: Told, seed: int, seconds: float) -> list[Outcome]:
-    """Run faults, a few at a time; Interrupted if the suite was told to end."""
+    """Run faults, a few at a time; InterruptError if the suite was told to end."""
     logging.disable()  # what the parts under test log of their misfortunes
-    recordings = make(folder / "recordings", MACHINES, seed)
+    recordings = make(folder / "recordings", MACHINES, seed, stop=told.stop)
     scenarios = [
         (
             fault,
@@ -57,7 +57,7 @@ def run_suite(faults: Iterable[Fault], folder: Path, told: Told, seed: int, seco
         runs = [lanes.submit(_run, fault, scenario) for fault, scenario in scenarios]
         outcomes = [run.result() for run in runs]
     if told.stop.is_set():
-        raise Interrupted
+        raise InterruptError
     return outcomes
 
 
@@ -67,7 +67,7 @@ def _run(fault: Fault, scenario: Scenario) -> Outcome:
         return Outcome(fault.name)
     try:
         outcome = fault.run(scenario)
-    except Interrupted:
+    except InterruptError:
         return Outcome(fault.name, problems=["interrupted"])
     except Exception as error:
         return Outcome(fault.name, problems=[f"{type(error).__name__}: {error}"])

