@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.audit import AuditLog
-from agents.spool_file import checksum, connect, make_or_check, transaction, why_unusable
+from agents.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.samples import SAMPLE_DTYPE, empty
@@ -271,10 +271,7 @@ class Spool:
 
     def _start_run(self) -> list[Run]:
         """Add a run to those that are still of interest: not closed, or among the last. One without samples is not."""
-        found = [
-            Run(base, int(spool_id, 16), acknowledged, bool(closed))
-            for base, spool_id, acknowledged, closed in self._db.execute("SELECT * FROM run ORDER BY base")
-        ]
+        found = [_run_of(*values) for values in self._db.execute("SELECT * FROM run ORDER BY base")]
         filled = [run for run in found if run.base < self._meta.newest]
         last = filled[-KEPT_RUNS:]
         first = next((i for i, run in enumerate(filled) if not run.closed or run in last), len(filled))
@@ -328,7 +325,10 @@ class Spool:
         values = [(f"{run.spool_id:016x}", number - run.base, row, why) for number, row in rows]
         with transaction(self._db):
             self._db.executemany("INSERT INTO aside VALUES (?, ?, ?, ?)", values)
-            self._db.executemany("DELETE FROM sample WHERE number = ?", [(number,) for number, _ in rows])
+            places = [(number,) for number, _ in rows]
+            gone = self._db.executemany("DELETE FROM sample WHERE number = ?", places).rowcount
+            if gone < len(rows):  # it is found where it is not: the file's own structure is damaged
+                raise sqlite3.DatabaseError(f"samples {places[0][0]} and on cannot be removed: the file is damaged")
         self._aside += len(values)
         self._depth -= len(values)
 
@@ -348,12 +348,25 @@ class Spool:
 
     def _save_run(self, run: Run) -> None:
         values = (run.base, f"{run.spool_id:016x}", run.acknowledged, int(run.closed))
-        self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?)", values)
+        self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?, ?)", (*values, checksum_of(*values)))
 
 
 def _damaged(rows: list[_Row]) -> list[tuple[int, bytes]]:
     """Those that are not what was written."""
-    return [(number, row) for number, row, _, crc32 in rows if crc32 not in (None, checksum(number, row))]
+    return [(number, row) for number, row, _, crc32 in rows if not _is_sound(number, row, crc32)]
+
+
+def _is_sound(number: int, row: object, crc32: int | None) -> bool:
+    if not isinstance(row, bytes) or len(row) != SAMPLE_DTYPE.itemsize:
+        return False
+    return crc32 in (None, checksum(number, row))
+
+
+def _run_of(base: int, spool_id: str, acknowledged: int, closed: int, crc32: int | None = None) -> Run:
+    """A run as the file has it; ValueError where that is not what was written."""
+    if crc32 not in (None, checksum_of(base, spool_id, acknowledged, closed)):
+        raise ValueError(f"what it knows of samples from {base} on is damaged; move the file away")
+    return Run(base, int(spool_id, 16), acknowledged, bool(closed))
 
 
 def _table(rows: Iterable[bytes]) -> Table:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 SCHEMA = 2
 LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
-_RUN = "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INTEGER, closed INTEGER)"
+_RUN = "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INTEGER, closed INTEGER, crc32 INTEGER)"
 _TABLES = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
     "CREATE TABLE sample (number INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL, crc32 INTEGER)",
@@ -19,7 +19,7 @@ _TABLES = (
 )
 _FROM_SCHEMA_1 = (
     _RUN,
-    "INSERT INTO run SELECT 0, value, 0, 0 FROM meta WHERE key = 'spool_id'",
+    "INSERT INTO run SELECT 0, value, 0, 0, NULL FROM meta WHERE key = 'spool_id'",
     "UPDATE run SET acknowledged = (SELECT value FROM meta WHERE key = 'acknowledged')",
     "DELETE FROM meta WHERE key IN ('spool_id', 'acknowledged')",
     "ALTER TABLE sample RENAME COLUMN seq TO number",
@@ -48,6 +48,11 @@ def make_or_check(db: sqlite3.Connection) -> None:
 def checksum(number: int, row: bytes) -> int:
     """CRC-32 of a sample and its place."""
     return zlib.crc32(row, number & 0xFFFFFFFF)
+
+
+def checksum_of(*values: object) -> int:
+    """CRC-32 of plain values."""
+    return zlib.crc32(repr(values).encode())
 
 
 def why_unusable(error: Exception) -> str:

@@ -63,6 +63,7 @@ CREATE TABLE watermark (
     seq INTEGER NOT NULL,
     lost INTEGER NOT NULL,
     newest_ns INTEGER NOT NULL DEFAULT 0,
+    crc32 INTEGER,
     PRIMARY KEY (machine, spool_id)
 ) WITHOUT ROWID;
 {_EXTENT}"""
@@ -73,6 +74,8 @@ BEGIN IMMEDIATE;
 {_EXTENT}
 INSERT INTO extent {_OLD_EXTENT};
 ALTER TABLE watermark ADD COLUMN newest_ns INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE watermark ADD COLUMN crc32 INTEGER;
+INSERT INTO meta SELECT 'plain_until', COALESCE(MAX(row), 0) FROM journal;
 UPDATE watermark SET newest_ns = newest FROM
     (SELECT machine AS m, spool_id AS s, MAX(last_stamp_ns) AS newest FROM journal GROUP BY machine, spool_id)
     WHERE m = machine AND s = spool_id;
@@ -83,7 +86,7 @@ COMMIT;
 _SEEN_FROM_SCHEMA_1 = f"""
 CREATE TEMP VIEW extent (row, first_stamp_ns, last_stamp_ns, west_m, south_m, east_m, north_m) AS {_OLD_EXTENT};
 CREATE TEMP VIEW watermark AS SELECT machine, spool_id, seq, lost,
-    (SELECT COALESCE(MAX(last_stamp_ns), 0) FROM main.journal) AS newest_ns FROM main.watermark;
+    (SELECT COALESCE(MAX(last_stamp_ns), 0) FROM main.journal) AS newest_ns, NULL AS crc32 FROM main.watermark;
 CREATE TEMP TABLE events (id INTEGER PRIMARY KEY, kind TEXT, stamp_ns INTEGER, body TEXT);
 """
 _COLUMNS = "SELECT row, machine, spool_id, first_seq, received_ns, payload, crc32 FROM "
@@ -166,6 +169,7 @@ class JournalReads:
 
     path: Path
     _db: sqlite3.Connection
+    _plain_until: int  # rows up to this one were written by schema 1, which had a checksum of the payload alone
 
     def read(self, after: int = 0, until: int = LAST, wanted: Wanted = ALL) -> Iterator[JournalRow]:
         """Rows after < row <= until in order, also those that are committed meanwhile.
@@ -211,17 +215,26 @@ class JournalReads:
     def _row(
         self, row: int, machine: str, spool: bytes, first_seq: int, received_ns: int, payload: bytes, crc32: int
     ) -> JournalRow:
-        if zlib.crc32(payload) != crc32:
+        plain = row <= self._plain_until and isinstance(payload, bytes) and zlib.crc32(payload) == crc32
+        if not plain and _checksum(row, machine, spool, first_seq, received_ns, payload) != crc32:
             raise StoreError(self.path, f"journal row {row} is damaged; restore the file from a backup")
         return JournalRow(row, machine, int.from_bytes(spool, "big"), first_seq, _unpack(payload), received_ns)
 
     def _load_marks(self) -> dict[tuple[str, int], Mark]:
-        rows = self._db.execute("SELECT machine, spool_id, seq, lost, newest_ns FROM watermark")
-        return {(machine, int.from_bytes(spool, "big")): Mark(*values) for machine, spool, *values in rows}
+        marks = {}
+        for machine, spool, *values, crc32 in self._db.execute(
+            "SELECT machine, spool_id, seq, lost, newest_ns, crc32 FROM watermark"
+        ):
+            if crc32 not in (None, _checksum(machine, spool, *values)):
+                raise StoreError(self.path, f"the watermark of {machine} is damaged; restore the file from a backup")
+            marks[machine, int.from_bytes(spool, "big")] = Mark(*values)
+        return marks
 
 
 class Journal(JournalReads):
     """One writer's connection to the journal of one site."""
+
+    last_row: int
 
     def __init__(self, path: Path, site: str, frame: str) -> None:
         self.path = path
@@ -258,13 +271,15 @@ class Journal(JournalReads):
         payload = _pack(batch.rows)
         x_m, y_m, stamps = (batch.rows[name] for name in ("x_m", "y_m", "stamp_ns"))
         first_ns, last_ns = int(stamps.min()), int(stamps.max())
-        values = (batch.machine, _spool_bytes(batch.spool_id), batch.first_seq, len(batch.rows), received_ns)
-        cursor = self._db.execute(
-            "INSERT INTO journal (machine, spool_id, first_seq, n, received_ns, first_stamp_ns, last_stamp_ns, payload,"
-            " crc32) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*values, first_ns, last_ns, payload, zlib.crc32(payload)),
+        spool = _spool_bytes(batch.spool_id)
+        row = self.last_row + 1
+        crc32 = _checksum(row, batch.machine, spool, batch.first_seq, received_ns, payload)
+        values = (row, batch.machine, spool, batch.first_seq, len(batch.rows), received_ns)
+        self._db.execute(
+            "INSERT INTO journal (row, machine, spool_id, first_seq, n, received_ns, first_stamp_ns, last_stamp_ns,"
+            " payload, crc32) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (*values, first_ns, last_ns, payload, crc32),
         )
-        row = int(cursor.lastrowid or 0)
         box = (float(x_m.min()), float(y_m.min()), float(x_m.max()), float(y_m.max()))
         self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?)", (row, first_ns, last_ns, *box))
         before = self.mark(batch.machine, batch.spool_id)
@@ -284,7 +299,7 @@ class Journal(JournalReads):
     def put_mark(self, machine: str, spool_id: int, mark: Mark) -> None:
         """Write a watermark into the open transaction."""
         values = (machine, _spool_bytes(spool_id), mark.seq, mark.lost, mark.newest_ns)
-        self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?)", values)
+        self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", (*values, _checksum(*values)))
         self._marks[machine, spool_id] = mark
 
     def commit(self) -> None:
@@ -358,6 +373,8 @@ class Journal(JournalReads):
                 raise StoreError(self.path, problem)
         if found["schema"] == "1":
             self._db.executescript(_FROM_SCHEMA_1)
+            found = _meta(self._db)
+        self._plain_until = int(found.get("plain_until", 0))
 
     def _return_to_disk(self) -> None:
         self._marks = self._load_marks()
@@ -389,6 +406,7 @@ class JournalReader(JournalReads):
             except sqlite3.Error as error:
                 raise StoreError(path, f"is no usable journal: {error}") from None
             self.site, self.frame = found["site"], found["frame"]
+            self._plain_until = LAST if found["schema"] == "1" else int(found.get("plain_until", 0))
             opened.pop_all()
 
     @property
@@ -413,6 +431,14 @@ class JournalReader(JournalReads):
 
 def _meta(db: sqlite3.Connection) -> dict[str, str]:
     return dict(db.execute("SELECT key, value FROM meta"))
+
+
+def _checksum(*values: object) -> int:
+    """CRC-32 of plain values, bytes among them."""
+    crc32 = 0
+    for value in values:
+        crc32 = zlib.crc32(value if isinstance(value, bytes) else repr(value).encode(), crc32)
+    return crc32
 
 
 def _spool_bytes(spool_id: int) -> bytes:

@@ -137,7 +137,7 @@ def _command(data: bytes) -> None:
 def _configs() -> Iterator[Decoder]:
     shipped = {name: (CONFIG / f"{name}.toml").read_bytes() for name in ("site", "server", "agent", "sim")}
     ground = b'[[known_ground]]\nname = "pad"\nc_rr = 0.02\noutline = [[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]\n'
-    yield _config("site", (shipped["site"], shipped["site"] + ground), lambda path: load_site(path).frame)
+    yield _config("site", (shipped["site"], shipped["site"].replace(b"known_ground = []", b"") + ground), lambda path: load_site(path).frame)
     yield _config("server", (shipped["server"],), lambda path: from_table(ServerConfig, load_toml(path), str(path)))
     yield _config("agent", (shipped["agent"],), load_agent)
     yield _config("sim", (shipped["sim"],), load_sim)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver.archive import FOLDER, ArchiveFile, archive
+from mapserver.archive import FOLDER, ArchiveFile, next_file
 from mapserver.ingest import Admission
 from mapserver.journal import Journal, JournalReader, JournalRow
 from protocol.errors import StoreError
@@ -42,7 +42,8 @@ def archive_decoder(folder: Path) -> Decoder:
     """A file that is damaged anywhere."""
     expected = _journal(folder)
     with JournalReader(folder / "journal.db") as reader:
-        (made,) = archive(folder / FOLDER, reader, SITE, T0 + 100 * HOUR_NS, lambda until: until)
+        made = next_file(folder / FOLDER, reader, SITE, T0 + 100 * HOUR_NS)
+    assert made is not None
 
     def decode(data: bytes) -> None:
         made.write_bytes(data)

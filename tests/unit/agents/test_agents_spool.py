@@ -533,3 +533,48 @@ def test_disk_that_takes_nothing_is_named(tmp_path: Path) -> None:
     spool._db.execute("PRAGMA query_only = OFF")
     assert spool.record(made_up_samples(2)) == 1
     spool.close()
+
+
+# --- damage that SQLite does not see ---------------------------------------------------------------------------------
+
+
+def changed(path: Path, statement: str) -> Path:
+    db = sqlite3.connect(path / "spool.db")
+    db.execute(statement)
+    db.commit()
+    db.close()
+    return path
+
+
+@pytest.mark.parametrize("column", ["spool_id = '00000000000000ff'", "acknowledged = 2", "closed = 1", "crc32 = 5"])
+def test_a_run_that_is_not_what_was_written_is_no_reason_to_send_under_another_identity(
+    tmp_path: Path, column: str
+) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:3])
+    spool.close()
+    with pytest.raises(StoreError, match="is damaged; move the file away"):
+        opened(changed(tmp_path, f"UPDATE run SET {column}"))
+
+
+@pytest.mark.parametrize("row", ["x''", "x'0102'", "5", "'text'"])
+def test_a_sample_that_is_none_is_put_aside_and_the_others_are_sent(tmp_path: Path, row: str) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:3])
+    spool.close()
+    spool = opened(changed(tmp_path, f"UPDATE sample SET row = {row} WHERE number = 1"))
+    head = spool.head(10)
+    assert (head.first_seq, len(head.rows), head.lost_before) == (2, 2, 1)
+    assert spool.counters()["put_aside"] == 1
+    spool.close()
+
+
+def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:3])
+    spool._db.execute("UPDATE sample SET crc32 = 1 WHERE number = 2")
+    spool._db.execute("CREATE TRIGGER stays BEFORE DELETE ON sample BEGIN SELECT RAISE(IGNORE); END")
+    with pytest.raises(sqlite3.DatabaseError, match="the file is damaged"):
+        spool.head(10)
+    assert spool.counters()["put_aside"] == 0
+    spool.close()

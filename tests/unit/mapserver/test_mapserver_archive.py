@@ -489,8 +489,9 @@ def test_a_file_that_is_not_the_journal_s_is_never_a_reason_to_forget(day):
     with pytest.raises(StoreError, match=r"000003\.parquet: row 3 is not the journal's; .* move this file away"):
         day.archive()
     day.journal._db.execute("UPDATE journal SET machine = 'c' WHERE row = 1")
-    with pytest.raises(StoreError, match="row 1 is not the journal's"):
+    with pytest.raises(StoreError, match="row 1 is damaged"):
         day.archive()
+    day.journal._db.execute("UPDATE journal SET machine = 'a' WHERE row = 1")
     assert day.journal.archived_row == 0
     path.rename(path.with_suffix(".away"))
     assert len(day.archive()) == 3

@@ -1,4 +1,5 @@
 import sqlite3
+import zlib
 from pathlib import Path
 
 import msgpack
@@ -337,8 +338,10 @@ def older(tmp_path) -> Path:
     write(journal, admission(5), admission(2, first_seq=6, lost=1), admission(4, spool_id=2**64 - 1))
     journal._db.executescript(
         "DROP TABLE extent; DROP TABLE events; ALTER TABLE watermark DROP COLUMN newest_ns;"
-        "UPDATE meta SET value = '1' WHERE key = 'schema'"
+        "ALTER TABLE watermark DROP COLUMN crc32; UPDATE meta SET value = '1' WHERE key = 'schema'"
     )
+    for row, payload in journal._db.execute("SELECT row, payload FROM journal").fetchall():
+        journal._db.execute("UPDATE journal SET crc32 = ? WHERE row = ?", (zlib.crc32(payload), row))
     journal.close()
     return tmp_path / "journal.db"
 
@@ -459,3 +462,36 @@ def test_an_event_is_never_part_of_a_group_commit(tmp_path):
     journal.commit()
     assert (numbers(journal.read()), journal.events()) == ([1], [])
     journal.close()
+
+
+# --- damage ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "machine = 'b'",
+        "spool_id = x'0000000000000009'",
+        "first_seq = 2",
+        "received_ns = 5",
+        "payload = x'00'",
+        "crc32 = 1",
+    ],
+)
+def test_a_row_that_is_not_what_was_written_is_named_and_not_read(tmp_path, change):
+    journal = open_journal(tmp_path)
+    write(journal, admission(3))
+    journal._db.execute(f"UPDATE journal SET {change} WHERE row = 1")
+    with pytest.raises(StoreError, match="journal row 1 is damaged"):
+        list(journal.read())
+    journal.close()
+
+
+@pytest.mark.parametrize("change", ["machine = 'b'", "seq = 2", "lost = 1", "newest_ns = 7", "crc32 = 1"])
+def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
+    journal = open_journal(tmp_path)
+    write(journal, admission(3))
+    journal._db.execute(f"UPDATE watermark SET {change}")
+    journal.close()
+    with pytest.raises(StoreError, match=r"the watermark of . is damaged"):
+        open_journal(tmp_path)
