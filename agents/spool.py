@@ -66,11 +66,15 @@ class Run:
 
 @dataclass(frozen=True)
 class _Meta:
-    """Counts of the file: the last number given out, samples that were dropped, samples that were recorded."""
+    """Counts of the file: the last number given out, samples that were dropped, samples that were recorded.
+
+    plain_until: numbers up to this one were given by schema 1, which had no checksums.
+    """
 
     newest: int
     dropped: int
     recorded: int
+    plain_until: int = 0
 
 
 _Row = tuple[int, bytes, int, int | None]  # number, sample, whether it is final, checksum
@@ -175,7 +179,7 @@ class Spool:
         """
         with self._lock:
             run, end = self._runs[self._at], self._end(self._at)
-            while damaged := _damaged(found := self._oldest(limit)):
+            while damaged := _damaged(found := self._oldest(limit), self._meta.plain_until):
                 self._move_aside(run, damaged, "damaged on the machine's disk")
             if not found:
                 is_earlier = self._at < len(self._runs) - 1
@@ -271,7 +275,8 @@ class Spool:
 
     def _start_run(self) -> list[Run]:
         """Add a run to those that are still of interest: not closed, or among the last. One without samples is not."""
-        found = [_run_of(*values) for values in self._db.execute("SELECT * FROM run ORDER BY base")]
+        plain = self._meta.plain_until
+        found = [_run_of(*row, is_plain=row[0] < plain) for row in self._db.execute("SELECT * FROM run ORDER BY base")]
         filled = [run for run in found if run.base < self._meta.newest]
         last = filled[-KEPT_RUNS:]
         first = next((i for i, run in enumerate(filled) if not run.closed or run in last), len(filled))
@@ -351,20 +356,20 @@ class Spool:
         self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?, ?)", (*values, checksum_of(*values)))
 
 
-def _damaged(rows: list[_Row]) -> list[tuple[int, bytes]]:
-    """Those that are not what was written."""
-    return [(number, row) for number, row, _, crc32 in rows if not _is_sound(number, row, crc32)]
+def _damaged(rows: list[_Row], plain_until: int) -> list[tuple[int, bytes]]:
+    """Those that are not what was written; up to plain_until samples have no checksum."""
+    return [(number, row) for number, row, _, crc32 in rows if not _is_sound(number, row, crc32, number <= plain_until)]
 
 
-def _is_sound(number: int, row: object, crc32: int | None) -> bool:
+def _is_sound(number: int, row: object, crc32: int | None, is_plain: bool) -> bool:  # noqa: FBT001
     if not isinstance(row, bytes) or len(row) != SAMPLE_DTYPE.itemsize:
         return False
-    return crc32 in (None, checksum(number, row))
+    return crc32 == checksum(number, row) or (is_plain and crc32 is None)
 
 
-def _run_of(base: int, spool_id: str, acknowledged: int, closed: int, crc32: int | None = None) -> Run:
+def _run_of(base: int, spool_id: str, acknowledged: int, closed: int, crc32: int | None, *, is_plain: bool) -> Run:
     """A run as the file has it; ValueError where that is not what was written."""
-    if crc32 not in (None, checksum_of(base, spool_id, acknowledged, closed)):
+    if crc32 != checksum_of(base, spool_id, acknowledged, closed) and not (is_plain and crc32 is None):
         raise ValueError(f"what it knows of samples from {base} on is damaged; move the file away")
     return Run(base, int(spool_id, 16), acknowledged, bool(closed))
 

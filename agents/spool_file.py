@@ -23,7 +23,8 @@ _FROM_SCHEMA_1 = (
     "UPDATE run SET acknowledged = (SELECT value FROM meta WHERE key = 'acknowledged')",
     "DELETE FROM meta WHERE key IN ('spool_id', 'acknowledged')",
     "ALTER TABLE sample RENAME COLUMN seq TO number",
-    "ALTER TABLE sample ADD COLUMN crc32 INTEGER",  # NULL: not known, taken as it is
+    "ALTER TABLE sample ADD COLUMN crc32 INTEGER",
+    "INSERT INTO meta SELECT 'plain_until', value FROM meta WHERE key = 'newest'",  # up to there it is not known
     f"PRAGMA user_version={SCHEMA}",
 )
 

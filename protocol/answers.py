@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Floats, Floats32
-from protocol.codec import MAX_SMALL_BYTES, pack, take, unpack
+from protocol.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_plain, unpack
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.geometry import MAX_CELLS, Bounds
 
 MAX_REPLY_BYTES = 2**30
 MAX_CELL_M = 1e4
+MAX_PLACE_M = 1e7  # from the origin
+MAX_ITEMS = 100_000  # of one list
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def encode_point(answer: PointAnswer) -> bytes:
 
 def decode_point(data: bytes) -> PointAnswer:
     """Undo `encode_point`."""
-    table = unpack(data, MAX_REPLY_BYTES)
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     x, y, values = take(table, "x_m", float), take(table, "y_m", float), _take_values(table)
     return PointAnswer(x, y, values, take(table, "merged", int), take(table, "stamp_ns", int))
 
@@ -109,20 +111,29 @@ def encode_region(region: Region) -> bytes:
 
 def decode_region(data: bytes) -> Region:
     """Undo `encode_region`."""
-    table = unpack(data, MAX_REPLY_BYTES)
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
     if not (0 < cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
-    tables = take(table, "layers", dict)
+    if not (tables := take(table, "layers", dict)):  # what is in them proves the number of cells
+        raise MessageError(Refusal.MISSING_FIELD, "empty", field="layers")
     layers = {name: _decode_layer(tables, name, rows, columns) for name in tables}
+    west_m, south_m = (_take_place(table, name) for name in ("west_m", "south_m"))
     return Region(
-        x_m=take(table, "west_m", float) + (np.arange(columns) + 0.5) * cell_m,
-        y_m=take(table, "south_m", float) + (np.arange(rows) + 0.5) * cell_m,
+        x_m=west_m + (np.arange(columns) + 0.5) * cell_m,
+        y_m=south_m + (np.arange(rows) + 0.5) * cell_m,
         cell_m=cell_m,
         layers=layers,
         merged=take(table, "merged", int),
         stamp_ns=take(table, "stamp_ns", int),
     )
+
+
+def _take_place(table: dict[str, Any], name: str) -> float:
+    value: float = take(table, name, float)
+    if abs(value) > MAX_PLACE_M:
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{value} is beyond {MAX_PLACE_M:g} m", field=name)
+    return value
 
 
 def _decode_layer(layers: dict[str, Any], name: str, rows: int, columns: int) -> Floats32:
@@ -142,7 +153,7 @@ def encode_history(answer: HistoryAnswer) -> bytes:
 
 def decode_history(data: bytes) -> HistoryAnswer:
     """Undo `encode_history`."""
-    table = unpack(data, MAX_REPLY_BYTES)
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     spans = tuple(
         Span(take(span, "first_ns", int), take(span, "last_ns", int), _take_values(span))
         for span in _take_rows(table, "spans")
@@ -173,7 +184,7 @@ def encode_info(info: Mapping[str, Any]) -> bytes:
 
 def decode_info(data: bytes) -> dict[str, Any]:
     """Undo `encode_info`."""
-    info: dict[str, Any] = take(unpack(data, MAX_REPLY_BYTES), "info", dict)
+    info: dict[str, Any] = take_plain(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
     return info
 
 
@@ -184,7 +195,7 @@ def encode_machines(machines: Sequence[Mapping[str, Any]]) -> bytes:
 
 def decode_machines(data: bytes) -> list[dict[str, Any]]:
     """Undo `encode_machines`."""
-    return _take_rows(unpack(data, MAX_REPLY_BYTES), "machines")
+    return _take_rows(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machines")
 
 
 def encode_machine(machine: Mapping[str, Any]) -> bytes:
@@ -194,7 +205,7 @@ def encode_machine(machine: Mapping[str, Any]) -> bytes:
 
 def decode_machine(data: bytes) -> dict[str, Any]:
     """Undo `encode_machine`."""
-    machine: dict[str, Any] = take(unpack(data, MAX_REPLY_BYTES), "machine", dict)
+    machine: dict[str, Any] = take_plain(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
     return machine
 
 
@@ -205,7 +216,7 @@ def encode_changes(changes: Sequence[Mapping[str, Any]]) -> bytes:
 
 def decode_changes(data: bytes) -> list[dict[str, Any]]:
     """Undo `encode_changes`."""
-    return _take_rows(unpack(data, MAX_REPLY_BYTES), "changes")
+    return _take_rows(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "changes")
 
 
 def encode_change(change: Mapping[str, Any]) -> bytes:
@@ -215,7 +226,7 @@ def encode_change(change: Mapping[str, Any]) -> bytes:
 
 def decode_change(data: bytes) -> dict[str, Any]:
     """Undo `encode_change`."""
-    change: dict[str, Any] = take(unpack(data, MAX_SMALL_BYTES), "change", dict)
+    change: dict[str, Any] = take_plain(unpack(data, MAX_SMALL_BYTES), "change")
     return change
 
 
@@ -224,6 +235,7 @@ def _take_rows(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
     for index, row in enumerate(rows):
         if type(row) is not dict:
             raise MessageError(Refusal.WRONG_TYPE, f"map expected, not {type(row).__name__}", field=name, row=index)
+        check_plain(row, f"{name}[{index}]")
     return rows
 
 
@@ -237,5 +249,5 @@ def encode_error(error: QueryError) -> bytes:
 
 def decode_error(data: bytes) -> QueryError:
     """Undo `encode_error`."""
-    table = unpack(data, MAX_REPLY_BYTES)
+    table = unpack(data, MAX_SMALL_BYTES)
     return QueryError(take(table, "reason", str), take(table, "problem", str))

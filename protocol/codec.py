@@ -10,7 +10,7 @@ import msgpack
 import numpy as np
 
 from protocol.arrays import Table
-from protocol.errors import MessageError, Refusal
+from protocol.errors import MessageError, Refusal, one_line
 from protocol.messages import VERSION, Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 from protocol.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
 from protocol.samples import COLUMNS, SAMPLE_DTYPE, check_samples
@@ -20,7 +20,8 @@ MAX_BATCH_BYTES = 4 * 2**20
 MAX_BATCH_SAMPLES = 20_000
 MAX_BUNDLE_BYTES = 2**20
 MAX_SMALL_BYTES = 64 * 2**10
-MAX_ITEMS = 100_000  # of one list: the decoder reserves the length that a header claims
+MAX_ITEMS = 1000  # of one list, answers aside: the decoder reserves what a header claims, at each depth anew
+MAX_DEPTH = 16  # of plain values
 MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
 
@@ -31,12 +32,12 @@ def pack(table: dict[str, Any]) -> bytes:
     return packed
 
 
-def unpack(data: bytes, limit: int) -> dict[str, Any]:
-    """Undo `pack`; refuses what is too long, no MessagePack map, or of another version."""
+def unpack(data: bytes, limit: int, items: int = MAX_ITEMS) -> dict[str, Any]:
+    """Undo `pack`; refuses what is too long, no MessagePack map, or of another version. items: most in one list."""
     if len(data) > limit:
         raise MessageError(Refusal.TOO_LARGE, f"{len(data)} bytes, at most {limit} are allowed")
     try:
-        table = msgpack.unpackb(data, max_array_len=MAX_ITEMS)
+        table = msgpack.unpackb(data, max_array_len=min(items, len(data)))
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
         raise MessageError(Refusal.NOT_MSGPACK, f"not MessagePack, or cut off: {error}") from None
     if not isinstance(table, dict):
@@ -58,6 +59,29 @@ def take(table: dict[str, Any], name: str, kind: type[Any], default: Any = None)
     if kind is float and not math.isfinite(value):
         raise MessageError(Refusal.NOT_FINITE, f"{value} is not finite", field=name)
     return value
+
+
+def check_plain(value: Any, field: str, depth: int = MAX_DEPTH) -> None:
+    """Refuse what is no plain value: bytes, MessagePack's own types, and tables deeper than `depth`."""
+    if depth < 0:
+        raise MessageError(Refusal.WRONG_TYPE, f"nested more than {MAX_DEPTH} deep", field=field)
+    if isinstance(value, dict):
+        for name, of in value.items():
+            if type(name) is not str:
+                raise MessageError(Refusal.WRONG_TYPE, f"the name {name!r:.40} is no text", field=field)
+            check_plain(of, field, depth - 1)
+    elif isinstance(value, list):
+        for of in value:
+            check_plain(of, field, depth - 1)
+    elif not isinstance(value, str | int | float | None):
+        raise MessageError(Refusal.WRONG_TYPE, f"{type(value).__name__} is no plain value", field=field)
+
+
+def take_plain(table: dict[str, Any], name: str) -> dict[str, Any]:
+    """Take a map of plain values, which can be shown as they are."""
+    values: dict[str, Any] = take(table, name, dict)
+    check_plain(values, name)
+    return values
 
 
 def _take_int(table: dict[str, Any], name: str, low: int, high: int, reason: Refusal = Refusal.OUT_OF_RANGE) -> int:
@@ -142,7 +166,8 @@ def decode_reply(data: bytes) -> Ack | Refused:
     if take(table, "ack", bool):
         numbers = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
         return Ack(*numbers)
-    return Refused(take(table, "reason", str), take(table, "problem", str), _take_int(table, "expected", 0, MAX_SEQ))
+    reason, problem = (one_line(take(table, name, str)) for name in ("reason", "problem"))
+    return Refused(reason, problem, _take_int(table, "expected", 0, MAX_SEQ))
 
 
 # --- readings --------------------------------------------------------------------------------------------------------
@@ -229,4 +254,4 @@ def decode_health(data: bytes) -> Health:
     """Undo `encode_health`."""
     table = unpack(data, MAX_SMALL_BYTES)
     stamp_ns = _take_int(table, "stamp_ns", 0, MAX_STAMP_NS)  # 0: nothing was read yet
-    return Health(_take_name(table), stamp_ns, take(table, "values", dict))
+    return Health(_take_name(table), stamp_ns, take_plain(table, "values"))

@@ -24,7 +24,7 @@ def load_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(path, "no such file") from None
     except OSError as error:
         raise ConfigError(path, f"cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also numbers of thousands of digits, and lists as deep
         raise ConfigError(path, f"not valid TOML: {error}") from None
 
 
@@ -71,12 +71,15 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         return {name: _convert(v, of, f"{where}.{name}") for name, v in _table(value, where).items()}
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_table(hint, _table(value, where), where)
+    if type(value) is int and value.bit_length() > 63:
+        raise ConfigError(where, "a number of at most 64 bits is expected")
     if hint is float and type(value) is int:
         return float(value)
     if hint is float and type(value) is float and not math.isfinite(value):
         raise ConfigError(where, f"a finite number is expected, not {value}")
     if type(value) is not hint:
-        raise ConfigError(where, f"{hint.__name__} is expected, not {type(value).__name__} ({value!r})")
+        shown = "" if isinstance(value, dict | list) else f" ({value!r:.80})"
+        raise ConfigError(where, f"{hint.__name__} is expected, not {type(value).__name__}{shown}")
     return value
 
 

@@ -33,8 +33,22 @@ class Refusal(StrEnum):
     AFTER_TIMEOUT = "after_timeout"
 
 
+MAX_LINE = 500  # characters
+
+
+def one_line(text: str) -> str:
+    """A text that may hold anything from outside as one line: signs that do not print escaped, its end cut off."""
+    plain = text[:MAX_LINE]
+    if not plain.isprintable():
+        plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in plain)
+    return text if plain == text else f"{plain[: MAX_LINE - 3]}..." if len(plain) > MAX_LINE - 3 else plain
+
+
 class SitegridError(Exception):
-    """Base of all errors that this project raises on purpose."""
+    """Base of all errors that this project raises on purpose. Their texts are one line, whatever they quote."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
 
 
 class ConfigError(SitegridError):

@@ -24,6 +24,7 @@ from protocol.site import SiteConfig
 from protocol.units import factor, stamp_ns, stamp_scale
 
 MANIFEST = "log.toml"
+MAX_LINE = 2**20  # characters of a CSV file
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ class LogFolder:
         path = self.data / source.file
         try:
             with _open_text(path) as text:
-                yield from self._parse(csv.DictReader(text), source, path)
-        except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
+                yield from self._parse(csv.DictReader(_lines(text, path)), source, path)
+        except (OSError, EOFError, zlib.error, ValueError, csv.Error) as error:  # ValueError: no UTF-8, or no path
             raise LogFolderError(path, f"cannot be read: {error}") from None
 
     def _parse(self, rows: csv.DictReader[str], source: Source, path: Path) -> Iterator[Reading]:
@@ -183,6 +184,14 @@ def _open_text(path: Path) -> IO[str]:
     if path.suffix == ".gz":
         return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
     return path.open(encoding="utf-8-sig", newline="")  # with or without the mark that spreadsheets write
+
+
+def _lines(text: IO[str], path: Path) -> Iterator[str]:
+    """Lines, refused where one is so long that it is none: a small packed file can hold one of many gigabytes."""
+    while line := text.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            raise LogFolderError(path, f"cannot be read: a line is longer than {MAX_LINE} characters")
+        yield line
 
 
 def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig, readings: Iterable[Reading]) -> None:

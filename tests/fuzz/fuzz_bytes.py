@@ -7,7 +7,16 @@ from collections.abc import Sequence
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
 
-_CHUNKS = (b"\x00", b"\xff\xff\xff\xff", b"\x00" * 64, b"\xdd\xff\xff\xff\xff", b"\n", b'"', b"[" * 3000, b"\xef\xbb\xbf")
+_CHUNKS = (
+    b"\x00",
+    b"\xff\xff\xff\xff",
+    b"\x00" * 64,
+    b"\xdd\xff\xff\xff\xff",
+    b"\n",
+    b'"',
+    b"[" * 3000,
+    b"\xef\xbb\xbf",
+)
 
 
 @st.composite

@@ -13,7 +13,7 @@ from pathlib import Path
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis.errors import HypothesisException
 
-from tests.fuzz.fuzz_verdict import Decoder, Fault, judge
+from tests.fuzz.fuzz_verdict import Decoder, FaultError, judge
 
 CORPUS = Path(__file__).parent / "corpus"
 MAX_FILE_BYTES = 16 * 2**10
@@ -37,7 +37,7 @@ class Result:
                 self.accepted += 1
             else:
                 self.refused += 1
-        except Fault as fault:
+        except FaultError as fault:
             shortest = self.faults.get(fault.signature)
             if shortest is None or len(data) < len(shortest[1]):
                 self.faults[fault.signature] = (str(fault), data)
@@ -82,11 +82,11 @@ def fuzz(decoder: Decoder, result: Result, n: int, number: int) -> None:
         tries += bool(first)
         if signature and signature not in known and signature == (first or signature) and tries < SHRINK:
             first = signature
-            raise Fault(signature, "again")
+            raise FaultError(signature, "again")
 
     try:
         one()
-    except (Fault, HypothesisException):  # also where shrinking was cut short, which Hypothesis calls flaky
+    except (FaultError, HypothesisException):  # also where shrinking was cut short, which Hypothesis calls flaky
         assert first, "Hypothesis failed by itself"
 
 

@@ -18,14 +18,14 @@ from agents import calibration_file
 from agents.config import load_agent
 from agents.estimation.calibration import Calibration
 from mapserver.config import ServerConfig
-from protocol import codec, queries
+from protocol import queries
 from protocol.admin import TrustCommand, encode_command, parse_command
 from protocol.config import from_table, load_toml
 from protocol.credentials import check_valid, load_credentials
 from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
 from protocol.geometry import Bounds
 from protocol.logfolder import open_log, write_log
-from protocol.machine import MachineConfig, SensorConfig, machine_toml
+from protocol.machine import MachineConfig, SensorConfig
 from protocol.parameters import selector_of, split_selector
 from protocol.readings import Gps, Imu
 from protocol.site import load_site
@@ -65,7 +65,7 @@ def decoders() -> tuple[Decoder, ...]:
 
 def _messages() -> Iterator[Decoder]:
     batches = ("batch.bin", "batch_lost.bin", "batch_empty.bin", NEWER)
-    golden = {name: tuple((FOLDER / f"{name}.bin").read_bytes() for _ in (0,)) for name in _SINGLE}
+    golden = {name: ((FOLDER / f"{name}.bin").read_bytes(),) for name in _SINGLE}
     several = {"batch": tuple((FOLDER / name).read_bytes() for name in batches)}
     several["reply"] = tuple((FOLDER / name).read_bytes() for name in ("ack.bin", "refused.bin"))
     for name, seeds in {**golden, **several}.items():
@@ -137,7 +137,11 @@ def _command(data: bytes) -> None:
 def _configs() -> Iterator[Decoder]:
     shipped = {name: (CONFIG / f"{name}.toml").read_bytes() for name in ("site", "server", "agent", "sim")}
     ground = b'[[known_ground]]\nname = "pad"\nc_rr = 0.02\noutline = [[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]\n'
-    yield _config("site", (shipped["site"], shipped["site"].replace(b"known_ground = []", b"") + ground), lambda path: load_site(path).frame)
+    yield _config(
+        "site",
+        (shipped["site"], shipped["site"].replace(b"known_ground = []", b"") + ground),
+        lambda path: load_site(path).frame,
+    )
     yield _config("server", (shipped["server"],), lambda path: from_table(ServerConfig, load_toml(path), str(path)))
     yield _config("agent", (shipped["agent"],), load_agent)
     yield _config("sim", (shipped["sim"],), load_sim)

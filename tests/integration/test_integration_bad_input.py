@@ -1,0 +1,234 @@
+"""Bad input to real processes: one counted refusal each, a clear error, an untouched journal, and service goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import zenoh
+from site_run import READY_S, SiteRun  # beside this file
+
+from protocol import keys
+from protocol.codec import MAX_BATCH_BYTES, decode_health, decode_reply, encode_batch
+from protocol.errors import Refusal
+from protocol.messages import Ack, Refused, SampleBatch
+from protocol.queries import decode_error
+from protocol.samples import SAMPLE_DTYPE
+from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.site import load_site
+from sim.config import SimConfig
+from sitegrid.processes import Children, wait_until
+
+pytestmark = pytest.mark.processes
+
+NOW_NS = 1_767_225_600_000_000_000
+MACHINE = "probe"
+
+
+class Probe:
+    """A site with router and server, and a session that sends it whatever a test likes."""
+
+    def __init__(self, run: SiteRun) -> None:
+        self.router, self.server, self.run = run.start_router(), run.start_server(), run
+        self.site = load_site(run.site_file)
+        self.session: zenoh.Session = open_session(SessionConfig(run.endpoint))
+        self.client = run.connect()
+        self.where = f"router {self.router.pid}, server {self.server.pid}"
+        self.seq = 0
+
+    def close(self) -> None:
+        self.client.close()
+        self.session.close()
+
+    def send(self, payload: bytes | None, key: str = "") -> Ack | Refused:
+        key = key or keys.ingest(self.site.name, MACHINE)
+        found = [reply.ok for reply in self.session.get(key, payload=payload, timeout=READY_S)]
+        assert [ok is not None for ok in found] == [True], f"one answer is expected: {self.where}"
+        return decode_reply(found[0].payload.to_bytes())
+
+    def batch(self, n: int = 3, **over: Any) -> SampleBatch:
+        columns = {name: over.pop(name) for name in list(over) if name in SAMPLE_DTYPE.names}
+        rows = np.zeros(n, SAMPLE_DTYPE)
+        rows["stamp_ns"] = NOW_NS + np.arange(n) * 10**9
+        rows["distance_m"], rows["c_rr"], rows["cov_xx_m2"], rows["cov_yy_m2"] = 1.0, 0.04, 1.0, 1.0
+        for name, value in columns.items():
+            rows[name][-1] = value
+        fields = {"machine": MACHINE, "spool_id": 7, "first_seq": self.seq + 1, "frame": self.site.frame}
+        return SampleBatch(rows=rows, **{**fields, **over})
+
+    def takes_a_good_one(self) -> None:
+        reply = self.send(encode_batch(self.batch()))
+        assert isinstance(reply, Ack), f"{reply}: {self.where}"
+        self.seq = reply.watermark
+
+
+@pytest.fixture(scope="module")
+def probe(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Probe]:
+    folder = tmp_path_factory.mktemp("bad-input")
+    with Children(folder) as children:
+        sim = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
+        opened = Probe(SiteRun(folder, children, free_endpoint(), sim))
+        opened.takes_a_good_one()
+        yield opened
+        opened.close()
+
+
+def edited(probe: Probe, **fields: Any) -> bytes:
+    """A good batch with other fields, None for none."""
+    table = {**msgpack.unpackb(encode_batch(probe.batch())), **fields}
+    return bytes(msgpack.packb({name: value for name, value in table.items() if value is not None}))
+
+
+def with_column(probe: Probe, name: str, value: Any) -> bytes:
+    return edited(probe, cols={**msgpack.unpackb(encode_batch(probe.batch()))["cols"], name: value})
+
+
+BAD_BATCHES = {
+    "nan position": (lambda p: encode_batch(p.batch(x_m=np.nan)), Refusal.NOT_FINITE, "x_m[2]"),
+    "infinite covariance": (lambda p: encode_batch(p.batch(cov_xx_m2=np.inf)), Refusal.NOT_FINITE, "cov_xx_m2[2]"),
+    "half a gradient": (lambda p: encode_batch(p.batch(grade_n=np.nan)), Refusal.NOT_FINITE, "grade_e[2]"),
+    "a position that jumps": (lambda p: encode_batch(p.batch(y_m=9e6)), Refusal.OUTSIDE_SITE, "y_m[2]"),
+    "a stamp that goes back to 0": (lambda p: encode_batch(p.batch(stamp_ns=0)), Refusal.OUT_OF_RANGE, "stamp_ns[2]"),
+    "no covariance": (lambda p: encode_batch(p.batch(cov_xy_m2=2.0)), Refusal.COVARIANCE, "cov_xy_m2[2]"),
+    "oversize": (lambda p: bytes(MAX_BATCH_BYTES + 1), Refusal.TOO_LARGE, "4194305 bytes"),
+    "too many samples": (lambda p: edited(p, n=20_001), Refusal.TOO_LARGE, "n: 20001"),
+    "negative length": (lambda p: edited(p, n=-1), Refusal.TOO_LARGE, "n: -1"),
+    "deep nesting": (lambda p: b"\x81\xa1v" + b"\x91" * 100_000, Refusal.NOT_MSGPACK, "not MessagePack"),
+    "claimed lengths": (lambda p: b"\x81\xa1v" + b"\xdd\x00\x01\x86\xa0" * 900, Refusal.NOT_MSGPACK, "not Mess"),
+    "wrong type": (lambda p: edited(p, first_seq="1"), Refusal.WRONG_TYPE, "first_seq"),
+    "column of numbers": (lambda p: with_column(p, "x_m", [1.0, 2.0, 3.0]), Refusal.WRONG_TYPE, "x_m"),
+    "column cut": (lambda p: with_column(p, "x_m", bytes(17)), Refusal.COLUMN_LENGTH, "cols.x_m"),
+    "column missing": (lambda p: with_column(p, "x_m", None), Refusal.MISSING_FIELD, "x_m"),
+    "unknown version": (lambda p: edited(p, v=2), Refusal.VERSION, "v: 2"),
+    "sequence 0": (lambda p: edited(p, first_seq=0), Refusal.FIRST_SEQ, "first_seq: 0"),
+    "sequence ahead": (lambda p: edited(p, first_seq=900), Refusal.GAP, "first_seq: 900"),
+    "more lost than before it": (lambda p: edited(p, lost_before=900), Refusal.OUT_OF_RANGE, "lost_before"),
+    "another machine": (lambda p: edited(p, machine="loader-1"), Refusal.WRONG_MACHINE, "machine"),
+    "no name": (lambda p: edited(p, machine="a\nb/*"), Refusal.OUT_OF_RANGE, "machine"),
+    "another frame": (lambda p: edited(p, frame="00000000"), Refusal.WRONG_FRAME, "frame"),
+    "empty payload": (lambda p: b"", Refusal.NOT_MSGPACK, "not MessagePack"),
+    "no payload": (lambda p: None, Refusal.NOT_MSGPACK, "not MessagePack"),
+    "garbage": (lambda p: np.random.default_rng(1).bytes(5000), Refusal.NOT_MSGPACK, "not"),
+    "no map": (lambda p: b"\x93\x01\x02\x03", Refusal.NOT_MSGPACK, "not a MessagePack map"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_BATCHES)
+def test_a_bad_batch_is_refused_counted_and_leaves_no_trace(probe: Probe, name: str):
+    make, reason, problem = BAD_BATCHES[name]
+    before = probe.client.info()
+    reply = probe.send(make(probe))
+    assert isinstance(reply, Refused), f"{reply}: {probe.where}"
+    assert (reply.reason, reply.problem[: len(problem)]) == (reason, problem), probe.where
+    assert reply.problem.isprintable()
+    after = probe.client.info()
+    changed = {k: n - before["counters"].get(k, 0) for k, n in after["counters"].items()}
+    assert {k: n for k, n in changed.items() if n} == {f"refused_{reason}": 1}, probe.where
+    assert {k: after[k] for k in after if k != "counters"} == {k: before[k] for k in before if k != "counters"}
+    probe.takes_a_good_one()
+    assert probe.client.info()["journalled"] == before["journalled"] + 1
+
+
+def test_a_key_with_a_wildcard_names_no_machine(probe: Probe):
+    before = probe.client.info()
+    reply = probe.send(encode_batch(probe.batch()), f"sitegrid/{probe.site.name}/ingest/*")
+    assert isinstance(reply, Refused)
+    assert reply.reason == Refusal.WRONG_MACHINE, probe.where
+    assert probe.client.info()["journalled"] == before["journalled"]
+
+
+def test_a_sequence_that_goes_back_is_acknowledged_and_changes_nothing(probe: Probe):
+    before = probe.client.info()
+    reply = probe.send(encode_batch(probe.batch(first_seq=1)))
+    assert reply == Ack(probe.seq, before["journalled"], 3), probe.where
+    after = probe.client.info()
+    assert (after["journalled"], after["samples_merged"]) == (before["journalled"], before["samples_merged"])
+
+
+BAD_QUERIES = {
+    "map/point?x=nan;y=1": Refusal.NOT_FINITE,
+    "map/point?x=one;y=1": Refusal.WRONG_TYPE,
+    "map/point?x=1": Refusal.MISSING_FIELD,
+    "map/point?x=1;y=1;z=1": Refusal.UNKNOWN_PARAMETER,
+    "map/point?x=1;y=1;layers=gold": Refusal.UNKNOWN_LAYER,
+    "map/point?x=1;y=1;as_of=-1": Refusal.WRONG_TYPE,
+    "map/region?bounds=0,0,1": Refusal.MISSING_FIELD,
+    "map/region?bounds=9,0,1,1": Refusal.OUT_OF_RANGE,
+    "map/region?bounds=-1e14,-1e14,1e14,1e14": Refusal.TOO_LARGE,
+    "map/history?x=1;y=1;span=0": Refusal.OUT_OF_RANGE,
+    "map/history?x=1;y=1;from=1;to=4102444800000000000;span=1": Refusal.TOO_LARGE,
+    "map/info?wait=61": Refusal.OUT_OF_RANGE,
+    "map/info?after=99999;wait=0": Refusal.AFTER_TIMEOUT,
+    "map/gold": Refusal.UNKNOWN_QUERY,
+    "admin/trust?machine=probe;trusted=maybe": Refusal.OUT_OF_RANGE,
+    "admin/trust?machine=nobody;trusted=yes": Refusal.UNKNOWN_MACHINE,
+    "admin/trust?machine=probe;trusted=no": Refusal.MISSING_FIELD,
+}
+
+
+@pytest.mark.parametrize("selector", BAD_QUERIES)
+def test_a_bad_query_is_refused_counted_and_named(probe: Probe, selector: str):
+    before = probe.client.info()
+    replies = list(probe.session.get(f"sitegrid/{probe.site.name}/{selector}", timeout=READY_S))
+    assert [reply.err is not None for reply in replies] == [True], probe.where
+    error = decode_error(replies[0].err.payload.to_bytes())
+    assert error.reason == BAD_QUERIES[selector], f"{error}: {probe.where}"
+    assert str(error).isprintable()
+    after = probe.client.info()
+    name = f"refused_query_{error.reason}"
+    assert after["counters"][name] - before["counters"].get(name, 0) == 1, probe.where
+    assert after["journalled"] == before["journalled"]
+    assert probe.server.code is None, probe.where
+
+
+def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children: Children, tmp_path):
+    """The server's site is smaller than the agent's: what lies beyond it is refused, the way back in arrives."""
+    sim = SimConfig(machines=1, seconds=60, speed=10, seed=3, world="fast")
+    run = SiteRun(tmp_path, children, free_endpoint(), sim)
+    wide = run.site_file.read_text()
+    lines = [line for line in wide.splitlines() if not line.startswith("extent_m")]
+    router = run.start_router()
+    # Where the machine drives is known from a first look: half of what it sees lies within the median.
+    children.start("record", "sim", "--record", tmp_path / "logs", *words(sim)).wait(60)
+    extent_m = middle_of(tmp_path / "logs" / "loader-1", run)
+    run.site_file.write_text("\n".join([f"extent_m = {extent_m}", *lines]) + "\n")
+    server = run.start_server()
+    run.site_file.write_text(wide)
+    session = open_session(SessionConfig(run.endpoint))
+    heard: list[bytes] = []
+    session.declare_subscriber(keys.health(run.site, "loader-1"), lambda s: heard.append(s.payload.to_bytes()))
+    agent = run.start_agent(run.configs[0])
+    run.start_sim()
+    where = f"router {router.pid}, server {server.pid}, agent {agent.pid}"
+    report = agent.expect("ended", 90.0)["ended"]
+    aside = report["spool"]["put_aside"]
+    assert report["delivered"], where
+    assert 0 < aside < report["samples"], where
+    assert report["uplink"]["counters"]["refused_outside_site"] >= aside, where
+    wait_until(lambda: decode_health(heard[-1]).values["spool"]["put_aside"] == aside, READY_S, "health says so")
+    session.close()
+    with run.connect() as client:
+        info = client.info()
+    sent = info["machines"]["loader-1"]
+    assert (sent["samples"], sent["samples"] + aside) == (info["samples_merged"], report["samples"]), where
+    assert 0 < sent["lost"] <= aside, f"declared lost, those before the last that was taken: {where}"
+
+
+def words(sim: SimConfig) -> list[str]:
+    names = ("seconds", "machines", "seed", "world")
+    return [word for name in names for word in (f"--{name}", str(getattr(sim, name)))]
+
+
+def middle_of(log: Any, run: SiteRun) -> float:
+    """The extent that about half of a recorded drive lies within [m]."""
+    from protocol.logfolder import open_log
+    from protocol.readings import Gps
+    from protocol.site import Projection
+
+    to_map = Projection(load_site(run.site_file)).to_map
+    fixes = [r for r in open_log(log).readings() if isinstance(r, Gps)]
+    places = [to_map(fix.lat_deg, fix.lon_deg, fix.height_m)[:2] for fix in fixes]
+    return float(np.median(np.abs(places).max(axis=1)))
