@@ -185,7 +185,7 @@ class Spool:
                 is_earlier = self._at < len(self._runs) - 1
                 return Head(run.spool_id, end + 1, empty(), end) if is_earlier else None
             first = found[0][0]
-            n = next((i for i, (number, _, final, _) in enumerate(found) if not final or number != first + i), None)
+            n = next((i for i, (number, _, final, _) in enumerate(found) if final == 0 or number != first + i), None)
             seq, rows = first - run.base, _table(row for _, row, _, _ in found[:n])
             return Head(run.spool_id, seq, rows, seq - 1 - run.acknowledged) if len(rows) else None
 
@@ -264,7 +264,7 @@ class Spool:
         with transaction(self._db):  # all together: a kill leaves all or nothing
             make_or_check(self._db)
             # After a crash pending samples are sent as they are: a coarse place is better than none.
-            self._db.execute("UPDATE sample SET final = 1 WHERE final = 0")
+            self._db.execute("UPDATE sample SET final = 1 WHERE final IS NOT 1")
             self._meta = _Meta(**{k: int(v) for k, v in self._db.execute("SELECT key, value FROM meta")})
             self._runs = self._start_run()
         self._at = 0

@@ -10,7 +10,7 @@ import msgpack
 import numpy as np
 
 from protocol.arrays import Table
-from protocol.errors import MessageError, Refusal, one_line
+from protocol.errors import MessageError, Refusal
 from protocol.messages import VERSION, Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 from protocol.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
 from protocol.samples import COLUMNS, SAMPLE_DTYPE, check_samples
@@ -166,8 +166,7 @@ def decode_reply(data: bytes) -> Ack | Refused:
     if take(table, "ack", bool):
         numbers = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
         return Ack(*numbers)
-    reason, problem = (one_line(take(table, name, str)) for name in ("reason", "problem"))
-    return Refused(reason, problem, _take_int(table, "expected", 0, MAX_SEQ))
+    return Refused(take(table, "reason", str), take(table, "problem", str), _take_int(table, "expected", 0, MAX_SEQ))
 
 
 # --- readings --------------------------------------------------------------------------------------------------------

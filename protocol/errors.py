@@ -38,10 +38,14 @@ MAX_LINE = 500  # characters
 
 def one_line(text: str) -> str:
     """A text that may hold anything from outside as one line: signs that do not print escaped, its end cut off."""
+    if len(text) <= MAX_LINE and text.isprintable():
+        return text
     plain = text[:MAX_LINE]
     if not plain.isprintable():
         plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in plain)
-    return text if plain == text else f"{plain[: MAX_LINE - 3]}..." if len(plain) > MAX_LINE - 3 else plain
+    if len(plain) > MAX_LINE - 3 and plain != text:
+        plain = f"{plain[: MAX_LINE - 3]}..."
+    return plain
 
 
 class SitegridError(Exception):

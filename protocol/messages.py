@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from protocol.arrays import Table
+from protocol.errors import one_line
 from protocol.readings import Reading
 
 VERSION = 1
@@ -44,11 +45,18 @@ class Ack:
 
 @dataclass(frozen=True)
 class Refused:
-    """The server did not take a batch. expected: the next sequence number it would take, 0 where that is not known."""
+    """The server did not take a batch. expected: the next sequence number it would take, 0 where that is not known.
+
+    reason, problem: one line each; what would not print is escaped, here as on the side that reads it.
+    """
 
     reason: str
     problem: str
     expected: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("reason", "problem"):
+            object.__setattr__(self, name, one_line(getattr(self, name)))
 
 
 @dataclass(frozen=True)

@@ -100,15 +100,16 @@ def read_store(folder: Path, definition: Any) -> Content:
 def read_spool(path: Path) -> Content:
     """All that an agent would send: contents by identity, and what it says is lost."""
     spool, found, end_s = Spool(path, SpoolConfig()), {}, time.monotonic() + STUCK_S
+    declared = 0  # lost, to the server, which counts them
     spool._db.set_progress_handler(lambda: time.monotonic() > end_s, 20)
     try:
         while head := spool.head(1000):
+            declared += head.lost_before
             for i, row in enumerate(head.rows):
                 found[head.spool_id, head.first_seq + i] = content_hash(row)
             spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
         counters = spool.counters()
-        named = sum(counters.get(name, 0) for name in ("put_aside", "damaged"))
-        return {"contents": found, "named": named}
+        return {"contents": found, "named": counters["put_aside"] + declared}
     except sqlite3.Error as error:
         if time.monotonic() > end_s:
             raise TimeoutError from None
@@ -142,8 +143,8 @@ def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[
         return Verdict.UNNAMED, type(error).__name__
     if found == truth:
         return Verdict.HARMLESS, ""
-    if found.get("named") and found["contents"].items() <= truth["contents"].items():
-        return Verdict.DETECTED, ""  # the damaged samples are named, the others sent
+    if found.get("named", 0) > truth.get("named", 0) and found["contents"].items() <= truth["contents"].items():
+        return Verdict.DETECTED, ""  # the damaged samples are named or declared lost, the others sent
     return Verdict.SERVED, ""
 
 

@@ -26,6 +26,7 @@ pytestmark = pytest.mark.processes
 
 NOW_NS = 1_767_225_600_000_000_000
 MACHINE = "probe"
+LEFT_ALONE = ("journalled", "merged", "samples_merged", "cells", "stamp_ns", "machines")  # by what is refused
 
 
 class Probe:
@@ -127,7 +128,7 @@ def test_a_bad_batch_is_refused_counted_and_leaves_no_trace(probe: Probe, name: 
     after = probe.client.info()
     changed = {k: n - before["counters"].get(k, 0) for k, n in after["counters"].items()}
     assert {k: n for k, n in changed.items() if n} == {f"refused_{reason}": 1}, probe.where
-    assert {k: after[k] for k in after if k != "counters"} == {k: before[k] for k in before if k != "counters"}
+    assert [after[name] for name in LEFT_ALONE] == [before[name] for name in LEFT_ALONE], probe.where
     probe.takes_a_good_one()
     assert probe.client.info()["journalled"] == before["journalled"] + 1
 
