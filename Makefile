@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: venv demo test check chaos bench
+.PHONY: venv demo test check chaos fuzz soak bench
 
 venv: $(VENV)/.installed
 
@@ -26,6 +26,9 @@ check: venv
 
 chaos: venv
 	$(BIN)/python -m tests.chaos
+
+fuzz: venv
+	$(BIN)/python -m tests.fuzz --seconds 300
 
 soak: venv
 	$(BIN)/python -m tests.soak --minutes 60 --speed 30

@@ -51,7 +51,7 @@ def _parse(path: Path, kept: dict[str, Any]) -> Calibration:
         stamp_ns, passages = int(kept["stamp_ns"]), int(kept["passages"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StoreError(path, f"is no calibration: {error}") from None
-    sound = math.isfinite(zero + scale + zz + zs + ss) and zz > 0 and ss > 0 and zs**2 <= zz * ss and zs == sz
+    sound = math.isfinite(zero + scale + zz + zs + ss) and zz > 0 and ss > 0 and zs * zs <= zz * ss and zs == sz
     if not (sound and abs(zero) < 1 and abs(scale) < 1 and stamp_ns >= 0 and passages >= 0):
         raise StoreError(path, "is no calibration: its numbers make no sense")
     return Calibration(zero, scale, ((zz, zs), (sz, ss)), stamp_ns, passages)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
 from protocol.config import from_table, load_toml
@@ -64,6 +64,6 @@ def check_valid(credentials: Credentials, now: datetime) -> None:
     """ConfigError if the certificate has expired."""
     identity = credentials.identity
     if now > identity.expires:
-        day = identity.expires.astimezone(UTC).date()
+        day = identity.expires.date()  # in its own zone: near the year 1 there is no other
         advice = f"make a new one with `sitegrid keys add {identity.name} --renew`"
         raise ConfigError(credentials.folder, f"the certificate of {identity.name} expired on {day}; {advice}")
