@@ -120,24 +120,29 @@ def _arrays(pages: Sequence[Placed]) -> dict[str, AnyArray]:
 
 def _pages(file: Mapping[str, AnyArray]) -> tuple[Placed, ...]:
     """Undo `_arrays`; pages are copies, so that those which are merged later give their memory back."""
-    parts, cells, taken = (file["narrow"], file["wide"]), file["cells"], [0, 0, 0]
-    found = []
-    for x, y, rung, index, which, votes, k in file["pages"].tolist():
-        if min(rung, index, which, votes, k) < 0:
-            raise ValueError("a page of an impossible kind")
-        page = Page(frozen(parts[which][taken[which] :][:votes]), frozen(cells[taken[2] :][:k]))
-        _check(page)
+    table, cells, parts = file["pages"], file["cells"], (file["narrow"], file["wide"])
+    wide, votes, k = table[:, 4], table[:, 5], table[:, 6]
+    if (table[:, 2:] < 0).any() or (wide > 1).any() or (k < 1).any():
+        raise ValueError("a page of an impossible kind")
+    for which, part in enumerate(parts):
+        _check_order(part["place"], votes[wide == which], ev.COUNTS * ev.CELLS)
+    _check_order(cells["cell"], k, ev.CELLS)
+    found, taken = [], [0, 0, 0]
+    for x, y, rung, index, which, n, m in table.tolist():
+        page = Page(frozen(parts[which][taken[which] :][:n]), frozen(cells[taken[2] :][:m]))
         found.append(Placed(x, y, rung, index, page))
-        taken[which] += votes
-        taken[2] += k
-    if taken != [len(parts[0]), len(parts[1]), len(cells)]:
-        raise ValueError("parts of other lengths than its pages say")
+        taken[which] += n
+        taken[2] += m
     return tuple(found)
 
 
-def _check(page: Page) -> None:
-    """Refuse what no page can be: places in order and within a block, cells in order."""
-    place, cell = page.votes["place"].astype(np.int64), page.cells["cell"].astype(np.int64)
-    in_order = (np.diff(place) > 0).all() and (np.diff(cell) > 0).all()
-    if not in_order or not len(cell) or (len(place) and place[-1] >= ev.COUNTS * ev.CELLS):
+def _check_order(values: AnyArray, lengths: AnyArray, limit: int) -> None:
+    """Refuse what the pages of a part, laid end to end, cannot be: each in order, and below a limit."""
+    if int(lengths.sum()) != len(values):
+        raise ValueError("parts of other lengths than its pages say")
+    rises = np.ones(len(values), np.bool_)
+    rises[1:] = values[1:] > values[:-1]
+    starts = np.cumsum(lengths)[:-1]
+    rises[starts[starts < len(values)]] = True  # a new page begins
+    if not rises.all() or (len(values) and int(values.max()) >= limit):
         raise ValueError("votes or cells that no page can have")
