@@ -147,7 +147,7 @@ def test_restart_opens_a_store_with_snapshot_and_tail(monkeypatch, capsys):
     assert (result["samples"], row["samples"], row["journal_rows"], row["tail_rows"]) == (2000, 2000, 20, 7)
     assert 0 < row["open_s"] < row["process_s"]
     assert row["open_cpu_s"] > 0
-    assert row["build_s"] > 0
+    assert row["build_s"] >= 0  # in tenths of a second
     assert row["journal_mb"] > 0
     assert row["snapshot_mb"] > 0
 
