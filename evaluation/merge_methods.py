@@ -58,7 +58,7 @@ def contradicting(deliveries: Sequence[Delivery]) -> tuple[str, ...]:
     """Machines that contradict all others, as the server's trust finds them at the end."""
     auditor = Auditor(TrustConfig(), CELL_M)
     for delivery in deliveries:
-        auditor.add(delivery.machine, delivery.rows, delivery.received_ns)
+        auditor.add(delivery.machine, delivery.rows)
     return tuple(name for name, verdict in auditor.verdicts().items() if verdict.contradicts)
 
 

@@ -142,19 +142,17 @@ class Archive:
 
 def archive(
     folder: Path, journal: JournalReader, site: SiteConfig, before_ns: int, forget: Callable[[int], int]
-) -> list[Path]:
-    """Move all hours of reception that ended before `before_ns` from the journal into files; returns those.
+) -> Iterator[Path]:
+    """Move hours of reception that ended before `before_ns` from the journal into files, one for each that is taken.
 
     Runs on any thread with a reader of its own. forget: is handed a row and has the journal's owner call
     `Journal.forget` with it once, in between other work; returns what that returned.
     """
-    made: list[Path] = []
     while path := next_file(folder, journal, site, before_ns):
         _, last = row_range(path)
         while forget(last) < last:
             pass
-        made.append(path)
-    return made
+        yield path
 
 
 def next_file(folder: Path, journal: JournalReader, site: SiteConfig, before_ns: int) -> Path | None:

@@ -116,10 +116,6 @@ class Grid:
             total += int(known.sum())
         return total
 
-    def page_count(self) -> int:
-        """How many pages there are."""
-        return sum(1 for ladder in self._ladders.values() for _ in ladder.items())
-
     def state(self) -> GridState:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()

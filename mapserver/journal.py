@@ -21,74 +21,14 @@ import msgpack
 import numpy as np
 
 from mapserver.ingest import Admission
+from mapserver.journal_schema import FROM_SCHEMA_1, SCHEMA, SEEN_FROM_SCHEMA_1, TABLES
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.geometry import Bounds
 from protocol.readings import MAX_STAMP_NS
 from protocol.samples import SAMPLE_DTYPE
 
-SCHEMA = 2
-# When and where the samples of a row lie is a table of its own: 50 bytes a row, so that a read by time and place passes
-# over rows without touching the pages of their payloads. A box that is NULL is not known.
-_EXTENT = """
-CREATE TABLE extent (
-    row INTEGER PRIMARY KEY,
-    first_stamp_ns INTEGER NOT NULL,
-    last_stamp_ns INTEGER NOT NULL,
-    west_m REAL,
-    south_m REAL,
-    east_m REAL,
-    north_m REAL
-);
-CREATE TABLE events (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, stamp_ns INTEGER NOT NULL, body TEXT NOT NULL);
-"""
-_TABLES = f"""
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE journal (
-    row INTEGER PRIMARY KEY AUTOINCREMENT,
-    machine TEXT NOT NULL,
-    spool_id BLOB NOT NULL,
-    first_seq INTEGER NOT NULL,
-    n INTEGER NOT NULL,
-    received_ns INTEGER NOT NULL,
-    first_stamp_ns INTEGER NOT NULL,
-    last_stamp_ns INTEGER NOT NULL,
-    payload BLOB NOT NULL,
-    crc32 INTEGER NOT NULL
-);
-CREATE INDEX journal_machine ON journal (machine, row);
-CREATE TABLE watermark (
-    machine TEXT NOT NULL,
-    spool_id BLOB NOT NULL,
-    seq INTEGER NOT NULL,
-    lost INTEGER NOT NULL,
-    newest_ns INTEGER NOT NULL DEFAULT 0,
-    crc32 INTEGER,
-    PRIMARY KEY (machine, spool_id)
-) WITHOUT ROWID;
-{_EXTENT}"""
 # ruff: noqa: S608 - statements are put together from constants, never from input
-_OLD_EXTENT = "SELECT row, first_stamp_ns, last_stamp_ns, NULL, NULL, NULL, NULL FROM journal"
-_FROM_SCHEMA_1 = f"""
-BEGIN IMMEDIATE;
-{_EXTENT}
-INSERT INTO extent {_OLD_EXTENT};
-ALTER TABLE watermark ADD COLUMN newest_ns INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE watermark ADD COLUMN crc32 INTEGER;
-INSERT INTO meta SELECT 'plain_until', COALESCE(MAX(row), 0) FROM journal;
-UPDATE watermark SET newest_ns = newest FROM
-    (SELECT machine AS m, spool_id AS s, MAX(last_stamp_ns) AS newest FROM journal GROUP BY machine, spool_id)
-    WHERE m = machine AND s = spool_id;
-UPDATE meta SET value = '2' WHERE key = 'schema';
-COMMIT;
-"""
-# What a reader, which may not write, puts over a journal of schema 1.
-_SEEN_FROM_SCHEMA_1 = f"""
-CREATE TEMP VIEW extent (row, first_stamp_ns, last_stamp_ns, west_m, south_m, east_m, north_m) AS {_OLD_EXTENT};
-CREATE TEMP VIEW watermark AS SELECT machine, spool_id, seq, lost,
-    (SELECT COALESCE(MAX(last_stamp_ns), 0) FROM main.journal) AS newest_ns, NULL AS crc32 FROM main.watermark;
-CREATE TEMP TABLE events (id INTEGER PRIMARY KEY, kind TEXT, stamp_ns INTEGER, body TEXT);
-"""
 _COLUMNS = "SELECT row, machine, spool_id, first_seq, received_ns, payload, crc32 FROM "
 _IN_ORDER = """
     AND row > :after AND row <= :until AND machine NOT IN (SELECT value FROM json_each(:without))
@@ -225,7 +165,8 @@ class JournalReads:
         for machine, spool, *values, crc32 in self._db.execute(
             "SELECT machine, spool_id, seq, lost, newest_ns, crc32 FROM watermark"
         ):
-            if crc32 not in (None, _checksum(machine, spool, *values)):
+            is_plain = crc32 is None and self._plain_until > 0
+            if not is_plain and crc32 != _checksum(machine, spool, *values):
                 raise StoreError(self.path, f"the watermark of {machine} is damaged; restore the file from a backup")
             marks[machine, int.from_bytes(spool, "big")] = Mark(*values)
         return marks
@@ -363,7 +304,7 @@ class Journal(JournalReads):
     def _create_or_check(self, site: str, frame: str) -> None:
         expected = {"schema": str(SCHEMA), "site": site, "frame": frame}
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
-            self._db.executescript("BEGIN IMMEDIATE;" + _TABLES)
+            self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
             self._db.executemany("INSERT INTO meta VALUES (?, ?)", expected.items())
             self._db.execute("COMMIT")
         found = _meta(self._db)
@@ -372,7 +313,7 @@ class Journal(JournalReads):
                 problem = f"the store has {key} {found.get(key)!r}, this server {value!r}; choose another --store"
                 raise StoreError(self.path, problem)
         if found["schema"] == "1":
-            self._db.executescript(_FROM_SCHEMA_1)
+            self._db.executescript(FROM_SCHEMA_1)
             found = _meta(self._db)
         self._plain_until = int(found.get("plain_until", 0))
 
@@ -400,7 +341,7 @@ class JournalReader(JournalReads):
                 opened.callback(self._db.close)
                 found = _meta(self._db)
                 if found.get("schema") == "1":
-                    self._db.executescript(_SEEN_FROM_SCHEMA_1)
+                    self._db.executescript(SEEN_FROM_SCHEMA_1)
                 elif found.get("schema") != str(SCHEMA):
                     raise StoreError(path, f"the journal has schema {found.get('schema')!r}, known is {SCHEMA}")
             except sqlite3.Error as error:

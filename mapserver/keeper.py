@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from mapserver import watch
-from mapserver.archive import FOLDER, next_file, row_range
+from mapserver.archive import FOLDER, archive
 from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
-from mapserver.decisions import KIND, PERSON, Decision, Decisions
+from mapserver.decisions import AUDIT, KIND, PERSON, Decision, Decisions
 from mapserver.grid import Grid
 from mapserver.journal import JournalReader, Wanted
 from mapserver.ladder import Block, TimedPage
@@ -131,7 +131,7 @@ class Keeper:
         if trusted is None:
             verdict = self._verdicts.get(machine)
             contradicts = bool(verdict and verdict.contradicts)
-            return Decision(machine, not contradicts, "audit", reason or "left to the audit", stamp_ns)
+            return Decision(machine, not contradicts, AUDIT, reason or "left to the audit", stamp_ns)
         return Decision(machine, trusted, PERSON, reason, stamp_ns)
 
     # --- the thread --------------------------------------------------------------------------------------------------
@@ -155,7 +155,7 @@ class Keeper:
         """Hand new journal rows to the audit; a piece at a time, so that commands need not wait."""
         until = self._reader.last_row  # what comes in meanwhile waits for the next turn, or a busy site would have none
         for row in self._reader.read(after=max(self._followed, self._reader.archived_row), until=until):
-            self._auditor.add(row.machine, row.rows, row.received_ns)
+            self._auditor.add(row.machine, row.rows)
             self._followed = row.row
             if self._ending or self._asked:
                 return
@@ -217,12 +217,9 @@ class Keeper:
         if not keep.archive_after_h or not self._is_due("archive", ARCHIVE_S):
             return
         before_ns = self._now_ns() - round(keep.archive_after_h * 3600e9)
-        path = next_file(self._folder / FOLDER, self._reader, self._site, before_ns)
-        if path is None:
+        hours = archive(self._folder / FOLDER, self._reader, self._site, before_ns, self._forget)
+        if (path := next(hours, None)) is None:
             return
-        _, last = row_range(path)
-        while not self._ending and self._forget(last) < last:
-            pass
         self._writer.read(lambda store: store.shrink())
         log.info("archived file=%s", path.name)
         self._due_s["archive"] = 0.0  # there may be more hours
@@ -231,6 +228,8 @@ class Keeper:
         self._writer.read(lambda store: store.remember(kind, stamp_ns, body))
 
     def _forget(self, until: int) -> int:
+        if self._ending:  # what is in both meanwhile counts once, and the next start goes on with it
+            return until
         return self._writer.read(lambda store: store.forget(until))
 
     def _is_due(self, work: str, every_s: float) -> bool:

@@ -73,7 +73,7 @@ class Store:
             found = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.left_out)
             self.merged, self.grid = found
             self.snapshot_row = self.merged
-            self._fold_tail(self.grid, self.merged)
+            self._fold_tail(self.grid, self.merged, self.left_out)
             self.merged = last_row
             self.newest_ns = self._journal.newest_ns()
             self._opened = opened.pop_all()
@@ -125,9 +125,8 @@ class Store:
 
     def adopt(self, grid: Grid, row: int, left_out: frozenset[str]) -> None:
         """Go on with a grid that was folded elsewhere up to a journal row, without the machines in left_out."""
-        self.left_out = left_out
-        self._fold_tail(grid, row)
-        self.grid = grid
+        self._fold_tail(grid, row, left_out)
+        self.grid, self.left_out = grid, left_out
         self.snapshot_row = 0  # what is on disk has other machines in it
         self.grid.touch_all()
 
@@ -218,10 +217,10 @@ class Store:
         self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
         self.merged = row
 
-    def _fold_tail(self, grid: Grid, merged: int) -> None:
+    def _fold_tail(self, grid: Grid, merged: int, left_out: frozenset[str]) -> None:
         """Fold what a grid does not hold yet."""
         history = History(self._journal, Archive(self._folder / FOLDER))
-        for row in history_rows(history, after=merged, wanted=Wanted(without=self.left_out)):
+        for row in history_rows(history, after=merged, wanted=Wanted(without=left_out)):
             grid.fold(row.rows, row.machine)
 
 

@@ -65,11 +65,11 @@ class Auditor:
         """Memory of all machines' maps."""
         return sum(ledger.nbytes for ledger in self._ledgers.values())
 
-    def add(self, machine: str, rows: Table, received_ns: int) -> None:  # noqa: ARG002
+    def add(self, machine: str, rows: Table) -> None:
         """Add samples of one machine, as they lie in a journal row; rows in the order of the journal.
 
         The maps depend on no order. The clocks do: compared is what the machines sent at about the same time, and the
-        order of the journal tells that better than received_ns, which steps where the server's clock is set.
+        order of the journal tells that better than the time of receipt, which steps where the server's clock is set.
         """
         if not len(rows):
             return

@@ -17,7 +17,6 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from protocol.errors import ConfigError, MessageError, Refusal
 
-SIGNATURE_BYTES = 64
 _CONTEXT = b"sitegrid batch 1\0"  # a signature of anything else is none of a batch
 
 

@@ -12,15 +12,15 @@ import json
 import re
 import sys
 from collections.abc import Sequence
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TypeAlias
 
 from protocol.errors import SitegridError
 from protocol.session import DEFAULT_ENDPOINT
+from sitegrid.argument_types import address, count, days, not_negative, positive, seed, withhold
 from sitegrid.logs import start_logging
 from sitegrid.times import HELP as TIME_HELP
-from sitegrid.times import parse_time
+from sitegrid.times import STAMP_HELP, parse_stamp, parse_time
 
 METRICS_PORT = 9464
 EXTRA = {
@@ -93,8 +93,8 @@ Parent: TypeAlias = argparse.ArgumentParser
 
 def _add_demo(nouns: Nouns, common: Parent, _: Parent) -> None:
     demo = _noun(nouns, "demo", "router, map server, simulator and agents, each its own process; pictures", [common])
-    demo.add_argument("--seconds", type=_positive, default=240.0, help="simulated time (default %(default)s)")
-    demo.add_argument("--speed", type=_positive, default=4.0, help="times real time (default %(default)s)")
+    demo.add_argument("--seconds", type=positive, default=240.0, help="simulated time (default %(default)s)")
+    demo.add_argument("--speed", type=positive, default=4.0, help="times real time (default %(default)s)")
     demo.add_argument("--scenario", default="paper_site", help="what is simulated (default %(default)s)")
     demo.add_argument("--world", choices=("pybullet", "fast"), help="what moves the machines (over the scenario)")
     demo.add_argument("--machines", type=int, help="machines of the scenario's first fleet (over the scenario)")
@@ -135,7 +135,7 @@ def _add_keys(nouns: Nouns, common: Parent, _: Parent) -> None:
     for action in (add, revoke):
         action.add_argument("name", metavar="MACHINE")
     for action in (init, add):
-        action.add_argument("--days", type=_days, default=365, help="how long it is valid (default %(default)s)")
+        action.add_argument("--days", type=days, default=365, help="how long it is valid (default %(default)s)")
     for action in (init, add, revoke, actions.add_parser("list", help="who is let in, until when", parents=[quiet])):
         action.add_argument("--dir", type=Path, default=Path("keys"), help="folder of the keys (default %(default)s)")
 
@@ -152,7 +152,7 @@ def _add_server(nouns: Nouns, common: Parent, network: Parent) -> None:
     )
     server.add_argument(
         "--metrics",
-        type=_address,
+        type=address,
         nargs="?",
         const=("127.0.0.1", METRICS_PORT),
         metavar="[HOST:]PORT",
@@ -192,7 +192,7 @@ def _add_agent(nouns: Nouns, common: Parent, network: Parent) -> None:
     agent.add_argument("--driver", choices=("zenoh", "replay"), default="zenoh", help="where readings come from")
     agent.add_argument("--log", type=Path, help="replay: manifest of the log")
     agent.add_argument("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
-    agent.add_argument("--speed", type=_not_negative, default=1.0, help="replay: times real time, 0 at once")
+    agent.add_argument("--speed", type=not_negative, default=1.0, help="replay: times real time, 0 at once")
     agent.add_argument(
         "--withhold", action="store_true", help="withhold GPS ([holdout]) and report the error against it"
     )
@@ -228,7 +228,7 @@ def _add_query(nouns: Nouns, common: Parent, network: Parent) -> None:
     _add_times(
         history, ("from", "samples from this time on"), ("to", "samples up to this time; default the site's now")
     )
-    history.add_argument("--span", type=_positive, metavar="SECONDS", help="length of a span; default 5 minutes")
+    history.add_argument("--span", type=positive, metavar="SECONDS", help="length of a span; default 5 minutes")
     _ask(asks, "machines", "what the map server knows of each machine")
     changes = _ask(asks, "changes", "where the ground changed, and when")
     changes.add_argument("--follow", action="store_true", help="go on with each change that is found, until stopped")
@@ -253,7 +253,7 @@ def _add_trust(nouns: Nouns, common: Parent, network: Parent) -> None:
         noun.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
         noun.add_argument(
             "--wait",
-            type=_not_negative,
+            type=not_negative,
             default=30.0,
             help="seconds for the map to be folded again (default %(default)g)",
         )
@@ -290,7 +290,7 @@ def _add_plot(nouns: Nouns, common: Parent, network: Parent) -> None:
     plot.add_argument("--bounds", type=float, nargs=4, metavar=("W", "S", "E", "N"), help="metres; default all")
     plot.add_argument("--truth", type=Path, help="true map of a simulation (truth_map.npz): draw the difference")
     plot.add_argument("--follow", action="store_true", help="redraw while machines drive, until stopped")
-    plot.add_argument("--every", type=_positive, default=1.0, help="seconds between two pictures (default %(default)s)")
+    plot.add_argument("--every", type=positive, default=1.0, help="seconds between two pictures (default %(default)s)")
     plot.add_argument("--pictures", type=int, default=0, help="with --follow: end after so many pictures")
 
 
@@ -322,11 +322,11 @@ def _add_eval(nouns: Nouns, common: Parent, _: Parent) -> None:
     log.add_argument(
         "--withhold",
         action="append",
-        type=_withhold,
+        type=withhold,
         metavar="OFF/PERIOD",
         help="seconds without GPS of every so many, again for more (default none, 1/10, 10/30 and 30/60)",
     )
-    log.add_argument("--gps", type=_count, help="use the first receivers only")
+    log.add_argument("--gps", type=count, help="use the first receivers only")
     log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="default %(default)s")
     log.add_argument("--profile", choices=("default", "paper"), default="default", help="default %(default)s")
 
@@ -345,18 +345,18 @@ def _add_fold(nouns: Nouns, common: Parent, _: Parent) -> None:
     )
     fold.add_argument("--out", type=Path, required=True, metavar="STORE", help="folder of the new store")
     fold.add_argument("--site-file", type=Path, help="the site, where the archives do not say it (site.toml)")
-    fold.add_argument("--cell", type=_positive, metavar="M", help="edge of a cell (default: that of the site)")
+    fold.add_argument("--cell", type=positive, metavar="M", help="edge of a cell (default: that of the site)")
     fold.add_argument("--config", type=Path, help="options to fold and read with (config/server.toml)")
     fold.add_argument("--without", action="append", default=[], metavar="MACHINE", help="leave it out; again for more")
     for name, what in (("from", "samples stamped then or later"), ("until", "samples stamped before then")):
-        help_text = f"{what} only; as 2026-01-31T07:00, UTC where no zone is given"
-        fold.add_argument(f"--{name}", type=_instant, dest=f"{name}_ns", metavar="T", help=help_text)
+        help_text = f"{what} only; {STAMP_HELP}"
+        fold.add_argument(f"--{name}", type=parse_stamp, dest=f"{name}_ns", metavar="T", help=help_text)
 
 
 def _add_recorded(ask: argparse.ArgumentParser, seconds: float) -> None:
     """Options of what runs on recordings that are kept."""
     _add_kept(ask)
-    ask.add_argument("--seconds", type=_positive, default=seconds, help="of each recording (default %(default)g)")
+    ask.add_argument("--seconds", type=positive, default=seconds, help="of each recording (default %(default)g)")
 
 
 def _add_kept(ask: argparse.ArgumentParser) -> None:
@@ -365,12 +365,12 @@ def _add_kept(ask: argparse.ArgumentParser) -> None:
     ask.add_argument(
         "--out", type=Path, default=Path("eval-output"), help="folder of recordings and results (default %(default)s)"
     )
-    ask.add_argument("--processes", type=_count, help="how many at a time (default: one per core)")
+    ask.add_argument("--processes", type=count, help="how many at a time (default: one per core)")
 
 
-def _add_seeds(ask: argparse.ArgumentParser, count: int) -> None:
-    ask.add_argument("--seeds", type=_count, default=count, help="how many (default %(default)s)")
-    ask.add_argument("--first-seed", type=_seed, default=0, help="the first of them (default %(default)s)")
+def _add_seeds(ask: argparse.ArgumentParser, usual: int) -> None:
+    ask.add_argument("--seeds", type=count, default=usual, help="how many (default %(default)s)")
+    ask.add_argument("--first-seed", type=seed, default=0, help="the first of them (default %(default)s)")
 
 
 def _noun(nouns: Nouns, name: str, what: str, parents: list[Parent]) -> argparse.ArgumentParser:
@@ -379,73 +379,6 @@ def _noun(nouns: Nouns, name: str, what: str, parents: list[Parent]) -> argparse
     )
     parser.set_defaults(module=f"sitegrid.commands.{name}")
     return parser
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
-    return value
-
-
-def _days(text: str) -> int:
-    value = _count(text)
-    if value > 3650:
-        raise argparse.ArgumentTypeError(f"{text} is more than 3650, the ten years of the authority")
-    return value
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
-    return value
-
-
-def _not_negative(text: str) -> float:
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
-
-
-def _seed(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
-
-
-def _address(text: str) -> tuple[str, int]:
-    """`9464`, of this host alone, or `0.0.0.0:9464`; port 0 takes a free one."""
-    host, _, port = text.rpartition(":")
-    if not (port.isascii() and port.isdecimal() and int(port) < 2**16):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither PORT nor HOST:PORT")
-    return host or "127.0.0.1", int(port)
-
-
-def _instant(text: str) -> int:
-    """Nanoseconds since 1970 of a date and time."""
-    try:
-        time = datetime.fromisoformat(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no date and time, as 2026-01-31T07:00") from None
-    time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    return (time - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
-
-
-def _withhold(text: str) -> tuple[float, float]:
-    """Seconds off and period: `10/30`; `none` withholds nothing."""
-    if text == "none":
-        return 0.0, 1.0
-    off, _, period = text.partition("/")
-    try:
-        off_s, period_s = float(off), float(period)
-    except ValueError:
-        off_s = period_s = 0.0
-    if not 0 < off_s < period_s < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither OFF/PERIOD in seconds, as 10/30, nor none")
-    return off_s, period_s
 
 
 def _fail(problem: str, as_json: bool) -> int:  # noqa: FBT001 - the user's own flag

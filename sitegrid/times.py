@@ -11,7 +11,8 @@ from datetime import UTC, datetime, timedelta
 from protocol.errors import ConfigError
 from protocol.readings import MAX_STAMP_NS
 
-HELP = "ISO 8601 (UTC unless it names a zone), a stamp in ns, or before the site's now: -2h, -30m, -90s"
+STAMP_HELP = "ISO 8601 (UTC unless it names a zone) or a stamp in ns"
+HELP = f"{STAMP_HELP}, or before the site's now: -2h, -30m, -90s"
 _UNIT_S = {"d": 86_400, "h": 3600, "m": 60, "s": 1}
 _AGO = re.compile(r"-(\d+(?:\.\d+)?)([dhms])")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -40,10 +41,15 @@ def parse_time(text: str) -> SiteTime:
     """Parse ISO 8601, a stamp, or a time before the site's now; as a type of an argparse option."""
     if ago := _AGO.fullmatch(text):
         return SiteTime(-round(float(ago[1]) * _UNIT_S[ago[2]] * 1e9), from_now=True)
+    return SiteTime(parse_stamp(text))
+
+
+def parse_stamp(text: str) -> int:
+    """Parse ISO 8601, UTC where no zone is named, or a stamp in ns; as a type of an argparse option."""
     ns = int(text) if text.isascii() and text.isdigit() and len(text) < 30 else _iso_ns(text)
     if not 1 <= ns <= MAX_STAMP_NS:
         raise ArgumentTypeError(f"{text} is not between the years 1970 and 2100")
-    return SiteTime(ns)
+    return ns
 
 
 def told(stamp_ns: int) -> str:
@@ -57,6 +63,6 @@ def _iso_ns(text: str) -> int:
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
-        raise ArgumentTypeError(f"{text!r} is no time: {HELP}") from None
+        raise ArgumentTypeError(f"{text!r} is no time: {STAMP_HELP}") from None
     zoned = time if time.tzinfo else time.replace(tzinfo=UTC)
     return (zoned - _EPOCH) // timedelta(microseconds=1) * 1000  # exact, where floating point would not be

@@ -247,6 +247,6 @@ def test_rows_that_are_archived_are_not_lost(clean, tmp_path):
     path = tmp_path / "store" / JOURNAL_FILE
     writer = Journal(path, SITE.name, SITE.frame)
     with JournalReader(path) as reader:
-        assert archive(tmp_path / "store" / FOLDER, reader, SITE, 2**62, writer.forget)
+        assert list(archive(tmp_path / "store" / FOLDER, reader, SITE, 2**62, writer.forget))
     writer.close()
     assert audit_store(clean[1], tmp_path / "store", SITE, CONFIG) == CLEAN

@@ -30,6 +30,16 @@ NOW_NS = 1_767_225_600_000_000_000
 WAIT_S = 20.0
 
 
+def wait_for(fact: Callable[[], Any]) -> None:
+    """Wait on a condition that has no event of its own."""
+    never = Event()
+    for _ in range(int(WAIT_S / 0.005)):
+        if fact():
+            return
+        never.wait(0.005)
+    raise AssertionError("did not come true")
+
+
 def now_ns() -> int:
     return NOW_NS
 

@@ -458,7 +458,8 @@ elif step == "rename":
     Path.rename = killing(Path.rename)
 else:
     setattr(ar, step, killing(getattr(ar, step)))
-ar.archive(folder / "archive", JournalReader(folder / "journal.db"), site, 2**62, forget)
+for _ in ar.archive(folder / "archive", JournalReader(folder / "journal.db"), site, 2**62, forget):
+    pass
 """
 
 

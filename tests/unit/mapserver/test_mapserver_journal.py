@@ -139,7 +139,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path):
 
 
 def test_tables_and_their_names_are_made_in_one_transaction(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.journal._TABLES", "CREATE TABLE meta (key, value, more); ")
+    monkeypatch.setattr("mapserver.journal.TABLES", "CREATE TABLE meta (key, value, more); ")
     with pytest.raises(StoreError):
         open_journal(tmp_path)
     monkeypatch.undo()
@@ -377,8 +377,8 @@ def test_a_journal_of_schema_1_is_brought_up_in_place(older):
 
 def test_an_upgrade_that_fails_leaves_schema_1_as_it_was(older, monkeypatch):
     before = on_disk(older, "SELECT * FROM sqlite_master")
-    broken = journal_module._FROM_SCHEMA_1.replace("COMMIT;", "INSERT INTO nowhere VALUES (1); COMMIT;")
-    monkeypatch.setattr(journal_module, "_FROM_SCHEMA_1", broken)
+    broken = journal_module.FROM_SCHEMA_1.replace("COMMIT;", "INSERT INTO nowhere VALUES (1); COMMIT;")
+    monkeypatch.setattr(journal_module, "FROM_SCHEMA_1", broken)
     with pytest.raises(StoreError, match="nowhere"):
         open_journal(older.parent)
     monkeypatch.undo()
@@ -487,7 +487,9 @@ def test_a_row_that_is_not_what_was_written_is_named_and_not_read(tmp_path, chan
     journal.close()
 
 
-@pytest.mark.parametrize("change", ["machine = 'b'", "seq = 2", "lost = 1", "newest_ns = 7", "crc32 = 1"])
+@pytest.mark.parametrize(
+    "change", ["machine = 'b'", "seq = 2", "lost = 1", "newest_ns = 7", "crc32 = 1", "crc32 = NULL"]
+)
 def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
     journal = open_journal(tmp_path)
     write(journal, admission(3))

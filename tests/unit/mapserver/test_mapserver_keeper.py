@@ -1,13 +1,12 @@
 """The keeper on a real writer and store: decisions fold machines out and in, changes are told, old rows move away."""
 
 import threading
-from collections.abc import Callable
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, SITE, WAIT_S, incoming, now_ns, random_samples, same, samples, send
+from mapserver_data import NOW_NS, SITE, incoming, now_ns, random_samples, same, samples, send, wait_for
 
 from mapserver.archive import FOLDER
 from mapserver.config import KeepConfig, ServerConfig
@@ -58,15 +57,6 @@ def opened(tmp_path):
     yield open_site
     for site in sites:
         site.close()
-
-
-def wait_for(fact: Callable[[], Any]) -> None:
-    never = threading.Event()
-    for _ in range(int(WAIT_S / 0.01)):
-        if fact():
-            return
-        never.wait(0.01)
-    raise AssertionError("did not come true")
 
 
 def fleet(bad: dict[str, float], passes: int = 2, size: int = 48) -> dict[str, list[Any]]:

@@ -57,7 +57,7 @@ def store(request, tmp_path_factory) -> Iterator[History]:
         for machine in "ab":
             add(journal, PARTS[machine][i], 1 + 20 * i, machine, NOW_NS + journal.last_row * HOUR_NS)
     reader = JournalReader(journal.path)
-    archive(folder / FOLDER, reader, SITE, NOW_NS + request.param * HOUR_NS, journal.forget)
+    list(archive(folder / FOLDER, reader, SITE, NOW_NS + request.param * HOUR_NS, journal.forget))
     assert journal.archived_row == request.param
     yield History.of(reader)
     reader.close(), journal.close()
@@ -90,7 +90,7 @@ def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
     rows, found = history_rows(History.of(reader)), []
     for i in range(2):
         found += [next(rows).row for _ in range(10 * where + 5 * i)]
-        archive(tmp_path / FOLDER, other, SITE, NOW_NS + 3 * (i + 1) * HOUR_NS, journal.forget)
+        list(archive(tmp_path / FOLDER, other, SITE, NOW_NS + 3 * (i + 1) * HOUR_NS, journal.forget))
     assert found + numbers(rows) == list(range(1, 601))
     reader.close(), other.close(), journal.close()
 
@@ -103,7 +103,7 @@ def test_rows_come_once_while_another_thread_archives_and_the_owner_writes(tmp_p
 
     def age() -> None:
         mine = JournalReader(journal.path)
-        archive(tmp_path / FOLDER, mine, SITE, NOW_NS + 8 * HOUR_NS, forget)
+        list(archive(tmp_path / FOLDER, mine, SITE, NOW_NS + 8 * HOUR_NS, forget))
         mine.close()
 
     def forget(until: int) -> int:
@@ -127,7 +127,7 @@ def test_a_missing_file_is_no_silent_gap(tmp_path):
         add(journal, samples(1), i + 1, received_ns=NOW_NS + i * HOUR_NS)
     history = History.of(journal)
     with JournalReader(journal.path) as reader:
-        archive(tmp_path / FOLDER, reader, SITE, NOW_NS + 2 * HOUR_NS, journal.forget)
+        list(archive(tmp_path / FOLDER, reader, SITE, NOW_NS + 2 * HOUR_NS, journal.forget))
     history.archive.paths()[1].unlink()
     with pytest.raises(StoreError, match="the file with row 2 is missing"):
         list(history_rows(history))

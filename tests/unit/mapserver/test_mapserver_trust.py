@@ -72,7 +72,7 @@ def audit(fleet: list[Table], config: TrustConfig | None = None, batch: int = 25
 def send(auditor: Auditor, names: str, fleet: list[Table], batch: int = 250) -> None:
     for first in range(0, max(map(len, fleet)), batch):
         for name, rows in zip(names, fleet, strict=False):
-            auditor.add(name, rows[first : first + batch], received_ns=0)
+            auditor.add(name, rows[first : first + batch])
 
 
 def found(verdicts: dict[str, Verdict]) -> dict[str, tuple[Reason, ...]]:
@@ -179,7 +179,7 @@ def test_samples_unsure_of_their_place_are_left_out() -> None:
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = 4.0
     auditor = Auditor(TrustConfig(), 1.0, FoldConfig(std_cap_m=1.9))
     for name, part in zip("abcd", [*fleet(0, GOOD, GOOD, GOOD), rows], strict=True):
-        auditor.add(name, part, received_ns=0)
+        auditor.add(name, part)
     assert auditor.verdicts()["d"].evidence["cells"] == 0
 
 

@@ -77,8 +77,8 @@ def test_ten_machines_on_a_large_site_take_little_memory() -> None:
     tracemalloc.start()
     auditor = Auditor(TrustConfig(), 1.0)
     for machine in "abcdefghij":
-        auditor.add(machine, rows, received_ns=0)
-        auditor.add(machine, rows, received_ns=0)
+        auditor.add(machine, rows)
+        auditor.add(machine, rows)
     used = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert auditor.nbytes <= used < 30 * MB
@@ -86,7 +86,7 @@ def test_ten_machines_on_a_large_site_take_little_memory() -> None:
 
 def test_an_auditor_that_heard_nothing_has_no_verdicts() -> None:
     auditor = Auditor(TrustConfig(), 1.0)
-    auditor.add("a", samples(0), received_ns=0)
+    auditor.add("a", samples(0))
     assert auditor.verdicts() == {}
 
 

@@ -1,6 +1,5 @@
 import sqlite3
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +22,7 @@ from mapserver_data import (
     same,
     samples,
     send,
+    wait_for,
 )
 
 from mapserver import snapshot
@@ -48,16 +48,6 @@ def start(tmp_path):
     for writer in writers:
         if writer._thread.is_alive():
             writer.close()
-
-
-def wait_for(fact: Callable[[], bool]) -> None:
-    """Wait on a condition that has no event of its own."""
-    never = threading.Event()
-    for _ in range(int(WAIT_S / 0.005)):
-        if fact():
-            return
-        never.wait(0.005)
-    raise AssertionError("did not come true")
 
 
 def spied(monkeypatch, method: str) -> list[str]:
