@@ -11,7 +11,7 @@ import json
 import math
 import sqlite3
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ import msgpack
 import numpy as np
 
 from mapserver.ingest import Admission
-from mapserver.journal_schema import FROM_SCHEMA_1, SCHEMA, SEEN_FROM_SCHEMA_1, TABLES
+from mapserver.journal_schema import SCHEMA, SEEN, TABLES, UPGRADES
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.geometry import Bounds
@@ -29,20 +29,18 @@ from protocol.readings import MAX_STAMP_NS
 from protocol.samples import SAMPLE_DTYPE
 
 # ruff: noqa: S608 - statements are put together from constants, never from input
-_COLUMNS = "SELECT row, machine, spool_id, first_seq, received_ns, payload, crc32 FROM "
-_IN_ORDER = """
-    AND row > :after AND row <= :until AND machine NOT IN (SELECT value FROM json_each(:without))
-ORDER BY row LIMIT :most
-"""
-_READ_ALL = _COLUMNS + "journal WHERE TRUE" + _IN_ORDER
-# CROSS JOIN keeps SQLite from walking the journal first.
-_READ_SOME = f"""{_COLUMNS} extent CROSS JOIN journal USING (row)
+_COLUMNS = "SELECT row, machine, spool_id, first_seq, received_ns, payload, journal.crc32 FROM "
+_IN_ORDER = "AND row > :after AND row <= :until ORDER BY row LIMIT :most"
+_READ_ALL = f"{_COLUMNS} journal WHERE TRUE {_IN_ORDER}"
+# LEFT JOIN keeps SQLite from walking the journal first, and shows a row that is not there.
+_READ_SOME = f"""{_COLUMNS} extent LEFT JOIN journal USING (row)
 WHERE extent.last_stamp_ns >= :from_ns AND extent.first_stamp_ns <= :to_ns
     AND (west_m IS NULL OR west_m <= :east_m AND east_m >= :west_m AND south_m <= :north_m AND north_m >= :south_m)
 {_IN_ORDER}"""
-_LAST_ROW = "SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'"  # also where all is archived
 _WAL_LIMIT = 64 * 2**20
 _AT_ONCE = 200  # rows that are read or removed in one transaction: short ones keep the write-ahead log small
+_EXTENTS_AT_ONCE = 10_000
+_PLAIN_UNTIL = "SELECT COALESCE(MAX(value), 0) FROM meta WHERE key = 'plain_until'"
 LAST = 2**63 - 1
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
 SPARE = 0.25  # share of free pages above which a file is made smaller
@@ -81,6 +79,11 @@ class Wanted:
     bounds: Bounds | None = None
     without: frozenset[str] = frozenset()
 
+    @property
+    def everywhere(self) -> bool:
+        """Whether neither time nor place keeps a row out."""
+        return self == Wanted(without=self.without)
+
 
 ALL = Wanted()
 
@@ -114,66 +117,124 @@ class JournalReads:
     def read(self, after: int = 0, until: int = LAST, wanted: Wanted = ALL) -> Iterator[JournalRow]:
         """Rows after < row <= until in order, also those that are committed meanwhile.
 
-        StoreError where a row's checksum does not fit, ArchivedError as soon as one of these rows is archived.
+        StoreError where a row is missing or not what was written; ArchivedError as soon as one of them is archived.
         """
         while True:
-            rows = self._piece(after, until, wanted)
+            last = min(until, self._last_row())  # asked before the rows are read: all up to this one must be there
+            found = self._piece(after, until, wanted)
             # Asked after the rows were read: none beyond this one had been removed then.
             if after < min(archived := self.archived_row, until):
                 raise ArchivedError(self.path, archived)
-            yield from rows
-            if len(rows) < _AT_ONCE:
+            is_end = len(found) < _AT_ONCE
+            if wanted.everywhere:
+                self._require_each((row for row, *_ in found), after, last if is_end else 0)
+            yield from (self._row(*values) for values in found if values[1] not in wanted.without)
+            if is_end:
                 return
-            after = rows[-1].row
+            after = found[-1][0]
 
     def newest_ns(self) -> int:
         """The newest stamp of all samples, archived or not: the site's now."""
-        return int(self._db.execute("SELECT COALESCE(MAX(newest_ns), 0) FROM watermark").fetchone()[0])
+        return self._number("SELECT COALESCE(MAX(newest_ns), 0) FROM watermark")
 
     @property
     def archived_row(self) -> int:
         """The last row that has moved to the archive."""
-        found = self._db.execute("SELECT value FROM meta WHERE key = 'archived_row'").fetchone()
-        return int(found[0]) if found else 0
+        return self._number("SELECT COALESCE(MAX(value), 0) FROM meta WHERE key = 'archived_row'")
 
     def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
         """Events beyond the number `after`, of one kind or of all, in the order in which they were written."""
-        query = "SELECT id, kind, stamp_ns, body FROM events WHERE id > ? AND kind = COALESCE(?, kind) ORDER BY id"
-        return [Event(i, k, ns, json.loads(body)) for i, k, ns, body in self._db.execute(query, (after, kind))]
+        query = (
+            "SELECT id, kind, stamp_ns, body, crc32 FROM events WHERE id > ? AND kind = COALESCE(?, kind) ORDER BY id"
+        )
+        return [self._event(*values) for values in self._query(query, (after, kind))]
 
-    def _piece(self, after: int, until: int, wanted: Wanted) -> list[JournalRow]:
-        everything = wanted == Wanted(without=wanted.without)
-        box = asdict(wanted.bounds) if wanted.bounds else _EVERYWHERE
-        span = {"after": after, "until": until, "from_ns": wanted.from_ns, "to_ns": wanted.to_ns, "most": _AT_ONCE}
+    def check(self) -> None:
+        """Look at what stands beside the rows, which are looked at when they are read: StoreError where it is damaged.
+
+        A damaged extent would hide its row from whoever asks by time and place, without a word.
+        """
+        self._db.execute("BEGIN")  # one state for all of it, also while a server writes
         try:
-            query = {**span, **box, "without": json.dumps(sorted(wanted.without))}
-            found = self._db.execute(_READ_ALL if everything else _READ_SOME, query).fetchall()
+            self._require_each(self._extent_rows(), self.archived_row, self._last_row())
+            self._require_each((event.id for event in self.events()), 0)
+            self._load_marks()
+        finally:
+            self._db.execute("ROLLBACK")
+
+    def _query(self, query: str, values: Sequence[Any] | Mapping[str, Any] = ()) -> list[tuple[Any, ...]]:
+        try:
+            return self._db.execute(query, values).fetchall()
         except sqlite3.Error as error:
             raise StoreError(self.path, f"cannot be read: {error}") from None
-        return [self._row(*values) for values in found]
+
+    def _meta(self) -> dict[str, str]:
+        return dict(self._query("SELECT key, value FROM meta"))
+
+    def _number(self, query: str) -> int:
+        ((value,),) = self._query(query)
+        try:
+            return int(value)
+        except ValueError:
+            raise self._damaged(f"the value {value!r}") from None
+
+    def _last_row(self) -> int:  # also where all rows are archived
+        return self._number("SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'")
+
+    def _piece(self, after: int, until: int, wanted: Wanted) -> list[tuple[Any, ...]]:
+        span = {"after": after, "until": until, "most": _AT_ONCE}
+        if wanted.everywhere:
+            return self._query(_READ_ALL, span)
+        box = asdict(wanted.bounds) if wanted.bounds else _EVERYWHERE
+        return self._query(_READ_SOME, {**span, **box, "from_ns": wanted.from_ns, "to_ns": wanted.to_ns})
+
+    def _require_each(self, numbers: Iterable[int], after: int, last: int = 0) -> None:
+        """StoreError unless each number follows the one before, from `after` on, to `last` at least."""
+        for number in numbers:
+            if number != after + 1:
+                raise self._damaged(f"what follows number {after}")
+            after = number
+        if after < last:
+            raise self._damaged(f"what follows number {after}")
+
+    def _damaged(self, what: str) -> StoreError:
+        return StoreError(self.path, f"{what} is damaged; restore the file from a backup")
 
     def _row(
         self, row: int, machine: str, spool: bytes, first_seq: int, received_ns: int, payload: bytes, crc32: int
     ) -> JournalRow:
         plain = row <= self._plain_until and isinstance(payload, bytes) and zlib.crc32(payload) == crc32
-        if not plain and _checksum(row, machine, spool, first_seq, received_ns, payload) != crc32:
-            raise StoreError(self.path, f"journal row {row} is damaged; restore the file from a backup")
+        if not plain and checksum(row, machine, spool, first_seq, received_ns, payload) != crc32:
+            raise self._damaged(f"journal row {row}")
         return JournalRow(row, machine, int.from_bytes(spool, "big"), first_seq, _unpack(payload), received_ns)
+
+    def _extent_rows(self) -> Iterator[int]:
+        """The rows that have an extent, in order; read in pieces, since there may be millions."""
+        query, row = "SELECT * FROM extent WHERE row > ? ORDER BY row LIMIT ?", 0
+        while piece := self._query(query, (row, _EXTENTS_AT_ONCE)):
+            for row, *extent, crc32 in piece:
+                if crc32 != checksum(row, *extent):
+                    raise self._damaged(f"the extent of journal row {row}")
+                yield row
+
+    def _event(self, number: int, kind: str, stamp_ns: int, body: str, crc32: int) -> Event:
+        if crc32 != checksum(number, kind, stamp_ns, body):
+            raise self._damaged(f"event {number}")
+        return Event(number, kind, stamp_ns, json.loads(body))
 
     def _load_marks(self) -> dict[tuple[str, int], Mark]:
         marks = {}
-        for machine, spool, *values, crc32 in self._db.execute(
-            "SELECT machine, spool_id, seq, lost, newest_ns, crc32 FROM watermark"
-        ):
+        query = "SELECT machine, spool_id, seq, lost, newest_ns, crc32 FROM watermark"
+        for machine, spool, *values, crc32 in self._query(query):
             is_plain = crc32 is None and self._plain_until > 0
-            if not is_plain and crc32 != _checksum(machine, spool, *values):
-                raise StoreError(self.path, f"the watermark of {machine} is damaged; restore the file from a backup")
+            if not is_plain and crc32 != checksum(machine, spool, *values):
+                raise self._damaged(f"the watermark of {machine}")
             marks[machine, int.from_bytes(spool, "big")] = Mark(*values)
         return marks
 
 
 class Journal(JournalReads):
-    """One writer's connection to the journal of one site."""
+    """One writer's connection to the journal of one site. StoreError where anything in it is damaged (`check`)."""
 
     last_row: int
 
@@ -184,11 +245,13 @@ class Journal(JournalReads):
             try:
                 self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
                 opened.callback(self._db.close)
+                self._db.create_function("checksum", -1, checksum, deterministic=True)
                 self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")  # only a new file takes it
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
                 self._create_or_check(site, frame)
+                self.check()
                 self._return_to_disk()
             except sqlite3.Error as error:
                 raise StoreError(path, f"is no usable journal: {error}") from None
@@ -214,7 +277,7 @@ class Journal(JournalReads):
         first_ns, last_ns = int(stamps.min()), int(stamps.max())
         spool = _spool_bytes(batch.spool_id)
         row = self.last_row + 1
-        crc32 = _checksum(row, batch.machine, spool, batch.first_seq, received_ns, payload)
+        crc32 = checksum(row, batch.machine, spool, batch.first_seq, received_ns, payload)
         values = (row, batch.machine, spool, batch.first_seq, len(batch.rows), received_ns)
         self._db.execute(
             "INSERT INTO journal (row, machine, spool_id, first_seq, n, received_ns, first_stamp_ns, last_stamp_ns,"
@@ -222,7 +285,8 @@ class Journal(JournalReads):
             (*values, first_ns, last_ns, payload, crc32),
         )
         box = (float(x_m.min()), float(y_m.min()), float(x_m.max()), float(y_m.max()))
-        self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?)", (row, first_ns, last_ns, *box))
+        extent = (row, first_ns, last_ns, *box)
+        self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, checksum(*extent)))
         before = self.mark(batch.machine, batch.spool_id)
         mark = Mark(admission.watermark, before.lost + admission.lost, max(before.newest_ns, last_ns))
         self.put_mark(batch.machine, batch.spool_id, mark)
@@ -240,7 +304,7 @@ class Journal(JournalReads):
     def put_mark(self, machine: str, spool_id: int, mark: Mark) -> None:
         """Write a watermark into the open transaction."""
         values = (machine, _spool_bytes(spool_id), mark.seq, mark.lost, mark.newest_ns)
-        self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", (*values, _checksum(*values)))
+        self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", (*values, checksum(*values)))
         self._marks[machine, spool_id] = mark
 
     def commit(self) -> None:
@@ -258,8 +322,9 @@ class Journal(JournalReads):
         text = json.dumps(body, allow_nan=False)
         self.begin()
         try:
-            query = "INSERT INTO events (kind, stamp_ns, body) VALUES (?, ?, ?)"
-            number = int(self._db.execute(query, (kind, stamp_ns, text)).lastrowid or 0)
+            number = self._number("SELECT COALESCE(MAX(id), 0) + 1 FROM events")
+            values = (number, kind, stamp_ns, text)
+            self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
             self.commit()
         except sqlite3.Error:
             self.rollback()
@@ -307,22 +372,18 @@ class Journal(JournalReads):
             self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
             self._db.executemany("INSERT INTO meta VALUES (?, ?)", expected.items())
             self._db.execute("COMMIT")
-        found = _meta(self._db)
+        found = self._meta()
         for key, value in expected.items():
-            if found.get(key) != value and not (key == "schema" and found.get(key) == "1"):
+            if found.get(key) != value and not (key == "schema" and found.get(key) in UPGRADES):
                 problem = f"the store has {key} {found.get(key)!r}, this server {value!r}; choose another --store"
                 raise StoreError(self.path, problem)
-        if found["schema"] == "1":
-            self._db.executescript(FROM_SCHEMA_1)
-            found = _meta(self._db)
-        self._plain_until = int(found.get("plain_until", 0))
+        if found["schema"] in UPGRADES:
+            self._db.executescript(UPGRADES[found["schema"]])
+        self._plain_until = self._number(_PLAIN_UNTIL)
 
     def _return_to_disk(self) -> None:
         self._marks = self._load_marks()
-        self.last_row = self._number(_LAST_ROW)
-
-    def _number(self, query: str) -> int:
-        return int(self._db.execute(query).fetchone()[0])
+        self.last_row = self._last_row()
 
 
 class JournalReader(JournalReads):
@@ -339,21 +400,22 @@ class JournalReader(JournalReads):
                     f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None, check_same_thread=False
                 )
                 opened.callback(self._db.close)
-                found = _meta(self._db)
-                if found.get("schema") == "1":
-                    self._db.executescript(SEEN_FROM_SCHEMA_1)
-                elif found.get("schema") != str(SCHEMA):
-                    raise StoreError(path, f"the journal has schema {found.get('schema')!r}, known is {SCHEMA}")
+                self._db.create_function("checksum", -1, checksum, deterministic=True)
+                found = self._meta()
+                if (schema := found.get("schema")) in SEEN:
+                    self._db.executescript(SEEN[schema])
+                elif schema != str(SCHEMA):
+                    raise StoreError(path, f"the journal has schema {schema!r}, known is {SCHEMA}")
             except sqlite3.Error as error:
                 raise StoreError(path, f"is no usable journal: {error}") from None
-            self.site, self.frame = found["site"], found["frame"]
-            self._plain_until = LAST if found["schema"] == "1" else int(found.get("plain_until", 0))
+            self.site, self.frame = found.get("site", ""), found.get("frame", "")
+            self._plain_until = LAST if schema == "1" else self._number(_PLAIN_UNTIL)
             opened.pop_all()
 
     @property
     def last_row(self) -> int:
         """The last row on disk, archived or not."""
-        return int(self._db.execute(_LAST_ROW).fetchone()[0])
+        return self._last_row()
 
     def marks(self) -> dict[tuple[str, int], Mark]:
         """Progress of all spools."""
@@ -370,11 +432,7 @@ class JournalReader(JournalReads):
         self.close()
 
 
-def _meta(db: sqlite3.Connection) -> dict[str, str]:
-    return dict(db.execute("SELECT key, value FROM meta"))
-
-
-def _checksum(*values: object) -> int:
+def checksum(*values: object) -> int:
     """CRC-32 of plain values, bytes among them."""
     crc32 = 0
     for value in values:

@@ -9,7 +9,7 @@ import socket
 import sqlite3
 import ssl
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeVar
@@ -213,20 +213,13 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     if not (folder / JOURNAL_FILE).is_file():
         raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")
     with JournalReader(folder / JOURNAL_FILE) as journal:
-        last_row = _read(folder, lambda: journal.last_row)
-        machines = {machine for machine, _ in _read(folder, journal.marks)}
-        archived = _read(folder, lambda: journal.archived_row)
+        journal.check()
+        last_row, archived = journal.last_row, journal.archived_row
+        machines = {machine for machine, _ in journal.marks()}
         site, frame = journal.site, journal.frame
     newest = next(iter(snapshot.rows_on_disk(folder)), 0)
     age_s = now_s - (folder / f"snapshot-{newest}.npz").stat().st_mtime if newest else math.inf
     return StoreState(site, frame, SCHEMA, last_row, archived, len(machines), newest, age_s)
-
-
-def _read(folder: Path, what: Callable[[], T]) -> T:
-    try:
-        return what()
-    except sqlite3.Error as error:
-        raise StoreError(folder, f"its journal cannot be read: {error}") from None
 
 
 def _read_only(path: Path) -> str:

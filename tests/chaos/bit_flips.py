@@ -16,6 +16,7 @@ from typing import Any
 
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
+from mapserver.journal import Wanted
 from mapserver.past import History, history_rows
 from mapserver.store import JOURNAL_FILE, Store
 from protocol.errors import StoreError
@@ -92,7 +93,15 @@ def read_store(folder: Path, definition: Any) -> Content:
         grid = store.grid.state()
         votes = [(at.x, at.y, at.rung, at.index, at.page.votes.tobytes()) for at in grid.pages]
         marks = {key: (mark.seq, mark.lost) for key, mark in store._journal.marks().items()}
-        return {"rows": rows, "marks": marks, "grid": (grid.folded, sorted(votes)), "last": store.journalled}
+        placed = [(row.row, int(row.rows["stamp_ns"].min())) for row in store._journal.read(wanted=Wanted(from_ns=1))]
+        return {
+            "rows": rows,
+            "placed": placed,  # what is found by time and place
+            "events": store._journal.events(),
+            "marks": marks,
+            "grid": (grid.folded, sorted(votes)),
+            "last": store.journalled,
+        }
     finally:
         store._opened.close()
 
@@ -149,9 +158,10 @@ def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[
 
 
 def _near_identities(content: bytes, truth: Content) -> list[int]:
-    """Where a file keeps identities, watermarks and counts: few bytes, which chance would rarely hit."""
+    """Where a file keeps identities, watermarks, counts and times: few bytes, which chance would rarely hit."""
     ids = {spool_id for _, spool_id in truth.get("marks", ())} | {spool_id for spool_id, _ in truth.get("contents", ())}
     texts = {spool_id.to_bytes(8, "big") for spool_id in ids} | {f"{spool_id:016x}".encode() for spool_id in ids}
+    texts |= {stamp_ns.to_bytes(8, "big") for _, stamp_ns in truth.get("placed", ())}
     found = [match.span() for text in texts for match in re.finditer(re.escape(text), content)]
     return [at for begin, end in found for at in range(max(0, begin - 12), min(len(content), end + 8))]
 

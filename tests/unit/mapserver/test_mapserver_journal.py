@@ -9,7 +9,7 @@ from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 
 from mapserver import journal as journal_module
 from mapserver.ingest import Admission
-from mapserver.journal import ALL, ArchivedError, Event, Journal, JournalReader, Mark, Wanted
+from mapserver.journal import ALL, ArchivedError, Event, Journal, JournalReader, JournalReads, Mark, Wanted
 from protocol.errors import StoreError
 from protocol.geometry import Bounds
 from protocol.samples import SAMPLE_DTYPE
@@ -324,11 +324,11 @@ def test_a_reader_of_nothing_or_of_another_schema_is_refused(tmp_path):
     journal = open_journal(tmp_path)
     journal._db.execute("UPDATE meta SET value = '99' WHERE key = 'schema'")
     journal.close()
-    with pytest.raises(StoreError, match="schema '99', known is 2"):
+    with pytest.raises(StoreError, match="schema '99', known is 3"):
         JournalReader(tmp_path / "journal.db")
 
 
-# --- journals of schema 1 --------------------------------------------------------------------------------------------
+# --- journals of older schemas ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -368,7 +368,7 @@ def test_a_journal_of_schema_1_is_brought_up_in_place(older):
         assert numbers(journal.read(wanted=Wanted(bounds=Bounds(1e4, 1e4, 2e4, 2e4)))) == [1, 2, 3]  # boxes unknown
         assert numbers(journal.read(wanted=Wanted(to_ns=1))) == []
         journal.close()
-    assert on_disk(older, "SELECT value FROM meta WHERE key = 'schema'") == [("2",)]
+    assert on_disk(older, "SELECT value FROM meta WHERE key = 'schema'") == [("3",)]
     journal = open_journal(older.parent)
     write(journal, admission(1, first_seq=8))
     assert numbers(journal.read(wanted=Wanted(bounds=Bounds(-60, -60, 60, 60)))) == [1, 2, 3, 4]
@@ -377,13 +377,37 @@ def test_a_journal_of_schema_1_is_brought_up_in_place(older):
 
 def test_an_upgrade_that_fails_leaves_schema_1_as_it_was(older, monkeypatch):
     before = on_disk(older, "SELECT * FROM sqlite_master")
-    broken = journal_module.FROM_SCHEMA_1.replace("COMMIT;", "INSERT INTO nowhere VALUES (1); COMMIT;")
-    monkeypatch.setattr(journal_module, "FROM_SCHEMA_1", broken)
+    broken = journal_module.UPGRADES["1"].replace("COMMIT;", "INSERT INTO nowhere VALUES (1); COMMIT;")
+    monkeypatch.setitem(journal_module.UPGRADES, "1", broken)
     with pytest.raises(StoreError, match="nowhere"):
         open_journal(older.parent)
     monkeypatch.undo()
     assert on_disk(older, "SELECT * FROM sqlite_master") == before
     open_journal(older.parent).close()
+
+
+def test_a_journal_of_schema_2_is_brought_up_in_place(placed):
+    kept = placed.append_event("t", 5, {"machine": "a"})
+    rows, marks, folder = numbers(placed.read()), placed.marks(), placed.path.parent
+    placed._db.executescript(
+        "ALTER TABLE extent DROP COLUMN crc32; ALTER TABLE events DROP COLUMN crc32;"
+        "UPDATE meta SET value = '2' WHERE key = 'schema'"
+    )
+    placed.close()
+
+    def check(journal: JournalReads) -> None:
+        journal.check()
+        assert (numbers(journal.read()), journal.marks(), journal.last_row) == (rows, marks, 4)
+        assert journal.events() == [Event(kept, "t", 5, {"machine": "a"})]
+        assert numbers(journal.read(wanted=Wanted(from_ns=400))) == [4]
+        journal.close()
+
+    check(JournalReader(folder / "journal.db"))
+    assert on_disk(folder / "journal.db", "SELECT value FROM meta WHERE key = 'schema'") == [("2",)]
+    check(open_journal(folder))
+    assert on_disk(folder / "journal.db", "SELECT value FROM meta WHERE key = 'schema'") == [("3",)]
+    check(open_journal(folder))
+    placed._db = sqlite3.connect(":memory:")  # the fixture closes it again
 
 
 # --- rows that are archived ------------------------------------------------------------------------------------------
@@ -497,3 +521,50 @@ def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
     journal.close()
     with pytest.raises(StoreError, match=r"the watermark of . is damaged"):
         open_journal(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ("UPDATE extent SET first_stamp_ns = 1 WHERE row = 2", "the extent of journal row 2"),
+        ("UPDATE extent SET west_m = NULL WHERE row = 2", "the extent of journal row 2"),
+        ("UPDATE extent SET crc32 = 1 WHERE row = 2", "the extent of journal row 2"),
+        ("DELETE FROM extent WHERE row = 2", "what follows number 1"),
+        ("DELETE FROM extent WHERE row = 4", "what follows number 3"),
+        ("UPDATE extent SET row = 9 WHERE row = 4", "the extent of journal row 9"),
+        ("UPDATE events SET body = '{}' WHERE id = 1", "event 1"),
+        ("UPDATE events SET kind = 'u' WHERE id = 2", "event 2"),
+        ("DELETE FROM events WHERE id = 1", "what follows number 0"),
+        ("INSERT INTO meta VALUES ('archived_row', '2')", "what follows number 2"),
+        ("INSERT INTO meta VALUES ('archived_row', '2x')", "the value '2x'"),
+    ],
+)
+def test_what_stands_beside_the_rows_is_looked_at_on_opening(placed, monkeypatch, change, problem):
+    monkeypatch.setattr(journal_module, "_EXTENTS_AT_ONCE", 3)  # read in two pieces
+    for i in range(2):
+        placed.append_event("t", i, {"machine": "a"})
+    placed.check()
+    placed._db.execute(change)
+    for _ in range(2):  # nothing is left open by the first
+        with pytest.raises(StoreError, match=rf"journal\.db: {problem} is damaged; restore"):
+            placed.check()
+    with pytest.raises(StoreError, match="is damaged"):
+        open_journal(placed.path.parent)
+
+
+@pytest.mark.parametrize("row", [1, 3, 4])
+def test_a_row_that_is_gone_is_missed(placed, row):
+    placed._db.execute("DELETE FROM journal WHERE row = ?", (row,))
+    with pytest.raises(StoreError, match=f"what follows number {row - 1} is damaged"):
+        list(placed.read())
+    with pytest.raises(StoreError, match=f"journal row {row} is damaged"):
+        list(placed.read(wanted=Wanted(from_ns=1)))
+    assert numbers(placed.read(until=row - 1)) == list(range(1, row))
+
+
+def test_machines_that_are_left_out_are_not_missed(tmp_path):
+    journal = open_journal(tmp_path)
+    write(journal, *(admission(1, first_seq=1 + i // 2, machine="ab"[i % 2]) for i in range(500)))
+    assert numbers(journal.read(wanted=Wanted(without=frozenset("a")))) == list(range(2, 501, 2))
+    assert numbers(journal.read(wanted=Wanted(without=frozenset("ab")))) == []
+    journal.close()

@@ -369,8 +369,16 @@ def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
     filled_store(tmp_path)
     with closing(Store(tmp_path, SITE, ServerConfig(), time.time_ns)):
         state = probes.read_store(tmp_path, time.time() + 100)
-    assert state == StoreState("pit", SITE.frame, 2, 2, 0, 1, 1, state.snapshot_age_s)
+    assert state == StoreState("pit", SITE.frame, 3, 2, 0, 1, 1, state.snapshot_age_s)
     assert 99 < state.snapshot_age_s < 160
+
+
+def test_a_store_that_hides_rows_is_a_finding(tmp_path: Path, capsys):
+    filled_store(tmp_path)
+    with closing(sqlite3.connect(tmp_path / "journal.db")) as db, db:
+        db.execute("UPDATE extent SET last_stamp_ns = 1 WHERE row = 2")
+    assert main(["doctor", "--endpoint", free_endpoint(), "--store", str(tmp_path)]) == 1
+    assert "journal.db: the extent of journal row 2 is damaged; restore" in capsys.readouterr().out
 
 
 def test_a_damaged_store_is_a_finding(tmp_path: Path, capsys):
