@@ -227,11 +227,16 @@ def test_options_that_make_no_sense_are_refused(words, problem, capsys):
 @pytest.mark.processes
 def test_an_interrupted_suite_ends_everything(tmp_path):
     work = tmp_path / "work"
-    words = [sys.executable, "-m", "tests.chaos", "--faults", "freezes", "--keep", str(work)]
+    words = [sys.executable, "-X", "faulthandler", "-m", "tests.chaos", "--faults", "freezes", "--keep", str(work)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ) as suite:
         wait_until(lambda: len(list(work.glob("freezes/log/*.out"))) >= 3, 60.0, "processes of the suite")
         suite.send_signal(signal.SIGINT)
-        assert suite.communicate(timeout=30)[0].splitlines()[-1] == "interrupted; everything is ended"
+        try:
+            said, _ = suite.communicate(timeout=30)
+        except subprocess.TimeoutExpired:
+            suite.send_signal(signal.SIGABRT)  # it says where it hangs
+            raise
+        assert said.splitlines()[-1] == "interrupted; everything is ended"
         assert suite.returncode == 130
     assert not _commands_with(str(work))
 
