@@ -174,4 +174,5 @@ class Agent:
             self._kept_ns, self._calibration_problem = calibration.stamp_ns, ""
 
     def _is_delivered(self) -> bool:
+        self._deliver(empty())  # what the disk did not take yet
         return not len(self._unsaved) and self._spool.is_settled()

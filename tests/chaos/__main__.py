@@ -1,7 +1,7 @@
 """`python -m tests.chaos`: real processes under faults, and a table of what was lost or came twice.
 
 Exit code 0 if nothing was, 1 if something was or anything else went wrong, 2 for a wrong option, 130 if interrupted.
-The order and the times of faults come from --seed and are printed.
+The order and the times of faults come from --seed, which is printed.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ class Site:
         code = process.end(*ALL_STOPPED)
         took_s = time.monotonic() - began_s
         self.outcome.notes["slowest end [s]"] = round(max(took_s, self.outcome.notes.get("slowest end [s]", 0)), 1)
-        if code:
+        if code and (code != -signal.SIGTERM or process.said("ready")):  # before that, Python itself may end it
             self.problem(f"{role} ended with {code} on SIGTERM: {process.last_words()}")
 
     def expect_end(self, role: str) -> tuple[int | None, str]:
@@ -200,11 +200,13 @@ class Site:
 
     def _resume(self) -> None:
         before = self.progress()
-        self._wait(
-            lambda: all(self.progress().get(m, 0) > before.get(m, 0) for m in self.machines),
-            RESUME_S,
-            "service does not resume",
-        )
+
+        def is_served() -> bool:
+            self.tend()  # a drive may be over
+            progress = self.progress()
+            return all(progress.get(machine, 0) > before.get(machine, 0) for machine in self.machines)
+
+        self._wait(is_served, RESUME_S, "service does not resume")
 
     def _count(self, ended_s: float, resumed_s: float) -> None:
         audits = {machine: self.folder / "audit" / machine for machine in self.machines}

@@ -27,7 +27,7 @@ def kills(scenario: Scenario) -> Outcome:
     n = scenario.strikes or max(LEAST, round(KILLS * scenario.scale))
     with scenario.site() as site:
         plan = draw_kills(scenario.rng, site.machines, n, scenario.seconds)
-        scenario.say("order " + " ".join(f"{pause:.2f}s {victim}" for pause, victim in plan))
+        scenario.say(f"{n} within {scenario.seconds:.0f} s")
         site.start_all()
         for pause_s, victim in plan:
             site.linger(pause_s)

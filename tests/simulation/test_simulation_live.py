@@ -208,6 +208,24 @@ def test_agent_goes_on_while_its_disk_takes_nothing(opened: Opened, tmp_path: Pa
     agent.close()
 
 
+def test_samples_that_the_disk_takes_only_after_the_end_are_delivered(
+    endpoint: str, opened: Opened, tmp_path: Path
+) -> None:
+    with server_at(endpoint, tmp_path / "store"):
+        agent = Agent(opened(), SITE, MACHINE, AgentConfig(linger_s=WAIT_S), Places(tmp_path / "spool.db"))
+        agent._spool._db.execute("PRAGMA query_only = ON")
+        agent._deliver(made_up(5))
+
+        def mend(seconds: float) -> None:
+            agent._spool._db.execute("PRAGMA query_only = OFF")
+            time.sleep(seconds)
+
+        report = agent.run(Silent(3), lambda: False, wait=mend)
+        agent.close()
+    assert (report["samples"], report["spool"]["unsaved"], report["spool_problem"]) == (5, 0, "")
+    assert report["delivered"]
+
+
 # --- a machine that was off for a week -------------------------------------------------------------------------------
 
 
