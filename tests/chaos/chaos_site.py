@@ -120,7 +120,8 @@ class Site:
         code = process.end(*ALL_STOPPED)
         took_s = time.monotonic() - began_s
         self.outcome.notes["slowest end [s]"] = round(max(took_s, self.outcome.notes.get("slowest end [s]", 0)), 1)
-        if code and (code != -signal.SIGTERM or process.said("ready")):  # before that, Python itself may end it
+        works = process.said("ready") and not process.said("ended")  # before and after, SIGTERM is Python's own
+        if code and (code != -signal.SIGTERM or works):
             self.problem(f"{role} ended with {code} on SIGTERM: {process.last_words()}")
 
     def expect_end(self, role: str) -> tuple[int | None, str]:
