@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
 import os
@@ -14,6 +15,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 END_S = 2.5  # from the signal to the end of the process
+LARGE_BYTES = 2**20  # a block of memory that is worth a system call
+_MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of malloc.h
 log = logging.getLogger("sitegrid.process")
 
 
@@ -63,6 +66,16 @@ def _end_now(after_s: float) -> None:
     told.start()
     told.join(0.2)
     os._exit(0)
+
+
+def return_large_blocks() -> bool:
+    """Have the C library give large blocks back to the system when they are freed; False where it cannot be told to.
+
+    glibc puts up its threshold for that, to 32 MB, when blocks of that size are freed, and keeps what lies below it:
+    arrays that live for one query would stay in resident memory, a few more of them every hour.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    return bool(mallopt and mallopt(_MMAP_THRESHOLD, LARGE_BYTES))
 
 
 def wait(stop: threading.Event) -> None:

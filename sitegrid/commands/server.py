@@ -18,7 +18,7 @@ from protocol.config import from_table, load_toml
 from protocol.session import open_session
 from protocol.site import load_site
 from protocol.version import package_version
-from sitegrid.process import say, stop_flag
+from sitegrid.process import return_large_blocks, say, stop_flag
 from sitegrid.register import load_register
 from sitegrid.security import join
 
@@ -26,6 +26,7 @@ from sitegrid.security import join
 def run(arguments: Namespace) -> int:
     """Serve until stopped; then finish what has come in, commit, snapshot."""
     stop = stop_flag()
+    return_large_blocks()
     site = load_site(arguments.site_file)
     table = load_toml(arguments.config) if arguments.config else {}
     config = from_table(ServerConfig, table, str(arguments.config))

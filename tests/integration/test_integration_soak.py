@@ -20,7 +20,7 @@ def test_ten_minutes_of_work_leave_the_memory_flat(tmp_path: Path):
     result = soak(tmp_path, minutes=10, speed=75, machines=4)
     assert [round(look.minute) for look in result.looks] == list(range(1, 11))
     assert result.looks[-1].samples == result.sent == 4 * 10 * 150
-    assert result.growth_pct() < 25, "in the first minutes everything is still being used for the first time"
+    assert result.growth_pct() < 10, "in the first minutes everything is still being used for the first time"
 
 
 def test_growth_is_that_of_the_second_half():

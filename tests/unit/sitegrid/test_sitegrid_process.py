@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import signal
 import subprocess
 import sys
@@ -34,6 +35,26 @@ mutex = ctypes.create_string_buffer(256)
 pthread = ctypes.CDLL(None)
 pthread.pthread_mutex_lock(mutex)
 pthread.pthread_mutex_lock(mutex)
+"""
+# Blocks that are freed between others that stay: the second of each size used to lie in the heap.
+GREEDY = """
+import os, sys
+import numpy as np
+from sitegrid.process import return_large_blocks
+
+def resident_mib():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+if sys.argv[1] == "steady" and not return_large_blocks():
+    sys.exit("no such thing in this C library")
+before, kept = resident_mib(), []
+for _ in range(8):
+    np.ones(30 * 2**17)
+    block = np.ones(30 * 2**17)
+    kept.append(np.ones(2**14))
+    del block
+print(resident_mib() - before)
 """
 
 
@@ -95,3 +116,13 @@ def test_what_is_no_address_is_a_usage_error(text: str):
     with pytest.raises(SystemExit) as end:
         build_parser().parse_args(["server", "--site-file", "s", "--store", "x", f"--metrics={text}"])
     assert end.value.code == 2
+
+
+@pytest.mark.skipif("glibc" not in platform.libc_ver()[0], reason="other C libraries keep no such blocks")
+def test_large_blocks_go_back_to_the_system():
+    def grown_mib(how: str) -> float:
+        words = [sys.executable, "-c", GREEDY, how]
+        return float(subprocess.run(words, capture_output=True, text=True, check=True, timeout=60).stdout)
+
+    assert grown_mib("steady") < 10
+    assert grown_mib("as it is") > 25
