@@ -19,6 +19,7 @@ from mapserver.votes import FoldConfig
 from protocol.arrays import Bools
 
 HOUR_S, DAY_S = 3600, 86_400
+PATIENCE = 8  # pages that a rung takes before it hands on: fewer cost time, more cost memory
 Block = tuple[int, int]  # column and row
 
 
@@ -50,11 +51,12 @@ def rungs(config: FoldConfig) -> tuple[Rung, ...]:
 
 
 class Ladder:
-    """Pages of one block."""
+    """Pages of one block. What is beyond the newest of a rung is handed on after a few pages, and before reading."""
 
     def __init__(self, rungs: tuple[Rung, ...]) -> None:
         self._rungs = rungs
         self._pages: tuple[dict[int, Page], ...] = tuple({} for _ in rungs)
+        self._taken = [0] * len(rungs)  # pages since the rung handed on
 
     def add(self, bucket: int, page: Page) -> None:
         """Add evidence of a time bucket."""
@@ -66,6 +68,9 @@ class Ladder:
 
     def items(self) -> Iterator[tuple[int, int, Page]]:
         """Rung, index on it, and page, sorted."""
+        for rung, taken in enumerate(self._taken):  # the finest first: it hands on to the others
+            if taken:
+                self._thin(rung)
         for rung, pages in enumerate(self._pages):
             for index in sorted(pages):
                 yield rung, index, pages[index]
@@ -84,19 +89,23 @@ class Ladder:
         return [timed for _, timed in sorted(found, key=lambda item: (item[0], item[1].first_ns))]
 
     def _put(self, rung: int, index: int, page: Page) -> None:
-        pages, keep = self._pages[rung], self._rungs[rung].keep
+        pages = self._pages[rung]
         pages[index] = merge(pages[index], page) if index in pages else page
-        if keep and len(pages) > keep:
+        self._taken[rung] += 1
+        if self._taken[rung] >= PATIENCE:
             self._thin(rung)
 
     def _thin(self, rung: int) -> None:
         """Hand on what cells have beyond their newest `keep` spans."""
-        pages = self._pages[rung]
+        self._taken[rung] = 0
+        pages, keep = self._pages[rung], self._rungs[rung].keep
+        if not keep or len(pages) <= keep:
+            return
         order = sorted(pages, reverse=True)
         held: Bools = np.zeros((len(order), ev.CELLS), np.bool_)
         for i, index in enumerate(order):
             held[i, pages[index].cells["cell"]] = True
-        beyond = held & (held.cumsum(axis=0) > self._rungs[rung].keep)
+        beyond = held & (held.cumsum(axis=0) > keep)
         for i in np.flatnonzero(beyond.any(axis=1)).tolist():
             index = order[i]
             page = pages.pop(index)

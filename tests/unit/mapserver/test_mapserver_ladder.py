@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from mapserver_data import same_page
 
 from mapserver import evidence as ev
-from mapserver.ladder import DAY_S, HOUR_S, Ladder, rungs
+from mapserver.ladder import DAY_S, HOUR_S, PATIENCE, Ladder, rungs
 from mapserver.pages import Page, merge, pack
 from mapserver.votes import FoldConfig
 
@@ -88,6 +88,24 @@ def test_what_stays_apart_is_decided_cell_by_cell(driven, keeps, random):
     for bucket_, cells in driven:
         again.add(bucket_, page(bucket_, cells=cells))
     assert same(found, again)
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(bucket, st.booleans(), st.sets(st.integers(0, 3), min_size=1).map(tuple)), max_size=40))
+def test_reading_in_between_changes_nothing(driven):
+    read, unread = ladder([]), ladder([])
+    for bucket_, is_read, cells in driven:
+        for one in (read, unread):
+            one.add(bucket_, page(bucket_, cells=cells))
+        if is_read:
+            read.timed()
+    assert same(read, unread)
+
+
+def test_a_ladder_that_nobody_reads_does_not_grow():
+    found = ladder(START + 3 * i for i in range(1003))
+    assert all(len(pages) <= 2 + PATIENCE for pages in found._pages)
+    assert len(found._pages[0]) > 2, "it does not hand on with each page"
 
 
 @pytest.mark.parametrize("keeps", [(1, 2, 4), (4, 1, 2), (2, 4, 1)])
