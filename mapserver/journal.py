@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
+import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -21,7 +22,7 @@ import msgpack
 import numpy as np
 
 from mapserver.ingest import Admission
-from mapserver.journal_schema import SCHEMA, SEEN, TABLES, UPGRADES
+from mapserver.journal_schema import EXTENT_VALUES, SCHEMA, SEEN, TABLES, UPGRADES
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.geometry import Bounds
@@ -43,6 +44,7 @@ _EXTENTS_AT_ONCE = 10_000
 _PLAIN_UNTIL = "SELECT COALESCE(MAX(value), 0) FROM meta WHERE key = 'plain_until'"
 LAST = 2**63 - 1
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
+_EXTENT = struct.Struct("<3q4d")
 SPARE = 0.25  # share of free pages above which a file is made smaller
 
 
@@ -212,8 +214,9 @@ class JournalReads:
         """The rows that have an extent, in order; read in pieces, since there may be millions."""
         query, row = "SELECT * FROM extent WHERE row > ? ORDER BY row LIMIT ?", 0
         while piece := self._query(query, (row, _EXTENTS_AT_ONCE)):
-            for row, *extent, crc32 in piece:
-                if crc32 != checksum(row, *extent):
+            for *extent, crc32 in piece:
+                row = extent[0]
+                if crc32 != extent_checksum(*extent):
                     raise self._damaged(f"the extent of journal row {row}")
                 yield row
 
@@ -245,7 +248,7 @@ class Journal(JournalReads):
             try:
                 self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
                 opened.callback(self._db.close)
-                self._db.create_function("checksum", -1, checksum, deterministic=True)
+                _lend_checksums(self._db)
                 self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")  # only a new file takes it
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
@@ -286,7 +289,7 @@ class Journal(JournalReads):
         )
         box = (float(x_m.min()), float(y_m.min()), float(x_m.max()), float(y_m.max()))
         extent = (row, first_ns, last_ns, *box)
-        self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, checksum(*extent)))
+        self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, extent_checksum(*extent)))
         before = self.mark(batch.machine, batch.spool_id)
         mark = Mark(admission.watermark, before.lost + admission.lost, max(before.newest_ns, last_ns))
         self.put_mark(batch.machine, batch.spool_id, mark)
@@ -400,7 +403,7 @@ class JournalReader(JournalReads):
                     f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None, check_same_thread=False
                 )
                 opened.callback(self._db.close)
-                self._db.create_function("checksum", -1, checksum, deterministic=True)
+                _lend_checksums(self._db)
                 found = self._meta()
                 if (schema := found.get("schema")) in SEEN:
                     self._db.executescript(SEEN[schema])
@@ -430,6 +433,20 @@ class JournalReader(JournalReads):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _lend_checksums(db: sqlite3.Connection) -> None:
+    """What the statements of journal_schema call."""
+    db.create_function("checksum", -1, checksum, deterministic=True)
+    db.create_function("extent_checksum", len(EXTENT_VALUES), extent_checksum, deterministic=True)
+
+
+def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float | None) -> int:
+    """CRC-32 of when and where a row lies, ten times as fast as `checksum`; none of what it cannot be."""
+    try:
+        return zlib.crc32(_EXTENT.pack(row, first_ns, last_ns, *((math.nan,) * 4 if None in box else box)))
+    except struct.error:
+        return -1
 
 
 def checksum(*values: object) -> int:

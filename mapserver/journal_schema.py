@@ -1,6 +1,6 @@
 """The tables of the journal, and how a journal of an older schema becomes one of this schema, or is read as one.
 
-Statements call `checksum` (journal.checksum), which the connection brings along.
+Statements call `checksum` and `extent_checksum` of journal.py, which the connection brings along.
 """
 
 # ruff: noqa: S608 - statements are put together from constants, never from input
@@ -55,9 +55,10 @@ CREATE TABLE watermark (
     PRIMARY KEY (machine, spool_id)
 ) WITHOUT ROWID;
 {EXTENT}"""
-_EXTENT_VALUES = "row, first_stamp_ns, last_stamp_ns, west_m, south_m, east_m, north_m"
+EXTENT_VALUES = ("row", "first_stamp_ns", "last_stamp_ns", "west_m", "south_m", "east_m", "north_m")
+_EXTENT_CRC32 = f"extent_checksum({', '.join(EXTENT_VALUES)})"
 _EVENT_VALUES = "id, kind, stamp_ns, body"
-_PLACED = f"{_EXTENT_VALUES}, checksum({_EXTENT_VALUES}) AS crc32"
+_PLACED = f"{', '.join(EXTENT_VALUES)}, {_EXTENT_CRC32} AS crc32"
 _UNPLACED = f"""SELECT {_PLACED} FROM
     (SELECT row, first_stamp_ns, last_stamp_ns, NULL AS west_m, NULL AS south_m, NULL AS east_m, NULL AS north_m
     FROM main.journal)"""
@@ -80,7 +81,7 @@ COMMIT;
 BEGIN IMMEDIATE;
 ALTER TABLE extent ADD COLUMN crc32 INTEGER;
 ALTER TABLE events ADD COLUMN crc32 INTEGER;
-UPDATE extent SET crc32 = checksum({_EXTENT_VALUES});
+UPDATE extent SET crc32 = {_EXTENT_CRC32};
 UPDATE events SET crc32 = checksum({_EVENT_VALUES});
 UPDATE meta SET value = '{SCHEMA}' WHERE key = 'schema';
 COMMIT;
