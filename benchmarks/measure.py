@@ -77,7 +77,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 def memory_mb(name: str = "VmRSS") -> float:
     """Memory of this process: resident now, or with VmHWM the most that ever was (getrusage counts a parent's too)."""
     lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(name)) / 1024
+    return next(int(line.split()[1]) for line in lines if line.startswith(name)) * 1024 / 1e6
 
 
 def in_child(module: str, *words: str) -> Result:

@@ -52,7 +52,7 @@ class FoldConfig:
     keep_days: int = 7
     std_floor_m: float = 0.3
     std_cap_m: float = 3.0
-    hot_blocks: int = 256
+    hot_blocks: int = 128
     kernel: str = "auto"
 
     def __post_init__(self) -> None:
