@@ -38,6 +38,7 @@ BLOCKING = {
     Refusal.COLUMN_LENGTH,
 }
 PASSING = {Refusal.OVERLOADED, Refusal.STORE}  # the server will take the same batch later
+MAX_GATHER_S = 60.0  # samples lie on the machine's disk alone meanwhile
 SHARE = 1 / 3  # of the time-out that an exchange should take: a link that gets twice as slow still answers in time
 
 
@@ -47,7 +48,8 @@ class UplinkConfig:
 
     batch_samples, max_batch_samples: how many at first and at most; halved on a time-out, doubled while exchanges stay
     short. timeout_s: how long to wait for an acknowledgement; an exchange is kept to about a third of it. backoff_s,
-    max_backoff_s: pause after a failure, doubled each time, of which half to all is taken at random.
+    max_backoff_s: pause after a failure, doubled each time, of which half to all is taken at random. gather_s: pause
+    after a batch that left nothing behind, in which samples gather: each batch costs the server a row and a sync.
     """
 
     batch_samples: int = 200
@@ -55,12 +57,15 @@ class UplinkConfig:
     timeout_s: float = 3.0
     backoff_s: float = 0.2
     max_backoff_s: float = 5.0
+    gather_s: float = 1.0
 
     def __post_init__(self) -> None:
         if not 1 <= self.batch_samples <= self.max_batch_samples <= 20_000:
             raise ValueError("batch_samples must lie between 1 and max_batch_samples, that at most 20000")
         if min(self.timeout_s, self.backoff_s) <= 0 or self.max_backoff_s < self.backoff_s:
             raise ValueError("timeout_s and backoff_s must be positive, max_backoff_s not below backoff_s")
+        if not 0 <= self.gather_s <= MAX_GATHER_S:
+            raise ValueError(f"gather_s must lie between 0 and {MAX_GATHER_S:g}")
 
 
 class UplinkState:
@@ -111,11 +116,13 @@ class UplinkState:
             return self._on_silence(took_s)
         if isinstance(reply, Refused):
             return self._on_refused(reply)
+        head, limit = self._head, self._limit
         if not self._on_ack(reply, took_s):
             self.problem = f"the map server acknowledges {reply.watermark}, which is not what was sent"
             return self._back_off()
         self.problem, self._failures, self._has_met = "", 0, True
-        return 0.0
+        took_all = head and 0 < len(head.rows) < limit and head.spool_id == self._spool.spool_id
+        return self._config.gather_s if took_all else 0.0
 
     def on_disk_error(self, error: Exception) -> float:
         """Take in that the spool could not be read or written; returns the pause before the next try [s]."""

@@ -2,7 +2,7 @@
 
 python -m tests.soak --minutes 60 --speed 30
 
-Machines drive laps and send batches as agents do, stamped as in that hour; visitors ask for the map all along.
+Machines drive laps and send batches of 4 s, stamped as in that hour; visitors ask for the map all along.
 """
 
 from __future__ import annotations

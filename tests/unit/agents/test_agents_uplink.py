@@ -1,4 +1,5 @@
 import itertools
+import math
 import random
 from collections import Counter
 from pathlib import Path
@@ -271,7 +272,7 @@ def test_gap_that_names_no_expected_sample_puts_nothing_aside() -> None:
 def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
     rows = ROWS[:20].copy()
     rows["c_rr"][bad] = 99.0
-    state, spool = met(batch_samples=20)
+    state, spool = met(batch_samples=20, gather_s=0.0)
     spool.record(rows)
     server = Server()
     for _ in range(60):
@@ -454,7 +455,13 @@ def test_linger_waits_until_the_spool_is_empty_or_time_is_over() -> None:
     assert linger(lambda: True, waits.append, lambda: 0.0, 0.0)
 
 
-OPTIONS: dict[str, Any] = {"batch_samples": 3, "max_batch_samples": 30, "backoff_s": 0.5, "max_backoff_s": 0.3}
+OPTIONS: dict[str, Any] = {
+    "batch_samples": 3,
+    "max_batch_samples": 30,
+    "backoff_s": 0.5,
+    "max_backoff_s": 0.3,
+    "gather_s": 3.0,
+}
 BASE: dict[str, Any] = {"batch_samples": 20, "max_batch_samples": 80}
 
 
@@ -465,7 +472,30 @@ def trace(**options: Any) -> list[Any]:
     for reply in ("ok", "ok", "lost", "ok", "lost", "lost", "lost"):
         batch = next_batch(state)
         found.append((len(batch.rows), heard(state, Ack(batch.last_seq, 1) if reply == "ok" else None)))
+    while payload := state.next_payload():
+        found.append(heard(state, Ack(decode_batch(payload, 1e9).last_seq, 1)))
     return found
+
+
+def test_samples_gather_after_a_batch_that_left_nothing_behind() -> None:
+    state, spool = met(50, batch_samples=20, max_batch_samples=20, gather_s=1.5)
+    pauses = [heard(state, Ack(next_batch(state).last_seq, 1)) for _ in range(3)]
+    assert pauses == [0.0, 0.0, 1.5]
+    spool.record(ROWS[50:57])
+    assert len(next_batch(state).rows) == 7
+
+
+def test_runs_that_are_left_over_do_not_wait_for_one_another(tmp_path: Path) -> None:
+    for first in (0, 3, 6):
+        spool = Spool(tmp_path / "spool.db", SpoolConfig())
+        spool.record(ROWS[first : first + 3])
+        if first < 6:
+            spool.close()
+    state = UplinkState("loader-1", SITE.frame, spool, UplinkConfig(gather_s=1.5), np.random.default_rng(0))
+    server = Server()
+    pauses = [heard(state, server.answer(state.next_payload() or b"")) for _ in range(3)]
+    assert pauses == [0.0, 0.0, 1.5]
+    spool.close()
 
 
 @pytest.mark.parametrize("name", sorted(OPTIONS))
@@ -483,6 +513,9 @@ def test_option_changes_what_is_sent_or_when(name: str) -> None:
         ({"timeout_s": 0.0}, "timeout_s"),
         ({"backoff_s": 0.0}, "backoff_s"),
         ({"max_backoff_s": 0.1}, "max_backoff_s"),
+        ({"gather_s": -0.1}, "gather_s"),
+        ({"gather_s": 61.0}, "gather_s"),
+        ({"gather_s": math.nan}, "gather_s"),
     ],
 )
 def test_bad_uplink_option_is_refused_by_name(options: dict[str, Any], named: str) -> None:
