@@ -162,7 +162,8 @@ class JournalReads:
             self._require_each((event.id for event in self.events()), 0)
             self._load_marks()
         finally:
-            self._db.execute("ROLLBACK")
+            if self._db.in_transaction:  # SQLite itself ends it where the disk fails
+                self._db.execute("ROLLBACK")
 
     def _query(self, query: str, values: Sequence[Any] | Mapping[str, Any] = ()) -> list[tuple[Any, ...]]:
         try:
