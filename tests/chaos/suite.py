@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,8 @@ def run_suite(faults: Iterable[Fault], folder: Path, told: Told, seed: int, seco
     ]
     with ThreadPoolExecutor(LANES) as lanes:
         runs = [lanes.submit(_run, fault, scenario) for fault, scenario in scenarios]
+        while wait(runs, timeout=0.5).not_done:  # with a time-out, or a signal that another thread got is not heard
+            pass
         outcomes = [run.result() for run in runs]
     if told.stop.is_set():
         raise InterruptError
