@@ -330,7 +330,7 @@ class Journal(JournalReads):
             values = (number, kind, stamp_ns, text)
             self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
             self.commit()
-        except sqlite3.Error:
+        except (sqlite3.Error, StoreError):
             self.rollback()
             raise
         return number
