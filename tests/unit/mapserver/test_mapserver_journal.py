@@ -494,10 +494,11 @@ def test_an_event_that_cannot_be_numbered_leaves_no_transaction_open(tmp_path, m
     def broken(query: str) -> int:
         raise StoreError(journal.path, "cannot be read: disk I/O error")
 
-    with monkeypatch.context() as patch, pytest.raises(StoreError, match="disk I/O error"):
+    with monkeypatch.context() as patch:
         patch.setattr(journal, "_number", broken)
         patch.setattr(journal, "_return_to_disk", lambda: None)
-        journal.append_event("t", 1, {})
+        with pytest.raises(StoreError, match="disk I/O error"):
+            journal.append_event("t", 1, {})
     write(journal, admission(1))
     assert numbers(journal.read()) == [1]
     journal.close()
