@@ -21,7 +21,8 @@ from mapserver.config import ServerConfig
 from mapserver.decisions import KIND as TRUST
 from mapserver.decisions import Decisions
 from mapserver.grid import Grid, GridState, Placed
-from mapserver.journal import JournalReader, JournalRow
+from mapserver.journal import JournalReader
+from mapserver.journal_rows import JournalRow
 from mapserver.pages import Page
 from mapserver.past import History, history_rows
 from mapserver.store import JOURNAL_FILE

@@ -12,7 +12,7 @@ import numpy as np
 from mapserver import layers
 from mapserver.config import ServerConfig
 from mapserver.filling import AREA_LAYERS
-from mapserver.journal import Wanted
+from mapserver.journal_rows import Wanted
 from mapserver.past import Moment
 from mapserver.views import Past, View, cropped, read_cells, view_now, widened
 from mapserver.writer import Writer

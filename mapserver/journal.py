@@ -10,24 +10,17 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import msgpack
-import numpy as np
-
 from mapserver.ingest import Admission
+from mapserver.journal_rows import ALL, Event, JournalRow, Mark, Wanted, checksum, extent_checksum, pack, unpack
 from mapserver.journal_schema import EXTENT_VALUES, SCHEMA, SEEN, TABLES, UPGRADES
-from protocol.arrays import Table
 from protocol.errors import StoreError
-from protocol.geometry import Bounds
-from protocol.readings import MAX_STAMP_NS
-from protocol.samples import SAMPLE_DTYPE
 
 # ruff: noqa: S608 - statements are put together from constants, never from input
 _COLUMNS = "SELECT row, machine, spool_id, first_seq, received_ns, payload, journal.crc32 FROM "
@@ -44,7 +37,6 @@ _EXTENTS_AT_ONCE = 10_000
 _PLAIN_UNTIL = "SELECT COALESCE(MAX(value), 0) FROM meta WHERE key = 'plain_until'"
 LAST = 2**63 - 1
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
-_EXTENT = struct.Struct("<3q4d")
 SPARE = 0.25  # share of free pages above which a file is made smaller
 
 
@@ -54,59 +46,6 @@ class ArchivedError(StoreError):
     def __init__(self, path: Path, archived_row: int) -> None:
         super().__init__(path, f"rows up to {archived_row} are in the archive; read them together (past.history_rows)")
         self.archived_row = archived_row
-
-
-@dataclass(frozen=True)
-class JournalRow:
-    """One admitted batch as it lies on disk. received_ns: the server's clock when it came in."""
-
-    row: int
-    machine: str
-    spool_id: int
-    first_seq: int
-    rows: Table
-    received_ns: int = 0
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """Which journal rows to read. A row that may hold a wanted sample is given whole.
-
-    from_ns, to_ns: rows with samples in from_ns <= stamp <= to_ns. bounds: rows whose samples' bounding box touches it.
-    without: machines that are left out.
-    """
-
-    from_ns: int = 0
-    to_ns: int = MAX_STAMP_NS
-    bounds: Bounds | None = None
-    without: frozenset[str] = frozenset()
-
-    @property
-    def everywhere(self) -> bool:
-        """Whether neither time nor place keeps a row out."""
-        return self == Wanted(without=self.without)
-
-
-ALL = Wanted()
-
-
-@dataclass(frozen=True)
-class Mark:
-    """Progress of one spool: the last committed sample, how many it declared lost, and its newest stamp."""
-
-    seq: int = 0
-    lost: int = 0
-    newest_ns: int = 0
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something that the server has to remember and that is no sample; body: plain values."""
-
-    id: int
-    kind: str
-    stamp_ns: int
-    body: Mapping[str, Any]
 
 
 class JournalReads:
@@ -209,7 +148,7 @@ class JournalReads:
         plain = row <= self._plain_until and isinstance(payload, bytes) and zlib.crc32(payload) == crc32
         if not plain and checksum(row, machine, spool, first_seq, received_ns, payload) != crc32:
             raise self._damaged(f"journal row {row}")
-        return JournalRow(row, machine, int.from_bytes(spool, "big"), first_seq, _unpack(payload), received_ns)
+        return JournalRow(row, machine, int.from_bytes(spool, "big"), first_seq, unpack(payload), received_ns)
 
     def _extent_rows(self) -> Iterator[int]:
         """The rows that have an extent, in order; read in pieces, since there may be millions."""
@@ -276,7 +215,7 @@ class Journal(JournalReads):
     def append(self, admission: Admission, received_ns: int) -> int:
         """Write one row and its watermark into the open transaction; returns the row's number."""
         batch = admission.batch
-        payload = _pack(batch.rows)
+        payload = pack(batch.rows)
         x_m, y_m, stamps = (batch.rows[name] for name in ("x_m", "y_m", "stamp_ns"))
         first_ns, last_ns = int(stamps.min()), int(stamps.max())
         spool = _spool_bytes(batch.spool_id)
@@ -442,36 +381,6 @@ def _lend_checksums(db: sqlite3.Connection) -> None:
     db.create_function("extent_checksum", len(EXTENT_VALUES), extent_checksum, deterministic=True)
 
 
-def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float | None) -> int:
-    """CRC-32 of when and where a row lies, ten times as fast as `checksum`; none of what it cannot be."""
-    try:
-        return zlib.crc32(_EXTENT.pack(row, first_ns, last_ns, *((math.nan,) * 4 if None in box else box)))
-    except struct.error:
-        return -1
-
-
-def checksum(*values: object) -> int:
-    """CRC-32 of plain values, bytes among them."""
-    crc32 = 0
-    for value in values:
-        crc32 = zlib.crc32(value if isinstance(value, bytes) else repr(value).encode(), crc32)
-    return crc32
-
-
 def _spool_bytes(spool_id: int) -> bytes:
     """SQLite integers are signed: 64-bit ids are stored as bytes."""
     return spool_id.to_bytes(8, "big")
-
-
-def _pack(rows: Table) -> bytes:
-    """Columns of a journal row; named, so that a column that is added later reads as NaN in older rows."""
-    packed: bytes = msgpack.packb({name: rows[name].tobytes() for name in SAMPLE_DTYPE.names or ()})
-    return packed
-
-
-def _unpack(payload: bytes) -> Table:
-    cols = msgpack.unpackb(payload)
-    rows = np.zeros(len(cols["stamp_ns"]) // 8, SAMPLE_DTYPE)
-    for name in SAMPLE_DTYPE.names or ():
-        rows[name] = np.frombuffer(cols[name], SAMPLE_DTYPE[name]) if name in cols else np.nan
-    return rows

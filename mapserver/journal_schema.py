@@ -1,6 +1,6 @@
 """The tables of the journal, and how a journal of an older schema becomes one of this schema, or is read as one.
 
-Statements call `checksum` and `extent_checksum` of journal.py, which the connection brings along.
+Statements call `checksum` and `extent_checksum` of journal_rows.py, which the connection brings along.
 """
 
 # ruff: noqa: S608 - statements are put together from constants, never from input

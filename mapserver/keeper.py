@@ -19,7 +19,8 @@ from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.decisions import AUDIT, KIND, PERSON, Decision, Decisions
 from mapserver.grid import Grid
-from mapserver.journal import JournalReader, Wanted
+from mapserver.journal import JournalReader
+from mapserver.journal_rows import Wanted
 from mapserver.ladder import Block, TimedPage
 from mapserver.past import History, history_rows
 from mapserver.reading import around

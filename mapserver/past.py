@@ -19,7 +19,8 @@ from mapserver import evidence as ev
 from mapserver.archive import FOLDER, Archive
 from mapserver.grid import Grid
 from mapserver.ingest import Admission
-from mapserver.journal import ALL, LAST, ArchivedError, Journal, JournalReads, JournalRow, Mark, Wanted
+from mapserver.journal import LAST, ArchivedError, Journal, JournalReads
+from mapserver.journal_rows import ALL, JournalRow, Mark, Wanted
 from mapserver.votes import FoldConfig
 from protocol.arrays import Bools, Table
 from protocol.errors import StoreError

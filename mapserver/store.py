@@ -19,7 +19,8 @@ from mapserver.decisions import KIND as TRUST
 from mapserver.decisions import Decisions
 from mapserver.grid import Grid
 from mapserver.ingest import Admission, GapError
-from mapserver.journal import Journal, Wanted
+from mapserver.journal import Journal
+from mapserver.journal_rows import Wanted
 from mapserver.past import History, history_rows
 from protocol import keys
 from protocol.errors import MessageError, Refusal, StoreError

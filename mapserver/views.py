@@ -13,7 +13,8 @@ from mapserver import layers
 from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.grid import Grid, chunks
-from mapserver.journal import JournalReader, Wanted
+from mapserver.journal import JournalReader
+from mapserver.journal_rows import Wanted
 from mapserver.ladder import Block
 from mapserver.past import History, Moment, grid_as_of, point_history
 from mapserver.reading import Pages, evidence, valid_pages

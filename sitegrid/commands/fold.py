@@ -17,7 +17,8 @@ from typing import Any
 
 from mapserver.archive import FOLDER, Archive, ArchiveFile
 from mapserver.config import ServerConfig
-from mapserver.journal import Journal, JournalReader, JournalRow, Mark, Wanted
+from mapserver.journal import Journal, JournalReader
+from mapserver.journal_rows import JournalRow, Mark, Wanted
 from mapserver.past import Copier, History, Spool, history_rows, merged
 from mapserver.store import JOURNAL_FILE, Store
 from protocol.config import from_table, load_toml

@@ -16,7 +16,7 @@ from typing import Any
 
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
-from mapserver.journal import Wanted
+from mapserver.journal_rows import Wanted
 from mapserver.past import History, history_rows
 from mapserver.store import JOURNAL_FILE, Store
 from protocol.errors import StoreError

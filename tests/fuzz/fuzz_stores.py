@@ -9,7 +9,8 @@ import numpy as np
 
 from mapserver.archive import FOLDER, ArchiveFile, next_file
 from mapserver.ingest import Admission
-from mapserver.journal import Journal, JournalReader, JournalRow
+from mapserver.journal import Journal, JournalReader
+from mapserver.journal_rows import JournalRow
 from protocol.errors import StoreError
 from protocol.messages import SampleBatch
 from protocol.site import SiteConfig

@@ -13,7 +13,8 @@ from mapserver.archive import FOLDER, archive
 from mapserver.config import ServerConfig
 from mapserver.decisions import KIND, PERSON, Decision
 from mapserver.grid import Grid
-from mapserver.journal import Journal, JournalReader, JournalRow, _pack, checksum
+from mapserver.journal import Journal, JournalReader
+from mapserver.journal_rows import JournalRow, checksum, pack
 from mapserver.store import JOURNAL_FILE, Incoming, Store
 from protocol.arrays import Table
 from protocol.codec import encode_batch
@@ -111,7 +112,7 @@ def test_a_clean_run_has_nothing_lost_and_nothing_double(run):
 
 
 def test_samples_dropped_from_a_row_are_lost(run, journal):
-    result = run(f"UPDATE journal SET payload = x'{_pack(journal[3].rows[:1]).hex()}' WHERE row = 4")
+    result = run(f"UPDATE journal SET payload = x'{pack(journal[3].rows[:1]).hex()}' WHERE row = 4")
     assert result.lost == BATCH - 1
     assert result.double > 0  # the grid has votes that the journal cannot explain
     assert result.unrecorded == 0

@@ -18,7 +18,8 @@ from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 from mapserver import archive as ar
 from mapserver.archive import HOUR_NS, Archive, ArchiveFile, archive, next_file
 from mapserver.ingest import Admission
-from mapserver.journal import ALL, Journal, JournalReader, JournalRow, Wanted
+from mapserver.journal import Journal, JournalReader
+from mapserver.journal_rows import ALL, JournalRow, Wanted
 from protocol.errors import ConfigError, StoreError
 from protocol.geometry import Bounds
 from protocol.site import KnownGround

@@ -9,7 +9,8 @@ from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 
 from mapserver import journal as journal_module
 from mapserver.ingest import Admission
-from mapserver.journal import ALL, ArchivedError, Event, Journal, JournalReader, JournalReads, Mark, Wanted
+from mapserver.journal import ArchivedError, Journal, JournalReader, JournalReads
+from mapserver.journal_rows import ALL, Event, Mark, Wanted
 from protocol.errors import StoreError
 from protocol.geometry import Bounds
 from protocol.samples import SAMPLE_DTYPE
@@ -197,9 +198,9 @@ def test_closing_folds_the_log_into_the_file(tmp_path):
 
 def test_column_that_an_older_row_lacks_reads_as_nan():
     rows = np.ones(3, SAMPLE_DTYPE)
-    older = msgpack.unpackb(journal_module._pack(rows))
+    older = msgpack.unpackb(journal_module.pack(rows))
     del older["grade_var"]
-    found = journal_module._unpack(msgpack.packb(older))
+    found = journal_module.unpack(msgpack.packb(older))
     assert np.isnan(found["grade_var"]).all()
     assert (found["c_rr"] == 1).all()
 

@@ -10,7 +10,8 @@ from mapserver import evidence as ev
 from mapserver.archive import FOLDER, HOUR_NS, Archive, archive
 from mapserver.grid import Grid
 from mapserver.ingest import Admission
-from mapserver.journal import Journal, JournalReader, JournalRow, Wanted
+from mapserver.journal import Journal, JournalReader
+from mapserver.journal_rows import JournalRow, Wanted
 from mapserver.past import History, grid_as_of, history_rows, point_history, samples_of
 from mapserver.votes import FoldConfig
 from protocol.arrays import Table

@@ -14,7 +14,8 @@ import pytest
 from mapserver.archive import FOLDER, HOUR_NS, archive
 from mapserver.config import ServerConfig
 from mapserver.grid import Grid
-from mapserver.journal import JournalReader, JournalRow
+from mapserver.journal import JournalReader
+from mapserver.journal_rows import JournalRow
 from mapserver.past import History, history_rows
 from mapserver.store import JOURNAL_FILE, Incoming, Store
 from protocol.arrays import Table

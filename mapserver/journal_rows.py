@@ -1,0 +1,104 @@
+"""What a journal holds, as values: rows, which of them are wanted, progress of spools, events; and their checksums."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from protocol.arrays import Table
+from protocol.geometry import Bounds
+from protocol.readings import MAX_STAMP_NS
+from protocol.samples import SAMPLE_DTYPE
+
+_EXTENT = struct.Struct("<3q4d")
+
+
+@dataclass(frozen=True)
+class JournalRow:
+    """One admitted batch as it lies on disk. received_ns: the server's clock when it came in."""
+
+    row: int
+    machine: str
+    spool_id: int
+    first_seq: int
+    rows: Table
+    received_ns: int = 0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which journal rows to read. A row that may hold a wanted sample is given whole.
+
+    from_ns, to_ns: rows with samples in from_ns <= stamp <= to_ns. bounds: rows whose samples' bounding box touches it.
+    without: machines that are left out.
+    """
+
+    from_ns: int = 0
+    to_ns: int = MAX_STAMP_NS
+    bounds: Bounds | None = None
+    without: frozenset[str] = frozenset()
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether neither time nor place keeps a row out."""
+        return self == Wanted(without=self.without)
+
+
+ALL = Wanted()
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Progress of one spool: the last committed sample, how many it declared lost, and its newest stamp."""
+
+    seq: int = 0
+    lost: int = 0
+    newest_ns: int = 0
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that the server has to remember and that is no sample; body: plain values."""
+
+    id: int
+    kind: str
+    stamp_ns: int
+    body: Mapping[str, Any]
+
+
+def pack(rows: Table) -> bytes:
+    """Columns of a journal row; named, so that a column that is added later reads as NaN in older rows."""
+    packed: bytes = msgpack.packb({name: rows[name].tobytes() for name in SAMPLE_DTYPE.names or ()})
+    return packed
+
+
+def unpack(payload: bytes) -> Table:
+    """Undo `pack`."""
+    cols = msgpack.unpackb(payload)
+    rows = np.zeros(len(cols["stamp_ns"]) // 8, SAMPLE_DTYPE)
+    for name in SAMPLE_DTYPE.names or ():
+        rows[name] = np.frombuffer(cols[name], SAMPLE_DTYPE[name]) if name in cols else np.nan
+    return rows
+
+
+def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float | None) -> int:
+    """CRC-32 of when and where a row lies, ten times as fast as `checksum`; none of what it cannot be."""
+    try:
+        return zlib.crc32(_EXTENT.pack(row, first_ns, last_ns, *((math.nan,) * 4 if None in box else box)))
+    except struct.error:
+        return -1
+
+
+def checksum(*values: object) -> int:
+    """CRC-32 of plain values, bytes among them."""
+    crc32 = 0
+    for value in values:
+        crc32 = zlib.crc32(value if isinstance(value, bytes) else repr(value).encode(), crc32)
+    return crc32
