@@ -16,9 +16,9 @@ from pathlib import Path
 
 from benchmarks.measure import START_NS, Result, in_child, machine, timed
 from benchmarks.merge_work import BATCH, batches
-from mapserver import snapshot
 from mapserver.config import ServerConfig
-from mapserver.grid import Grid
+from mapserver.evidence import snapshot
+from mapserver.evidence.grid import Grid
 from mapserver.ingest import Admission
 from mapserver.journal import Journal
 from mapserver.store import JOURNAL_FILE, Store

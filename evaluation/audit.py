@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 
 from agents.audit import read_audit
-from mapserver import evidence as ev
-from mapserver import snapshot
 from mapserver.config import ServerConfig
 from mapserver.decisions import KIND as TRUST
 from mapserver.decisions import Decisions
-from mapserver.grid import Grid, GridState, Placed
+from mapserver.evidence import cells as ev
+from mapserver.evidence import snapshot
+from mapserver.evidence.grid import Grid, GridState, Placed
+from mapserver.evidence.pages import Page
 from mapserver.journal import JournalReader
 from mapserver.journal_rows import JournalRow
-from mapserver.pages import Page
 from mapserver.past import History, history_rows
 from mapserver.store import JOURNAL_FILE
 from protocol.arrays import Ints

@@ -13,10 +13,10 @@ import numpy as np
 from evaluation.merge_cases import CELL_M
 from evaluation.merge_samples import Delivery
 from mapserver.config import ServerConfig
-from mapserver.grid import Grid
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.votes import FoldConfig
 from mapserver.trust import Auditor, TrustConfig
 from mapserver.views import read_cells, view_of
-from mapserver.votes import FoldConfig
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.geometry import CellWindow
 

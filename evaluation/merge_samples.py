@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from evaluation.merge_cases import CELL_M, PASSES_BEFORE, Case, Machine, Site, lay, parking_place
-from mapserver.votes import FoldConfig
+from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.samples import empty
 

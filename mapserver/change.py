@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mapserver import evidence as ev
-from mapserver.ladder import TimedPage
-from mapserver.pages import moments
+from mapserver.evidence import cells as ev
+from mapserver.evidence.pages import moments
+from mapserver.evidence.timeline import TimedPage
 from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_positive
 from protocol.geometry import BLOCK_CELLS

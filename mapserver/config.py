@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from mapserver.change import ChangeConfig
+from mapserver.evidence.votes import FoldConfig
 from mapserver.layers import ReadConfig
 from mapserver.trust import TrustConfig
-from mapserver.votes import FoldConfig
 from protocol.config import require_positive
 
 

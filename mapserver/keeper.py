@@ -18,10 +18,10 @@ from mapserver.archive import FOLDER, archive
 from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.decisions import AUDIT, KIND, PERSON, Decision, Decisions
-from mapserver.grid import Grid
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.journal import JournalReader
 from mapserver.journal_rows import Wanted
-from mapserver.ladder import Block, TimedPage
 from mapserver.past import History, history_rows
 from mapserver.reading import around
 from mapserver.store import JOURNAL_FILE, Store

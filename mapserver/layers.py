@@ -15,8 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from mapserver import evidence as ev
 from mapserver.estimators import linear_count, ratio, robust_centre, robust_spread
+from mapserver.evidence import cells as ev
 from mapserver.filling import AREA_LAYERS, Area
 from protocol import ground
 from protocol.arrays import AnyArray, Bools, Floats, Floats32

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver import evidence as ev
 from mapserver.change import ChangeConfig, credible, cuts, kinds, reach_blocks
-from mapserver.ladder import Block, TimedPage
-from mapserver.pages import pick
+from mapserver.evidence import cells as ev
+from mapserver.evidence.pages import pick
+from mapserver.evidence.timeline import Block, TimedPage
 from protocol.arrays import AnyArray, Ints
 from protocol.geometry import BLOCK_CELLS
 

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mapserver import ingest, snapshot
+from mapserver import ingest
 from mapserver.archive import FOLDER, Archive
 from mapserver.config import ServerConfig
 from mapserver.decisions import KIND as TRUST
 from mapserver.decisions import Decisions
-from mapserver.grid import Grid
+from mapserver.evidence import snapshot
+from mapserver.evidence.grid import Grid
 from mapserver.ingest import Admission, GapError
 from mapserver.journal import Journal
 from mapserver.journal_rows import Wanted

@@ -12,10 +12,10 @@ import numpy as np
 from mapserver import layers
 from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
-from mapserver.grid import Grid, chunks
+from mapserver.evidence.grid import Grid, chunks
+from mapserver.evidence.timeline import Block
 from mapserver.journal import JournalReader
 from mapserver.journal_rows import Wanted
-from mapserver.ladder import Block
 from mapserver.past import History, Moment, grid_as_of, point_history
 from mapserver.reading import Pages, evidence, valid_pages
 from mapserver.store import Store

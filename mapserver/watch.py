@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mapserver import evidence as ev
 from mapserver import layers
 from mapserver.change import ChangeConfig, cuts
-from mapserver.ladder import Block, TimedPage
+from mapserver.evidence import cells as ev
+from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.reading import evidence, image_of, valid_pages
 from protocol.arrays import Bools, Floats32, Ints
 from protocol.geometry import BLOCK_CELLS

@@ -205,7 +205,9 @@ def read_spool(path: Path) -> SpoolState:
 
 def read_store(folder: Path, now_s: float) -> StoreState:
     """The state of a store, also while a server uses it; StoreError where it cannot be used."""
-    from mapserver import snapshot  # imported here: needs the `server` extra, which a machine's host does not have
+    from mapserver.evidence import (
+        snapshot,  # imported here: needs the `server` extra, which a machine's host does not have
+    )
     from mapserver.journal import JournalReader
     from mapserver.journal_schema import SCHEMA
     from mapserver.store import JOURNAL_FILE

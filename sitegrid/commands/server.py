@@ -10,8 +10,8 @@ from pathlib import Path
 import zenoh
 
 from mapserver.config import ServerConfig
+from mapserver.evidence.grid import warm_up
 from mapserver.exporter import Exporter, HealthEar, text_of
-from mapserver.grid import warm_up
 from mapserver.server import Server
 from mapserver.store import Verify
 from protocol.config import from_table, load_toml

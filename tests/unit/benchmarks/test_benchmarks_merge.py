@@ -77,7 +77,7 @@ def test_ratio_is_to_add_at_of_the_same_pattern(monkeypatch, capsys):
         ("duckdb", "duckdb group-by", "bench"),
         ("boost_histogram", "boost_histogram", "bench"),
         ("benchmarks.merge_numba", "hard_votes", "server"),
-        ("mapserver.fold_numba", "soft_votes", "server"),
+        ("mapserver.evidence.fold_numba", "soft_votes", "server"),
     ],
 )
 def test_a_variant_without_its_library_is_listed_with_what_to_install(module, variant, extra, monkeypatch, capsys):

@@ -12,7 +12,7 @@ from evaluation.audit import AuditResult, audit_store, compare, grid_difference,
 from mapserver.archive import FOLDER, archive
 from mapserver.config import ServerConfig
 from mapserver.decisions import KIND, PERSON, Decision
-from mapserver.grid import Grid
+from mapserver.evidence.grid import Grid
 from mapserver.journal import Journal, JournalReader
 from mapserver.journal_rows import JournalRow, checksum, pack
 from mapserver.store import JOURNAL_FILE, Incoming, Store

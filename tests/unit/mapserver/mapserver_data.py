@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from mapserver import evidence as ev
 from mapserver.config import ServerConfig
-from mapserver.grid import Grid, GridState, Placed
-from mapserver.pages import WIDE, Page
+from mapserver.evidence import cells as ev
+from mapserver.evidence.grid import Grid, GridState, Placed
+from mapserver.evidence.pages import WIDE, Page
+from mapserver.evidence.votes import FoldConfig
 from mapserver.store import Incoming, Store
-from mapserver.votes import FoldConfig
 from mapserver.writer import Writer
 from protocol.arrays import Table
 from protocol.codec import encode_batch

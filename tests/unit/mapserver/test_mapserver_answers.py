@@ -92,7 +92,7 @@ def test_no_names_give_all_layers(answers):
 
 
 def test_many_blocks_are_read_in_pieces_and_put_together(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.grid.READ_BLOCKS", 3)
+    monkeypatch.setattr("mapserver.evidence.grid.READ_BLOCKS", 3)
     rows = random_samples(300, 3)
     writer = Writer(tmp_path, SITE, CONFIG, now_ns)
     send(writer, [incoming(rows)])

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, samples
 
-from mapserver import evidence as ev
 from mapserver.change import ChangeConfig, credible, cuts, kinds
-from mapserver.grid import Grid
-from mapserver.ladder import TimedPage
-from mapserver.votes import FoldConfig
+from mapserver.evidence import cells as ev
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.timeline import TimedPage
+from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Bools, Floats, Ints
 
 CONFIG = ChangeConfig()

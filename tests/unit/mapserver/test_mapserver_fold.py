@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapserver_data import APART, NOW_NS, filled_to, folded, merged, random_samples, same, samples, total
 
-from mapserver import evidence as ev
-from mapserver.fold import fold_numpy, kernel
-from mapserver.grid import Grid
-from mapserver.votes import TABLE, TABLE_LAST, FoldConfig, prepare, split_grade, split_resistance
+from mapserver.evidence import cells as ev
+from mapserver.evidence.fold import fold_numpy, kernel
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.votes import TABLE, TABLE_LAST, FoldConfig, prepare, split_grade, split_resistance
 from protocol.errors import MessageError
 from protocol.ground import ZONES
 from protocol.samples import check_samples
@@ -370,7 +370,7 @@ def test_kernel_option_is_obeyed():
 
 
 def test_auto_falls_back_to_numpy_where_numba_is_missing(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mapserver.fold_numba", None)
+    monkeypatch.setitem(sys.modules, "mapserver.evidence.fold_numba", None)
     assert kernel("auto") is fold_numpy
     with pytest.raises(ImportError):
         kernel("numba")

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, filled_to, folded, random_samples, same, samples
 
-from mapserver import evidence as ev
-from mapserver.grid import READ_BLOCKS, Grid, chunks
-from mapserver.votes import FoldConfig
+from mapserver.evidence import cells as ev
+from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks
+from mapserver.evidence.votes import FoldConfig
 from protocol.geometry import CellWindow
 
 EVERYTHING = CellWindow(-(2**20), -(2**20), 2**21, 2**21)
@@ -139,7 +139,7 @@ def test_a_stencil_larger_than_all_hot_blocks_makes_room_for_itself(kernel):
 @pytest.mark.parametrize("hot_blocks", [1, 3])
 @pytest.mark.parametrize("kernel", ["numpy", "numba"])
 def test_pieces_are_cut_until_they_fit_and_folded_once(kernel, hot_blocks, monkeypatch):
-    monkeypatch.setattr("mapserver.grid.PIECE", 64)
+    monkeypatch.setattr("mapserver.evidence.grid.PIECE", 64)
     rows = random_samples(200, 4)
     grid = folded(rows, hot_blocks=hot_blocks, kernel=kernel)
     assert (grid.folded, grid.skipped) == (200, 0)

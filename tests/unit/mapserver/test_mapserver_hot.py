@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapserver import evidence as ev
-from mapserver.fold_numba import _find
-from mapserver.hot import CODE_HALF, FREE, Hot, NoRoom, code_of, of_code
-from mapserver.votes import HASH
+from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_numba import _find
+from mapserver.evidence.open_blocks import CODE_HALF, FREE, Hot, NoRoom, code_of, of_code
+from mapserver.evidence.votes import HASH
 
 MINUTES_TO_2100 = 4_102_444_800 // 60
 corner = st.integers(-CODE_HALF, CODE_HALF - 1)

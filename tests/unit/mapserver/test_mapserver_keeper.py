@@ -10,7 +10,7 @@ from mapserver_data import NOW_NS, SITE, incoming, now_ns, random_samples, same,
 
 from mapserver.archive import FOLDER
 from mapserver.config import KeepConfig, ServerConfig
-from mapserver.grid import Grid
+from mapserver.evidence.grid import Grid
 from mapserver.keeper import Keeper
 from mapserver.trust import TrustConfig
 from mapserver.writer import Writer

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapserver_data import same_page
 
-from mapserver import evidence as ev
-from mapserver.ladder import DAY_S, HOUR_S, PATIENCE, Ladder, rungs
-from mapserver.pages import Page, merge, pack
-from mapserver.votes import FoldConfig
+from mapserver.evidence import cells as ev
+from mapserver.evidence.pages import Page, merge, pack
+from mapserver.evidence.timeline import DAY_S, HOUR_S, PATIENCE, Ladder, rungs
+from mapserver.evidence.votes import FoldConfig
 
 S = 10**9
 BUCKET_S = 300

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapserver_data import same_page
 
-from mapserver import evidence as ev
-from mapserver.pages import (
+from mapserver.evidence import cells as ev
+from mapserver.evidence.pages import (
     CELL,
     NARROW,
     WIDE,

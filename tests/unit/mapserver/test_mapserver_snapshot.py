@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from mapserver_data import APART, CONFIG, folded, incoming, merged, open_store, random_samples, same, samples
 
-from mapserver import evidence as ev
-from mapserver import snapshot
-from mapserver.grid import Grid
-from mapserver.pages import NARROW, WIDE
-from mapserver.votes import FoldConfig
+from mapserver.evidence import cells as ev
+from mapserver.evidence import snapshot
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.pages import NARROW, WIDE
+from mapserver.evidence.votes import FoldConfig
 from protocol.messages import Ack
 
 FOLD = FoldConfig()
@@ -217,8 +217,8 @@ import sys
 from pathlib import Path
 import numpy as np
 from mapserver import snapshot
-from mapserver.grid import Grid
-from mapserver.votes import FoldConfig
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.votes import FoldConfig
 
 folder, part, kernel, hot_blocks = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], int(sys.argv[4])
 config = FoldConfig(keep_buckets=1000, kernel=kernel, hot_blocks=hot_blocks)

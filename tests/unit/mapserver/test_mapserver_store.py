@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, SITE, Incoming, folded, incoming, open_store, random_samples, same, samples
 
-from mapserver import snapshot
+from mapserver.evidence import snapshot
 from protocol.errors import Refusal, StoreError
 from protocol.messages import Ack, Refused
 

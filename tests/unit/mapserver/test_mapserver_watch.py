@@ -5,10 +5,10 @@ import pytest
 from mapserver_data import NOW_NS, samples
 
 from mapserver.change import ChangeConfig
-from mapserver.grid import Grid
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.votes import FoldConfig
 from mapserver.layers import ReadConfig
 from mapserver.reading import around
-from mapserver.votes import FoldConfig
 from mapserver.watch import Change, ChangeWatch
 
 HOUR_NS = 3600 * 10**9

@@ -25,9 +25,9 @@ from mapserver_data import (
     wait_for,
 )
 
-from mapserver import snapshot
 from mapserver.answers import Answers
 from mapserver.config import ServerConfig, StoreConfig
+from mapserver.evidence import snapshot
 from mapserver.journal import Journal
 from mapserver.store import Store
 from mapserver.writer import Writer

@@ -13,7 +13,7 @@ import pytest
 
 from mapserver.archive import FOLDER, HOUR_NS, archive
 from mapserver.config import ServerConfig
-from mapserver.grid import Grid
+from mapserver.evidence.grid import Grid
 from mapserver.journal import JournalReader
 from mapserver.journal_rows import JournalRow
 from mapserver.past import History, history_rows

@@ -12,10 +12,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver import evidence as ev
-from mapserver.fold import WEIGHT_SHIFT
-from mapserver.hot import CODE_BITS, CODE_HALF, FREE, Hot
-from mapserver.votes import (
+from mapserver.evidence import cells as ev
+from mapserver.evidence.fold import WEIGHT_SHIFT
+from mapserver.evidence.open_blocks import CODE_BITS, CODE_HALF, FREE, Hot
+from mapserver.evidence.votes import (
     GRADE_LOW,
     GRADE_STEPS,
     HASH,

@@ -6,9 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from mapserver import evidence as ev
-from mapserver.hot import FREE, Hot, code_of
-from mapserver.votes import TABLE, TABLE_LAST, TABLE_PER_UNIT, FoldConfig, Votes, is_foldable, prepare
+from mapserver.evidence import cells as ev
+from mapserver.evidence.open_blocks import FREE, Hot, code_of
+from mapserver.evidence.votes import TABLE, TABLE_LAST, TABLE_PER_UNIT, FoldConfig, Votes, is_foldable, prepare
 from protocol.arrays import Ints, Table
 from protocol.geometry import BLOCK_CELLS
 
@@ -31,7 +31,7 @@ def kernel(name: str) -> Kernel:
     if name == "numpy":
         return fold_numpy
     try:
-        from mapserver.fold_numba import fold_numba
+        from mapserver.evidence.fold_numba import fold_numba
     except ImportError:
         if name == "numba":
             raise

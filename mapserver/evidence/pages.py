@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver import evidence as ev
+from mapserver.evidence import cells as ev
 from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 
 # place: bin * 256 + cell. Counts of a few passes fit into 16 bits; a page with one that does not is a wide one.
@@ -113,7 +113,7 @@ def _kind(largest: int) -> np.dtype[np.void]:
 
 def _with_numba() -> tuple[Pack, Merge, Pick, Moments]:
     """The same in numba, several times faster."""
-    from mapserver import pages_numba as kernels
+    from mapserver.evidence import page_kernels as kernels
 
     def space(votes: int, cells: int) -> tuple[Table, Table, Table]:
         return np.empty(votes, NARROW), np.empty(votes, WIDE), np.empty(cells, CELL)

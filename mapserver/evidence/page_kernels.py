@@ -10,7 +10,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver.evidence import CELLS, COUNT_MAX
+from mapserver.evidence.cells import CELLS, COUNT_MAX
 
 
 @numba.njit(cache=True, nogil=True)

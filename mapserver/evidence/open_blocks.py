@@ -6,9 +6,9 @@ from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
-from mapserver import evidence as ev
-from mapserver.pages import Page, pack
-from mapserver.votes import HASH
+from mapserver.evidence import cells as ev
+from mapserver.evidence.pages import Page, pack
+from mapserver.evidence.votes import HASH
 from protocol.arrays import Bools, Ints
 
 # Block columns and rows are packed as 18 bits each below the bucket, which has 27: enough for 5 cm cells 100 km away,

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver import evidence as ev
-from mapserver.pages import Page, merge, pick
-from mapserver.votes import FoldConfig
+from mapserver.evidence import cells as ev
+from mapserver.evidence.pages import Page, merge, pick
+from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Bools
 
 HOUR_S, DAY_S = 3600, 86_400

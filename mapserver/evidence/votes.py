@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver import evidence as ev
+from mapserver.evidence import cells as ev
 from protocol.arrays import Bools, Floats, Ints, Table
 
 VISIT_NS = 60_000_000_000  # one machine's passes within a minute are one visit

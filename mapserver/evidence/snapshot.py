@@ -16,16 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver import evidence as ev
-from mapserver.grid import Grid, GridState, Placed
-from mapserver.pages import CELL, NARROW, WIDE, Page, frozen
-from mapserver.votes import FoldConfig
+from mapserver.evidence import cells as ev
+from mapserver.evidence.grid import Grid, GridState, Placed
+from mapserver.evidence.pages import CELL, NARROW, WIDE, Page, frozen
+from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import AnyArray
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2
 _TOTALS = ("folded", "skipped", "newest_ns")
-log = logging.getLogger("mapserver.snapshot")
+log = logging.getLogger("mapserver.evidence.snapshot")
 
 
 def save(
