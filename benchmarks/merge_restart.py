@@ -20,7 +20,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest import Admission
-from mapserver.journal import Journal
+from mapserver.journal.journal import Journal
 from mapserver.store import JOURNAL_FILE, Store
 from protocol.arrays import Table
 from protocol.messages import SampleBatch

@@ -22,9 +22,9 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid, GridState, Placed
 from mapserver.evidence.pages import Page
-from mapserver.journal import JournalReader
-from mapserver.journal_rows import JournalRow
-from mapserver.past import History, history_rows
+from mapserver.journal.history import History, history_rows
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.rows import JournalRow
 from mapserver.store import JOURNAL_FILE
 from protocol.arrays import Ints
 from protocol.samples import content_hash

@@ -12,8 +12,8 @@ import numpy as np
 from mapserver import layers
 from mapserver.config import ServerConfig
 from mapserver.filling import AREA_LAYERS
-from mapserver.journal_rows import Wanted
-from mapserver.past import Moment
+from mapserver.journal.history import Moment
+from mapserver.journal.rows import Wanted
 from mapserver.views import Past, View, cropped, read_cells, view_now, widened
 from mapserver.writer import Writer
 from protocol.admin import TrustCommand, parse_command

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from mapserver.journal_rows import Event
+from mapserver.journal.rows import Event
 from mapserver.trust import Verdict
 
 KIND = "trust"

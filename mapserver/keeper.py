@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from mapserver import watch
-from mapserver.archive import FOLDER, archive
 from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.decisions import AUDIT, KIND, PERSON, Decision, Decisions
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import Block, TimedPage
-from mapserver.journal import JournalReader
-from mapserver.journal_rows import Wanted
-from mapserver.past import History, history_rows
+from mapserver.journal.archive import FOLDER, archive
+from mapserver.journal.history import History, history_rows
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.rows import Wanted
 from mapserver.reading import around
 from mapserver.store import JOURNAL_FILE, Store
 from mapserver.trust import Auditor, Verdict

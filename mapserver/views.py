@@ -14,9 +14,9 @@ from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block
-from mapserver.journal import JournalReader
-from mapserver.journal_rows import Wanted
-from mapserver.past import History, Moment, grid_as_of, point_history
+from mapserver.journal.history import History, Moment, grid_as_of, point_history
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.rows import Wanted
 from mapserver.reading import Pages, evidence, valid_pages
 from mapserver.store import Store
 from protocol.arrays import Floats32

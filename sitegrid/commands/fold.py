@@ -15,11 +15,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from mapserver.archive import FOLDER, Archive, ArchiveFile
 from mapserver.config import ServerConfig
-from mapserver.journal import Journal, JournalReader
-from mapserver.journal_rows import JournalRow, Mark, Wanted
-from mapserver.past import Copier, History, Spool, history_rows, merged
+from mapserver.journal.archive import FOLDER, Archive, ArchiveFile
+from mapserver.journal.history import Copier, History, Spool, history_rows, merged
+from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.rows import JournalRow, Mark, Wanted
 from mapserver.store import JOURNAL_FILE, Store
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError

@@ -16,8 +16,8 @@ from typing import Any
 
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
-from mapserver.journal_rows import Wanted
-from mapserver.past import History, history_rows
+from mapserver.journal.history import History, history_rows
+from mapserver.journal.rows import Wanted
 from mapserver.store import JOURNAL_FILE, Store
 from protocol.errors import StoreError
 from protocol.samples import content_hash

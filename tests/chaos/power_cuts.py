@@ -15,7 +15,7 @@ from pathlib import Path
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.past import History, history_rows
+from mapserver.journal.history import History, history_rows
 from mapserver.store import Incoming, Store
 from protocol.codec import encode_batch
 from protocol.errors import StoreError

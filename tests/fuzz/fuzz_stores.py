@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver.archive import FOLDER, ArchiveFile, next_file
 from mapserver.ingest import Admission
-from mapserver.journal import Journal, JournalReader
-from mapserver.journal_rows import JournalRow
+from mapserver.journal.archive import FOLDER, ArchiveFile, next_file
+from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.rows import JournalRow
 from protocol.errors import StoreError
 from protocol.messages import SampleBatch
 from protocol.site import SiteConfig

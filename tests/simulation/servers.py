@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from mapserver import ingest
 from mapserver.config import ServerConfig
 from mapserver.ingest import Admission, GapError
-from mapserver.journal import Journal
+from mapserver.journal.journal import Journal
 from mapserver.store import JOURNAL_FILE, Incoming, Store
 from protocol.errors import MessageError, Refusal
 from protocol.messages import Ack, Refused

@@ -15,11 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 
-from mapserver import archive as ar
-from mapserver.archive import HOUR_NS, Archive, ArchiveFile, archive, next_file
 from mapserver.ingest import Admission
-from mapserver.journal import Journal, JournalReader
-from mapserver.journal_rows import ALL, JournalRow, Wanted
+from mapserver.journal import archive as ar
+from mapserver.journal.archive import HOUR_NS, Archive, ArchiveFile, archive, next_file
+from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.rows import ALL, JournalRow, Wanted
 from protocol.errors import ConfigError, StoreError
 from protocol.geometry import Bounds
 from protocol.site import KnownGround
@@ -434,7 +434,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from mapserver import archive as ar
-from mapserver.journal import Journal, JournalReader
+from mapserver.journal.journal import Journal, JournalReader
 from protocol.site import SiteConfig
 
 site = SiteConfig("pit", 48.0, 11.0)

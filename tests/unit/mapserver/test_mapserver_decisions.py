@@ -1,7 +1,7 @@
 import pytest
 
 from mapserver.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER, Decision, Decisions
-from mapserver.journal_rows import Event
+from mapserver.journal.rows import Event
 from mapserver.trust import Reason, Verdict
 
 BAD = Verdict("c", (Reason.GAIN, Reason.OFFSET), {"gain": 1.6}, True)

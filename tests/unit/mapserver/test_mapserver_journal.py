@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 
-from mapserver import journal as journal_module
 from mapserver.ingest import Admission
-from mapserver.journal import ArchivedError, Journal, JournalReader, JournalReads
-from mapserver.journal_rows import ALL, Event, Mark, Wanted
+from mapserver.journal import journal as journal_module
+from mapserver.journal.journal import ArchivedError, Journal, JournalReader, JournalReads
+from mapserver.journal.rows import ALL, Event, Mark, Wanted
 from protocol.errors import StoreError
 from protocol.geometry import Bounds
 from protocol.samples import SAMPLE_DTYPE
@@ -140,7 +140,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path):
 
 
 def test_tables_and_their_names_are_made_in_one_transaction(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.journal.TABLES", "CREATE TABLE meta (key, value, more); ")
+    monkeypatch.setattr("mapserver.journal.journal.TABLES", "CREATE TABLE meta (key, value, more); ")
     with pytest.raises(StoreError):
         open_journal(tmp_path)
     monkeypatch.undo()

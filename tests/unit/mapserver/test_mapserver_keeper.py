@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, SITE, incoming, now_ns, random_samples, same, samples, send, wait_for
 
-from mapserver.archive import FOLDER
 from mapserver.config import KeepConfig, ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.journal.archive import FOLDER
 from mapserver.keeper import Keeper
 from mapserver.trust import TrustConfig
 from mapserver.writer import Writer

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, SITE, WAIT_S, batch, folded, random_samples, samples
 
-from mapserver.archive import FOLDER, HOUR_NS, Archive, archive
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest import Admission
-from mapserver.journal import Journal, JournalReader
-from mapserver.journal_rows import JournalRow, Wanted
-from mapserver.past import History, grid_as_of, history_rows, point_history, samples_of
+from mapserver.journal.archive import FOLDER, HOUR_NS, Archive, archive
+from mapserver.journal.history import History, grid_as_of, history_rows, point_history, samples_of
+from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.rows import JournalRow, Wanted
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.geometry import Bounds, CellWindow

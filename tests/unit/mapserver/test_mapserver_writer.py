@@ -28,7 +28,7 @@ from mapserver_data import (
 from mapserver.answers import Answers
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
-from mapserver.journal import Journal
+from mapserver.journal.journal import Journal
 from mapserver.store import Store
 from mapserver.writer import Writer
 from protocol.codec import MAX_BATCH_BYTES, encode_batch

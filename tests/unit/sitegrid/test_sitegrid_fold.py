@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapserver.archive import FOLDER, HOUR_NS, archive
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.journal import JournalReader
-from mapserver.journal_rows import JournalRow
-from mapserver.past import History, history_rows
+from mapserver.journal.archive import FOLDER, HOUR_NS, archive
+from mapserver.journal.history import History, history_rows
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.rows import JournalRow
 from mapserver.store import JOURNAL_FILE, Incoming, Store
 from protocol.arrays import Table
 from protocol.codec import encode_batch

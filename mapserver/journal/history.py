@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from mapserver.archive import FOLDER, Archive
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest import Admission
-from mapserver.journal import LAST, ArchivedError, Journal, JournalReads
-from mapserver.journal_rows import ALL, JournalRow, Mark, Wanted
+from mapserver.journal.archive import FOLDER, Archive
+from mapserver.journal.journal import LAST, ArchivedError, Journal, JournalReads
+from mapserver.journal.rows import ALL, JournalRow, Mark, Wanted
 from protocol.arrays import Bools, Table
 from protocol.errors import StoreError
 from protocol.geometry import BLOCK_CELLS, Bounds, CellWindow, GridGeometry

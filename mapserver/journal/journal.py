@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.ingest import Admission
-from mapserver.journal_rows import ALL, Event, JournalRow, Mark, Wanted, checksum, extent_checksum, pack, unpack
-from mapserver.journal_schema import EXTENT_VALUES, SCHEMA, SEEN, TABLES, UPGRADES
+from mapserver.journal.rows import ALL, Event, JournalRow, Mark, Wanted, checksum, extent_checksum, pack, unpack
+from mapserver.journal.schema import EXTENT_VALUES, SCHEMA, SEEN, TABLES, UPGRADES
 from protocol.errors import StoreError
 
 # ruff: noqa: S608 - statements are put together from constants, never from input

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from mapserver.journal import LAST, JournalReader
-from mapserver.journal_rows import ALL, JournalRow, Wanted
+from mapserver.journal.journal import LAST, JournalReader
+from mapserver.journal.rows import ALL, JournalRow, Wanted
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.config import from_table
 from protocol.errors import ConfigError, StoreError
