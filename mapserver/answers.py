@@ -9,11 +9,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mapserver import layers
 from mapserver.config import ServerConfig
-from mapserver.filling import AREA_LAYERS
 from mapserver.journal.history import Moment
 from mapserver.journal.rows import Wanted
+from mapserver.layers import cell_layers
+from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.views import Past, View, cropped, read_cells, view_now, widened
 from mapserver.writer import Writer
 from protocol.admin import TrustCommand, parse_command
@@ -132,7 +132,7 @@ class Answers:
 
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
-        return {**self._writer.info(), "layers": [*layers.LAYERS, *AREA_LAYERS]}
+        return {**self._writer.info(), "layers": [*cell_layers.LAYERS, *AREA_LAYERS]}
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
@@ -168,17 +168,17 @@ class Answers:
     def _read(self, window: CellWindow, names: tuple[str, ...], when: When) -> Region:
         check_size(window.columns, window.rows)
         if when.minus_ns is None:
-            return self._map(window, layers.select(names), when.as_of_ns)
+            return self._map(window, cell_layers.select(names), when.as_of_ns)
         names = _with_difference(names)
         newer, older = (self._map(window, names, as_of_ns) for as_of_ns in (when.as_of_ns, when.minus_ns))
         differences = {name: newer[name] - older[name] for name in names}
         return replace(newer, layers=differences, merged=min(newer.merged, older.merged))
 
     def _map(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None) -> Region:
-        wide = widened(window, layers.margin_cells(names, self._site.cell_m, self._config.read))
+        wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
         view = self._view(wide, as_of_ns)
-        values = read_cells(view, wide, layers.required(names), self._site.cell_m, self._config)
-        areas = layers.derive_area(names, values, self._site.cell_m, self._config.read)
+        values = read_cells(view, wide, cell_layers.required(names), self._site.cell_m, self._config)
+        areas = cell_layers.derive_area(names, values, self._site.cell_m, self._config.read)
         geometry = self._site.geometry
         return Region(
             x_m=geometry.centres(window.column, window.columns),
@@ -195,7 +195,7 @@ class Answers:
         return self._known_past().view(window, as_of_ns, self._keeper.distrusted())
 
     def _span(self, moment: Moment, names: tuple[str, ...]) -> Span:
-        values = layers.read(moment.evidence, names, self._config.read, moment.last_ns)
+        values = cell_layers.read(moment.evidence, names, self._config.read, moment.last_ns)
         return Span(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
 
     def _known_past(self) -> Past:
@@ -210,7 +210,7 @@ def reads_past(name: str, parameters: Mapping[str, str]) -> bool:
 
 
 def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:
-    names = layers.select(names)
+    names = cell_layers.select(names)
     if filled := [name for name in names if name in AREA_LAYERS]:
         problem = f"layer `{filled[0]}` is made from a cell's neighbours, a history is of one cell: leave it out"
         raise QueryError(Refusal.UNKNOWN_LAYER, problem)
@@ -222,7 +222,7 @@ def _with_difference(names: tuple[str, ...]) -> tuple[str, ...]:
     if refused := [name for name in names if name in WITHOUT_DIFFERENCE]:
         problem = f"layer `{refused[0]}` has no difference; ask for it without `minus`, as of each time"
         raise QueryError(Refusal.OUT_OF_RANGE, problem)
-    return tuple(name for name in layers.select(names) if name not in WITHOUT_DIFFERENCE)
+    return tuple(name for name in cell_layers.select(names) if name not in WITHOUT_DIFFERENCE)
 
 
 def _time_of(query: HistoryQuery, now_ns: int, span_s: float) -> tuple[int, int]:

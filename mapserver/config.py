@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from mapserver.change import ChangeConfig
 from mapserver.evidence.votes import FoldConfig
-from mapserver.layers import ReadConfig
+from mapserver.layers.cell_layers import ReadConfig
 from mapserver.trust import TrustConfig
 from protocol.config import require_positive
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver import layers
 from mapserver.change import reach_blocks
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
@@ -17,6 +16,7 @@ from mapserver.evidence.timeline import Block
 from mapserver.journal.history import History, Moment, grid_as_of, point_history
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import Wanted
+from mapserver.layers import cell_layers
 from mapserver.reading import Pages, evidence, valid_pages
 from mapserver.store import Store
 from protocol.arrays import Floats32
@@ -88,7 +88,7 @@ def read_cells(
     out: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in names}
     for some in chunks([block for block in view.pages if _touches(block, window)]):
         found = evidence([view.pages[block] for block in some], [first[block] for block in some])
-        for name, values in layers.read(found, names, config.read, view.stamp_ns).items():
+        for name, values in cell_layers.read(found, names, config.read, view.stamp_ns).items():
             _place(out[name], window, some, values)
     return out
 

@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mapserver import layers
 from mapserver.change import ChangeConfig, cuts
 from mapserver.evidence import cells as ev
 from mapserver.evidence.timeline import Block, TimedPage
+from mapserver.layers import cell_layers
 from mapserver.reading import evidence, image_of, valid_pages
 from protocol.arrays import Bools, Floats32, Ints
 from protocol.geometry import BLOCK_CELLS
@@ -62,7 +62,7 @@ class ChangeWatch:
     """Changes of one site. known: plain values of those from before, the newest of each number last."""
 
     def __init__(
-        self, cell_m: float, change: ChangeConfig, read: layers.ReadConfig, known: Iterable[Mapping[str, Any]] = ()
+        self, cell_m: float, change: ChangeConfig, read: cell_layers.ReadConfig, known: Iterable[Mapping[str, Any]] = ()
     ) -> None:
         self._cell_m, self._config, self._read = cell_m, change, read
         self._changes = {values["id"]: Change.of(values) for values in known}
@@ -159,11 +159,11 @@ def _older(pages: Sequence[TimedPage], first: Ints) -> Sequence[TimedPage]:
     return pages[: int(np.median(first[first > 0]))]
 
 
-def _before_and_after(old: ev.Evidence, now: ev.Evidence, config: layers.ReadConfig) -> dict[str, Floats32]:
+def _before_and_after(old: ev.Evidence, now: ev.Evidence, config: cell_layers.ReadConfig) -> dict[str, Floats32]:
     """Layers (blocks, 256) from the evidence before a change, and from what holds now."""
     found = {}
     for when, part in (("before", old), ("after", now)):
-        for name, values in layers.read(part, _BEFORE_AFTER, config).items():
+        for name, values in cell_layers.read(part, _BEFORE_AFTER, config).items():
             found[f"{name}_{when}"] = values
     return found
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from mapserver_data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
 
-from mapserver import layers
 from mapserver.answers import Answers
-from mapserver.filling import AREA_LAYERS
-from mapserver.layers import LAYERS, ReadConfig
+from mapserver.layers import cell_layers
+from mapserver.layers.cell_layers import LAYERS, ReadConfig
+from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.store import Store
 from mapserver.writer import Writer
 from protocol.errors import QueryError, Refusal
@@ -101,7 +101,9 @@ def test_many_blocks_are_read_in_pieces_and_put_together(tmp_path, monkeypatch):
     grid = folded(rows)
     for x in range(-4, 4):
         for y in range(-4, 4):
-            block = layers.read(grid.evidence([(x, y)]), ["resistance"], ReadConfig())["resistance"].reshape(16, 16)
+            block = cell_layers.read(grid.evidence([(x, y)]), ["resistance"], ReadConfig())["resistance"].reshape(
+                16, 16
+            )
             row, column = 16 * (y + 4), 16 * (x + 4)
             cut = here["resistance"][row : row + 16, column : column + 16]
             assert np.array_equal(cut, block, equal_nan=True)

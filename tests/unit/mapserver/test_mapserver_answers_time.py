@@ -7,7 +7,7 @@ import pytest
 from mapserver_data import CONFIG, NOW_NS, SITE, WAIT_S, batch, incoming, now_ns, random_samples, routed, samples, send
 
 from mapserver.answers import Answers, Nobody, reads_past
-from mapserver.layers import LAYERS
+from mapserver.layers.cell_layers import LAYERS
 from mapserver.server import Server
 from mapserver.store import JOURNAL_FILE
 from mapserver.writer import Writer

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from mapserver.filling import (
+from mapserver.layers.cell_layers import ReadConfig, derive_area, margin_cells, required
+from mapserver.layers.gap_filling import (
     AREA_LAYERS,
     GRADE_PRIOR_STD,
     RESISTANCE_PRIOR_STD,
@@ -11,7 +12,6 @@ from mapserver.filling import (
     filled_std,
     sparse_kernel,
 )
-from mapserver.layers import ReadConfig, derive_area, margin_cells, required
 from protocol.ground import BOUNDARIES, resistance_class
 
 ROWS, COLUMNS = 24, 40

@@ -7,8 +7,8 @@ from mapserver_data import NOW_NS, folded, samples
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
-from mapserver.filling import AREA_LAYERS
-from mapserver.layers import LAYERS, ReadConfig, derive_area, margin_cells, read, required, select
+from mapserver.layers.cell_layers import LAYERS, ReadConfig, derive_area, margin_cells, read, required, select
+from mapserver.layers.gap_filling import AREA_LAYERS
 from protocol.config import from_table
 from protocol.errors import ConfigError, QueryError, Refusal
 from protocol.ground import BOUNDARIES, SLOPE_LIMIT, ZONES

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, folded, random_samples, samples
 
-from mapserver import layers
 from mapserver.change import ChangeConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
-from mapserver.layers import ReadConfig
+from mapserver.layers import cell_layers
+from mapserver.layers.cell_layers import ReadConfig
 from mapserver.reading import around, evidence, valid_pages
 
 HOUR_NS = 3600 * 10**9
@@ -53,7 +53,7 @@ def read(grid: Grid, config: ChangeConfig = CONFIG) -> ev.Evidence:
 
 
 def resistance(found: ev.Evidence) -> np.ndarray:
-    return layers.read(found, ["resistance"], ReadConfig())["resistance"]
+    return cell_layers.read(found, ["resistance"], ReadConfig())["resistance"]
 
 
 def area(west: int, south: int, size: int, margin: int = 0) -> np.ndarray:

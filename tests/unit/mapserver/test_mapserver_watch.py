@@ -7,7 +7,7 @@ from mapserver_data import NOW_NS, samples
 from mapserver.change import ChangeConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
-from mapserver.layers import ReadConfig
+from mapserver.layers.cell_layers import ReadConfig
 from mapserver.reading import around
 from mapserver.watch import Change, ChangeWatch
 

@@ -15,9 +15,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from mapserver.estimators import linear_count, ratio, robust_centre, robust_spread
 from mapserver.evidence import cells as ev
-from mapserver.filling import AREA_LAYERS, Area
+from mapserver.layers.gap_filling import AREA_LAYERS, Area
+from mapserver.layers.statistics import linear_count, ratio, robust_centre, robust_spread
 from protocol import ground
 from protocol.arrays import AnyArray, Bools, Floats, Floats32
 from protocol.config import require_positive
