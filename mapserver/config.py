@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from mapserver.change import ChangeConfig
+from mapserver.change.detection import ChangeConfig
 from mapserver.evidence.votes import FoldConfig
 from mapserver.layers.cell_layers import ReadConfig
 from mapserver.trust import TrustConfig

@@ -13,8 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mapserver import watch
-from mapserver.change import reach_blocks
+from mapserver.change import change_log
+from mapserver.change.detection import reach_blocks
+from mapserver.change.validity import around
 from mapserver.config import ServerConfig
 from mapserver.decisions import AUDIT, KIND, PERSON, Decision, Decisions
 from mapserver.evidence.grid import Grid
@@ -23,7 +24,6 @@ from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import Wanted
-from mapserver.reading import around
 from mapserver.store import JOURNAL_FILE, Store
 from mapserver.trust import Auditor, Verdict
 from mapserver.writer import Writer
@@ -58,8 +58,8 @@ class Keeper:
         self._auditor = Auditor(config.trust, site.cell_m, config.fold)
         self._verdicts: dict[str, Verdict] = {}
         self._decisions = Decisions(self._reader.events(KIND))
-        known = [event.body for event in self._reader.events(watch.KIND)]
-        self._watch = watch.ChangeWatch(site.cell_m, config.change, config.read, known)
+        known = [event.body for event in self._reader.events(change_log.KIND)]
+        self._watch = change_log.ChangeWatch(site.cell_m, config.change, config.read, known)
         self._followed = self._reader.archived_row
         self._due_s = {"judge": 0.0, "archive": 0.0}
         self._wake, self._ending = threading.Event(), False
@@ -209,7 +209,7 @@ class Keeper:
             with self._state:
                 found = self._watch.look(blocks, pages)
             for change in found:
-                self._remember(watch.KIND, change.last_ns, change.values)
+                self._remember(change_log.KIND, change.last_ns, change.values)
                 self._publish(change.values)
 
     def _archive(self) -> None:

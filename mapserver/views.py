@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver.change import reach_blocks
+from mapserver.change.detection import reach_blocks
+from mapserver.change.validity import Pages, evidence, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block
@@ -17,7 +18,6 @@ from mapserver.journal.history import History, Moment, grid_as_of, point_history
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import Wanted
 from mapserver.layers import cell_layers
-from mapserver.reading import Pages, evidence, valid_pages
 from mapserver.store import Store
 from protocol.arrays import Floats32
 from protocol.errors import QueryError, Refusal, StoreError

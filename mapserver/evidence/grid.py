@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapserver.change.validity import evidence
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import kernel
 from mapserver.evidence.open_blocks import Hot, NoRoom, of_code
 from mapserver.evidence.pages import Page
 from mapserver.evidence.timeline import Block, Ladder, TimedPage, rungs
 from mapserver.evidence.votes import FoldConfig
-from mapserver.reading import evidence
 from protocol.arrays import Table
 from protocol.geometry import BLOCK_CELLS, CellWindow
 from protocol.samples import SAMPLE_DTYPE

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, samples
 
-from mapserver.change import ChangeConfig, credible, cuts, kinds
+from mapserver.change.detection import ChangeConfig, credible, cuts, kinds
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import TimedPage

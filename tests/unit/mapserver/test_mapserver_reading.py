@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, folded, random_samples, samples
 
-from mapserver.change import ChangeConfig
+from mapserver.change.detection import ChangeConfig
+from mapserver.change.validity import around, evidence, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import ReadConfig
-from mapserver.reading import around, evidence, valid_pages
 
 HOUR_NS = 3600 * 10**9
 CONFIG = ChangeConfig()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, samples
 
-from mapserver.change import ChangeConfig
+from mapserver.change.change_log import Change, ChangeWatch
+from mapserver.change.detection import ChangeConfig
+from mapserver.change.validity import around
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
 from mapserver.layers.cell_layers import ReadConfig
-from mapserver.reading import around
-from mapserver.watch import Change, ChangeWatch
 
 HOUR_NS = 3600 * 10**9
 

@@ -13,11 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mapserver.change import ChangeConfig, cuts
+from mapserver.change.detection import ChangeConfig, cuts
+from mapserver.change.validity import evidence, image_of, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.layers import cell_layers
-from mapserver.reading import evidence, image_of, valid_pages
 from protocol.arrays import Bools, Floats32, Ints
 from protocol.geometry import BLOCK_CELLS
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.change import ChangeConfig, credible, cuts, kinds, reach_blocks
+from mapserver.change.detection import ChangeConfig, credible, cuts, kinds, reach_blocks
 from mapserver.evidence import cells as ev
 from mapserver.evidence.pages import pick
 from mapserver.evidence.timeline import Block, TimedPage

@@ -1,0 +1,1 @@
+"""Where recent evidence contradicts older evidence, and the list of changes found so."""
