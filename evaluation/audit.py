@@ -16,8 +16,6 @@ import numpy as np
 
 from agents.audit import read_audit
 from mapserver.config import ServerConfig
-from mapserver.decisions import KIND as TRUST
-from mapserver.decisions import Decisions
 from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid, GridState, Placed
@@ -26,6 +24,8 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import JournalRow
 from mapserver.store import JOURNAL_FILE
+from mapserver.trust.decisions import KIND as TRUST
+from mapserver.trust.decisions import Decisions
 from protocol.arrays import Ints
 from protocol.samples import content_hash
 from protocol.site import SiteConfig

@@ -15,7 +15,7 @@ from evaluation.merge_samples import Delivery
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
-from mapserver.trust import Auditor, TrustConfig
+from mapserver.trust.auditor import Auditor, TrustConfig
 from mapserver.views import read_cells, view_of
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.geometry import CellWindow

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from mapserver.change.detection import ChangeConfig
 from mapserver.evidence.votes import FoldConfig
 from mapserver.layers.cell_layers import ReadConfig
-from mapserver.trust import TrustConfig
+from mapserver.trust.auditor import TrustConfig
 from protocol.config import require_positive
 
 

@@ -17,7 +17,6 @@ from mapserver.change import change_log
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.config import ServerConfig
-from mapserver.decisions import AUDIT, KIND, PERSON, Decision, Decisions
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.journal.archive import FOLDER, archive
@@ -25,7 +24,8 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import Wanted
 from mapserver.store import JOURNAL_FILE, Store
-from mapserver.trust import Auditor, Verdict
+from mapserver.trust.auditor import Auditor, Verdict
+from mapserver.trust.decisions import AUDIT, KIND, PERSON, Decision, Decisions
 from mapserver.writer import Writer
 from protocol.errors import QueryError, Refusal, SitegridError
 from protocol.site import SiteConfig

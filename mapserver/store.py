@@ -14,8 +14,6 @@ from typing import Any
 
 from mapserver import ingest
 from mapserver.config import ServerConfig
-from mapserver.decisions import KIND as TRUST
-from mapserver.decisions import Decisions
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest import Admission, GapError
@@ -23,6 +21,8 @@ from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Wanted
+from mapserver.trust.decisions import KIND as TRUST
+from mapserver.trust.decisions import Decisions
 from protocol import keys
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.messages import Ack, Refused, SampleBatch

@@ -10,12 +10,12 @@ import pytest
 from agents.audit import AuditLog
 from evaluation.audit import AuditResult, audit_store, compare, grid_difference, read_audits
 from mapserver.config import ServerConfig
-from mapserver.decisions import KIND, PERSON, Decision
 from mapserver.evidence.grid import Grid
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, checksum, pack
 from mapserver.store import JOURNAL_FILE, Incoming, Store
+from mapserver.trust.decisions import KIND, PERSON, Decision
 from protocol.arrays import Table
 from protocol.codec import encode_batch
 from protocol.messages import Ack, SampleBatch

@@ -1,8 +1,8 @@
 import pytest
 
-from mapserver.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER, Decision, Decisions
 from mapserver.journal.rows import Event
-from mapserver.trust import Reason, Verdict
+from mapserver.trust.auditor import Reason, Verdict
+from mapserver.trust.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER, Decision, Decisions
 
 BAD = Verdict("c", (Reason.GAIN, Reason.OFFSET), {"gain": 1.6}, True)
 GOOD = Verdict("c", (), {"gain": 1.0}, False)

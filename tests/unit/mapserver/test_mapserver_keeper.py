@@ -12,7 +12,7 @@ from mapserver.config import KeepConfig, ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.journal.archive import FOLDER
 from mapserver.keeper import Keeper
-from mapserver.trust import TrustConfig
+from mapserver.trust.auditor import TrustConfig
 from mapserver.writer import Writer
 from protocol.errors import QueryError
 from protocol.ground import ZONES

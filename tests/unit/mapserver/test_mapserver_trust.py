@@ -8,7 +8,7 @@ from mapserver_data import NOW_NS
 from scipy.signal import lfilter
 
 from mapserver.evidence.votes import FoldConfig
-from mapserver.trust import Auditor, Reason, TrustConfig, Verdict
+from mapserver.trust.auditor import Auditor, Reason, TrustConfig, Verdict
 from protocol.arrays import Table
 from protocol.ground import ZONES
 from protocol.samples import empty

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, random_samples, samples
 
-from mapserver.trust import Auditor, TrustConfig
-from mapserver.trust_clock import ClockWatch
-from mapserver.trust_ledger import LEVEL_FLOOR, Ledger, Surface, map_cell_m, pooled
-from mapserver.trust_vote import AGREE, DISAGREE, UNKNOWN, outvoted
+from mapserver.trust.auditor import Auditor, TrustConfig
+from mapserver.trust.clock import ClockWatch
+from mapserver.trust.coarse_map import LEVEL_FLOOR, Ledger, Surface, map_cell_m, pooled
+from mapserver.trust.machine_vote import AGREE, DISAGREE, UNKNOWN, outvoted
 from protocol.arrays import Ints, Table
 
 PERIOD_NS = 300 * 10**9

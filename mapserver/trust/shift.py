@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.trust_ledger import ROW, Surface, block_of
+from mapserver.trust.coarse_map import ROW, Surface, block_of
 from protocol.arrays import Bools, Floats, Ints
 
 REACH = 3  # cells; shifts up to here each way are tried

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from math import hypot, log, sqrt
 
-from mapserver.trust_compare import CELLS_PER_DRAW, Difference, Gain
-from mapserver.trust_shift import Shift
-from mapserver.trust_vote import AGREE, DISAGREE, UNKNOWN
+from mapserver.trust.comparison import CELLS_PER_DRAW, Difference, Gain
+from mapserver.trust.machine_vote import AGREE, DISAGREE, UNKNOWN
+from mapserver.trust.shift import Shift
 from protocol.config import require_positive
 
 _ALIKE = 0.75  # of the limit: above it nothing is said

@@ -10,8 +10,8 @@ from collections import deque
 
 import numpy as np
 
-from mapserver.trust_judge import Finding
-from mapserver.trust_vote import AGREE, DISAGREE, UNKNOWN
+from mapserver.trust.judgement import Finding
+from mapserver.trust.machine_vote import AGREE, DISAGREE, UNKNOWN
 
 _LOOKS = 16  # in a span
 _LOOKS_NEEDED = 8

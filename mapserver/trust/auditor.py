@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from mapserver.evidence.votes import FoldConfig, is_foldable
-from mapserver.trust_clock import ClockWatch
-from mapserver.trust_compare import CompareConfig, Difference, Map, compare, reverse
-from mapserver.trust_judge import GROUND, Finding, Reason, TrustConfig, judge
-from mapserver.trust_ledger import Ledger, map_cell_m, pooled
-from mapserver.trust_vote import AGREE, DISAGREE, UNKNOWN, outvoted
+from mapserver.trust.clock import ClockWatch
+from mapserver.trust.coarse_map import Ledger, map_cell_m, pooled
+from mapserver.trust.comparison import CompareConfig, Difference, Map, compare, reverse
+from mapserver.trust.judgement import GROUND, Finding, Reason, TrustConfig, judge
+from mapserver.trust.machine_vote import AGREE, DISAGREE, UNKNOWN, outvoted
 from protocol.arrays import Ints, Table
 
 __all__ = ["Auditor", "Reason", "TrustConfig", "Verdict"]

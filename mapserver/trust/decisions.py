@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from mapserver.journal.rows import Event
-from mapserver.trust import Verdict
+from mapserver.trust.auditor import Verdict
 
 KIND = "trust"
 AUDIT, PERSON = "audit", "person"

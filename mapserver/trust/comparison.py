@@ -10,8 +10,8 @@ from functools import cached_property
 
 import numpy as np
 
-from mapserver.trust_ledger import LEVEL_FLOOR, ROW, Surface
-from mapserver.trust_shift import Shift, find_shift, near_borders
+from mapserver.trust.coarse_map import LEVEL_FLOOR, ROW, Surface
+from mapserver.trust.shift import Shift, find_shift, near_borders
 from protocol.arrays import Floats, Ints
 
 _LOWEST_C_RR = 0.004  # the lowest that the map knows: ratios of less mean nothing

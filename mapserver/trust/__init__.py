@@ -1,0 +1,1 @@
+"""Which machines contradict all others, and whose samples are left out of the map."""
