@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.measure import START_NS, Result, machine, medians, timed, track
 from mapserver.config import ServerConfig
-from mapserver.store import Incoming, Store
+from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table
 from protocol.codec import encode_batch
 from protocol.messages import Ack, SampleBatch

@@ -20,10 +20,10 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid, GridState, Placed
 from mapserver.evidence.pages import Page
+from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import JournalRow
-from mapserver.store import JOURNAL_FILE
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import Decisions
 from protocol.arrays import Ints

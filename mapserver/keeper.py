@@ -19,14 +19,14 @@ from mapserver.change.validity import around
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import Block, TimedPage
+from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import Wanted
-from mapserver.store import JOURNAL_FILE, Store
 from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.decisions import AUDIT, KIND, PERSON, Decision, Decisions
-from mapserver.writer import Writer
 from protocol.errors import QueryError, Refusal, SitegridError
 from protocol.site import SiteConfig
 

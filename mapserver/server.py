@@ -15,9 +15,9 @@ import zenoh
 
 from mapserver.answers import Answers, reads_past
 from mapserver.config import ServerConfig
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Verify
+from mapserver.ingest.writer import Writer
 from mapserver.keeper import Keeper
-from mapserver.store import JOURNAL_FILE, Incoming, Verify
-from mapserver.writer import Writer
 from protocol import keys
 from protocol.codec import encode_reply
 from protocol.errors import ConfigError, QueryError

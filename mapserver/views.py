@@ -14,11 +14,11 @@ from mapserver.change.validity import Pages, evidence, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block
+from mapserver.ingest.store import Store
 from mapserver.journal.history import History, Moment, grid_as_of, point_history
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import Wanted
 from mapserver.layers import cell_layers
-from mapserver.store import Store
 from protocol.arrays import Floats32
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.geometry import BLOCK_CELLS, CellWindow

@@ -22,7 +22,7 @@ def start_logging(*, verbose: bool) -> None:
 
 
 class Lines(logging.Formatter):
-    """`2026-01-31T07:00:00.000Z level=WARNING logger=mapserver.writer refused machine=loader-1 reason=gap`."""
+    """`2026-01-31T07:00:00.000Z level=WARNING logger=mapserver.ingest.writer refused machine=loader-1 reason=gap`."""
 
     def format(self, record: logging.LogRecord) -> str:
         """One line; a traceback follows it, for people."""

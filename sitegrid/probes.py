@@ -208,9 +208,9 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     from mapserver.evidence import (
         snapshot,  # imported here: needs the `server` extra, which a machine's host does not have
     )
+    from mapserver.ingest.store import JOURNAL_FILE
     from mapserver.journal.journal import JournalReader
     from mapserver.journal.schema import SCHEMA
-    from mapserver.store import JOURNAL_FILE
 
     if not (folder / JOURNAL_FILE).is_file():
         raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")

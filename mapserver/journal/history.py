@@ -18,7 +18,7 @@ import numpy as np
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
-from mapserver.ingest import Admission
+from mapserver.ingest.admission import Admission
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.journal import LAST, ArchivedError, Journal, JournalReads
 from mapserver.journal.rows import ALL, JournalRow, Mark, Wanted

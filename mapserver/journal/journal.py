@@ -17,7 +17,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from mapserver.ingest import Admission
+from mapserver.ingest.admission import Admission
 from mapserver.journal.rows import ALL, Event, JournalRow, Mark, Wanted, checksum, extent_checksum, pack, unpack
 from mapserver.journal.schema import EXTENT_VALUES, SCHEMA, SEEN, TABLES, UPGRADES
 from protocol.errors import StoreError

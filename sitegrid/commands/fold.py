@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.config import ServerConfig
+from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.archive import FOLDER, Archive, ArchiveFile
 from mapserver.journal.history import Copier, History, Spool, history_rows, merged
 from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, Mark, Wanted
-from mapserver.store import JOURNAL_FILE, Store
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from protocol.machine import plain_lines

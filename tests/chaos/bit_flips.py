@@ -16,9 +16,9 @@ from typing import Any
 
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
+from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.rows import Wanted
-from mapserver.store import JOURNAL_FILE, Store
 from protocol.errors import StoreError
 from protocol.samples import content_hash
 from protocol.site import load_site

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
+from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
-from mapserver.store import JOURNAL_FILE
 from protocol.errors import StoreError
 from protocol.logfolder import open_log
 from protocol.machine import plain_lines

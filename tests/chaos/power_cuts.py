@@ -15,8 +15,8 @@ from pathlib import Path
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.history import History, history_rows
-from mapserver.store import Incoming, Store
 from protocol.codec import encode_batch
 from protocol.errors import StoreError
 from protocol.messages import Ack, SampleBatch

@@ -17,7 +17,7 @@ import numpy as np
 
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
-from mapserver.store import Incoming, Store
+from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table
 from protocol.codec import encode_batch
 from protocol.errors import StoreError

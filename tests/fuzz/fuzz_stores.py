@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver.ingest import Admission
+from mapserver.ingest.admission import Admission
 from mapserver.journal.archive import FOLDER, ArchiveFile, next_file
 from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow

@@ -20,10 +20,10 @@ from site_run import READY_S, SiteRun  # beside this file
 
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
-from mapserver.store import JOURNAL_FILE, Incoming, Store
 from protocol import keys
 from protocol.codec import decode_reply, encode_batch
 from protocol.messages import Ack, SampleBatch

@@ -10,8 +10,8 @@ import pytest
 
 from agents.spool import Run, Spool
 from agents.uplink import UplinkState
-from mapserver import ingest
-from mapserver.ingest import Admission
+from mapserver.ingest import admission
+from mapserver.ingest.admission import Admission
 from protocol.messages import Ack, Refused, SampleBatch
 from tests.simulation.faults import KILLS, Fault
 from tests.simulation.servers import ModelServer
@@ -33,8 +33,8 @@ def ack_before_commit(patch: pytest.MonkeyPatch) -> None:
 
 def watermark_one_too_low(patch: pytest.MonkeyPatch) -> None:
     """The server takes the last committed sample for the next that it expects."""
-    admit = ingest.admit
-    patch.setattr(ingest, "admit", lambda batch, watermark: admit(batch, max(0, watermark - 1)))
+    admit = admission.admit
+    patch.setattr(admission, "admit", lambda batch, watermark: admit(batch, max(0, watermark - 1)))
 
 
 def watermark_one_too_high(patch: pytest.MonkeyPatch) -> None:
@@ -56,13 +56,13 @@ def delete_before_ack(patch: pytest.MonkeyPatch) -> None:
 
 
 def _plant_admit(patch: pytest.MonkeyPatch, wrong: Callable[[SampleBatch, int], SampleBatch]) -> None:
-    admit = ingest.admit
+    admit = admission.admit
 
     def admit_wrongly(batch: SampleBatch, watermark: int) -> Admission:
         overlaps = len(batch.rows) and batch.first_seq <= watermark < batch.last_seq
         return Admission(wrong(batch, watermark), 0, 0) if overlaps else admit(batch, watermark)
 
-    patch.setattr(ingest, "admit", admit_wrongly)
+    patch.setattr(admission, "admit", admit_wrongly)
 
 
 def trim_whole_batch(patch: pytest.MonkeyPatch) -> None:
@@ -81,13 +81,13 @@ def trim_nothing(patch: pytest.MonkeyPatch) -> None:
 
 def gap_is_taken(patch: pytest.MonkeyPatch) -> None:
     """A batch beyond the next expected sample is taken, and what is missing is not counted."""
-    admit = ingest.admit
+    admit = admission.admit
 
     def admit_gap(batch: SampleBatch, watermark: int) -> Admission:
         is_gap = len(batch.rows) and batch.first_seq - watermark - 1 > batch.lost_before
         return Admission(batch, 0, 0) if is_gap else admit(batch, watermark)
 
-    patch.setattr(ingest, "admit", admit_gap)
+    patch.setattr(admission, "admit", admit_gap)
 
 
 def one_identity_for_ever(patch: pytest.MonkeyPatch) -> None:

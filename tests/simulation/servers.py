@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from mapserver import ingest
 from mapserver.config import ServerConfig
-from mapserver.ingest import Admission, GapError
+from mapserver.ingest import admission
+from mapserver.ingest.admission import Admission, GapError
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
-from mapserver.store import JOURNAL_FILE, Incoming, Store
 from protocol.errors import MessageError, Refusal
 from protocol.messages import Ack, Refused
 from protocol.site import SiteConfig
@@ -111,9 +111,9 @@ class ModelServer:
 
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
         try:
-            batch = ingest.parse(incoming.payload, incoming.machine, self._site, self._now_ns)
+            batch = admission.parse(incoming.payload, incoming.machine, self._site, self._now_ns)
             seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
-            admission = ingest.admit(batch, seq)
+            admission = admission.admit(batch, seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected)

@@ -19,7 +19,7 @@ import numpy as np
 
 from agents.spool import SpoolConfig
 from agents.uplink import UplinkConfig, UplinkState
-from mapserver.store import Incoming
+from mapserver.ingest.store import Incoming
 from protocol.arrays import Table
 from protocol.codec import decode_reply, encode_reply
 from protocol.errors import StoreError

@@ -11,7 +11,7 @@ from agents_drives import SITE, made_up_samples
 
 from agents.spool import Spool, SpoolConfig
 from agents.uplink import BLOCKING, PASSING, UplinkConfig, UplinkState, linger
-from mapserver.ingest import GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, parse
 from protocol.codec import decode_batch, decode_reply, encode_reply
 from protocol.errors import MessageError, Refusal
 from protocol.messages import Ack, Refused, SampleBatch

@@ -11,10 +11,10 @@ from agents.audit import AuditLog
 from evaluation.audit import AuditResult, audit_store, compare, grid_difference, read_audits
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, checksum, pack
-from mapserver.store import JOURNAL_FILE, Incoming, Store
 from mapserver.trust.decisions import KIND, PERSON, Decision
 from protocol.arrays import Table
 from protocol.codec import encode_batch

@@ -15,8 +15,8 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid, GridState, Placed
 from mapserver.evidence.pages import WIDE, Page
 from mapserver.evidence.votes import FoldConfig
-from mapserver.store import Incoming, Store
-from mapserver.writer import Writer
+from mapserver.ingest.store import Incoming, Store
+from mapserver.ingest.writer import Writer
 from protocol.arrays import Table
 from protocol.codec import encode_batch
 from protocol.messages import Ack, Refused, SampleBatch

@@ -7,10 +7,10 @@ import pytest
 from mapserver_data import CONFIG, NOW_NS, SITE, WAIT_S, batch, incoming, now_ns, random_samples, routed, samples, send
 
 from mapserver.answers import Answers, Nobody, reads_past
+from mapserver.ingest.store import JOURNAL_FILE
+from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.server import Server
-from mapserver.store import JOURNAL_FILE
-from mapserver.writer import Writer
 from protocol import keys
 from protocol.admin import TrustCommand, encode_command
 from protocol.codec import encode_batch

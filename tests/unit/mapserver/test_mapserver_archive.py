@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 
-from mapserver.ingest import Admission
+from mapserver.ingest.admission import Admission
 from mapserver.journal import archive as ar
 from mapserver.journal.archive import HOUR_NS, Archive, ArchiveFile, archive, next_file
 from mapserver.journal.journal import Journal, JournalReader

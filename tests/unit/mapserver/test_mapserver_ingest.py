@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mapserver_data import NOW_NS, SITE, batch, now_ns, samples
 
-from mapserver.ingest import GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, parse
 from protocol.codec import encode_batch
 from protocol.errors import MessageError, Refusal
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
 
-from mapserver.ingest import Admission
+from mapserver.ingest.admission import Admission
 from mapserver.journal import journal as journal_module
 from mapserver.journal.journal import ArchivedError, Journal, JournalReader, JournalReads
 from mapserver.journal.rows import ALL, Event, Mark, Wanted

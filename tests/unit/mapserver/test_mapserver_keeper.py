@@ -10,10 +10,10 @@ from mapserver_data import NOW_NS, SITE, incoming, now_ns, random_samples, same,
 
 from mapserver.config import KeepConfig, ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER
 from mapserver.keeper import Keeper
 from mapserver.trust.auditor import TrustConfig
-from mapserver.writer import Writer
 from protocol.errors import QueryError
 from protocol.ground import ZONES
 

@@ -9,7 +9,7 @@ from mapserver_data import NOW_NS, SITE, WAIT_S, batch, folded, random_samples, 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
-from mapserver.ingest import Admission
+from mapserver.ingest.admission import Admission
 from mapserver.journal.archive import FOLDER, HOUR_NS, Archive, archive
 from mapserver.journal.history import History, grid_as_of, history_rows, point_history, samples_of
 from mapserver.journal.journal import Journal, JournalReader

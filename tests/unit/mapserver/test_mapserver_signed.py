@@ -3,7 +3,7 @@
 import pytest
 from mapserver_data import CONFIG, SITE, Incoming, incoming, now_ns, samples
 
-from mapserver.store import Store
+from mapserver.ingest.store import Store
 from protocol import keys
 from protocol.messages import Ack
 from protocol.signing import Signer, Verifier, make_signing_key

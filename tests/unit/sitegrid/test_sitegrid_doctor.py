@@ -22,8 +22,8 @@ import pytest
 
 from agents.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
+from mapserver.ingest.store import Incoming, Store
 from mapserver.server import Server
-from mapserver.store import Incoming, Store
 from protocol import keys
 from protocol.codec import encode_batch, encode_health
 from protocol.credentials import Identity

@@ -13,11 +13,11 @@ import pytest
 
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import JournalRow
-from mapserver.store import JOURNAL_FILE, Incoming, Store
 from protocol.arrays import Table
 from protocol.codec import encode_batch
 from protocol.config import from_table, load_toml

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mapserver.config import ServerConfig
-from mapserver.store import Incoming, Store, Verify
+from mapserver.ingest.store import Incoming, Store, Verify
 from protocol.errors import QueryError, Refusal
 from protocol.messages import Ack, Refused
 from protocol.site import SiteConfig
 
 T = TypeVar("T")
 Reply = Callable[[Ack | Refused], None]
-log = logging.getLogger("mapserver.writer")
+log = logging.getLogger("mapserver.ingest.writer")
 
 
 @dataclass(frozen=True)
