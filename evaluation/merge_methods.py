@@ -15,8 +15,8 @@ from evaluation.merge_samples import Delivery
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
+from mapserver.query.views import read_cells, view_of
 from mapserver.trust.auditor import Auditor, TrustConfig
-from mapserver.views import read_cells, view_of
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.geometry import CellWindow
 

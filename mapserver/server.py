@@ -13,11 +13,11 @@ from typing import Any
 
 import zenoh
 
-from mapserver.answers import Answers, reads_past
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Verify
 from mapserver.ingest.writer import Writer
 from mapserver.keeper import Keeper
+from mapserver.query.answers import Answers, reads_past
 from protocol import keys
 from protocol.codec import encode_reply
 from protocol.errors import ConfigError, QueryError

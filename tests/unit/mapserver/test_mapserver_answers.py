@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from mapserver_data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
 
-from mapserver.answers import Answers
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import LAYERS, ReadConfig
 from mapserver.layers.gap_filling import AREA_LAYERS
+from mapserver.query.answers import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.geometry import Bounds
 from protocol.queries import PointQuery, RegionQuery, decode_info, decode_point, decode_region

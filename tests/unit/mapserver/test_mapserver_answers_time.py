@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from mapserver_data import CONFIG, NOW_NS, SITE, WAIT_S, batch, incoming, now_ns, random_samples, routed, samples, send
 
-from mapserver.answers import Answers, Nobody, reads_past
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
+from mapserver.query.answers import Answers, Nobody, reads_past
 from mapserver.server import Server
 from protocol import keys
 from protocol.admin import TrustCommand, encode_command
@@ -247,7 +247,7 @@ def test_too_many_spans_are_refused_before_any_is_read(served, monkeypatch):
     answers = served(hours(0.02, 0.05))
     to_ns = NOW_NS + MAX_SPANS * 300 * S - 1
     assert len(answers.history(HistoryQuery(8.5, 8.5, ("weight",), NOW_NS, to_ns)).spans) == 2
-    monkeypatch.setattr("mapserver.views.point_history", None)
+    monkeypatch.setattr("mapserver.query.views.point_history", None)
     with pytest.raises(QueryError, match=r"2001 spans of 300 s; at most 2000 .* a longer `span`") as caught:
         answers.history(HistoryQuery(8.5, 8.5, ("weight",), NOW_NS, to_ns + 1))
     assert caught.value.reason == Refusal.TOO_LARGE

@@ -25,12 +25,12 @@ from mapserver_data import (
     wait_for,
 )
 
-from mapserver.answers import Answers
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.journal import Journal
+from mapserver.query.answers import Answers
 from protocol.codec import MAX_BATCH_BYTES, encode_batch
 from protocol.errors import QueryError, Refusal
 from protocol.messages import Ack

@@ -15,7 +15,7 @@ from mapserver.journal.history import Moment
 from mapserver.journal.rows import Wanted
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
-from mapserver.views import Past, View, cropped, read_cells, view_now, widened
+from mapserver.query.views import Past, View, cropped, read_cells, view_now, widened
 from protocol.admin import TrustCommand, parse_command
 from protocol.errors import QueryError, Refusal
 from protocol.geometry import Bounds, CellWindow
