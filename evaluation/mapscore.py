@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.ground_truth import border_distance
-from mapserver.plotter import Layers
+from mapserver.pictures.plotter import Layers
 from protocol.arrays import Bools, Floats, Ints
 from protocol.ground import UNKNOWN, resistance_class, slope_class, wrong_percent
 from protocol.queries import Region

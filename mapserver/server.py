@@ -14,9 +14,9 @@ from typing import Any
 import zenoh
 
 from mapserver.config import ServerConfig
+from mapserver.follower.follower import Keeper
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Verify
 from mapserver.ingest.writer import Writer
-from mapserver.keeper import Keeper
 from mapserver.query.answers import Answers, reads_past
 from protocol import keys
 from protocol.codec import encode_reply

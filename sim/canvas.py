@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mapserver.sheet import Colour, Image, text, text_size
+from mapserver.pictures.frame import Colour, Image, text, text_size
 from protocol.arrays import AnyArray, Floats
 
 INK, PAPER = (45, 45, 45), (255, 255, 255)

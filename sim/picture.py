@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapserver.plotter import write_image
-from mapserver.sheet import INK, Image, text
+from mapserver.pictures.frame import INK, Image, text
+from mapserver.pictures.plotter import write_image
 from protocol.errors import ConfigError
 from sim.config import SimConfig
 from sim.machine_model import MachineModel

@@ -10,7 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from mapserver.sheet import Axes, Colour, Entry, Image, compose
+from mapserver.pictures.frame import Axes, Colour, Entry, Image, compose
 from protocol.arrays import Floats
 from protocol.geometry import Bounds
 from protocol.ground import ZONES

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import zenoh
 
-from mapserver.plotter import Track
+from mapserver.pictures.plotter import Track
 from protocol import keys
 from protocol.codec import decode_pose
 from protocol.errors import MessageError

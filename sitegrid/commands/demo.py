@@ -16,7 +16,7 @@ from evaluation.ground_truth import read_way
 from evaluation.localisation import position_rmse
 from evaluation.mapscore import DrivenScore, MapScore, score, score_driven
 from mapserver.config import ServerConfig
-from mapserver.plotter import draw_difference, side_by_side, write_image
+from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.logfolder import LogFolder, open_log
 from protocol.queries import Region

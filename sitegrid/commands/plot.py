@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
-from mapserver.sheet import Image
+from mapserver.pictures.frame import Image
+from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.geometry import Bounds
 from protocol.queries import Region

@@ -11,8 +11,8 @@ import zenoh
 
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import warm_up
-from mapserver.exporter import Exporter, HealthEar, text_of
 from mapserver.ingest.store import Verify
+from mapserver.monitoring.exporter import Exporter, HealthEar, text_of
 from mapserver.server import Server
 from protocol.config import from_table, load_toml
 from protocol.session import open_session

@@ -10,9 +10,9 @@ from mapserver_data import NOW_NS, SITE, incoming, now_ns, random_samples, same,
 
 from mapserver.config import KeepConfig, ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.follower.follower import Keeper
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER
-from mapserver.keeper import Keeper
 from mapserver.trust.auditor import TrustConfig
 from protocol.errors import QueryError
 from protocol.ground import ZONES

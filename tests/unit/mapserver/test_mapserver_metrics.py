@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from mapserver_data import CONFIG, NOW_NS, SITE, now_ns, routed, samples  # beside this file
 
-from mapserver.exporter import MOST_AGENTS, Exporter, HealthEar, look, text_of
-from mapserver.metrics import Heard, Host, Metric, metrics_of, render
+from mapserver.monitoring.exporter import MOST_AGENTS, Exporter, HealthEar, look, text_of
+from mapserver.monitoring.metrics import Heard, Host, Metric, metrics_of, render
 from mapserver.server import Server
 from protocol import keys
 from protocol.codec import MAX_SMALL_BYTES, encode_batch, encode_health

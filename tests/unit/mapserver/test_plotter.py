@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mapserver import plotter, sheet
-from mapserver.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from mapserver.pictures import frame, plotter
+from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.ground import ZONES
 from protocol.queries import Region
 
@@ -20,8 +20,8 @@ def region(columns: int, rows: int, *, west: float = 0.0, south: float = 0.0, ce
 
 def cell_colour(image: np.ndarray, column: int, row: int, rows: int, cell_px: int) -> tuple[int, ...]:
     """Colour in the middle of a cell; row 0 is the southernmost."""
-    x = sheet.LEFT + column * cell_px + cell_px // 2
-    y = sheet.TOP + (rows - 1 - row) * cell_px + cell_px // 2
+    x = frame.LEFT + column * cell_px + cell_px // 2
+    y = frame.TOP + (rows - 1 - row) * cell_px + cell_px // 2
     return tuple(int(v) for v in image[y, x])
 
 
@@ -36,36 +36,36 @@ def test_north_is_up_and_east_is_right():
     values = np.full((4, 4), 0.008)
     values[3, 0] = 0.25  # north-west
     image = draw_resistance(region(4, 4, resistance=values))
-    top_left = image[sheet.TOP + 10, sheet.LEFT + 10]
+    top_left = image[frame.TOP + 10, frame.LEFT + 10]
     assert tuple(top_left) == ZONES[4].bgr
 
 
 def test_usual_site_has_five_pixels_per_metre():
     image = draw_resistance(region(200, 150, resistance=0.02))
-    ground = image[sheet.TOP : sheet.TOP + 750, sheet.LEFT : sheet.LEFT + 1000]
+    ground = image[frame.TOP : frame.TOP + 750, frame.LEFT : frame.LEFT + 1000]
     assert (ground == ZONES[1].bgr).all()
-    assert tuple(image[sheet.TOP + 751, sheet.LEFT + 500]) != ZONES[1].bgr
+    assert tuple(image[frame.TOP + 751, frame.LEFT + 500]) != ZONES[1].bgr
 
 
 def test_slope_is_red_uphill_and_downhill():
     east = np.array([[0.0, 0.27, -0.27, 0.1, NAN]])
     image = draw_grade(region(5, 1, grade_east=east, grade_north=0.0))
-    corner = [tuple(image[sheet.TOP + 3, sheet.LEFT + 64 * column + 3]) for column in range(5)]
+    corner = [tuple(image[frame.TOP + 3, frame.LEFT + 64 * column + 3]) for column in range(5)]
     flat, slope = ZONES[0].bgr, ZONES[1].bgr
     assert corner == [flat, slope, slope, flat, plotter.UNKNOWN_COLOUR]
 
 
 def test_arrow_tip_points_uphill():
     hill = region(1, 1, grade_east=0.0, grade_north=0.3)
-    ground = draw_grade(hill)[sheet.TOP : sheet.TOP + 64, sheet.LEFT : sheet.LEFT + 64]
+    ground = draw_grade(hill)[frame.TOP : frame.TOP + 64, frame.LEFT : frame.LEFT + 64]
     white = (ground > 200).all(axis=2)
     assert white[:32].sum() > white[32:].sum() + 5  # the head is in the northern half
 
 
 def test_wrong_cells_are_loud_and_counted(monkeypatch):
     titles = []
-    real = sheet.text
-    monkeypatch.setattr(sheet, "text", lambda s, words, *a: (titles.append(words), real(s, words, *a)))
+    real = frame.text
+    monkeypatch.setattr(frame, "text", lambda s, words, *a: (titles.append(words), real(s, words, *a)))
     values = np.array([[0.008, 0.008, 0.25, NAN]])
     image = draw_difference(region(4, 1, resistance=values), {"resistance": np.full((1, 4), 0.008)}, "resistance")
     shown = [cell_colour(image, column, 0, 1, plotter.MAX_CELL_PX) for column in range(4)]
@@ -110,7 +110,7 @@ def test_thin_track_stays_visible_on_a_large_map():
     values = np.full((1300, 2600), np.nan)
     values[700, :] = 0.25
     image = draw_resistance(region(2600, 1300, resistance=values))
-    ground = image[sheet.TOP :, sheet.LEFT : sheet.LEFT + 800]
+    ground = image[frame.TOP :, frame.LEFT : frame.LEFT + 800]
     assert (ground == ZONES[4].bgr).all(axis=2).any(axis=0).all()
 
 

@@ -32,7 +32,7 @@ from protocol.site import SiteConfig
 
 LOOK_BLOCKS = 256  # at a time
 ARCHIVE_S = 60.0  # between two looks for rows that are old enough
-log = logging.getLogger("mapserver.keeper")
+log = logging.getLogger("mapserver.follower.follower")
 
 
 class Keeper:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.sheet import EDGE, MAX_NAME, PAPER, Axes, Colour, Entry, Image, compose, text, text_size
+from mapserver.pictures.frame import EDGE, MAX_NAME, PAPER, Axes, Colour, Entry, Image, compose, text, text_size
 from protocol.arrays import AnyArray, Floats, Ints
 from protocol.ground import SLOPE, UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
 from protocol.queries import Region

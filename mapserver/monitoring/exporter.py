@@ -16,7 +16,7 @@ from typing import Any
 
 import zenoh
 
-from mapserver.metrics import CONTENT_TYPE, Heard, Host, metrics_of, render
+from mapserver.monitoring.metrics import CONTENT_TYPE, Heard, Host, metrics_of, render
 from protocol import keys
 from protocol.codec import MAX_SMALL_BYTES, decode_health
 from protocol.errors import ConfigError, LinkError, MessageError
@@ -25,7 +25,7 @@ PATH = "/metrics"
 MOST_AGENTS = 1000  # names are free to choose where there are no keys
 REQUEST_S = 5.0
 _STARTED_S = time.time()
-log = logging.getLogger("mapserver.exporter")
+log = logging.getLogger("mapserver.monitoring.exporter")
 
 
 class HealthEar:

@@ -1,0 +1,1 @@
+"""The server in numbers, for Prometheus."""
