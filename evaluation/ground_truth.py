@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from protocol.arrays import Floats, Ints
 from protocol.ground import UNKNOWN
-from sim.ground import GroundConfig, lay
+from sim.scenario.ground import GroundConfig, lay
 from sim.terrain import Terrain
 from sim.truth import TruthMap, truth_map
 

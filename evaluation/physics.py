@@ -15,7 +15,7 @@ from sim.bullet import BulletWorld
 from sim.config import SimConfig
 from sim.fleet import Fleet
 from sim.machine_model import MachineModel, load_model
-from sim.scenario_file import load_scenario
+from sim.scenario.file import load_scenario
 from sim.simulator import Simulator
 from sim.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
 from sim.terrain import Terrain

@@ -21,8 +21,8 @@ from protocol.site import SiteConfig
 from sim.config import SimConfig
 from sim.presets import load_preset
 from sim.recorder import record
-from sim.scenario import FleetConfig, Scenario
-from sim.scenario_file import load_scenario
+from sim.scenario.file import load_scenario
+from sim.scenario.tables import FleetConfig, Scenario
 
 ROOT = Path(__file__).parents[1]
 MACHINE = "loader"

@@ -10,8 +10,8 @@ from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from protocol.readings import MAX_STAMP_NS
 from protocol.site import NAME
-from sim.scenario import MAX_MACHINES, FleetConfig, Scenario
-from sim.scenario_file import check, load_scenario
+from sim.scenario.file import check, load_scenario
+from sim.scenario.tables import MAX_MACHINES, FleetConfig, Scenario
 
 T = TypeVar("T", FleetConfig, Scenario)
 STEP_MS = 10  # the world runs at 100 Hz

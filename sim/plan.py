@@ -15,10 +15,10 @@ from protocol.arrays import Floats
 from protocol.geometry import Bounds
 from protocol.ground import ZONES
 from sim.canvas import INK, Canvas, beside
-from sim.ground import Ramp, lay, soil_index
 from sim.machine_model import MachineModel
 from sim.routes import Leg, Route
-from sim.scenario import Change, Scenario
+from sim.scenario.ground import Ramp, lay, soil_index
+from sim.scenario.tables import Change, Scenario
 from sim.terrain import Terrain
 from sim.world import FleetState
 

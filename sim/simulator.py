@@ -15,10 +15,10 @@ from sim.config import STEP_MS, SimConfig, resolve
 from sim.course import Start, lay_course, line_up
 from sim.driver import DRIVER_STEPS, board, drive, hire, idle, look_out
 from sim.fleet import Fleet
-from sim.ground import lay, pave
 from sim.machine_model import MachineModel
 from sim.machines import draw_bodies
-from sim.scenario import Scenario
+from sim.scenario.ground import lay, pave
+from sim.scenario.tables import Scenario
 from sim.sensors import Sensors, Span
 from sim.terrain import Terrain
 from sim.traffic import APART_M, LOOK_OUT_STEPS

@@ -24,7 +24,7 @@ from protocol.session import free_endpoint
 from protocol.site import load_site
 from sim.config import SimConfig, resolve
 from sim.recorder import TRACKS_FOLDER
-from sim.scenario import Scenario
+from sim.scenario.tables import Scenario
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.commands.plot import draw, draw_both

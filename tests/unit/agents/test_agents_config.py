@@ -12,7 +12,7 @@ from agents.estimation.plausibility import FAULTS
 from protocol.errors import ConfigError
 from protocol.machine import MachineConfig, Mount, SensorConfig
 from protocol.site import SiteConfig, load_site
-from sim.scenario_file import load_scenario
+from sim.scenario.file import load_scenario
 
 CONFIG = Path(__file__).resolve().parents[3] / "config"
 

@@ -12,7 +12,7 @@ from evaluation.ground_score import Judged, c_rr_bias, figures, gather, judge, p
 from evaluation.ground_truth import Ground, Way, border_distance, lay_ground, read_way
 from protocol.ground import UNKNOWN
 from protocol.samples import SAMPLE_DTYPE
-from sim.ground import GroundConfig, Ramp, Zone
+from sim.scenario.ground import GroundConfig, Ramp, Zone
 
 SPEED_MPS, EVERY_M = 2.0, 0.5
 BORDER_M = 20.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from protocol.arrays import Floats
 from sim.config import SimConfig
-from sim.scenario import Scenario
+from sim.scenario.tables import Scenario
 from sim.simulator import Simulator
 from sim.world import FleetState, stack
 

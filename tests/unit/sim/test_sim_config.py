@@ -6,7 +6,7 @@ import pytest
 
 from protocol.errors import ConfigError
 from sim.config import SimConfig, load_sim, resolve
-from sim.scenario_file import load_scenario
+from sim.scenario.file import load_scenario
 
 EXAMPLE = Path(__file__).parents[3] / "config" / "sim.toml"
 

@@ -9,7 +9,7 @@ from sim_drives import Driven, drive
 
 from sim.config import SimConfig
 from sim.driver import bend
-from sim.ground import lay
+from sim.scenario.ground import lay
 from sim.vehicle import GRAVITY
 from sim.world import FleetState
 

@@ -7,10 +7,10 @@ from protocol.config import load_toml
 from protocol.errors import ConfigError
 from protocol.ground import ZONES
 from sim.driver import bend
-from sim.ground import lay
 from sim.machine_model import load_model
 from sim.routes import tour
-from sim.scenario_file import FOLDER, load_scenario
+from sim.scenario.file import FOLDER, load_scenario
+from sim.scenario.ground import lay
 
 LIBRARY = sorted(path.stem for path in FOLDER.glob("*.toml"))
 

@@ -16,7 +16,7 @@ from protocol.machine import machine_toml
 from protocol.session import free_endpoint
 from protocol.site import load_site
 from sim.config import resolve
-from sim.scenario_file import load_scenario
+from sim.scenario.file import load_scenario
 from sim.truth import TruthMap
 from sitegrid.cli import build_parser, main
 from sitegrid.commands import agent, sim

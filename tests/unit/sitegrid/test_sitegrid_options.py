@@ -10,7 +10,7 @@ import pytest
 from mapserver.config import ServerConfig
 from protocol.geometry import Bounds
 from protocol.logfolder import open_log
-from sim.scenario_file import FOLDER, load_scenario
+from sim.scenario.file import FOLDER, load_scenario
 from sitegrid.cli import build_parser
 from sitegrid.commands import agent, demo, plot, server
 

@@ -17,7 +17,7 @@ from sim.machine_model import MachineModel, load_model
 from sim.machines import machine_config
 from sim.presets import parse_preset
 from sim.routes import Leg, Route
-from sim.scenario import FleetConfig, Scenario
+from sim.scenario.tables import FleetConfig, Scenario
 
 FOLDER = Path(__file__).parent / "scenarios"
 MARGIN_M = 3.0  # that a route keeps from the edges of the map

@@ -1,0 +1,1 @@
+"""What is simulated: scenario files, their tables, and the ground that they describe."""
