@@ -14,12 +14,12 @@ from protocol.arrays import Floats
 from sim.bullet import BulletWorld
 from sim.config import SimConfig
 from sim.fleet import Fleet
-from sim.machine_model import MachineModel, load_model
+from sim.machines.model import MachineModel, load_model
+from sim.machines.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
+from sim.machines.vehicle import GRAVITY, Bodies
 from sim.scenario.file import load_scenario
 from sim.simulator import Simulator
-from sim.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
 from sim.terrain import Terrain
-from sim.vehicle import GRAVITY, Bodies
 from sim.world import STEP_S, FleetState, World, stack
 
 WORLDS: dict[str, type[BulletWorld] | type[Fleet]] = {"pybullet": BulletWorld, "fast": Fleet}

@@ -19,10 +19,10 @@ from protocol.machine import MachineConfig
 from protocol.readings import Reading
 from protocol.site import SiteConfig
 from sim.config import SimConfig
-from sim.presets import load_preset
 from sim.recorder import record
 from sim.scenario.file import load_scenario
 from sim.scenario.tables import FleetConfig, Scenario
+from sim.sensors.presets import load_preset
 
 ROOT = Path(__file__).parents[1]
 MACHINE = "loader"

@@ -8,22 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocol.arrays import Floats
-from sim.machine_model import WHEELS, MachineModel
+from sim.machines.model import WHEELS, MachineModel
+from sim.machines.soil import TRACTION
+from sim.machines.vehicle import GRAVITY, SETTLE_STEPS, TRACTION_USE, Bodies, chassis_of, drive_force_n, steering_radps
 from sim.multibody import MultiBodies
 from sim.observe import Burden, Drive, observe
 from sim.rigid import POINT_FRAME, Ground, look
-from sim.soil import TRACTION
 from sim.terrain import Terrain
 from sim.tyre import Motion, TyreForces, Tyres, at_rest, radial_load, roll
-from sim.vehicle import (
-    GRAVITY,
-    SETTLE_STEPS,
-    TRACTION_USE,
-    Bodies,
-    chassis_of,
-    drive_force_n,
-    steering_radps,
-)
 from sim.world import STEP_S, FleetState
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from sim.course import Course, Start
-from sim.machine_model import MachineModel
+from sim.machines.model import MachineModel
 from sim.traffic import Bodywork, clear_way
 from sim.world import FleetState
 

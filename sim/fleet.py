@@ -13,10 +13,9 @@ import numpy as np
 
 from protocol.arrays import Floats
 from sim import kernels as k
-from sim.machine_model import MachineModel
-from sim.soil import C_RR, SLIP_STIFFNESS, TRACTION
-from sim.terrain import Terrain
-from sim.vehicle import (
+from sim.machines.model import MachineModel
+from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
+from sim.machines.vehicle import (
     GRAVITY,
     SETTLE_STEPS,
     STANDSTILL_MPS,
@@ -27,6 +26,7 @@ from sim.vehicle import (
     steering_radps,
     weigh,
 )
+from sim.terrain import Terrain
 from sim.world import STEP_S, FleetState
 
 _CONSTANTS = k.Constants(STEP_S, GRAVITY, STANDSTILL_MPS, TRACTION_USE)

@@ -14,9 +14,9 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.machine import BASE, FRONT
 from sim.engine import pybullet
-from sim.machine_model import PAYLOAD, WHEELS, MachineModel
-from sim.urdf import rigid_urdf
-from sim.vehicle import GRAVITY
+from sim.machines.model import PAYLOAD, WHEELS, MachineModel
+from sim.machines.urdf import rigid_urdf
+from sim.machines.vehicle import GRAVITY
 
 OSCILLATION_NM = 2000.0  # friction of the joint that lets all wheels touch
 FRAMES = 3  # that are watched: rear frame, front frame, and the carrier of the rear wheels

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats
+from sim.machines.soil import C_RR
+from sim.machines.vehicle import GRAVITY
 from sim.rigid import BASE_POINT, Scene, articulation, attitude, plane_gradient
-from sim.soil import C_RR
-from sim.vehicle import GRAVITY
 from sim.world import STEP_S, FleetState
 
 _GRAVITY_UP = np.array([0.0, 0.0, GRAVITY])

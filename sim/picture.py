@@ -13,7 +13,7 @@ from mapserver.pictures.frame import INK, Image, text
 from mapserver.pictures.plotter import write_image
 from protocol.errors import ConfigError
 from sim.config import SimConfig
-from sim.machine_model import MachineModel
+from sim.machines.model import MachineModel
 from sim.plan import draw_plan
 from sim.render import closeup, overview, render
 from sim.simulator import Simulator

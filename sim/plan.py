@@ -15,7 +15,7 @@ from protocol.arrays import Floats
 from protocol.geometry import Bounds
 from protocol.ground import ZONES
 from sim.canvas import INK, Canvas, beside
-from sim.machine_model import MachineModel
+from sim.machines.model import MachineModel
 from sim.routes import Leg, Route
 from sim.scenario.ground import Ramp, lay, soil_index
 from sim.scenario.tables import Change, Scenario

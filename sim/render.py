@@ -13,7 +13,7 @@ import numpy as np
 from protocol.arrays import AnyArray, Floats, Ints
 from protocol.ground import ZONES
 from sim.engine import pybullet
-from sim.machine_model import FOLDER, MachineModel
+from sim.machines.model import FOLDER, MachineModel
 from sim.terrain import Terrain
 from sim.world import FleetState
 

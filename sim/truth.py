@@ -12,7 +12,7 @@ import numpy as np
 
 from protocol.arrays import Floats32, Table
 from protocol.errors import StoreError
-from sim.soil import C_RR
+from sim.machines.soil import C_RR
 from sim.terrain import Terrain
 
 TRACK_EVERY = 10  # steps: 10 Hz

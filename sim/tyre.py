@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.soil import C_RR, SLIP_STIFFNESS, TRACTION
-from sim.vehicle import GRAVITY, STANDSTILL_MPS
+from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
+from sim.machines.vehicle import GRAVITY, STANDSTILL_MPS
 
 BRISTLE_DAMPING = 0.3  # of a wheel's share of the machine on its bristles, against critical; nothing at steady slip
 LONGEST_STRETCH = 2.5  # of a bristle, against where its tangent meets the traction limit: then the tread slides

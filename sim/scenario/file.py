@@ -13,11 +13,11 @@ import numpy as np
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from sim.driver import bend
-from sim.machine_model import MachineModel, load_model
-from sim.machines import machine_config
-from sim.presets import parse_preset
+from sim.machines.model import MachineModel, load_model
 from sim.routes import Leg, Route
 from sim.scenario.tables import FleetConfig, Scenario
+from sim.sensors.presets import parse_preset
+from sim.sensors.rigs import machine_config
 
 FOLDER = Path(__file__).parent / "scenarios"
 MARGIN_M = 3.0  # that a route keeps from the edges of the map

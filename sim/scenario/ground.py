@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.soil import SOILS
+from sim.machines.soil import SOILS
 from sim.terrain import Terrain
 
 FILLET_M = 2.0  # length over which the foot and the crown of a ramp are rounded

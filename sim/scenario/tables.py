@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from protocol.site import NAME, SiteConfig
-from sim.machine_model import load_model
-from sim.machines import Faults, Rig, machine_config
-from sim.presets import Preset, load_preset
+from sim.machines.model import load_model
 from sim.routes import ROUNDING_M, Leg, Route, tour, way
 from sim.scenario.ground import GroundConfig, Point, Zone
+from sim.sensors.presets import Preset, load_preset
+from sim.sensors.rigs import Faults, Rig, machine_config
 
 WORLDS = ("pybullet", "fast")
 MAX_MACHINES = 1000

@@ -9,9 +9,9 @@ import pytest
 
 from sim.bullet import BulletWorld
 from sim.fleet import Fleet
-from sim.machine_model import MachineModel, load_model
+from sim.machines.model import MachineModel, load_model
+from sim.machines.vehicle import Bodies
 from sim.terrain import Terrain
-from sim.vehicle import Bodies
 from sim.world import STEP_S, FleetState, World
 
 LOADER, TRUCK = load_model("wheel_loader"), load_model("dump_truck")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from protocol.site import Projection, SiteConfig
-from sim.bank import Block
-from sim.datasheets import GpsNoise
-from sim.machine_model import load_model
-from sim.machines import Faults, Rig, machine_config
-from sim.presets import Preset, load_preset
-from sim.sensors import Sensors
+from sim.machines.model import load_model
+from sim.sensors.datasheets import GpsNoise
+from sim.sensors.presets import Preset, load_preset
+from sim.sensors.rigs import Faults, Rig, machine_config
+from sim.sensors.sensor_group import Block
+from sim.sensors.sensors import Sensors
 from sim.world import FleetState
 
 SEED = 7

@@ -11,9 +11,9 @@ from sim_bullet_worlds import BOTH, LOADER, TRUCK, hold_speed, idle, placed, pla
 
 from protocol.arrays import Floats
 from sim.bullet import BulletWorld
-from sim.machine_model import MachineModel
-from sim.soil import SAND, SLIP_STIFFNESS, TRACTION
-from sim.vehicle import GRAVITY, Bodies
+from sim.machines.model import MachineModel
+from sim.machines.soil import SAND, SLIP_STIFFNESS, TRACTION
+from sim.machines.vehicle import GRAVITY, Bodies
 from sim.world import STEP_S, FleetState, stack
 
 

@@ -9,8 +9,8 @@ from sim_drives import Driven, drive
 
 from sim.config import SimConfig
 from sim.driver import bend
+from sim.machines.vehicle import GRAVITY
 from sim.scenario.ground import lay
-from sim.vehicle import GRAVITY
 from sim.world import FleetState
 
 

@@ -18,9 +18,9 @@ from sim_sensor_rigs import (
     values,
 )
 
-from sim.machines import Rig
-from sim.presets import Preset
-from sim.sensors import Sensors
+from sim.sensors.presets import Preset
+from sim.sensors.rigs import Rig
+from sim.sensors.sensors import Sensors
 
 N = 1000  # machines, hence independent draws
 RATES = pytest.mark.parametrize("rate_hz", [5, 10])

@@ -4,9 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sim.machines.soil import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT
 from sim.scenario.file import load_scenario
 from sim.scenario.ground import GroundConfig, Ramp, Zone, lay, pave
-from sim.soil import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT
 from sim.terrain import Terrain
 from sim.truth import truth_map
 

@@ -19,7 +19,7 @@ from sim_sensor_rigs import (
 )
 
 from protocol.machine import BASE, FRONT, Mount
-from sim.presets import Preset
+from sim.sensors.presets import Preset
 from sim.world import FleetState
 
 N = 500

@@ -6,8 +6,8 @@ from sim_bullet_worlds import LOADER, TRUCK
 
 from protocol.errors import ConfigError
 from protocol.machine import MachineConfig, Mount
-from sim.machine_model import BASE, FOLDER, FRONT, PAYLOAD, WHEELS, MachineModel, load_model
-from sim.urdf import Mass, Pose, joined, read_urdf, rigid_urdf, rpy_rad
+from sim.machines.model import BASE, FOLDER, FRONT, PAYLOAD, WHEELS, MachineModel, load_model
+from sim.machines.urdf import Mass, Pose, joined, read_urdf, rigid_urdf, rpy_rad
 
 BOTH = pytest.mark.parametrize("model", [LOADER, TRUCK], ids=lambda m: m.name)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sim_sensor_rigs import check_correlation, check_deviation
 
-from sim.noise import BLOCK_ROWS, STREAMS, Draws, GaussMarkov, generator, site_generator
+from sim.sensors.noise import BLOCK_ROWS, STREAMS, Draws, GaussMarkov, generator, site_generator
 
 SEED = 7
 UNITS = 2000

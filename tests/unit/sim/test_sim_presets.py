@@ -10,10 +10,10 @@ from sim_sensor_rigs import DGPS, LOADER, noisy, perfect, rig
 from protocol.config import load_toml
 from protocol.errors import ConfigError
 from protocol.machine import BASE, FRONT
-from sim.datasheets import EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise
-from sim.machines import Rig, draw_bodies, machine_config
-from sim.presets import LIBRARY, load_preset, parse_preset
-from sim.sensors import _BANKS
+from sim.sensors.datasheets import EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise
+from sim.sensors.presets import LIBRARY, load_preset, parse_preset
+from sim.sensors.rigs import Rig, draw_bodies, machine_config
+from sim.sensors.sensors import _BANKS
 
 NAMES = tuple(load_toml(LIBRARY))
 HARDER = ("dgps", "harsh")

@@ -22,8 +22,8 @@ from sim_sensor_rigs import (
 )
 
 from protocol.readings import Reading, columns, parse_reading
-from sim.machines import Faults, Rig
-from sim.sensors import Sensors
+from sim.sensors.rigs import Faults, Rig
+from sim.sensors.sensors import Sensors
 from sim.world import FleetState
 
 N = 500

@@ -16,8 +16,8 @@ from protocol.logfolder import open_log
 from protocol.readings import Gps, Imu, Reading, parse_reading
 from protocol.site import Projection
 from sim.config import SimConfig
-from sim.presets import load_preset
 from sim.recorder import record
+from sim.sensors.presets import load_preset
 from sim.simulator import Simulator
 from sim.truth import TRACK_VALUES, TruthMap
 

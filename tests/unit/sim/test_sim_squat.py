@@ -8,10 +8,10 @@ from sim_bullet_worlds import BOTH, hold_speed, idle, placed, plane
 
 from protocol.machine import MachineConfig
 from sim.bullet import BulletWorld
-from sim.machine_model import MachineModel
-from sim.machines import machine_config
-from sim.presets import load_preset
-from sim.vehicle import GRAVITY
+from sim.machines.model import MachineModel
+from sim.machines.vehicle import GRAVITY
+from sim.sensors.presets import load_preset
+from sim.sensors.rigs import machine_config
 
 
 def load_difference_n(machine: MachineConfig, payload_kg: float, force_x_mps2: float, force_z_mps2: float) -> float:

@@ -9,10 +9,10 @@ from sim_bullet_worlds import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, n
 
 from protocol.machine import Mount
 from sim.fleet import Fleet
-from sim.machine_model import MachineModel
-from sim.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
+from sim.machines.model import MachineModel
+from sim.machines.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
+from sim.machines.vehicle import GRAVITY, chassis_of, drive_force_n, steering_radps, weigh
 from sim.terrain import Terrain
-from sim.vehicle import GRAVITY, chassis_of, drive_force_n, steering_radps, weigh
 from sim.world import STEP_S, FleetState, stack
 
 

@@ -10,9 +10,9 @@ from sim_bullet_worlds import BOTH, EACH, GRADE_15, LOADER, TRUCK, hold_speed, i
 
 from sim.bullet import BulletWorld
 from sim.fleet import Fleet
-from sim.machine_model import MachineModel
-from sim.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
-from sim.vehicle import GRAVITY, TRACTION_USE, Bodies
+from sim.machines.model import MachineModel
+from sim.machines.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
+from sim.machines.vehicle import GRAVITY, TRACTION_USE, Bodies
 from sim.world import STEP_S, FleetState, World, stack
 
 

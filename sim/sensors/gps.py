@@ -8,10 +8,10 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site import Projection
-from sim.bank import Bank, Unit
-from sim.datasheets import BASE_RATE_HZ
 from sim.frames import map_from_base
-from sim.noise import Draws, GaussMarkov, generator, site_generator
+from sim.sensors.datasheets import BASE_RATE_HZ
+from sim.sensors.noise import Draws, GaussMarkov, generator, site_generator
+from sim.sensors.sensor_group import Bank, Unit
 from sim.world import STEP_S, FleetState
 
 AXES = np.array([1.0, 1.0, 5 / 3])  # heights are this much worse

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.machine import MachineConfig, Mount, SensorConfig
-from sim.datasheets import GpsNoise
-from sim.machine_model import MachineModel
-from sim.noise import generator
-from sim.presets import Preset
-from sim.vehicle import Bodies
+from sim.machines.model import MachineModel
+from sim.machines.vehicle import Bodies
+from sim.sensors.datasheets import GpsNoise
+from sim.sensors.noise import generator
+from sim.sensors.presets import Preset
 
 
 @dataclass(frozen=True)

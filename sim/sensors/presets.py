@@ -1,4 +1,4 @@
-"""Presets: named sets of sensor errors, as bad as real sensors. `sim/presets.toml` is their library."""
+"""Presets: named sets of sensor errors, as bad as real sensors. `sim/sensors/presets.toml` is their library."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from protocol.site import NAME
-from sim.datasheets import (
+from sim.sensors.datasheets import (
     ArticulationNoise,
     AttitudeNoise,
     BodySpread,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from protocol.arrays import Bools, Floats
-from sim.machine_model import MachineModel
+from sim.machines.model import MachineModel
 from sim.world import STEP_S
 
 GRAVITY = 9.80665

@@ -11,8 +11,8 @@ import numpy as np
 from protocol.arrays import Bools, Floats, Ints
 from protocol.machine import SensorConfig
 from protocol.readings import KINDS, Reading, columns
-from sim.datasheets import BASE_RATE_HZ
-from sim.machines import Rig
+from sim.sensors.datasheets import BASE_RATE_HZ
+from sim.sensors.rigs import Rig
 from sim.world import STEP_S, FleetState
 
 

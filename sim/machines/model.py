@@ -12,7 +12,7 @@ from protocol.arrays import Floats
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from protocol.machine import BASE, FRONT, Mount
-from sim.urdf import Mass, Pose, Robot, joined, read_urdf, rpy_rad
+from sim.machines.urdf import Mass, Pose, Robot, joined, read_urdf, rpy_rad
 
 FOLDER = Path(__file__).parent / "models"
 PAYLOAD = "payload_link"

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from protocol.arrays import Ints
 from protocol.readings import Reading
 from protocol.site import Projection
-from sim.bank import Bank, Block, Unit
-from sim.drivetrain import ArticulationBank, EncoderBank, PayloadBank, TorqueBank
-from sim.gps import GpsBank
-from sim.inertial import AttitudeBank, ImuBank
-from sim.machines import Rig
-from sim.noise import generator
+from sim.sensors.drivetrain import ArticulationBank, EncoderBank, PayloadBank, TorqueBank
+from sim.sensors.gps import GpsBank
+from sim.sensors.inertial import AttitudeBank, ImuBank
+from sim.sensors.noise import generator
+from sim.sensors.rigs import Rig
+from sim.sensors.sensor_group import Bank, Block, Unit
 from sim.world import FleetState
 
 _BANKS: dict[str, type[Bank]] = {

@@ -9,9 +9,9 @@ import numpy as np
 
 from protocol.arrays import Floats, Ints
 from protocol.machine import BASE, FRONT
-from sim.bank import Bank, Unit
 from sim.frames import compose, cross, quaternion, rotation, seen_turned, turned
-from sim.noise import Draws, GaussMarkov
+from sim.sensors.noise import Draws, GaussMarkov
+from sim.sensors.sensor_group import Bank, Unit
 from sim.world import FleetState
 
 _LEVEL = np.zeros(1)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.bank import Bank, Unit
-from sim.noise import Draws, GaussMarkov
+from sim.sensors.noise import Draws, GaussMarkov
+from sim.sensors.sensor_group import Bank, Unit
 from sim.world import FleetState
 
 

@@ -1,0 +1,1 @@
+"""What machines' sensors read of a true state: models of their errors, and rigs of them."""
