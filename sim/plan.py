@@ -16,7 +16,7 @@ from protocol.geometry import Bounds
 from protocol.ground import ZONES
 from sim.canvas import INK, Canvas, beside
 from sim.machines.model import MachineModel
-from sim.routes import Leg, Route
+from sim.operators.routes import Leg, Route
 from sim.scenario.ground import Ramp, lay, soil_index
 from sim.scenario.tables import Change, Scenario
 from sim.terrain import Terrain

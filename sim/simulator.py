@@ -12,17 +12,17 @@ from protocol.machine import MachineConfig
 from protocol.readings import Reading
 from protocol.site import Projection, SiteConfig
 from sim.config import STEP_MS, SimConfig, resolve
-from sim.course import Start, lay_course, line_up
-from sim.driver import DRIVER_STEPS, board, drive, hire, idle, look_out
 from sim.fleet import Fleet
 from sim.machines.model import MachineModel
 from sim.machines.vehicle import Bodies
+from sim.operators.course import Start, lay_course, line_up
+from sim.operators.driver import DRIVER_STEPS, board, drive, hire, idle, look_out
+from sim.operators.traffic import APART_M, LOOK_OUT_STEPS
 from sim.scenario.ground import lay, pave
 from sim.scenario.tables import Scenario
 from sim.sensors.rigs import draw_bodies
 from sim.sensors.sensors import Sensors, Span
 from sim.terrain import Terrain
-from sim.traffic import APART_M, LOOK_OUT_STEPS
 from sim.truth import TRACK_DTYPE, TRACK_EVERY, TRACK_VALUES, TruthMap, truth_map
 from sim.world import STEP_S, FleetState, World, stack
 

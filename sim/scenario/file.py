@@ -12,9 +12,9 @@ import numpy as np
 
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
-from sim.driver import bend
 from sim.machines.model import MachineModel, load_model
-from sim.routes import Leg, Route
+from sim.operators.driver import bend
+from sim.operators.routes import Leg, Route
 from sim.scenario.tables import FleetConfig, Scenario
 from sim.sensors.presets import parse_preset
 from sim.sensors.rigs import machine_config

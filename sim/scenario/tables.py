@@ -11,7 +11,7 @@ import numpy as np
 
 from protocol.site import NAME, SiteConfig
 from sim.machines.model import load_model
-from sim.routes import ROUNDING_M, Leg, Route, tour, way
+from sim.operators.routes import ROUNDING_M, Leg, Route, tour, way
 from sim.scenario.ground import GroundConfig, Point, Zone
 from sim.sensors.presets import Preset, load_preset
 from sim.sensors.rigs import Faults, Rig, machine_config

@@ -8,8 +8,8 @@ import pytest
 from sim_drives import Driven, drive
 
 from sim.config import SimConfig
-from sim.driver import bend
 from sim.machines.vehicle import GRAVITY
+from sim.operators.driver import bend
 from sim.scenario.ground import lay
 from sim.world import FleetState
 

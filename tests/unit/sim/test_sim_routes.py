@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from sim.course import BEYOND_M, lay_course, line_up
-from sim.routes import SPACING_M, Route, speed_limits, tour, way
+from sim.operators.course import BEYOND_M, lay_course, line_up
+from sim.operators.routes import SPACING_M, Route, speed_limits, tour, way
 
 SQUARE = ((0.0, 0.0), (100.0, 0.0), (100.0, 100.0), (0.0, 100.0))
 HOOK = ((0.0, 0.0), (40.0, 0.0), (50.0, 20.0), (50.0, 60.0))

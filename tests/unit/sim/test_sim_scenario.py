@@ -6,9 +6,9 @@ import pytest
 from protocol.config import load_toml
 from protocol.errors import ConfigError
 from protocol.ground import ZONES
-from sim.driver import bend
 from sim.machines.model import load_model
-from sim.routes import tour
+from sim.operators.driver import bend
+from sim.operators.routes import tour
 from sim.scenario.file import FOLDER, load_scenario
 from sim.scenario.ground import lay
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.course import BEYOND_M, Course
+from sim.operators.course import BEYOND_M, Course
 from sim.world import FleetState
 
 LOOK_OUT_STEPS = 20  # of the world: drivers look about at 5 Hz

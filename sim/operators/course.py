@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
-from sim.routes import SPACING_M, Leg, Route, speed_limits
+from sim.operators.routes import SPACING_M, Leg, Route, speed_limits
 
 BEYOND_M = 24.0  # every leg goes on for so long, for drivers to look ahead
 

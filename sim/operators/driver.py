@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
-from sim.course import Course, Start
 from sim.machines.model import MachineModel
-from sim.traffic import Bodywork, clear_way
+from sim.operators.course import Course, Start
+from sim.operators.traffic import Bodywork, clear_way
 from sim.world import FleetState
 
 DRIVER_STEPS = 5  # of the world: drivers act at 20 Hz

@@ -1,0 +1,1 @@
+"""Who drives: routes, pure pursuit along them, and regard for other machines."""
