@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Floats
-from sim.bullet import BulletWorld
 from sim.config import SimConfig
-from sim.fleet import Fleet
 from sim.machines.model import MachineModel, load_model
 from sim.machines.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
 from sim.machines.vehicle import GRAVITY, Bodies
 from sim.scenario.file import load_scenario
 from sim.simulator import Simulator
-from sim.terrain import Terrain
-from sim.world import STEP_S, FleetState, World, stack
+from sim.worlds.bullet import BulletWorld
+from sim.worlds.fast import Fleet
+from sim.worlds.terrain import Terrain
+from sim.worlds.world import STEP_S, FleetState, World, stack
 
 WORLDS: dict[str, type[BulletWorld] | type[Fleet]] = {"pybullet": BulletWorld, "fast": Fleet}
 GRADE_15 = math.tan(math.radians(15))

@@ -19,8 +19,8 @@ from sim.machines.model import MachineModel
 from sim.operators.routes import Leg, Route
 from sim.scenario.ground import Ramp, lay, soil_index
 from sim.scenario.tables import Change, Scenario
-from sim.terrain import Terrain
-from sim.world import FleetState
+from sim.worlds.terrain import Terrain
+from sim.worlds.world import FleetState
 
 WIDTH_PX, HEIGHT_PX = 1380, 900  # of the ground, at most
 PALE = 0.6  # strength of the paper's colours, so that what is drawn on them can be read

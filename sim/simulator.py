@@ -12,7 +12,6 @@ from protocol.machine import MachineConfig
 from protocol.readings import Reading
 from protocol.site import Projection, SiteConfig
 from sim.config import STEP_MS, SimConfig, resolve
-from sim.fleet import Fleet
 from sim.machines.model import MachineModel
 from sim.machines.vehicle import Bodies
 from sim.operators.course import Start, lay_course, line_up
@@ -22,9 +21,10 @@ from sim.scenario.ground import lay, pave
 from sim.scenario.tables import Scenario
 from sim.sensors.rigs import draw_bodies
 from sim.sensors.sensors import Sensors, Span
-from sim.terrain import Terrain
 from sim.truth import TRACK_DTYPE, TRACK_EVERY, TRACK_VALUES, TruthMap, truth_map
-from sim.world import STEP_S, FleetState, World, stack
+from sim.worlds.fast import Fleet
+from sim.worlds.terrain import Terrain
+from sim.worlds.world import STEP_S, FleetState, World, stack
 
 STEP_NS = STEP_MS * 1_000_000
 
@@ -153,7 +153,7 @@ def build_world(
     places: Floats = np.column_stack([base, heading])
     if name == "fast":
         return Fleet(terrain, models, bodies, places)
-    from sim.bullet import BulletWorld  # imported here: the fast world needs no PyBullet
+    from sim.worlds.bullet import BulletWorld  # imported here: the fast world needs no PyBullet
 
     return BulletWorld(terrain, models, bodies, places)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats
 from sim.machines.model import MachineModel
-from sim.world import STEP_S
+from sim.worlds.world import STEP_S
 
 GRAVITY = 9.80665
 # Of what the worst soil under a machine's wheels can take, with the torque split in proportion to the wheels' loads,

@@ -12,7 +12,7 @@ from protocol.machine import BASE, FRONT
 from sim.frames import compose, cross, quaternion, rotation, seen_turned, turned
 from sim.sensors.noise import Draws, GaussMarkov
 from sim.sensors.sensor_group import Bank, Unit
-from sim.world import FleetState
+from sim.worlds.world import FleetState
 
 _LEVEL = np.zeros(1)
 

@@ -13,7 +13,7 @@ from protocol.machine import SensorConfig
 from protocol.readings import KINDS, Reading, columns
 from sim.sensors.datasheets import BASE_RATE_HZ
 from sim.sensors.rigs import Rig
-from sim.world import STEP_S, FleetState
+from sim.worlds.world import STEP_S, FleetState
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from sim.sensors.presets import Preset, load_preset
 from sim.sensors.rigs import Faults, Rig, machine_config
 from sim.sensors.sensor_group import Block
 from sim.sensors.sensors import Sensors
-from sim.world import FleetState
+from sim.worlds.world import FleetState
 
 SEED = 7
 GRAVITY = 9.80665

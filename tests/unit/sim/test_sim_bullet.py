@@ -10,11 +10,11 @@ import pytest
 from sim_bullet_worlds import BOTH, LOADER, TRUCK, hold_speed, idle, placed, plane
 
 from protocol.arrays import Floats
-from sim.bullet import BulletWorld
 from sim.machines.model import MachineModel
 from sim.machines.soil import SAND, SLIP_STIFFNESS, TRACTION
 from sim.machines.vehicle import GRAVITY, Bodies
-from sim.world import STEP_S, FleetState, stack
+from sim.worlds.bullet import BulletWorld
+from sim.worlds.world import STEP_S, FleetState, stack
 
 
 @pytest.mark.parametrize("zone", [0, 3, SAND])

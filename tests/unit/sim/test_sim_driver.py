@@ -11,7 +11,7 @@ from sim.config import SimConfig
 from sim.machines.vehicle import GRAVITY
 from sim.operators.driver import bend
 from sim.scenario.ground import lay
-from sim.world import FleetState
+from sim.worlds.world import FleetState
 
 
 @pytest.fixture(scope="module")

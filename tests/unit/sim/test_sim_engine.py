@@ -3,17 +3,19 @@ import sys
 
 
 def test_pybullet_is_imported_without_a_word() -> None:
-    done = subprocess.run([sys.executable, "-c", "import sim.bullet, sim.render"], capture_output=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", "import sim.worlds.bullet, sim.render"], capture_output=True, check=True
+    )
     assert (done.stdout, done.stderr) == (b"", b"")
 
 
 def test_errors_are_still_shown_afterwards() -> None:
-    code = "import sim.engine, sys; print('broken', file=sys.stderr)"
+    code = "import sim.worlds.pybullet_import, sys; print('broken', file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert done.stderr == b"broken\n"
 
 
 def test_a_process_without_standard_error_can_simulate() -> None:
-    code = "import os; os.close(2); import sim.engine; print(sim.engine.pybullet.getAPIVersion() > 0)"
+    code = "import os; os.close(2); import sim.worlds.pybullet_import; print(sim.worlds.pybullet_import.pybullet.getAPIVersion() > 0)"
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, check=True)
     assert done.stdout == b"True\n"

@@ -20,7 +20,7 @@ from sim_sensor_rigs import (
 
 from protocol.machine import BASE, FRONT, Mount
 from sim.sensors.presets import Preset
-from sim.world import FleetState
+from sim.worlds.world import FleetState
 
 N = 500
 AT_REST = np.array([0, 0, 0, 0, 0, GRAVITY])

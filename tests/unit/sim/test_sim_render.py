@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from sim_bullet_worlds import LOADER, placed, plane
 
-from sim.fleet import Fleet
 from sim.machines.soil import GRAVEL
 from sim.render import SKY_RGB, Camera, closeup, overview, render
+from sim.worlds.fast import Fleet
 
 
 def test_machine_ground_and_sky_are_in_the_picture() -> None:

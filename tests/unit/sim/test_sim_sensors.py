@@ -24,7 +24,7 @@ from sim_sensor_rigs import (
 from protocol.readings import Reading, columns, parse_reading
 from sim.sensors.rigs import Faults, Rig
 from sim.sensors.sensors import Sensors
-from sim.world import FleetState
+from sim.worlds.world import FleetState
 
 N = 500
 STEPS = 600

@@ -7,11 +7,11 @@ import pytest
 from sim_bullet_worlds import BOTH, hold_speed, idle, placed, plane
 
 from protocol.machine import MachineConfig
-from sim.bullet import BulletWorld
 from sim.machines.model import MachineModel
 from sim.machines.vehicle import GRAVITY
 from sim.sensors.presets import load_preset
 from sim.sensors.rigs import machine_config
+from sim.worlds.bullet import BulletWorld
 
 
 def load_difference_n(machine: MachineConfig, payload_kg: float, force_x_mps2: float, force_z_mps2: float) -> float:

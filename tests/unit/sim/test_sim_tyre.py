@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.machines.soil import C_RR, SLIP_STIFFNESS, SOILS, TRACTION
-from sim.tyre import Motion, TyreForces, Tyres, TyreState, at_rest, radial_load, roll
+from sim.worlds.tyre import Motion, TyreForces, Tyres, TyreState, at_rest, radial_load, roll
 
 STEP_S = 0.01
 RADIUS_M, LOAD_N = 0.75, 43e3

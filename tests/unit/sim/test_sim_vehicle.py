@@ -8,12 +8,12 @@ import pytest
 from sim_bullet_worlds import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, nominal, placed, plane
 
 from protocol.machine import Mount
-from sim.fleet import Fleet
 from sim.machines.model import MachineModel
 from sim.machines.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
 from sim.machines.vehicle import GRAVITY, chassis_of, drive_force_n, steering_radps, weigh
-from sim.terrain import Terrain
-from sim.world import STEP_S, FleetState, stack
+from sim.worlds.fast import Fleet
+from sim.worlds.terrain import Terrain
+from sim.worlds.world import STEP_S, FleetState, stack
 
 
 def wheels(model: MachineModel, state: FleetState) -> np.ndarray:

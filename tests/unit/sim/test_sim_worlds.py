@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from sim_bullet_worlds import BOTH, EACH, GRADE_15, LOADER, TRUCK, hold_speed, idle, placed, plane
 
-from sim.bullet import BulletWorld
-from sim.fleet import Fleet
 from sim.machines.model import MachineModel
 from sim.machines.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
 from sim.machines.vehicle import GRAVITY, TRACTION_USE, Bodies
-from sim.world import STEP_S, FleetState, World, stack
+from sim.worlds.bullet import BulletWorld
+from sim.worlds.fast import Fleet
+from sim.worlds.world import STEP_S, FleetState, World, stack
 
 
 @EACH

@@ -11,12 +11,12 @@ from protocol.arrays import Floats
 from sim.machines.model import WHEELS, MachineModel
 from sim.machines.soil import TRACTION
 from sim.machines.vehicle import GRAVITY, SETTLE_STEPS, TRACTION_USE, Bodies, chassis_of, drive_force_n, steering_radps
-from sim.multibody import MultiBodies
-from sim.observe import Burden, Drive, observe
-from sim.rigid import POINT_FRAME, Ground, look
-from sim.terrain import Terrain
-from sim.tyre import Motion, TyreForces, Tyres, at_rest, radial_load, roll
-from sim.world import STEP_S, FleetState
+from sim.worlds.multibody import MultiBodies
+from sim.worlds.observe import Burden, Drive, observe
+from sim.worlds.rigid import POINT_FRAME, Ground, look
+from sim.worlds.terrain import Terrain
+from sim.worlds.tyre import Motion, TyreForces, Tyres, at_rest, radial_load, roll
+from sim.worlds.world import STEP_S, FleetState
 
 
 @dataclass(frozen=True, slots=True)

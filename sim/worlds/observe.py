@@ -9,8 +9,8 @@ import numpy as np
 from protocol.arrays import Floats
 from sim.machines.soil import C_RR
 from sim.machines.vehicle import GRAVITY
-from sim.rigid import BASE_POINT, Scene, articulation, attitude, plane_gradient
-from sim.world import STEP_S, FleetState
+from sim.worlds.rigid import BASE_POINT, Scene, articulation, attitude, plane_gradient
+from sim.worlds.world import STEP_S, FleetState
 
 _GRAVITY_UP = np.array([0.0, 0.0, GRAVITY])
 

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from protocol.arrays import Floats
-from sim.terrain import Terrain
+from sim.worlds.terrain import Terrain
 
 STEP_S = 0.01
 

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim import kernels
+from sim.worlds import fast_kernels
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,14 @@ class Terrain:
     zone_cell_m: float
 
     @cached_property
-    def grid(self) -> kernels.Grid:
+    def grid(self) -> fast_kernels.Grid:
         """The same as a tuple of arrays, for kernels."""
         heights, zones = np.ascontiguousarray(self.heights_m, float), np.ascontiguousarray(self.zones, np.int64)
-        return kernels.Grid(heights, float(self.cell_m), zones, float(self.zone_cell_m))
+        return fast_kernels.Grid(heights, float(self.cell_m), zones, float(self.zone_cell_m))
 
     def surface(self, x_m: Floats, y_m: Floats) -> Floats:
         """Height [m], bilinear, and its gradient to the east and north [m/m], as (3, ...)."""
-        found: Floats = kernels.surfaces(self.grid, x_m.ravel(), y_m.ravel())
+        found: Floats = fast_kernels.surfaces(self.grid, x_m.ravel(), y_m.ravel())
         return found.reshape(3, *x_m.shape)
 
     def height(self, x_m: Floats, y_m: Floats) -> Floats:
@@ -47,5 +47,5 @@ class Terrain:
 
     def zone(self, x_m: Floats, y_m: Floats) -> Ints:
         """Index into `soil.SOILS`."""
-        found: Ints = kernels.zones(self.grid, x_m.ravel(), y_m.ravel())
+        found: Ints = fast_kernels.zones(self.grid, x_m.ravel(), y_m.ravel())
         return found.reshape(x_m.shape)

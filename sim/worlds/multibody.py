@@ -13,10 +13,10 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.machine import BASE, FRONT
-from sim.engine import pybullet
 from sim.machines.model import PAYLOAD, WHEELS, MachineModel
 from sim.machines.urdf import rigid_urdf
 from sim.machines.vehicle import GRAVITY
+from sim.worlds.pybullet_import import pybullet
 
 OSCILLATION_NM = 2000.0  # friction of the joint that lets all wheels touch
 FRAMES = 3  # that are watched: rear frame, front frame, and the carrier of the rear wheels

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from protocol.arrays import Floats
-from sim import kernels as k
 from sim.machines.model import MachineModel
 from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
 from sim.machines.vehicle import (
@@ -26,8 +25,9 @@ from sim.machines.vehicle import (
     steering_radps,
     weigh,
 )
-from sim.terrain import Terrain
-from sim.world import STEP_S, FleetState
+from sim.worlds import fast_kernels as k
+from sim.worlds.terrain import Terrain
+from sim.worlds.world import STEP_S, FleetState
 
 _CONSTANTS = k.Constants(STEP_S, GRAVITY, STANDSTILL_MPS, TRACTION_USE)
 _SOILS = np.array([C_RR, TRACTION, SLIP_STIFFNESS])
