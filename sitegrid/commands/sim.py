@@ -62,7 +62,7 @@ def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> i
 
 
 def _draw(config: SimConfig, arguments: Namespace) -> None:
-    from sim.picture import draw  # imported here: a run without pictures needs no renderer
+    from sim.pictures.picture import draw  # imported here: a run without pictures needs no renderer
 
     pictures = [str(path) for path in draw(config, arguments.picture)]
     say({"pictures": pictures}) if arguments.json else note("\n".join(pictures))

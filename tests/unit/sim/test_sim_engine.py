@@ -4,7 +4,7 @@ import sys
 
 def test_pybullet_is_imported_without_a_word() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", "import sim.worlds.bullet, sim.render"], capture_output=True, check=True
+        [sys.executable, "-c", "import sim.worlds.bullet, sim.pictures.render"], capture_output=True, check=True
     )
     assert (done.stdout, done.stderr) == (b"", b"")
 

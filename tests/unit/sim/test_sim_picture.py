@@ -6,11 +6,11 @@ import pytest
 
 from protocol.errors import ConfigError
 from protocol.ground import ZONES
-from sim import picture
-from sim.canvas import WRITTEN, Canvas
 from sim.config import SimConfig, resolve
-from sim.plan import draw_plan, stops_of
-from sim.render import render
+from sim.pictures import picture
+from sim.pictures.canvas import WRITTEN, Canvas
+from sim.pictures.plan import draw_plan, stops_of
+from sim.pictures.render import render
 from sim.simulator import Simulator
 
 

@@ -3,7 +3,7 @@ import pytest
 from sim_bullet_worlds import LOADER, placed, plane
 
 from sim.machines.soil import GRAVEL
-from sim.render import SKY_RGB, Camera, closeup, overview, render
+from sim.pictures.render import SKY_RGB, Camera, closeup, overview, render
 from sim.worlds.fast import Fleet
 
 

@@ -14,9 +14,9 @@ from mapserver.pictures.frame import Axes, Colour, Entry, Image, compose
 from protocol.arrays import Floats
 from protocol.geometry import Bounds
 from protocol.ground import ZONES
-from sim.canvas import INK, Canvas, beside
 from sim.machines.model import MachineModel
 from sim.operators.routes import Leg, Route
+from sim.pictures.canvas import INK, Canvas, beside
 from sim.scenario.ground import Ramp, lay, soil_index
 from sim.scenario.tables import Change, Scenario
 from sim.worlds.terrain import Terrain

@@ -14,8 +14,8 @@ from mapserver.pictures.plotter import write_image
 from protocol.errors import ConfigError
 from sim.config import SimConfig
 from sim.machines.model import MachineModel
-from sim.plan import draw_plan
-from sim.render import closeup, overview, render
+from sim.pictures.plan import draw_plan
+from sim.pictures.render import closeup, overview, render
 from sim.simulator import Simulator
 
 DRIVE_S = 20.0  # simulated time after which the views are taken
