@@ -14,9 +14,9 @@ import numpy as np
 
 from agents.estimation.calibration import Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
-from agents.localisation.belief import PoseBelief
+from agents.localisation.filters.belief import PoseBelief
+from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from agents.localisation.state import SPEED
 from agents.order import Order, Verdict
 from agents.sampling import NOTHING, PoseHistory, Sampler, SamplingConfig, Way
 from protocol.arrays import Table

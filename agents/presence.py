@@ -18,7 +18,7 @@ from typing import Any
 
 import zenoh
 
-from agents.localisation.belief import PoseBelief
+from agents.localisation.filters.belief import PoseBelief
 from protocol import keys
 from protocol.codec import MAX_SMALL_BYTES, encode_health, encode_pose, pack, take, unpack
 from protocol.errors import MessageError

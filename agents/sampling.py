@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.estimation.ground import GroundEstimate
-from agents.localisation.belief import PoseBelief
+from agents.localisation.filters.belief import PoseBelief
 from protocol.arrays import Table
 from protocol.readings import Encoder, Odometry, Reading
 from protocol.samples import SAMPLE_DTYPE

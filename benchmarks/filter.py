@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from agents.localisation.belief import Belief, Filter, Measurement
-from agents.localisation.ekf import Ekf
-from agents.localisation.kinematics import MotionConfig, motion
-from agents.localisation.state import ATTITUDE, POSITION, RATE, VELOCITY, Layout
-from agents.localisation.unscented import Ukf
+from agents.localisation.filters.belief import Belief, Filter, Measurement
+from agents.localisation.filters.ekf import Ekf
+from agents.localisation.filters.motion import MotionConfig, motion
+from agents.localisation.filters.state import ATTITUDE, POSITION, RATE, VELOCITY, Layout
+from agents.localisation.filters.ukf import Ukf
 from benchmarks import agent
 from benchmarks.measure import Result, machine, medians, timed
 from protocol.arrays import Floats

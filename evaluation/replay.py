@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.holdout import Holdout
-from agents.localisation.belief import PoseBelief
+from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import Locates
 from evaluation.consistency import normalised_square, summarise
 from protocol.arrays import Floats, Ints

@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import AttitudeConfig, LeanFilter
 from agents.estimation.squat import front_share, squat_rad
-from agents.localisation.odometry import DeadReckoning
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import BASE, MachineConfig, SensorConfig

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from agents.dead_reckoning import DeadReckoning
 from agents.estimation.balance import Balance
-from agents.localisation.odometry import DeadReckoning
 from protocol.arrays import Floats
 from protocol.config import require_positive
 

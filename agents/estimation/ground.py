@@ -13,6 +13,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import AttitudeConfig
 from agents.estimation.balance import Balance, Balancer
 from agents.estimation.calibration import Calibration, CalibrationConfig, Calibrator, unknown
@@ -20,7 +21,6 @@ from agents.estimation.kalman import KalmanConfig, KalmanResistance
 from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility, PlausibilityConfig
 from agents.estimation.recursive import RecursiveConfig, RecursiveGrade, RecursiveResistance
 from agents.estimation.resistance import Push, Resistance
-from agents.localisation.odometry import DeadReckoning
 from protocol.config import require_positive
 from protocol.machine import MachineConfig, SensorConfig
 from protocol.readings import Reading

@@ -8,19 +8,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from agents.localisation import sensing
-from agents.localisation.belief import Belief, Filter, Measurement, Motion, PoseBelief
-from agents.localisation.ekf import Ekf
-from agents.localisation.fusion import Fusion, FusionConfig
-from agents.localisation.kinematics import MotionConfig, motion
-from agents.localisation.odometry import Alignment, Dead, DeadReckoning, align, mean_std, turn_source
-from agents.localisation.receivers import Fix, Receivers, drifting
-from agents.localisation.references import UNKNOWN_STD, References, counted_from_start
-from agents.localisation.sensing import SensingConfig
-from agents.localisation.state import ACCELERATION, ATTITUDE, POSITION, RATE, SPEED, VELOCITY, YAW, Layout
-from agents.localisation.steps import Step, Steps
-from agents.localisation.unscented import Ukf
-from agents.localisation.watch import Consistency
+from agents.dead_reckoning import Alignment, Dead, DeadReckoning, align, mean_std, turn_source
+from agents.localisation import measurements
+from agents.localisation.consistency import Consistency
+from agents.localisation.filters.belief import Belief, Filter, Measurement, Motion, PoseBelief
+from agents.localisation.filters.ekf import Ekf
+from agents.localisation.filters.history import Fusion, FusionConfig
+from agents.localisation.filters.motion import MotionConfig, motion
+from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, SPEED, VELOCITY, YAW, Layout
+from agents.localisation.filters.ukf import Ukf
+from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.headings import UNKNOWN_STD, References, counted_from_start
+from agents.localisation.imu_steps import Step, Steps
+from agents.localisation.measurements import SensingConfig
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.config import require_positive
@@ -170,7 +170,7 @@ class Localiser:
         R = np.diag([rate_std**2] * 3 + [force_std**2] * 3)
         bias = self._layout.gyro_bias(imu) if self._layout.imus else None
         lever, gate = np.array(sensor.mount.xyz_m), sensor.gate_sigma or c.gate_sigma
-        return sensing.inertial(step.stamp_ns, name, felt.rates_radps, felt.force_mps2, R, lever, bias, gate)
+        return measurements.inertial(step.stamp_ns, name, felt.rates_radps, felt.force_mps2, R, lever, bias, gate)
 
     def _of_turn(self, step: Step) -> list[Measurement]:
         """The turn rate where no IMU tells it. Where nothing does, it shows only in the fixes and is very unsure."""
@@ -181,7 +181,7 @@ class Localiser:
         std, told = _turn_std(self._turns, self._config.sensing), step.turn
         error = self._layout.gyro_bias(len(self._imus)) if self._layout.imus else None
         gate = self._turns.gate_sigma or self._config.sensing.gate_sigma
-        return [sensing.turn(step.stamp_ns, told.rate_radps, std, error, told.per_error, gate)]
+        return [measurements.turn(step.stamp_ns, told.rate_radps, std, error, told.per_error, gate)]
 
     def _of_wheels(self, step: Step) -> list[Measurement]:
         c, stamp = self._config.sensing, step.stamp_ns
@@ -190,9 +190,9 @@ class Localiser:
         R = np.diag([self._wheels.std.get("speed", c.speed_mps) ** 2, c.side_mps**2, c.side_mps**2])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
         gate = self._wheels.gate_sigma or c.gate_sigma
-        found = [sensing.wheels(stamp, "wheels", np.array([speed, 0.0, 0.0]), R, scale, gate)]
+        found = [measurements.wheels(stamp, "wheels", np.array([speed, 0.0, 0.0]), R, scale, gate)]
         if step.still_s >= self._config.standstill_s:
-            found.append(sensing.standstill(stamp, c))
+            found.append(measurements.standstill(stamp, c))
         return found
 
     def _slip(self, step: Step) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.localisation.belief import Belief
+from agents.localisation.filters.belief import Belief
 from protocol.arrays import Floats
 
 PAIR_S = 1.1  # the mean over more says too little of its middle; a receiver of 1 Hz, with its jitter, makes pairs

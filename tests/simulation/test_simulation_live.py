@@ -17,7 +17,7 @@ import zenoh
 
 from agents.agent import Agent, Places
 from agents.config import AgentConfig
-from agents.localisation.belief import PoseBelief
+from agents.localisation.filters.belief import PoseBelief
 from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
 from agents.spool import Spool, SpoolConfig
 from agents.uplink import Uplink, UplinkConfig, UplinkState

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from agents.estimation.squat import front_share, squat_rad
-from agents.localisation.belief import Belief
+from agents.localisation.filters.belief import Belief
 from agents.localisation.localiser import Localiser
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats, Table

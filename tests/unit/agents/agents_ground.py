@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from agents_drives import START_NS
 
+from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import AttitudeConfig
 from agents.estimation.balance import Balance, Balancer
 from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEstimator
 from agents.estimation.resistance import Push, Resistance
-from agents.localisation.odometry import DeadReckoning
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import MachineConfig

@@ -10,9 +10,9 @@ import pytest
 from agents_drives import START_NS
 from agents_ground import STEADY, STEP_S
 
+from agents.dead_reckoning import Dead, DeadReckoning
 from agents.estimation.balance import Balance
 from agents.estimation.calibration import RELOCK, Calibration, CalibrationConfig, Calibrator, unknown
-from agents.localisation.odometry import Dead, DeadReckoning
 from protocol.arrays import Floats
 
 FLAT: Callable[[float], float] = lambda _: 0.0  # noqa: E731

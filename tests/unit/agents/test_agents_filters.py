@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from agents.localisation.belief import Belief, Filter, Measurement, Motion
-from agents.localisation.conditioning import definite, factor, root, wrapped
-from agents.localisation.ekf import Ekf
-from agents.localisation.kinematics import GpsError, MotionConfig, map_from_base, motion
-from agents.localisation.state import ATTITUDE, PITCH, POSITION, RATE, ROLL, VELOCITY, YAW, Layout
-from agents.localisation.unscented import Ukf
+from agents.localisation.filters.belief import Belief, Filter, Measurement, Motion
+from agents.localisation.filters.ekf import Ekf
+from agents.localisation.filters.motion import GpsError, MotionConfig, map_from_base, motion
+from agents.localisation.filters.square_root import definite, factor, root, wrapped
+from agents.localisation.filters.state import ATTITUDE, PITCH, POSITION, RATE, ROLL, VELOCITY, YAW, Layout
+from agents.localisation.filters.ukf import Ukf
 from protocol.arrays import Floats
 
 # CI takes so many steps of each filter; a million were run with this variable set.

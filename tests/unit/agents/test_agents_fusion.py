@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.localisation import sensing
-from agents.localisation.belief import Belief, Filter, Measurement, Motion
-from agents.localisation.ekf import Ekf
-from agents.localisation.fusion import Fusion, FusionConfig
-from agents.localisation.kinematics import MotionConfig, motion
-from agents.localisation.state import POSITION, SPEED, VELOCITY, YAW, Layout
-from agents.localisation.unscented import Ukf
+from agents.localisation import measurements
+from agents.localisation.filters.belief import Belief, Filter, Measurement, Motion
+from agents.localisation.filters.ekf import Ekf
+from agents.localisation.filters.history import Fusion, FusionConfig
+from agents.localisation.filters.motion import MotionConfig, motion
+from agents.localisation.filters.state import POSITION, SPEED, VELOCITY, YAW, Layout
+from agents.localisation.filters.ukf import Ukf
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 
@@ -42,16 +42,18 @@ def fix(ms: float, east_m: float = 0.0, north_m: float = 0.0, sensor: str = "gps
     way_m = 2.0 * ms / 1000
     position = np.array([way_m * math.cos(0.7) + east_m, way_m * math.sin(0.7) + north_m])
     lever = np.array([0.0, 0.0, 3.0])
-    return sensing.fix(START_NS + round(ms * MS), sensor, position, np.eye(2), lever, None, gate)
+    return measurements.fix(START_NS + round(ms * MS), sensor, position, np.eye(2), lever, None, gate)
 
 
 def wheels(ms: float, speed_mps: float = 2.0) -> Measurement:
-    return sensing.wheels(START_NS + round(ms * MS), "wheels", np.array([speed_mps, 0, 0]), np.eye(3) * 1e-2, None, 0.0)
+    return measurements.wheels(
+        START_NS + round(ms * MS), "wheels", np.array([speed_mps, 0, 0]), np.eye(3) * 1e-2, None, 0.0
+    )
 
 
 def imu(ms: float) -> Measurement:
     z, R = np.array([0.0, 0.0, GRAVITY_MPS2]), np.diag([1e-4] * 3 + [1.0] * 3)
-    return sensing.inertial(START_NS + round(ms * MS), "imu", np.zeros(3), z, R, np.zeros(3), None, 0.0)
+    return measurements.inertial(START_NS + round(ms * MS), "imu", np.zeros(3), z, R, np.zeros(3), None, 0.0)
 
 
 def drive(seed: int, seconds: float = 2.0) -> list[list[Measurement]]:
@@ -81,7 +83,7 @@ def plainly(engine: Filter, groups: list[list[Measurement]], belief: Belief) -> 
 
 def test_only_a_fix_makes_the_place_unsure_when_it_is_believed_again() -> None:
     """A velocity (2,) of a differential receiver says nothing of the place."""
-    velocity = sensing.velocity(START_NS + 50 * MS, "gps-1", np.array([90.0, 0.0]), np.eye(2), np.zeros(3), 4.0)
+    velocity = measurements.velocity(START_NS + 50 * MS, "gps-1", np.array([90.0, 0.0]), np.eye(2), np.zeros(3), 4.0)
     variances = []
     for measurement in (velocity, fix(50, 90.0, gate=4.0)):
         found = fusion(relock=1)

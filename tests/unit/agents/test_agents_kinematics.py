@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from agents.localisation.belief import Belief
-from agents.localisation.kinematics import OFF_PLANE_VARIANCE, GpsError, MotionConfig, map_from_base, motion
-from agents.localisation.state import (
+from agents.localisation.filters.belief import Belief
+from agents.localisation.filters.motion import OFF_PLANE_VARIANCE, GpsError, MotionConfig, map_from_base, motion
+from agents.localisation.filters.state import (
     ACCELERATION,
     ANGLES,
     ATTITUDE,

@@ -18,10 +18,10 @@ from agents_drives import (
     simulated,
 )
 
-from agents.localisation.belief import PoseBelief
-from agents.localisation.fusion import FusionConfig
+from agents.localisation.filters.belief import PoseBelief
+from agents.localisation.filters.history import FusionConfig
+from agents.localisation.filters.state import ATTITUDE, BASE_STATES, SPEED, YAW, Layout
 from agents.localisation.localiser import POSITIVE, LocalisationConfig, Localiser
-from agents.localisation.state import ATTITUDE, BASE_STATES, SPEED, YAW, Layout
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import FRONT, MachineConfig, Mount, SensorConfig

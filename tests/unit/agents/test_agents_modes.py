@@ -20,11 +20,11 @@ from agents_drives import (
     machine,
 )
 
-from agents.localisation.belief import Belief
-from agents.localisation.kinematics import MotionConfig, map_from_base
+from agents.localisation.filters.belief import Belief
+from agents.localisation.filters.motion import MotionConfig, map_from_base
+from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.localisation.modes import PAIR_S, Told, rate, referred, renewed
-from agents.localisation.state import YAW, Layout
 from agents.pipeline import Pipeline, PipelineConfig
 from protocol.arrays import Floats
 from protocol.machine import MachineConfig, SensorConfig

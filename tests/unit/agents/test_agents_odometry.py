@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from agents_drives import START_NS, Drive, Leg, changed_sensor, drive, machine
 
-from agents.localisation.odometry import DeadReckoning, WheelTracker, align, mean_std
+from agents.dead_reckoning import DeadReckoning, WheelTracker, align, mean_std
 from agents.physics import GRAVITY_MPS2
 from protocol.machine import MachineConfig, Mount, SensorConfig
 from protocol.readings import Encoder, Odometry, Torque

@@ -14,7 +14,7 @@ from agents_drives import S_BEND, SITE, START_NS, Drive, Ground, Leg, changed_se
 import agents
 import protocol
 from agents.estimation.calibration import Calibration
-from agents.localisation.belief import PoseBelief
+from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.localiser import LocalisationConfig
 from agents.physics import GRAVITY_MPS2
 from agents.pipeline import Pipeline, PipelineConfig, Positioning

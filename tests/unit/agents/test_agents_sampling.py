@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents.estimation.ground import NOTHING_KNOWN, GroundEstimate
-from agents.localisation.belief import PoseBelief
+from agents.localisation.filters.belief import PoseBelief
 from agents.sampling import PoseHistory, Sampler, SamplingConfig, Way
 from protocol.arrays import Table
 from protocol.readings import Encoder, Imu, Odometry, Reading

@@ -3,12 +3,11 @@ import math
 import numpy as np
 import pytest
 
-from agents.localisation import sensing
-from agents.localisation.belief import Belief, Filter, Measurement
-from agents.localisation.ekf import Ekf
-from agents.localisation.kinematics import map_from_base
-from agents.localisation.sensing import SensingConfig
-from agents.localisation.state import (
+from agents.localisation import measurements
+from agents.localisation.filters.belief import Belief, Filter, Measurement
+from agents.localisation.filters.ekf import Ekf
+from agents.localisation.filters.motion import map_from_base
+from agents.localisation.filters.state import (
     ACCELERATION,
     ATTITUDE,
     PITCH,
@@ -20,7 +19,8 @@ from agents.localisation.state import (
     YAW_RATE,
     Layout,
 )
-from agents.localisation.unscented import Ukf
+from agents.localisation.filters.ukf import Ukf
+from agents.localisation.measurements import SensingConfig
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import Mount
@@ -34,17 +34,19 @@ def every_kind(layout: Layout) -> list[Measurement]:
     """One measurement of each kind, of sensors that are not the first of theirs."""
     augmented = layout is FULL
     return [
-        sensing.fix(0, "gps-2", np.zeros(2), np.eye(2), LEVER_M, layout.gps_error(1) if augmented else None, 4.0),
-        sensing.inertial(
+        measurements.fix(0, "gps-2", np.zeros(2), np.eye(2), LEVER_M, layout.gps_error(1) if augmented else None, 4.0),
+        measurements.inertial(
             0, "imu-2", np.zeros(3), np.zeros(3), np.eye(6), LEVER_M, layout.gyro_bias(1) if augmented else None, 6.0
         ),
-        sensing.wheels(0, "wheels", np.zeros(3), np.eye(3), layout.wheel_scales.start if augmented else None, 6.0),
-        sensing.orientation(0, "ahrs", np.zeros(3), np.eye(3), 6.0),
-        sensing.standstill(0, CONFIG),
-        sensing.velocity(0, "gps-2", np.zeros(2), np.eye(2), LEVER_M, 4.0),
-        sensing.rotation(0, "ahrs", np.zeros(3), np.eye(3), 6.0),
-        sensing.turn(0, 0.0, 0.02, layout.gyro_bias(1) if augmented else None, 3.0, 6.0),
-        sensing.orientation(0, "ahrs", np.zeros(3), np.eye(3), 6.0, layout.heading_errors.start if augmented else None),
+        measurements.wheels(0, "wheels", np.zeros(3), np.eye(3), layout.wheel_scales.start if augmented else None, 6.0),
+        measurements.orientation(0, "ahrs", np.zeros(3), np.eye(3), 6.0),
+        measurements.standstill(0, CONFIG),
+        measurements.velocity(0, "gps-2", np.zeros(2), np.eye(2), LEVER_M, 4.0),
+        measurements.rotation(0, "ahrs", np.zeros(3), np.eye(3), 6.0),
+        measurements.turn(0, 0.0, 0.02, layout.gyro_bias(1) if augmented else None, 3.0, 6.0),
+        measurements.orientation(
+            0, "ahrs", np.zeros(3), np.eye(3), 6.0, layout.heading_errors.start if augmented else None
+        ),
     ]
 
 
@@ -82,7 +84,7 @@ def test_many_states_are_told_as_each_alone(layout: Layout) -> None:
 def fix_at(attitude: tuple[float, float, float], lever_m: tuple[float, float, float]) -> list[float]:
     x = np.zeros(PAPER.n)
     x[POSITION], x[ATTITUDE] = (10.0, 20.0, 5.0), attitude
-    measurement = sensing.fix(0, "gps-1", np.zeros(2), np.eye(2), np.array(lever_m), None, 0.0)
+    measurement = measurements.fix(0, "gps-1", np.zeros(2), np.eye(2), np.array(lever_m), None, 0.0)
     return list(told(measurement, x))
 
 
@@ -111,14 +113,14 @@ def test_antenna_is_where_the_rotation_of_the_attitude_puts_it(seed: int) -> Non
 def test_velocity_of_an_antenna_is_that_of_the_body_and_of_its_turn(seed: int) -> None:
     x = somewhere(seed, PAPER)
     expected = map_from_base(x[ATTITUDE]) @ (x[VELOCITY] + np.cross(x[RATE], LEVER_M))
-    measurement = sensing.velocity(0, "gps-1", np.zeros(2), np.eye(2), LEVER_M, 0.0)
+    measurement = measurements.velocity(0, "gps-1", np.zeros(2), np.eye(2), LEVER_M, 0.0)
     assert told(measurement, x) == pytest.approx(expected[:2]), f"seed={seed}"
 
 
 def test_a_receivers_own_error_is_added_to_its_fix_and_to_no_other() -> None:
     x = np.zeros(FULL.n)
     x[FULL.gps_error(0)], x[FULL.gps_error(1)] = (100.0, 200.0), (3.0, 4.0)
-    fix = sensing.fix(0, "gps-2", np.zeros(2), np.eye(2), np.zeros(3), FULL.gps_error(1), 0.0)
+    fix = measurements.fix(0, "gps-2", np.zeros(2), np.eye(2), np.zeros(3), FULL.gps_error(1), 0.0)
     assert told(fix, x).tolist() == [3.0, 4.0]
 
 
@@ -127,7 +129,7 @@ def test_a_receivers_own_error_is_added_to_its_fix_and_to_no_other() -> None:
 
 def imu(rates: Floats, force: Floats, lever_m: Floats | None = None, bias: int | None = None) -> Measurement:
     R = np.diag([1e-3**2] * 3 + [0.1**2] * 3)
-    return sensing.inertial(0, "imu", rates, force, R, np.zeros(3) if lever_m is None else lever_m, bias, 0.0)
+    return measurements.inertial(0, "imu", rates, force, R, np.zeros(3) if lever_m is None else lever_m, bias, 0.0)
 
 
 @pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 0.0), (180.0, 0.0, 90.0), (20.0, -35.0, 110.0)])
@@ -196,9 +198,9 @@ def test_a_gyro_tells_the_rates_and_its_own_bias_about_the_vertical() -> None:
 def test_wheels_turn_by_their_scale_more_ahead_and_not_aside() -> None:
     x = np.zeros(FULL.n)
     x[VELOCITY], x[FULL.wheel_scales] = (2.0, 0.3, 0.1), 0.05
-    scaled = sensing.wheels(0, "wheels", np.zeros(3), np.eye(3), FULL.wheel_scales.start, 0.0)
+    scaled = measurements.wheels(0, "wheels", np.zeros(3), np.eye(3), FULL.wheel_scales.start, 0.0)
     assert told(scaled, x) == pytest.approx([2.1, 0.3, 0.1])
-    unscaled = sensing.wheels(0, "wheels", np.zeros(3), np.eye(3), None, 0.0)
+    unscaled = measurements.wheels(0, "wheels", np.zeros(3), np.eye(3), None, 0.0)
     assert told(unscaled, x) == pytest.approx([2.0, 0.3, 0.1])
 
 
@@ -209,7 +211,7 @@ def test_orientation_beyond_half_a_turn_is_near(engine: Filter) -> None:
     x[YAW] = 3.1
     belief = Belief(0, x, np.eye(PAPER.n) * 1e-2)
     told_rad = np.array([0.0, 0.0, -3.1])
-    result = engine.condition(belief, sensing.orientation(0, "ahrs", told_rad, np.eye(3) * 1e-2, 6.0))
+    result = engine.condition(belief, measurements.orientation(0, "ahrs", told_rad, np.eye(3) * 1e-2, 6.0))
     assert result.accepted
     assert result.innovation[2] == pytest.approx(2 * math.pi - 6.2)
     assert abs(math.remainder(result.belief.x[YAW] - math.pi, math.tau)) < 1e-9
@@ -222,7 +224,7 @@ def test_standstill_stops_the_machine_and_turns_the_gyros_rate_into_bias(engine:
     variances[VELOCITY], variances[RATE], variances[FULL.gyro_biases] = 0.1**2, 0.1**2, 0.01**2
     belief = Belief(0, x, np.diag(variances))
     gyro = imu(np.array([0.0, 0.0, 0.01]), np.array([0.0, 0.0, GRAVITY_MPS2]), bias=FULL.gyro_bias(0))
-    for measurement in (gyro, sensing.standstill(0, CONFIG)):
+    for measurement in (gyro, measurements.standstill(0, CONFIG)):
         result = engine.condition(belief, measurement)
         assert result.accepted
         belief = result.belief
@@ -235,7 +237,7 @@ def test_a_machine_that_surely_turns_does_not_stand_still() -> None:
     x = np.zeros(PAPER.n)
     x[YAW_RATE] = 0.1
     belief = Belief(0, x, np.eye(PAPER.n) * 1e-4)
-    assumed = sensing.standstill(0, CONFIG)
+    assumed = measurements.standstill(0, CONFIG)
     assert not Ekf().condition(belief, assumed).accepted
     assert not assumed.relocks
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from agents_drives import START_NS, Leg, drive, machine
 
-from agents.localisation.kinematics import map_from_base
-from agents.localisation.odometry import DeadReckoning
-from agents.localisation.steps import Step, Steps
+from agents.dead_reckoning import DeadReckoning
+from agents.localisation.filters.motion import map_from_base
+from agents.localisation.imu_steps import Step, Steps
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine import FRONT, MachineConfig, Mount, SensorConfig

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from agents_drives import LEVER_M, PROJECTION, START_NS, Drive, Leg, beliefs_of, drive
 
-from agents.localisation.belief import Belief
+from agents.dead_reckoning import DeadReckoning, turn_source
+from agents.localisation.filters.belief import Belief
+from agents.localisation.filters.state import YAW, YAW_RATE, Layout
+from agents.localisation.imu_steps import Step, Steps
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from agents.localisation.odometry import DeadReckoning, turn_source
-from agents.localisation.sensing import SensingConfig
-from agents.localisation.state import YAW, YAW_RATE, Layout
-from agents.localisation.steps import Step, Steps
+from agents.localisation.measurements import SensingConfig
 from protocol.machine import MachineConfig, Mount, SensorConfig
 from protocol.readings import Encoder, Gps, Odometry, Reading, Steering
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from agents.localisation.belief import Belief, Conditioned
-from agents.localisation.watch import ENOUGH, Watch
+from agents.localisation.consistency import ENOUGH, Watch
+from agents.localisation.filters.belief import Belief, Conditioned
 
 BELIEF = Belief(1, np.zeros(2), np.eye(2))
 

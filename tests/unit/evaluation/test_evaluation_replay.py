@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents.holdout import Holdout, HoldoutConfig
-from agents.localisation.belief import PoseBelief
+from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import Locates, Pipeline, PipelineConfig, Positioning
 from evaluation.replay import STEP_NS, Trace, Truth, read_track, replay, score
 from protocol.readings import Articulation, Reading

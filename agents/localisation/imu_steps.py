@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from agents.dead_reckoning import STALE_S, DeadReckoning, WheelTracker, turn_source
 from agents.localisation.modes import Told
-from agents.localisation.odometry import STALE_S, DeadReckoning, WheelTracker, turn_source
 from protocol.arrays import Floats
 from protocol.machine import ABSOLUTE, FRONT, MachineConfig, SensorConfig
 from protocol.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering

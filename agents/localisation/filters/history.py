@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from agents.localisation.belief import Belief, Conditioned, Filter, Measurement, Motion
+from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, Motion
 from protocol.config import require_positive
 
 Motions = Callable[[Belief, float], Motion]  # how a belief moves on over so many seconds

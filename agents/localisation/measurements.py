@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.localisation.belief import Measurement
-from agents.localisation.kinematics import EYE, map_from_base, turned_jacobian
-from agents.localisation.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
+from agents.localisation.filters.belief import Measurement
+from agents.localisation.filters.motion import EYE, map_from_base, turned_jacobian
+from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 

@@ -6,8 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.localisation.belief import Belief, Conditioned, Measurement, Motion
-from agents.localisation.conditioning import bounded, conclude, definite, noise_root, refused, root, wrapped_state
+from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
+from agents.localisation.filters.square_root import (
+    bounded,
+    conclude,
+    definite,
+    noise_root,
+    refused,
+    root,
+    wrapped_state,
+)
 
 
 @dataclass(frozen=True)

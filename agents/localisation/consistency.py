@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.localisation.belief import Conditioned
+from agents.localisation.filters.belief import Conditioned
 
 REMEMBERED = 150  # innovations: half a minute of a 5 Hz receiver
 ENOUGH = 50  # before anything is said

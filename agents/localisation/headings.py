@@ -12,13 +12,13 @@ from functools import partial
 
 import numpy as np
 
-from agents.localisation import sensing
-from agents.localisation.belief import Belief, Measurement
-from agents.localisation.fusion import Change, Fusion
+from agents.localisation import measurements
+from agents.localisation.filters.belief import Belief, Measurement
+from agents.localisation.filters.history import Change, Fusion
+from agents.localisation.filters.state import YAW, Layout
+from agents.localisation.imu_steps import Step
+from agents.localisation.measurements import SensingConfig
 from agents.localisation.modes import Told, rate, referred
-from agents.localisation.sensing import SensingConfig
-from agents.localisation.state import YAW, Layout
-from agents.localisation.steps import Step
 from protocol.arrays import Floats
 from protocol.machine import ABSOLUTE, RELATIVE, SensorConfig
 
@@ -69,7 +69,7 @@ class References:
 
     def _orientation(self, sensor: SensorConfig, stamp_ns: int, told: Told) -> Measurement:
         error, R = self._states.get(sensor.name), np.diag(told.variances)
-        return sensing.orientation(stamp_ns, sensor.name, told.values, R, self._gate(sensor), error)
+        return measurements.orientation(stamp_ns, sensor.name, told.values, R, self._gate(sensor), error)
 
     def _add_relative(self, fusion: Fusion, sensor: SensorConfig, told: Told) -> list[Belief]:
         """The first agrees with the belief at its stamp, unless that is too long ago to know."""
@@ -102,7 +102,7 @@ class References:
         (sr, cr), (sp, cp) = ((math.sin(a), math.cos(a)) for a in now.values[:2].tolist())
         body_from_rates = np.array([[1.0, 0.0, -sp], [0.0, cr, cp * sr], [0.0, -sr, cp * cr]])
         R = body_from_rates * mean.variances @ body_from_rates.T
-        return sensing.rotation(mean.stamp_ns, sensor.name, body_from_rates @ mean.values, R, self._gate(sensor))
+        return measurements.rotation(mean.stamp_ns, sensor.name, body_from_rates @ mean.values, R, self._gate(sensor))
 
     def _gate(self, sensor: SensorConfig) -> float:
         return sensor.gate_sigma or self._config.gate_sigma

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from scipy.linalg.lapack import dposv, dpotrf
 
-from agents.localisation.belief import Belief, Conditioned, Measurement
+from agents.localisation.filters.belief import Belief, Conditioned, Measurement
 from protocol.arrays import Floats
 
 MIN_VARIANCE = 1e-18  # of any state, in its unit squared

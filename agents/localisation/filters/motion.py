@@ -21,17 +21,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from agents.localisation.belief import Belief, Motion
-from agents.localisation.state import (
-    ACCELERATION,
-    ATTITUDE,
-    OFF_PLANE,
-    POSITION,
-    RATE,
-    VELOCITY,
-    Layout,
-    Z,
-)
+from agents.localisation.filters.belief import Belief, Motion
+from agents.localisation.filters.state import ACCELERATION, ATTITUDE, OFF_PLANE, POSITION, RATE, VELOCITY, Layout, Z
 from protocol.arrays import Floats
 from protocol.config import require_positive
 

@@ -27,8 +27,8 @@ from functools import lru_cache
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from agents.localisation.belief import Belief, Conditioned, Measurement, Motion
-from agents.localisation.conditioning import (
+from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
+from agents.localisation.filters.square_root import (
     bounded,
     conclude,
     definite,

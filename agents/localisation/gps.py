@@ -14,15 +14,15 @@ from functools import partial
 
 import numpy as np
 
-from agents.localisation import sensing
-from agents.localisation.belief import Belief, Measurement
-from agents.localisation.fusion import Change, Fusion
-from agents.localisation.kinematics import GpsError
+from agents.dead_reckoning import Dead
+from agents.localisation import measurements
+from agents.localisation.consistency import Consistency, Watch
+from agents.localisation.filters.belief import Belief, Measurement
+from agents.localisation.filters.history import Change, Fusion
+from agents.localisation.filters.motion import GpsError
+from agents.localisation.filters.state import Layout
+from agents.localisation.measurements import SensingConfig
 from agents.localisation.modes import Told, rate, referred, renewed
-from agents.localisation.odometry import Dead
-from agents.localisation.sensing import SensingConfig
-from agents.localisation.state import Layout
-from agents.localisation.watch import Consistency, Watch
 from protocol.arrays import Floats
 from protocol.machine import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
 from protocol.readings import Gps
@@ -124,7 +124,7 @@ class Receivers:
                 change = partial(_referred, states=error, lever_m=fix.lever_m, variance=2 * drift_m2)
                 drift_m2 = 2 * drift_m2 + self._referred_m2[sensor.name]
             self.errors[index] = GpsError(drift_m2, sensor.drift_time_s)
-        measurement = sensing.fix(
+        measurement = measurements.fix(
             fix.stamp_ns, sensor.name, fix.position_m, np.diag(self._white(fix)), fix.lever_m, error, self._gate(sensor)
         )
         # a receiver that comes late brings its own unknown error
@@ -153,7 +153,7 @@ class Receivers:
         R, dt_s = np.diag(mean.variances), (now.stamp_ns - before.stamp_ns) * 1e-9
         if self._slow:
             R += np.eye(2) * (2 * _drift_m2(fix) * -math.expm1(-dt_s / sensor.drift_time_s) / dt_s**2)
-        return sensing.velocity(mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, self._gate(sensor))
+        return measurements.velocity(mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, self._gate(sensor))
 
     def _white(self, fix: Fix) -> Floats:
         """Variance (2,) of a fix without its slow part; what is configured may be as small as it likes."""
@@ -172,7 +172,7 @@ def _drift_m2(fix: Fix) -> float:
 
 def _antenna(belief: Belief, lever_m: Floats) -> tuple[Floats, Floats]:
     """Where the antenna is believed (2,) in `map`, and the Jacobian (2, n) of that."""
-    model = sensing.fix(belief.stamp_ns, "", np.zeros(2), np.eye(2), lever_m, None, 0.0)
+    model = measurements.fix(belief.stamp_ns, "", np.zeros(2), np.eye(2), lever_m, None, 0.0)
     return model.h(belief.x[None])[0], model.jacobian(belief.x)
 
 

@@ -1,0 +1,1 @@
+"""The filters, as mathematics: state, belief, motion, EKF, UKF, and a history for late measurements."""
