@@ -12,15 +12,15 @@ import numpy as np
 import zenoh
 
 from agents import calibration_file
-from agents.audit import AuditLog
 from agents.config import AgentConfig
+from agents.delivery.audit import AuditLog
+from agents.delivery.spool import Spool
+from agents.delivery.uplink import Sign, Uplink, UplinkState, linger
 from agents.drivers import Driver
 from agents.estimation.calibration import Calibration
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Owner, Presence
-from agents.spool import Spool
-from agents.uplink import Sign, Uplink, UplinkState, linger
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine import MachineConfig

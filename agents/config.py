@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from agents.delivery.spool import SpoolConfig
+from agents.delivery.uplink import UplinkConfig
 from agents.holdout import HoldoutConfig
 from agents.pipeline import PipelineConfig
-from agents.spool import SpoolConfig
-from agents.uplink import UplinkConfig
 from protocol.config import from_table, load_toml, section
 from protocol.errors import ConfigError
 from protocol.machine import MachineConfig, SensorConfig, parse_machine

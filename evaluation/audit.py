@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.audit import read_audit
+from agents.delivery.audit import read_audit
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot

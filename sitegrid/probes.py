@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 import zenoh
 
-from agents.spool_file import SCHEMA as SPOOL_SCHEMA
+from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
 from protocol import keys
 from protocol.codec import decode_health, decode_reply, encode_batch
 from protocol.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, SIGNING_FILE, load_credentials

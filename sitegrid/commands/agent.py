@@ -12,11 +12,11 @@ import zenoh
 
 from agents.agent import Agent, Places
 from agents.config import AgentConfig, load_agent
+from agents.delivery.uplink import Sign
 from agents.drivers import Driver
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
 from agents.presence import Owner, find_namesake, this_process
-from agents.uplink import Sign
 from protocol.credentials import SIGNING_FILE
 from protocol.errors import ConfigError, LinkError
 from protocol.logfolder import LogFolder, open_log

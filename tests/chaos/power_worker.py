@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.spool import Spool, SpoolConfig
+from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table

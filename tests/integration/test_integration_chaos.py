@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.spool import Spool, SpoolConfig
+from agents.delivery.spool import Spool, SpoolConfig
 from protocol.samples import empty
 from sitegrid.processes import wait_until
 from tests.chaos import __main__ as command

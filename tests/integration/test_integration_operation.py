@@ -18,7 +18,7 @@ import pytest
 import zenoh
 from site_run import READY_S, SiteRun  # beside this file
 
-from agents.spool import Spool, SpoolConfig
+from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import HOUR_NS, archive

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from agents.spool import Run, Spool
-from agents.uplink import UplinkState
+from agents.delivery.spool import Run, Spool
+from agents.delivery.uplink import UplinkState
 from mapserver.ingest import admission
 from mapserver.ingest.admission import Admission
 from protocol.messages import Ack, Refused, SampleBatch
@@ -123,7 +123,7 @@ def failed_commit_stays_open(patch: pytest.MonkeyPatch) -> None:
     def leave(self: Any, kind: object, *_: object) -> None:
         self._db.execute("ROLLBACK" if kind else "COMMIT")
 
-    patch.setattr("agents.spool_file.transaction.__exit__", leave)
+    patch.setattr("agents.delivery.spool_file.transaction.__exit__", leave)
 
 
 def drops_are_silent(patch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from agents.spool import Spool
-from agents.spool_file import connect
+from agents.delivery.spool import Spool
+from agents.delivery.spool_file import connect
 
 
 class Killed(BaseException):

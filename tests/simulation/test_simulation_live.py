@@ -17,10 +17,10 @@ import zenoh
 
 from agents.agent import Agent, Places
 from agents.config import AgentConfig
+from agents.delivery.spool import Spool, SpoolConfig
+from agents.delivery.uplink import Uplink, UplinkConfig, UplinkState
 from agents.localisation.filters.belief import PoseBelief
 from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
-from agents.spool import Spool, SpoolConfig
-from agents.uplink import Uplink, UplinkConfig, UplinkState
 from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol import keys

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.spool import SpoolConfig
-from agents.uplink import UplinkConfig, UplinkState
+from agents.delivery.spool import SpoolConfig
+from agents.delivery.uplink import UplinkConfig, UplinkState
 from mapserver.ingest.store import Incoming
 from protocol.arrays import Table
 from protocol.codec import decode_reply, encode_reply

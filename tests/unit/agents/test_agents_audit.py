@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 from agents_drives import made_up_samples
 
-from agents.audit import AuditLog, parse, read_audit
-from agents.spool import Spool, SpoolConfig
+from agents.delivery.audit import AuditLog, parse, read_audit
+from agents.delivery.spool import Spool, SpoolConfig
 from protocol.errors import StoreError
 from protocol.samples import content_hash
 

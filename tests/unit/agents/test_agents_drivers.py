@@ -10,10 +10,10 @@ from agents_drives import SITE, START_NS, Leg, drive, machine
 from agents.agent import Agent, Places
 from agents.calibration_file import load
 from agents.config import AgentConfig
+from agents.delivery.uplink import UplinkConfig
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
 from agents.physics import GRAVITY_MPS2
-from agents.uplink import UplinkConfig
 from protocol import keys
 from protocol.codec import encode_bundle
 from protocol.logfolder import open_log, write_log

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from agents_drives import made_up_samples
 
-from agents.audit import AuditLog, read_audit
-from agents.spool import KEPT_RUNS, Spool, SpoolConfig
-from agents.spool_file import connect
+from agents.delivery.audit import AuditLog, read_audit
+from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
+from agents.delivery.spool_file import connect
 from protocol.errors import StoreError
 from protocol.samples import content_hash
 
@@ -135,7 +135,7 @@ def test_runs_that_are_not_closed_are_never_forgotten(tmp_path: Path) -> None:
 
 def test_spool_that_another_process_has_open_is_refused(tmp_path: Path) -> None:
     spool = opened(tmp_path)
-    script = "import sys; from pathlib import Path; from agents.spool import *; Spool(Path(sys.argv[1]), SpoolConfig())"
+    script = "import sys; from pathlib import Path; from agents.delivery.spool import *; Spool(Path(sys.argv[1]), SpoolConfig())"
     command = [sys.executable, "-c", script, str(tmp_path / "spool.db")]
     found = subprocess.run(command, capture_output=True, text=True, env={"PYTHONPATH": str(ROOT)}, check=False)
     assert "another agent is using this spool" in found.stderr
@@ -147,8 +147,8 @@ WRITER = """
 import sys
 from pathlib import Path
 from agents_drives import made_up_samples
-from agents.audit import AuditLog
-from agents.spool import KEPT_RUNS, Spool, SpoolConfig
+from agents.delivery.audit import AuditLog
+from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
 folder = Path(sys.argv[1])
 spool = Spool(folder / "spool.db", SpoolConfig(), AuditLog(folder / "audit.txt"))
 rows = made_up_samples(100_000)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from agents_drives import SITE, made_up_samples
 
-from agents.spool import Spool, SpoolConfig
-from agents.uplink import BLOCKING, PASSING, UplinkConfig, UplinkState, linger
+from agents.delivery.spool import Spool, SpoolConfig
+from agents.delivery.uplink import BLOCKING, PASSING, UplinkConfig, UplinkState, linger
 from mapserver.ingest.admission import GapError, admit, parse
 from protocol.codec import decode_batch, decode_reply, encode_reply
 from protocol.errors import MessageError, Refusal

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.audit import AuditLog
+from agents.delivery.audit import AuditLog
 from evaluation.audit import AuditResult, audit_store, compare, grid_difference, read_audits
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.spool import Spool, SpoolConfig
+from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.server import Server
@@ -330,7 +330,7 @@ def test_a_spool_is_read_without_a_trace(tmp_path: Path):
 
 def test_a_spool_that_was_killed_is_read_with_its_log(tmp_path: Path):
     code = (
-        "import os, sys; from pathlib import Path; from agents.spool import Spool, SpoolConfig\n"
+        "import os, sys; from pathlib import Path; from agents.delivery.spool import Spool, SpoolConfig\n"
         "import numpy as np; from protocol.samples import SAMPLE_DTYPE\n"
         "Spool(Path(sys.argv[1]), SpoolConfig()).record(np.ones(7, SAMPLE_DTYPE)); os._exit(0)"
     )

@@ -17,14 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 import zenoh
 
-from agents.spool import Head, Spool
+from agents.delivery.spool import Head, Spool
 from protocol import keys
 from protocol.codec import decode_reply, encode_batch
 from protocol.errors import MessageError, Refusal
 from protocol.messages import Ack, Refused, SampleBatch
 from protocol.samples import empty
 
-log = logging.getLogger("agents.uplink")
+log = logging.getLogger("agents.delivery.uplink")
 
 # The fault lies with the set-up, not with a sample: nothing is put aside, a person has to mend it.
 BLOCKING = {

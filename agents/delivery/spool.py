@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.audit import AuditLog
-from agents.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
+from agents.delivery.audit import AuditLog
+from agents.delivery.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.samples import SAMPLE_DTYPE, empty
