@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from agents import calibration_file
 from agents.config import AgentConfig
 from agents.delivery.audit import AuditLog
 from agents.delivery.spool import Spool
 from agents.delivery.uplink import Sign, Uplink, UplinkState, linger
 from agents.drivers import Driver
+from agents.estimation import calibration_file
 from agents.estimation.calibration import Calibration
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline

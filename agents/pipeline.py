@@ -12,12 +12,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from agents.drivers.stream_order import Order, Verdict
 from agents.estimation.calibration import Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from agents.order import Order, Verdict
 from agents.sampling import NOTHING, PoseHistory, Sampler, SamplingConfig, Way
 from protocol.arrays import Table
 from protocol.machine import MachineConfig, SensorConfig

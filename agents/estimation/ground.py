@@ -17,10 +17,10 @@ from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import AttitudeConfig
 from agents.estimation.balance import Balance, Balancer
 from agents.estimation.calibration import Calibration, CalibrationConfig, Calibrator, unknown
-from agents.estimation.kalman import KalmanConfig, KalmanResistance
 from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility, PlausibilityConfig
-from agents.estimation.recursive import RecursiveConfig, RecursiveGrade, RecursiveResistance
 from agents.estimation.resistance import Push, Resistance
+from agents.estimation.resistance_kalman import KalmanConfig, KalmanResistance
+from agents.estimation.resistance_rls import RecursiveConfig, RecursiveGrade, RecursiveResistance
 from protocol.config import require_positive
 from protocol.machine import MachineConfig, SensorConfig
 from protocol.readings import Reading

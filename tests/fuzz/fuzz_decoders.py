@@ -14,8 +14,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from agents import calibration_file
 from agents.config import load_agent
+from agents.estimation import calibration_file
 from agents.estimation.calibration import Calibration
 from mapserver.config import ServerConfig
 from protocol import queries

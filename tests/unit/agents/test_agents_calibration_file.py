@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from agents.calibration_file import load, save
 from agents.estimation.calibration import Calibration
+from agents.estimation.calibration_file import load, save
 from protocol.errors import StoreError
 
 KNOWN = Calibration(0.0031, -0.02, ((1e-6, -2e-7), (-2e-7, 1e-4)), 1_767_225_600_000_000_000, 41)

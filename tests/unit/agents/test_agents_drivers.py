@@ -8,11 +8,11 @@ import pytest
 from agents_drives import SITE, START_NS, Leg, drive, machine
 
 from agents.agent import Agent, Places
-from agents.calibration_file import load
 from agents.config import AgentConfig
 from agents.delivery.uplink import UplinkConfig
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
+from agents.estimation.calibration_file import load
 from agents.physics import GRAVITY_MPS2
 from protocol import keys
 from protocol.codec import encode_bundle

@@ -9,8 +9,8 @@ import pytest
 from agents_drives import START_NS
 from agents_ground import STEP_S, noise_of, pushed, pushes
 
-from agents.estimation.kalman import FIRST_C_RR, FIRST_STD, KalmanConfig, KalmanResistance
 from agents.estimation.resistance import Push
+from agents.estimation.resistance_kalman import FIRST_C_RR, FIRST_STD, KalmanConfig, KalmanResistance
 from protocol.arrays import Floats
 
 QUIET = 0.002  # half of the noise that is taken for granted: none is measured beyond it

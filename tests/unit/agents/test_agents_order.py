@@ -1,6 +1,6 @@
 import pytest
 
-from agents.order import LATE_LIMIT, Order, Verdict
+from agents.drivers.stream_order import LATE_LIMIT, Order, Verdict
 from protocol.readings import Articulation, Reading
 
 MS = 1_000_000

@@ -7,7 +7,7 @@ import pytest
 from agents_drives import START_NS
 from agents_ground import STEP_S, noise_of, pushed, pushes
 
-from agents.estimation.recursive import MultipleForgetting, RecursiveConfig, RecursiveGrade, RecursiveResistance
+from agents.estimation.resistance_rls import MultipleForgetting, RecursiveConfig, RecursiveGrade, RecursiveResistance
 from protocol.arrays import Floats
 
 
