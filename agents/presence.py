@@ -19,10 +19,10 @@ from typing import Any
 import zenoh
 
 from agents.localisation.filters.belief import PoseBelief
-from protocol import keys
-from protocol.codec import MAX_SMALL_BYTES, encode_health, encode_pose, pack, take, unpack
 from protocol.errors import MessageError
-from protocol.messages import Health, Pose
+from protocol.wire import keys
+from protocol.wire.codec import MAX_SMALL_BYTES, encode_health, encode_pose, pack, take, unpack
+from protocol.wire.messages import Health, Pose
 
 POSE_NS = 200_000_000  # five a second, of the machine's own time
 ANSWER_S = 1.0  # how long to wait for another agent of the same name

@@ -11,9 +11,9 @@ from benchmarks.measure import START_NS, Result, machine, medians, timed, track
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table
-from protocol.codec import encode_batch
-from protocol.messages import Ack, SampleBatch
 from protocol.site import SiteConfig
+from protocol.wire.codec import encode_batch
+from protocol.wire.messages import Ack, SampleBatch
 
 SITE = SiteConfig("bench", 48.0, 11.0)
 BATCHES = (100, 1000)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from protocol.messages import Pose
+from protocol.wire.messages import Pose
 
 
 def position_rmse(poses: Mapping[str, Sequence[Pose]], truth: Path) -> dict[str, float]:

@@ -18,13 +18,13 @@ from mapserver.follower.follower import Keeper
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Verify
 from mapserver.ingest.writer import Writer
 from mapserver.query.answers import Answers, reads_past
-from protocol import keys
-from protocol.codec import encode_reply
 from protocol.errors import ConfigError, QueryError
-from protocol.messages import Ack, Refused
 from protocol.parameters import split_selector
 from protocol.queries import encode_change, encode_error
 from protocol.site import SiteConfig
+from protocol.wire import keys
+from protocol.wire.codec import encode_reply
+from protocol.wire.messages import Ack, Refused
 
 log = logging.getLogger("mapserver")
 

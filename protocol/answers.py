@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Floats, Floats32
-from protocol.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_plain, unpack
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.geometry import MAX_CELLS, Bounds
+from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_plain, unpack
 
 MAX_REPLY_BYTES = 2**30
 MAX_CELL_M = 1e4

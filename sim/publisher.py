@@ -13,12 +13,12 @@ from typing import Any
 
 import zenoh
 
-from protocol import keys
-from protocol.codec import encode_bundle
 from protocol.errors import LinkError
-from protocol.messages import SensorBundle
 from protocol.readings import Reading
-from protocol.session import SessionConfig, open_session
+from protocol.wire import keys
+from protocol.wire.codec import encode_bundle
+from protocol.wire.messages import SensorBundle
+from protocol.wire.session import SessionConfig, open_session
 from sim.config import SimConfig
 from sim.recorder import Recording, write_truth
 from sim.simulator import Simulator

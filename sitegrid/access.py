@@ -1,7 +1,7 @@
 """What the router lets each name do: Zenoh's access control, size and rate limits, made from the register.
 
 Everything is denied that is not granted. Zenoh compares by inclusion: a granted `machine/a/**` never lets a
-`machine/*/pose` pass. Exact keys are those of `protocol.keys`; the patterns here are only ever used for granting.
+`machine/*/pose` pass. Exact keys are those of `protocol.wire.keys`; the patterns here are only ever used for granting.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from protocol import keys
-from protocol.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_SMALL_BYTES
+from protocol.wire import keys
+from protocol.wire.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_SMALL_BYTES
 from sitegrid.register import Register, common_name
 
 POSE_HZ, HEALTH_HZ = 50.0, 10.0  # of one link; poses come with 5 Hz, at ten times real time with 50

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from protocol.errors import SitegridError
-from protocol.session import DEFAULT_ENDPOINT
+from protocol.wire.session import DEFAULT_ENDPOINT
 from sitegrid.argument_types import address, count, days, not_negative, positive, seed, withhold
 from sitegrid.logs import start_logging
 from sitegrid.times import HELP as TIME_HELP

@@ -13,7 +13,6 @@ from typing import Any
 
 import zenoh
 
-from protocol import keys
 from protocol.admin import TrustCommand, encode_command
 from protocol.errors import LinkError
 from protocol.geometry import Bounds
@@ -43,7 +42,8 @@ from protocol.queries import (
     decode_region,
     encode_query,
 )
-from protocol.session import DEFAULT_ENDPOINT, open_session
+from protocol.wire import keys
+from protocol.wire.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.listener import Listener
 from sitegrid.security import join
 

@@ -12,10 +12,10 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
 
-from protocol.credentials import Identity
-from protocol.messages import Ack, Refused
 from protocol.site import SiteConfig
 from protocol.version import UNKNOWN
+from protocol.wire.credentials import Identity
+from protocol.wire.messages import Ack, Refused
 
 EXPIRES_DAYS = 30
 OFFSET_S = 1.0  # of two clocks, beyond which the ages on the map are off

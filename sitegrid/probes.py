@@ -18,14 +18,14 @@ import numpy as np
 import zenoh
 
 from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
-from protocol import keys
-from protocol.codec import decode_health, decode_reply, encode_batch
-from protocol.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, SIGNING_FILE, load_credentials
 from protocol.errors import ConfigError, LinkError, MessageError, StoreError
-from protocol.messages import Ack, Refused, SampleBatch
 from protocol.queries import decode_info
 from protocol.samples import SAMPLE_DTYPE, empty
-from protocol.session import SessionConfig, open_session
+from protocol.wire import keys
+from protocol.wire.codec import decode_health, decode_reply, encode_batch
+from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, SIGNING_FILE, load_credentials
+from protocol.wire.messages import Ack, Refused, SampleBatch
+from protocol.wire.session import SessionConfig, open_session
 from sitegrid.doctor import Certificate, Link, SpoolState, StoreState
 
 ANSWER_S = 5.0

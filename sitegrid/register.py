@@ -14,7 +14,7 @@ from pathlib import Path
 
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
-from protocol.keys import check_name
+from protocol.wire.keys import check_name
 
 REGISTER_FILE = "register.toml"
 ROUTER = "router"  # a name and a role: one per site

@@ -6,9 +6,9 @@ from datetime import UTC, datetime
 from ipaddress import ip_address
 from pathlib import Path
 
-from protocol.credentials import check_valid, load_credentials
 from protocol.errors import ConfigError
-from protocol.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT, SessionConfig
+from protocol.wire.credentials import check_valid, load_credentials
+from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT, SessionConfig
 
 
 def join(

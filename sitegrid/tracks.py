@@ -8,10 +8,10 @@ import numpy as np
 import zenoh
 
 from mapserver.pictures.plotter import Track
-from protocol import keys
-from protocol.codec import decode_pose
 from protocol.errors import MessageError
-from protocol.messages import Pose
+from protocol.wire import keys
+from protocol.wire.codec import decode_pose
+from protocol.wire.messages import Pose
 
 MAX_POSES = 50_000  # of one machine: nearly three hours at 5 Hz
 

@@ -22,14 +22,14 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from protocol import keys
 from protocol.arrays import Table
-from protocol.codec import decode_reply, encode_batch
 from protocol.errors import QueryError
-from protocol.messages import Ack, SampleBatch
 from protocol.samples import SAMPLE_DTYPE
-from protocol.session import SessionConfig, free_endpoint, open_session
 from protocol.site import SiteConfig, load_site
+from protocol.wire import keys
+from protocol.wire.codec import decode_reply, encode_batch
+from protocol.wire.messages import Ack, SampleBatch
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.client import Client, connect
 from sitegrid.processes import Child, Children
 

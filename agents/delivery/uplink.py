@@ -18,11 +18,11 @@ import numpy as np
 import zenoh
 
 from agents.delivery.spool import Head, Spool
-from protocol import keys
-from protocol.codec import decode_reply, encode_batch
 from protocol.errors import MessageError, Refusal
-from protocol.messages import Ack, Refused, SampleBatch
 from protocol.samples import empty
+from protocol.wire import keys
+from protocol.wire.codec import decode_reply, encode_batch
+from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("agents.delivery.uplink")
 

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 
 import zenoh
 
-from protocol import keys
-from protocol.codec import decode_bundle
 from protocol.errors import MessageError
 from protocol.readings import Reading
+from protocol.wire import keys
+from protocol.wire.codec import decode_bundle
 
 QUEUE_BUNDLES = 4000  # 200 s of bundles; beyond it bundles are dropped and counted
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from protocol.codec import decode_batch
 from protocol.errors import MessageError, Refusal
-from protocol.messages import SampleBatch
 from protocol.site import SiteConfig
+from protocol.wire.codec import decode_batch
+from protocol.wire.messages import SampleBatch
 
 
 class GapError(MessageError):

@@ -23,11 +23,11 @@ from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Wanted
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import Decisions
-from protocol import keys
 from protocol.errors import MessageError, Refusal, StoreError
-from protocol.messages import Ack, Refused, SampleBatch
 from protocol.site import SiteConfig
 from protocol.version import package_version
+from protocol.wire import keys
+from protocol.wire.messages import Ack, Refused, SampleBatch
 
 JOURNAL_FILE = "journal.db"
 LOCK_FILE = "lock"

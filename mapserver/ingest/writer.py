@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store, Verify
 from protocol.errors import QueryError, Refusal
-from protocol.messages import Ack, Refused
 from protocol.site import SiteConfig
+from protocol.wire.messages import Ack, Refused
 
 T = TypeVar("T")
 Reply = Callable[[Ack | Refused], None]

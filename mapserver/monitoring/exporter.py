@@ -17,9 +17,9 @@ from typing import Any
 import zenoh
 
 from mapserver.monitoring.metrics import CONTENT_TYPE, Heard, Host, metrics_of, render
-from protocol import keys
-from protocol.codec import MAX_SMALL_BYTES, decode_health
 from protocol.errors import ConfigError, LinkError, MessageError
+from protocol.wire import keys
+from protocol.wire.codec import MAX_SMALL_BYTES, decode_health
 
 PATH = "/metrics"
 MOST_AGENTS = 1000  # names are free to choose where there are no keys

@@ -20,8 +20,8 @@ from mapserver.pictures.plotter import draw_difference, side_by_side, write_imag
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.logfolder import LogFolder, open_log
 from protocol.queries import Region
-from protocol.session import free_endpoint
 from protocol.site import load_site
+from protocol.wire.session import free_endpoint
 from sim.config import SimConfig, resolve
 from sim.recorder import TRACKS_FOLDER
 from sim.scenario.tables import Scenario

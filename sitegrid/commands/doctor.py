@@ -12,12 +12,12 @@ from typing import Any
 
 import zenoh
 
-from protocol import keys
-from protocol.credentials import Identity, load_credentials
 from protocol.errors import ConfigError, SitegridError, StoreError
-from protocol.keys import check_name
 from protocol.site import SiteConfig, load_site
 from protocol.version import UNKNOWN, package_version
+from protocol.wire import keys
+from protocol.wire.credentials import Identity, load_credentials
+from protocol.wire.keys import check_name
 from sitegrid import doctor, probes
 from sitegrid.doctor import ASKS_MAP, Finding, Level, skipped
 from sitegrid.process import say

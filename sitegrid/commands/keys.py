@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from protocol.certificates import Pair, expires_at, issue, make_authority
-from protocol.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, IDENTITY_FILE, KEY_FILE, SIGNING_FILE
 from protocol.errors import ConfigError
-from protocol.keys import check_name
 from protocol.signing import make_signing_key
+from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, IDENTITY_FILE, KEY_FILE, SIGNING_FILE
+from protocol.wire.keys import check_name
 from sitegrid.process import say
 from sitegrid.register import (
     REGISTER_FILE,

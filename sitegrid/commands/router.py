@@ -8,9 +8,9 @@ from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from protocol.credentials import check_valid, load_credentials
 from protocol.errors import ConfigError
-from protocol.session import SessionConfig, open_session
+from protocol.wire.credentials import check_valid, load_credentials
+from protocol.wire.session import SessionConfig, open_session
 from sitegrid.access import router_settings
 from sitegrid.process import say, stop_flag, wait
 from sitegrid.register import REGISTER_FILE, ROUTER, Register, load_register

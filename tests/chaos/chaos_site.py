@@ -18,8 +18,8 @@ from mapserver.journal.journal import JournalReader
 from protocol.errors import StoreError
 from protocol.logfolder import open_log
 from protocol.machine import plain_lines
-from protocol.session import free_endpoint
 from protocol.site import load_site
+from protocol.wire.session import free_endpoint
 from tests.chaos.leashed import Process
 from tests.chaos.outcome import Outcome, Span, Told, longest_pause
 from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings

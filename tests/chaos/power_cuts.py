@@ -17,10 +17,10 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.history import History, history_rows
-from protocol.codec import encode_batch
 from protocol.errors import StoreError
-from protocol.messages import Ack, SampleBatch
 from protocol.samples import content_hash, empty
+from protocol.wire.codec import encode_batch
+from protocol.wire.messages import Ack, SampleBatch
 from tests.chaos import power_worker as work
 from tests.chaos.disk_model import Disk, Kind, Operation, read_trace
 from tests.chaos.disk_shim import FailingDisk, build

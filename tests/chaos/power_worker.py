@@ -19,11 +19,11 @@ from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table
-from protocol.codec import encode_batch
 from protocol.errors import StoreError
-from protocol.messages import Ack, SampleBatch
 from protocol.samples import content_hash, empty
 from protocol.site import SiteConfig
+from protocol.wire.codec import encode_batch
+from protocol.wire.messages import Ack, SampleBatch
 
 PROMISES, SPOOL_FILE, STORE_FOLDER = "promises", "spool.db", "store"
 MACHINE, SPOOL_ID = "loader-1", 7

@@ -21,7 +21,6 @@ from mapserver.config import ServerConfig
 from protocol import queries
 from protocol.admin import TrustCommand, encode_command, parse_command
 from protocol.config import from_table, load_toml
-from protocol.credentials import check_valid, load_credentials
 from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
 from protocol.geometry import Bounds
 from protocol.logfolder import open_log, write_log
@@ -29,6 +28,7 @@ from protocol.machine import MachineConfig, SensorConfig
 from protocol.parameters import selector_of, split_selector
 from protocol.readings import Gps, Imu
 from protocol.site import load_site
+from protocol.wire.credentials import check_valid, load_credentials
 from sim.config import load_sim
 from sitegrid.register import Entry, Register, load_register, register_toml
 from tests.fuzz.fuzz_bytes import files

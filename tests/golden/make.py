@@ -13,11 +13,12 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from protocol import codec, queries
+from protocol import queries
 from protocol.errors import QueryError, Refusal
-from protocol.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 from protocol.readings import Articulation, Attitude, Encoder, Gps, Imu, Odometry, Torque
 from protocol.samples import SAMPLE_DTYPE
+from protocol.wire import codec
+from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
 FOLDER = Path(__file__).parent
 EXTENT_M = 20_000.0

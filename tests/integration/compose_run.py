@@ -17,7 +17,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from protocol.session import free_endpoint
+from protocol.wire.session import free_endpoint
 from sitegrid.processes import Child, Children, ProcessError
 
 _ENV = re.compile(r"^ENV (?P<pairs>(?:.*\\\n)*.*)$", re.MULTILINE)

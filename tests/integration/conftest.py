@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from site_run import SiteRun  # beside this file
 
-from protocol.session import free_endpoint
+from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.processes import Children
 

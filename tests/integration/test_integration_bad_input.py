@@ -11,14 +11,14 @@ import pytest
 import zenoh
 from site_run import READY_S, SiteRun  # beside this file
 
-from protocol import keys
-from protocol.codec import MAX_BATCH_BYTES, decode_health, decode_reply, encode_batch
 from protocol.errors import Refusal
-from protocol.messages import Ack, Refused, SampleBatch
 from protocol.queries import decode_error
 from protocol.samples import SAMPLE_DTYPE
-from protocol.session import SessionConfig, free_endpoint, open_session
 from protocol.site import load_site
+from protocol.wire import keys
+from protocol.wire.codec import MAX_BATCH_BYTES, decode_health, decode_reply, encode_batch
+from protocol.wire.messages import Ack, Refused, SampleBatch
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid.processes import Children, wait_until
 

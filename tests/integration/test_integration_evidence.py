@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from site_run import READY_S, SiteRun, kill  # beside this file
 
-from protocol import keys
 from protocol.arrays import Table
-from protocol.codec import decode_reply, encode_batch
-from protocol.messages import Ack, SampleBatch
 from protocol.samples import empty
 from protocol.site import load_site
+from protocol.wire import keys
+from protocol.wire.codec import decode_reply, encode_batch
+from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import Client
 from sitegrid.processes import Child, wait_until
 

@@ -24,12 +24,12 @@ from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
-from protocol import keys
-from protocol.codec import decode_reply, encode_batch
-from protocol.messages import Ack, SampleBatch
 from protocol.samples import SAMPLE_DTYPE
-from protocol.session import SessionConfig, free_endpoint, open_session
 from protocol.site import SiteConfig, load_site
+from protocol.wire import keys
+from protocol.wire.codec import decode_reply, encode_batch
+from protocol.wire.messages import Ack, SampleBatch
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid.processes import Child, Children, wait_until
 

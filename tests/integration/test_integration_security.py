@@ -18,15 +18,15 @@ import numpy as np
 import pytest
 import zenoh
 
-from protocol import keys
-from protocol.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
-from protocol.credentials import SIGNING_FILE, Credentials, Identity, load_credentials
 from protocol.errors import LinkError
-from protocol.messages import Ack, SampleBatch
 from protocol.samples import SAMPLE_DTYPE
-from protocol.session import SessionConfig, free_endpoint, open_session
 from protocol.signing import Signer
 from protocol.site import load_site
+from protocol.wire import keys
+from protocol.wire.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
+from protocol.wire.credentials import SIGNING_FILE, Credentials, Identity, load_credentials
+from protocol.wire.messages import Ack, SampleBatch
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid import connect
 from sitegrid.access import SPARE_BYTES

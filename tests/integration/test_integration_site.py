@@ -9,7 +9,7 @@ import pytest
 from site_run import SiteRun, kill  # beside this file
 
 from protocol.errors import LinkError, QueryError
-from protocol.session import free_endpoint
+from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.processes import Children, wait_until
 

@@ -12,7 +12,7 @@ from agents.delivery.spool import Run, Spool
 from agents.delivery.uplink import UplinkState
 from mapserver.ingest import admission
 from mapserver.ingest.admission import Admission
-from protocol.messages import Ack, Refused, SampleBatch
+from protocol.wire.messages import Ack, Refused, SampleBatch
 from tests.simulation.faults import KILLS, Fault
 from tests.simulation.servers import ModelServer
 

@@ -15,8 +15,8 @@ from mapserver.ingest.admission import Admission, GapError
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
 from protocol.errors import MessageError, Refusal
-from protocol.messages import Ack, Refused
 from protocol.site import SiteConfig
+from protocol.wire.messages import Ack, Refused
 from tests.simulation.faults import Fault, FaultyConnection, Killed, Plan
 
 Run = tuple[str, int]  # machine, spool_id

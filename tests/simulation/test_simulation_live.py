@@ -23,13 +23,13 @@ from agents.localisation.filters.belief import PoseBelief
 from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
 from mapserver.config import ServerConfig
 from mapserver.server import Server
-from protocol import keys
-from protocol.codec import decode_health, decode_pose
 from protocol.errors import LinkError
 from protocol.machine import MachineConfig, SensorConfig
 from protocol.samples import SAMPLE_DTYPE
-from protocol.session import SessionConfig, free_endpoint, open_session
 from protocol.site import SiteConfig
+from protocol.wire import keys
+from protocol.wire.codec import decode_health, decode_pose
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.commands.agent import _claim_name, _open
 from sitegrid.processes import wait_until
 

@@ -21,11 +21,11 @@ from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig, UplinkState
 from mapserver.ingest.store import Incoming
 from protocol.arrays import Table
-from protocol.codec import decode_reply, encode_reply
 from protocol.errors import StoreError
-from protocol.messages import Ack, Refused
 from protocol.samples import SAMPLE_DTYPE
 from protocol.site import SiteConfig
+from protocol.wire.codec import decode_reply, encode_reply
+from protocol.wire.messages import Ack, Refused
 from tests.simulation.faults import Fault, FaultySpool, Killed, Plan
 from tests.simulation.rates import draw_rates
 from tests.simulation.servers import MapServer, ModelServer, RealServer

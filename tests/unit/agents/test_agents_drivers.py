@@ -14,12 +14,12 @@ from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
 from agents.estimation.calibration_file import load
 from agents.physics import GRAVITY_MPS2
-from protocol import keys
-from protocol.codec import encode_bundle
 from protocol.logfolder import open_log, write_log
-from protocol.messages import SensorBundle
 from protocol.readings import Articulation, Imu, Reading
-from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.wire import keys
+from protocol.wire.codec import encode_bundle
+from protocol.wire.messages import SensorBundle
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 
 OF = machine()
 

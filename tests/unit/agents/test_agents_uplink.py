@@ -12,10 +12,10 @@ from agents_drives import SITE, made_up_samples
 from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import BLOCKING, PASSING, UplinkConfig, UplinkState, linger
 from mapserver.ingest.admission import GapError, admit, parse
-from protocol.codec import decode_batch, decode_reply, encode_reply
 from protocol.errors import MessageError, Refusal
-from protocol.messages import Ack, Refused, SampleBatch
 from protocol.samples import content_hash
+from protocol.wire.codec import decode_batch, decode_reply, encode_reply
+from protocol.wire.messages import Ack, Refused, SampleBatch
 
 ROWS = made_up_samples(500)
 QUICK_S = 0.01  # an exchange over a good link

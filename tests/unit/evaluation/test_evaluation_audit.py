@@ -17,10 +17,10 @@ from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, checksum, pack
 from mapserver.trust.decisions import KIND, PERSON, Decision
 from protocol.arrays import Table
-from protocol.codec import encode_batch
-from protocol.messages import Ack, SampleBatch
 from protocol.samples import content_hash, empty
 from protocol.site import SiteConfig
+from protocol.wire.codec import encode_batch
+from protocol.wire.messages import Ack, SampleBatch
 
 SITE, CONFIG = SiteConfig("pit", 48.0, 11.0), ServerConfig()
 SPOOLS = {"a": 2**63 + 5, "b": 9}

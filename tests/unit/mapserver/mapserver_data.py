@@ -18,11 +18,11 @@ from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from protocol.arrays import Table
-from protocol.codec import encode_batch
-from protocol.messages import Ack, Refused, SampleBatch
 from protocol.samples import empty
-from protocol.session import SessionConfig, free_endpoint, open_session
 from protocol.site import SiteConfig
+from protocol.wire.codec import encode_batch
+from protocol.wire.messages import Ack, Refused, SampleBatch
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 
 SITE = SiteConfig("pit", 48.0, 11.0)
 CONFIG = ServerConfig()

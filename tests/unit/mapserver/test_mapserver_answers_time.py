@@ -11,9 +11,7 @@ from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answers import Answers, Nobody, reads_past
 from mapserver.server import Server
-from protocol import keys
 from protocol.admin import TrustCommand, encode_command
-from protocol.codec import encode_batch
 from protocol.errors import QueryError, Refusal
 from protocol.geometry import Bounds
 from protocol.parameters import selector_of
@@ -35,6 +33,8 @@ from protocol.queries import (
     encode_change,
     encode_query,
 )
+from protocol.wire import keys
+from protocol.wire.codec import encode_batch
 
 S, HOUR_NS = 10**9, 3600 * 10**9
 BOX = Bounds(-40, -40, 40, 40)

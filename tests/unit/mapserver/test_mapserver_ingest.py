@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from mapserver_data import NOW_NS, SITE, batch, now_ns, samples
 
 from mapserver.ingest.admission import GapError, admit, parse
-from protocol.codec import encode_batch
 from protocol.errors import MessageError, Refusal
+from protocol.wire.codec import encode_batch
 
 
 def numbered(first: int, n: int, **more):

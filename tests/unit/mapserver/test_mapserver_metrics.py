@@ -18,10 +18,10 @@ from mapserver_data import CONFIG, NOW_NS, SITE, now_ns, routed, samples  # besi
 from mapserver.monitoring.exporter import MOST_AGENTS, Exporter, HealthEar, look, text_of
 from mapserver.monitoring.metrics import Heard, Host, Metric, metrics_of, render
 from mapserver.server import Server
-from protocol import keys
-from protocol.codec import MAX_SMALL_BYTES, encode_batch, encode_health
 from protocol.errors import LinkError
-from protocol.messages import Health, SampleBatch
+from protocol.wire import keys
+from protocol.wire.codec import MAX_SMALL_BYTES, encode_batch, encode_health
+from protocol.wire.messages import Health, SampleBatch
 
 Read = dict[tuple[str, frozenset[tuple[str, str]]], float]
 HOST = Host(2**20, 1.5, 1e9, 4096, 10**10, 0.002)

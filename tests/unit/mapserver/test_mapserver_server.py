@@ -7,11 +7,8 @@ import zenoh
 from mapserver_data import CONFIG, SITE, WAIT_S, batch, now_ns, routed, samples
 
 from mapserver.server import Server
-from protocol import keys
-from protocol.codec import decode_reply, encode_batch
 from protocol.errors import Refusal
 from protocol.geometry import Bounds
-from protocol.messages import Ack
 from protocol.queries import (
     Freshness,
     InfoQuery,
@@ -23,6 +20,9 @@ from protocol.queries import (
     decode_region,
     encode_query,
 )
+from protocol.wire import keys
+from protocol.wire.codec import decode_reply, encode_batch
+from protocol.wire.messages import Ack
 
 
 @pytest.fixture(scope="module")

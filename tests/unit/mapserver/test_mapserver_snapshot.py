@@ -15,7 +15,7 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.pages import NARROW, WIDE
 from mapserver.evidence.votes import FoldConfig
-from protocol.messages import Ack
+from protocol.wire.messages import Ack
 
 FOLD = FoldConfig()
 

@@ -13,7 +13,7 @@ from mapserver_data import NOW_NS, SITE, Incoming, folded, incoming, open_store,
 
 from mapserver.evidence import snapshot
 from protocol.errors import Refusal, StoreError
-from protocol.messages import Ack, Refused
+from protocol.wire.messages import Ack, Refused
 
 
 def test_a_group_is_answered_in_order(tmp_path):

@@ -31,9 +31,9 @@ from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.journal import Journal
 from mapserver.query.answers import Answers
-from protocol.codec import MAX_BATCH_BYTES, encode_batch
 from protocol.errors import QueryError, Refusal
-from protocol.messages import Ack
+from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
+from protocol.wire.messages import Ack
 
 
 @pytest.fixture

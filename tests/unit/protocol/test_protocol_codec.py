@@ -6,12 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol import codec, queries
-from protocol.codec import decode_batch, encode_batch
+from protocol import queries
 from protocol.errors import MessageError, Refusal
-from protocol.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 from protocol.readings import KINDS, Encoder, Imu, columns
 from protocol.samples import COLUMNS, SAMPLE_DTYPE
+from protocol.wire import codec
+from protocol.wire.codec import decode_batch, encode_batch
+from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
 EXTENT_M = 20_000.0
 T0 = 1_750_000_000_000_000_000

@@ -7,17 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from protocol import admin, codec, parameters, queries
+from protocol import admin, parameters, queries
 from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.geometry import MAX_CELLS
 from protocol.logfolder import open_log
 from protocol.machine import GIVES, MODES
-from protocol.messages import Pose
 from protocol.readings import KINDS, MAX_STAMP_NS, columns
 from protocol.samples import COLUMNS
 from protocol.site import KnownGround
 from protocol.units import _NS, _UNITS
+from protocol.wire import codec
+from protocol.wire.messages import Pose
 
 DOCS = Path(__file__).parents[3] / "docs"
 WIRE, LOGS = ((DOCS / name).read_text() for name in ("protocol.md", "log-folders.md"))

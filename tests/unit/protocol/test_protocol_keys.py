@@ -3,8 +3,8 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import keys
 from protocol.errors import ConfigError
+from protocol.wire import keys
 
 names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,62}", fullmatch=True)
 OF_MACHINE = (keys.ingest, keys.pose, keys.health, keys.alive, keys.sensors)

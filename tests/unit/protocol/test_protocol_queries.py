@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.admin import TrustCommand, encode_command, parse_command
-from protocol.codec import pack
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.geometry import MAX_CELLS, Bounds
 from protocol.parameters import MAX_TEXT, quoted, selector_of, split_selector
@@ -46,6 +45,7 @@ from protocol.queries import (
     parse_query,
 )
 from protocol.readings import MAX_STAMP_NS
+from protocol.wire.codec import pack
 
 positions = st.floats(-1e15, 1e15)
 layers = st.lists(st.sampled_from(["resistance", "grade_east", "age_s"]), max_size=3).map(tuple)

@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from protocol.credentials import Credentials, Identity
 from protocol.errors import LinkError
-from protocol.session import SessionConfig, _settings, free_endpoint, open_session
+from protocol.wire.credentials import Credentials, Identity
+from protocol.wire.session import SessionConfig, _settings, free_endpoint, open_session
 
 CREDENTIALS = Credentials(Path("/keys/a"), Identity("paper", "a", "machine", datetime(2100, 1, 1, tzinfo=UTC)))
 

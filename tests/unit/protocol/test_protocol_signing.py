@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protocol import keys
 from protocol.errors import ConfigError, MessageError, Refusal
+from protocol.wire import keys
 
 signing = pytest.importorskip("protocol.signing", reason="cryptography is not installed")
 

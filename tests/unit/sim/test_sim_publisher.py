@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from protocol import keys
-from protocol.codec import decode_bundle
 from protocol.errors import LinkError
 from protocol.logfolder import open_log
-from protocol.messages import SensorBundle
-from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.wire import keys
+from protocol.wire.codec import decode_bundle
+from protocol.wire.messages import SensorBundle
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig, resolve
 from sim.publisher import Pace, run
 from sim.simulator import Simulator

@@ -13,8 +13,8 @@ from agents.config import AgentConfig
 from protocol.errors import ConfigError, LinkError
 from protocol.logfolder import open_log
 from protocol.machine import machine_toml
-from protocol.session import free_endpoint
 from protocol.site import load_site
+from protocol.wire.session import free_endpoint
 from sim.config import resolve
 from sim.scenario.file import load_scenario
 from sim.truth import TruthMap

@@ -24,15 +24,15 @@ from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.server import Server
-from protocol import keys
-from protocol.codec import encode_batch, encode_health
-from protocol.credentials import Identity
 from protocol.errors import Refusal, StoreError
-from protocol.messages import Ack, Health, Refused, SampleBatch
 from protocol.queries import InfoQuery, encode_info
 from protocol.samples import SAMPLE_DTYPE
-from protocol.session import SessionConfig, free_endpoint, open_session
 from protocol.site import SiteConfig
+from protocol.wire import keys
+from protocol.wire.codec import encode_batch, encode_health
+from protocol.wire.credentials import Identity
+from protocol.wire.messages import Ack, Health, Refused, SampleBatch
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid import doctor, probes
 from sitegrid.cli import main
 from sitegrid.doctor import Certificate, Finding, Level, Link, SpoolState, StoreState

@@ -19,12 +19,12 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import JournalRow
 from protocol.arrays import Table
-from protocol.codec import encode_batch
 from protocol.config import from_table, load_toml
 from protocol.geometry import CellWindow
-from protocol.messages import Ack, SampleBatch
 from protocol.samples import COLUMNS, empty
 from protocol.site import KnownGround, SiteConfig, load_site
+from protocol.wire.codec import encode_batch
+from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main
 from sitegrid.commands import fold
 from sitegrid.times import parse_stamp

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from protocol import keys
-from protocol.codec import MAX_BATCH_BYTES
-from protocol.credentials import check_valid, load_credentials
 from protocol.errors import ConfigError
-from protocol.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
+from protocol.wire import keys
+from protocol.wire.codec import MAX_BATCH_BYTES
+from protocol.wire.credentials import check_valid, load_credentials
+from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from sitegrid.access import access_control, router_settings
 from sitegrid.cli import build_parser, main
 from sitegrid.register import ROLES, Entry, Register, common_name, load_register, register_toml

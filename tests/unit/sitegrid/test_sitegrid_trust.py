@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import zenoh
 
-from protocol import keys
 from protocol.admin import TrustCommand, parse_command
 from protocol.errors import QueryError, Refusal
 from protocol.parameters import split_selector
@@ -26,7 +25,8 @@ from protocol.queries import (
     encode_machines,
     parse_query,
 )
-from protocol.session import SessionConfig, free_endpoint, open_session
+from protocol.wire import keys
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import build_parser, main
 from sitegrid.client import Client, connect
 from sitegrid.commands import query

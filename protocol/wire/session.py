@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 import zenoh
 
-from protocol.credentials import Credentials
 from protocol.errors import LinkError
+from protocol.wire.credentials import Credentials
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_TLS_ENDPOINT = "tls/127.0.0.1:7447"

@@ -11,10 +11,10 @@ import numpy as np
 
 from protocol.arrays import Table
 from protocol.errors import MessageError, Refusal
-from protocol.messages import VERSION, Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 from protocol.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
 from protocol.samples import COLUMNS, SAMPLE_DTYPE, check_samples
 from protocol.site import NAME
+from protocol.wire.messages import VERSION, Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
 MAX_BATCH_BYTES = 4 * 2**20
 MAX_BATCH_SAMPLES = 20_000

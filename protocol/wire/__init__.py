@@ -1,0 +1,1 @@
+"""What goes over Zenoh: key expressions, messages, their bytes, and sessions."""
