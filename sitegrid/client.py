@@ -13,11 +13,11 @@ from typing import Any
 
 import zenoh
 
-from protocol.admin import TrustCommand, encode_command
 from protocol.errors import LinkError
 from protocol.geometry import Bounds
-from protocol.parameters import selector_of
-from protocol.queries import (
+from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.parameters import selector_of
+from protocol.queries.requests import (
     NOW,
     ChangesQuery,
     Freshness,

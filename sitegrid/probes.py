@@ -19,7 +19,7 @@ import zenoh
 
 from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
 from protocol.errors import ConfigError, LinkError, MessageError, StoreError
-from protocol.queries import decode_info
+from protocol.queries.requests import decode_info
 from protocol.samples import SAMPLE_DTYPE, empty
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_reply, encode_batch

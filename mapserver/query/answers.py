@@ -16,10 +16,10 @@ from mapserver.journal.rows import Wanted
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.views import Past, View, cropped, read_cells, view_now, widened
-from protocol.admin import TrustCommand, parse_command
 from protocol.errors import QueryError, Refusal
 from protocol.geometry import Bounds, CellWindow
-from protocol.queries import (
+from protocol.queries.commands import TrustCommand, parse_command
+from protocol.queries.requests import (
     MAX_SPANS,
     ChangesQuery,
     HistoryAnswer,

@@ -19,7 +19,7 @@ from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.logfolder import LogFolder, open_log
-from protocol.queries import Region
+from protocol.queries.requests import Region
 from protocol.site import load_site
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig, resolve

@@ -11,7 +11,7 @@ import numpy as np
 
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
-from protocol.queries import Region
+from protocol.queries.requests import Region
 from sitegrid.client import Client, connect
 from sitegrid.process import plain, say, stop_flag, wait
 from sitegrid.times import SiteTime, told

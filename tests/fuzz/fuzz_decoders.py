@@ -18,14 +18,14 @@ from agents.config import load_agent
 from agents.estimation import calibration_file
 from agents.estimation.calibration import Calibration
 from mapserver.config import ServerConfig
-from protocol import queries
-from protocol.admin import TrustCommand, encode_command, parse_command
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
 from protocol.geometry import Bounds
 from protocol.logfolder import open_log, write_log
 from protocol.machine import MachineConfig, SensorConfig
-from protocol.parameters import selector_of, split_selector
+from protocol.queries import requests
+from protocol.queries.commands import TrustCommand, encode_command, parse_command
+from protocol.queries.parameters import selector_of, split_selector
 from protocol.readings import Gps, Imu
 from protocol.site import load_site
 from protocol.wire.credentials import check_valid, load_credentials
@@ -97,14 +97,14 @@ def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], 
 
 
 def _selectors() -> Iterator[Decoder]:
-    fresh, when = queries.Freshness(17, 2.5), queries.When(T0, T0 - 10**9)
+    fresh, when = requests.Freshness(17, 2.5), requests.When(T0, T0 - 10**9)
     asked = (
-        queries.PointQuery(12.0, -40.5, ("resistance", "visits"), fresh, when),
-        queries.RegionQuery(Bounds(0.0, 0.0, 200.0, 150.0), ("resistance",), fresh, when),
-        queries.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
-        queries.MachinesQuery(fresh),
-        queries.ChangesQuery(3),
-        queries.InfoQuery(fresh),
+        requests.PointQuery(12.0, -40.5, ("resistance", "visits"), fresh, when),
+        requests.RegionQuery(Bounds(0.0, 0.0, 200.0, 150.0), ("resistance",), fresh, when),
+        requests.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
+        requests.MachinesQuery(fresh),
+        requests.ChangesQuery(3),
+        requests.InfoQuery(fresh),
     )
     seeds = tuple(f"{query.name}?{selector_of(queries.encode_query(query))}".encode() for query in asked)
     yield Decoder("query", seeds, _query, (QueryError,), texts)
@@ -119,10 +119,10 @@ def _split(data: bytes) -> tuple[str, dict[str, str]]:
 
 
 def _query(data: bytes) -> None:
-    query = queries.parse_query(*_split(data))
-    sent = split_selector(selector_of(queries.encode_query(query)))
-    known = queries.parse_query(query.name, sent)
-    assert queries.encode_query(known) == queries.encode_query(query)
+    query = requests.parse_query(*_split(data))
+    sent = split_selector(selector_of(requests.encode_query(query)))
+    known = requests.parse_query(query.name, sent)
+    assert requests.encode_query(known) == requests.encode_query(query)
 
 
 def _command(data: bytes) -> None:

@@ -13,8 +13,8 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from protocol import queries
 from protocol.errors import QueryError, Refusal
+from protocol.queries import requests
 from protocol.readings import Articulation, Attitude, Encoder, Gps, Imu, Odometry, Torque
 from protocol.samples import SAMPLE_DTYPE
 from protocol.wire import codec
@@ -61,10 +61,10 @@ def readings() -> tuple[Any, ...]:
     )
 
 
-def region() -> queries.Region:
+def region() -> requests.Region:
     """3 x 2 cells of half a metre, south-west corner (-1, 2)."""
     resistance = np.array([[0.02, NAN, 0.25], [NAN, 0.008, 0.04]], np.float32)
-    return queries.Region(
+    return requests.Region(
         x_m=np.array([-0.75, -0.25, 0.25]),
         y_m=np.array([2.25, 2.75]),
         cell_m=0.5,
@@ -84,13 +84,13 @@ LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
-POINT = queries.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
-HISTORY = queries.HistoryAnswer(
+POINT = requests.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
+HISTORY = requests.HistoryAnswer(
     0.5,
     1.5,
     (
-        queries.Span(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
-        queries.Span(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
+        requests.Span(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
+        requests.Span(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
     ),
     17,
     T0 + 700_000_000_000,
@@ -130,18 +130,18 @@ GOLDEN: dict[str, Golden] = {
     "bundle.bin": Golden(SensorBundle("loader-1", 5, readings(), last=True), codec.encode_bundle, codec.decode_bundle),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
-    "point.bin": Golden(POINT, queries.encode_point, queries.decode_point),
-    "region.bin": Golden(region(), queries.encode_region, queries.decode_region),
-    "history.bin": Golden(HISTORY, queries.encode_history, queries.decode_history),
-    "machines.bin": Golden([MACHINE], queries.encode_machines, queries.decode_machines),
-    "machine.bin": Golden({**MACHINE, "merged": 17}, queries.encode_machine, queries.decode_machine),
-    "changes.bin": Golden([CHANGE], queries.encode_changes, queries.decode_changes),
-    "change.bin": Golden(CHANGE, queries.encode_change, queries.decode_change),
+    "point.bin": Golden(POINT, requests.encode_point, requests.decode_point),
+    "region.bin": Golden(region(), requests.encode_region, requests.decode_region),
+    "history.bin": Golden(HISTORY, requests.encode_history, requests.decode_history),
+    "machines.bin": Golden([MACHINE], requests.encode_machines, requests.decode_machines),
+    "machine.bin": Golden({**MACHINE, "merged": 17}, requests.encode_machine, requests.decode_machine),
+    "changes.bin": Golden([CHANGE], requests.encode_changes, requests.decode_changes),
+    "change.bin": Golden(CHANGE, requests.encode_change, requests.decode_change),
     "info.bin": Golden(
-        {"site": "paper", "merged": 17, "refused": {"gap": 1}}, queries.encode_info, queries.decode_info
+        {"site": "paper", "merged": 17, "refused": {"gap": 1}}, requests.encode_info, requests.decode_info
     ),
     "error.bin": Golden(
-        QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known"), queries.encode_error, queries.decode_error
+        QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known"), requests.encode_error, requests.decode_error
     ),
 }
 NEWER = "batch_newer.bin"  # of a later version of the software: an unknown field and an unknown column

@@ -12,7 +12,7 @@ import zenoh
 from site_run import READY_S, SiteRun  # beside this file
 
 from protocol.errors import Refusal
-from protocol.queries import decode_error
+from protocol.queries.requests import decode_error
 from protocol.samples import SAMPLE_DTYPE
 from protocol.site import load_site
 from protocol.wire import keys

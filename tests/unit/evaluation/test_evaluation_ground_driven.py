@@ -5,7 +5,7 @@ import pytest
 
 from evaluation.mapscore import by_border_distance, driven_cells, score_driven
 from protocol.ground import UNKNOWN
-from protocol.queries import Region
+from protocol.queries.requests import Region
 
 NAN = np.nan
 

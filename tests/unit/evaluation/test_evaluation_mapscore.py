@@ -3,7 +3,7 @@ import pytest
 
 from evaluation.mapscore import score
 from protocol.ground import SLOPE_LIMIT
-from protocol.queries import Region
+from protocol.queries.requests import Region
 
 NAN = np.nan
 

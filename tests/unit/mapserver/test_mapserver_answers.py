@@ -12,7 +12,7 @@ from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.answers import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.geometry import Bounds
-from protocol.queries import PointQuery, RegionQuery, decode_info, decode_point, decode_region
+from protocol.queries.requests import PointQuery, RegionQuery, decode_info, decode_point, decode_region
 
 # One sample in each cell of two diagonals, the value tells the cell.
 STEPS = np.arange(-40, 40)

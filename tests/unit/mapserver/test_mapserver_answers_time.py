@@ -11,11 +11,11 @@ from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answers import Answers, Nobody, reads_past
 from mapserver.server import Server
-from protocol.admin import TrustCommand, encode_command
 from protocol.errors import QueryError, Refusal
 from protocol.geometry import Bounds
-from protocol.parameters import selector_of
-from protocol.queries import (
+from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.parameters import selector_of
+from protocol.queries.requests import (
     MAX_SPANS,
     HistoryQuery,
     InfoQuery,

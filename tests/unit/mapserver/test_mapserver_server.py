@@ -9,7 +9,7 @@ from mapserver_data import CONFIG, SITE, WAIT_S, batch, now_ns, routed, samples
 from mapserver.server import Server
 from protocol.errors import Refusal
 from protocol.geometry import Bounds
-from protocol.queries import (
+from protocol.queries.requests import (
     Freshness,
     InfoQuery,
     PointQuery,

@@ -7,7 +7,7 @@ import pytest
 from mapserver.pictures import frame, plotter
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.ground import ZONES
-from protocol.queries import Region
+from protocol.queries.requests import Region
 
 NAN = np.float32(np.nan)
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol import queries
 from protocol.errors import MessageError, Refusal
+from protocol.queries import requests
 from protocol.readings import KINDS, Encoder, Imu, columns
 from protocol.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.wire import codec
@@ -324,10 +324,10 @@ DECODERS = {
     "bundle": codec.decode_bundle,
     "pose": codec.decode_pose,
     "health": codec.decode_health,
-    "point": queries.decode_point,
-    "region": queries.decode_region,
-    "info": queries.decode_info,
-    "error": queries.decode_error,
+    "point": requests.decode_point,
+    "region": requests.decode_region,
+    "info": requests.decode_info,
+    "error": requests.decode_error,
 }
 FIELDS = [
     "v",

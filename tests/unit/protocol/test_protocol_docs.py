@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from protocol import admin, parameters, queries
 from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.geometry import MAX_CELLS
 from protocol.logfolder import open_log
 from protocol.machine import GIVES, MODES
+from protocol.queries import commands, parameters, requests
 from protocol.readings import KINDS, MAX_STAMP_NS, columns
 from protocol.samples import COLUMNS
 from protocol.site import KnownGround
@@ -44,20 +44,20 @@ def test_limits_are_the_documented_ones():
     assert codec.MAX_SEQ == 2**62
 
 
-@pytest.mark.parametrize("query", queries._QUERIES)
+@pytest.mark.parametrize("query", requests._QUERIES)
 def test_every_parameter_of_a_query_is_documented(query):
-    known = set(queries._QUERIES[query][0]) - {"after", "wait"}
+    known = set(requests._QUERIES[query][0]) - {"after", "wait"}
     [row] = re.findall(rf"\n\| `{query}` \| (.*) \|", WIRE[: WIRE.index("Answers:")])
     assert {name.split("=")[0] for name in re.findall(r"`(.*?)`", row)} - {"after"} == known
 
 
 def test_every_parameter_and_limit_of_a_command_is_documented():
     [row] = re.findall(r"\n\| `trust` \| (.*?) \|", WIRE)
-    assert re.findall(r"`(.*?)`", row) == [*admin._NAMES]
-    assert [word for word in admin._WORDS if f"`{word}`" not in WIRE] == []
+    assert re.findall(r"`(.*?)`", row) == [*commands._NAMES]
+    assert [word for word in commands._WORDS if f"`{word}`" not in WIRE] == []
     assert f"at most {parameters.MAX_TEXT} characters" in WIRE
     assert f"More than {queries.MAX_SPANS} spans" in WIRE
-    assert queries.MAX_WAIT_S == admin.MAX_WAIT_S == 60
+    assert requests.MAX_WAIT_S == commands.MAX_WAIT_S == 60
 
 
 EXAMPLES = re.findall(r"`sitegrid/paper/(map|admin)/(\w+)\?(.*?)`", WIRE)
@@ -67,12 +67,12 @@ EXAMPLES = re.findall(r"`sitegrid/paper/(map|admin)/(\w+)\?(.*?)`", WIRE)
 def test_example_of_a_query_is_read_and_written(root, name, selector):
     given = parameters.split_selector(selector)
     if root == "admin":
-        parsed = admin.parse_command(name, given)
+        parsed = commands.parse_command(name, given)
         assert parsed.reason == "antenna moved; x = 3 m"
-        assert admin.parse_command(name, admin.encode_command(parsed)) == parsed
+        assert commands.parse_command(name, commands.encode_command(parsed)) == parsed
     else:
-        parsed = queries.parse_query(name, given)
-        assert queries.parse_query(name, queries.encode_query(parsed)) == parsed
+        parsed = requests.parse_query(name, given)
+        assert requests.parse_query(name, requests.encode_query(parsed)) == parsed
 
 
 def test_every_kind_of_query_has_an_example():

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.admin import TrustCommand, encode_command, parse_command
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.geometry import MAX_CELLS, Bounds
-from protocol.parameters import MAX_TEXT, quoted, selector_of, split_selector
-from protocol.queries import (
+from protocol.queries.commands import TrustCommand, encode_command, parse_command
+from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
+from protocol.queries.requests import (
     ChangesQuery,
     Freshness,
     HistoryAnswer,

@@ -25,7 +25,7 @@ from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
-from protocol.queries import InfoQuery, encode_info
+from protocol.queries.requests import InfoQuery, encode_info
 from protocol.samples import SAMPLE_DTYPE
 from protocol.site import SiteConfig
 from protocol.wire import keys

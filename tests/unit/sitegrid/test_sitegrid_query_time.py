@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
 from protocol.geometry import Bounds
-from protocol.parameters import split_selector
-from protocol.queries import (
+from protocol.queries.parameters import split_selector
+from protocol.queries.requests import (
     Freshness,
     HistoryAnswer,
     HistoryQuery,

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from protocol.admin import TrustCommand, parse_command
 from protocol.errors import QueryError, Refusal
-from protocol.parameters import split_selector
-from protocol.queries import (
+from protocol.queries.commands import TrustCommand, parse_command
+from protocol.queries.parameters import split_selector
+from protocol.queries.requests import (
     ChangesQuery,
     Freshness,
     MachinesQuery,

@@ -1,4 +1,4 @@
-"""Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers are in `protocol.answers`.
+"""Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers are in `protocol.queries.answers`.
 
 A query is parsed once, at the server's door, into a frozen type; an unknown parameter is refused by name.
 """
@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from protocol import parameters as ps
-from protocol.answers import (
+from protocol.errors import QueryError, Refusal
+from protocol.geometry import MAX_CELLS, Bounds
+from protocol.queries import parameters as ps
+from protocol.queries.answers import (
     HistoryAnswer,
     PointAnswer,
     Region,
@@ -33,8 +35,6 @@ from protocol.answers import (
     encode_point,
     encode_region,
 )
-from protocol.errors import QueryError, Refusal
-from protocol.geometry import MAX_CELLS, Bounds
 
 # fmt: off
 __all__ = [  # queries, and the answers to them

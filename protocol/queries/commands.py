@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from protocol import parameters as ps
 from protocol.errors import QueryError, Refusal
+from protocol.queries import parameters as ps
 from protocol.site import NAME
 
 MAX_WAIT_S = 60.0
