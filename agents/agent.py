@@ -23,9 +23,9 @@ from agents.pipeline import Pipeline
 from agents.presence import Owner, Presence
 from protocol.arrays import Table
 from protocol.errors import StoreError
-from protocol.machine import MachineConfig
-from protocol.samples import empty
-from protocol.site import SiteConfig
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.samples import empty
+from protocol.site.site_config import SiteConfig
 
 HEALTH_S = 1.0
 MOST_UNSAVED = 100_000  # samples that wait in memory while the disk takes nothing

@@ -11,7 +11,7 @@ from agents.holdout import HoldoutConfig
 from agents.pipeline import PipelineConfig
 from protocol.config import from_table, load_toml, section
 from protocol.errors import ConfigError
-from protocol.machine import MachineConfig, SensorConfig, parse_machine
+from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine
 
 
 @dataclass(frozen=True)

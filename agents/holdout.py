@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.pipeline import Locates
-from protocol.machine import MachineConfig
-from protocol.readings import Gps, Reading
-from protocol.site import Projection, SiteConfig
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Gps, Reading
+from protocol.site.site_config import Projection, SiteConfig
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, PoseHistory, Sampler, SamplingConfig, Way
 from protocol.arrays import Table
-from protocol.machine import MachineConfig, SensorConfig
-from protocol.readings import Reading
-from protocol.site import Projection, SiteConfig
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import Reading
+from protocol.site.site_config import Projection, SiteConfig
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import numpy as np
 from agents.estimation.ground import GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
 from protocol.arrays import Table
-from protocol.readings import Encoder, Odometry, Reading
-from protocol.samples import SAMPLE_DTYPE
+from protocol.machine.readings import Encoder, Odometry, Reading
+from protocol.machine.samples import SAMPLE_DTYPE
 
 NOTHING = np.empty(0, SAMPLE_DTYPE)
 SILENT_NS = 500_000_000  # wheels that say nothing for so long are not there

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from agents.physics import GRAVITY_MPS2
 from agents.pipeline import Pipeline, PipelineConfig
-from protocol.machine import MachineConfig, Mount, SensorConfig
-from protocol.readings import Encoder, Gps, Imu, Reading
-from protocol.site import Projection, SiteConfig
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Encoder, Gps, Imu, Reading
+from protocol.site.site_config import Projection, SiteConfig
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 LEVERS_M = {"gps-1": (0.8, 0.5, 3.0), "gps-2": (0.8, -0.5, 3.0)}

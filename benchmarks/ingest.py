@@ -11,7 +11,7 @@ from benchmarks.measure import START_NS, Result, machine, medians, timed, track
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 

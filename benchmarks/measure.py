@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Table
-from protocol.samples import empty
+from protocol.machine.samples import empty
 
 Result = dict[str, Any]
 START_NS = 1_767_225_600_000_000_000

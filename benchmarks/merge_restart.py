@@ -23,7 +23,7 @@ from mapserver.ingest.admission import Admission
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.journal import Journal
 from protocol.arrays import Table
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch
 
 SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()

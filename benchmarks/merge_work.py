@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.measure import START_NS
 from protocol.arrays import AnyArray, Floats, Table
-from protocol.samples import empty
+from protocol.machine.samples import empty
 
 MACHINES, ROADS = 10, 5  # roads in each direction
 WIDTH_M, LEG_M = 10.0, 250.0  # of a road; between two crossings

@@ -27,8 +27,8 @@ from mapserver.journal.rows import JournalRow
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import Decisions
 from protocol.arrays import Ints
-from protocol.samples import content_hash
-from protocol.site import SiteConfig
+from protocol.machine.samples import content_hash
+from protocol.site.site_config import SiteConfig
 
 Identity = tuple[str, int, int]  # machine, spool_id, seq
 

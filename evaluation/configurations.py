@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import PipelineConfig
 from protocol.errors import SitegridError
-from protocol.machine import MachineConfig
+from protocol.machine.machine_config import MachineConfig
 
 FILTERS = ("ekf", "ukf")
 PROFILES = ("paper", "default")

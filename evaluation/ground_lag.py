@@ -9,7 +9,7 @@ import numpy as np
 from agents.sampling import SamplingConfig
 from evaluation.ground_truth import Ground, Way
 from protocol.arrays import Floats, Ints, Table
-from protocol.ground import ZONES
+from protocol.site.ground_classes import ZONES
 
 LEAST_RUN_M = 4.0  # a zone that is left sooner gives the estimate no time to settle
 LEAST_STEP = 0.01  # of c_rr; below it noise decides

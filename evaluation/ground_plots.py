@@ -25,7 +25,7 @@ from evaluation.ground_score import INTERIOR_M, Judged, Placed, by_border, place
 from evaluation.ground_truth import Way
 from evaluation.plots import DPI, STYLE, WIDTH_IN
 from protocol.arrays import AnyArray, Bools, Floats, Ints
-from protocol.ground import ZONES, resistance_class
+from protocol.site.ground_classes import ZONES, resistance_class
 
 PICTURED = ("nominal", "calibrated")  # of GOAL_ROW's estimator, along the way and over the site
 SEEDS = 4  # one of each route has pictures of its own

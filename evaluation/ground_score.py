@@ -17,7 +17,7 @@ from evaluation.ground_lag import C_RR, crossings, lags
 from evaluation.ground_truth import CELL_M, Ground, Way
 from evaluation.mapscore import by_border_distance
 from protocol.arrays import Bools, Floats, Ints, Table
-from protocol.ground import UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
+from protocol.site.ground_classes import UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
 
 INTERIOR_M = 2.0  # the load centre this far from a border has all wheels on one kind of ground
 FLAT_SLOPE = math.tan(math.radians(2.0))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from protocol.arrays import Floats, Ints
-from protocol.ground import UNKNOWN
+from protocol.site.ground_classes import UNKNOWN
 from sim.scenario.ground import GroundConfig, lay
 from sim.truth import TruthMap, truth_map
 from sim.worlds.terrain import Terrain
@@ -52,7 +52,7 @@ class Ground:
     truth: TruthMap
 
     def zone(self, place_m: Floats) -> Ints:
-        """Kind of ground (n,) at places (n, 2), as an index into `protocol.ground.ZONES`."""
+        """Kind of ground (n,) at places (n, 2), as an index into `protocol.site.ground_classes.ZONES`."""
         return self.terrain.zone(place_m[:, 0], place_m[:, 1])
 
     def border_m(self, place_m: Floats) -> Floats:

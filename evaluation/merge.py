@@ -25,8 +25,8 @@ from evaluation.merge_samples import LANE_M, SPEED_MPS, Scene, simulate
 from evaluation.recordings import code_version, digest
 from evaluation.workers import each
 from protocol.arrays import Bools, Floats, Ints
-from protocol.geometry import CellWindow
-from protocol.ground import UNKNOWN, resistance_class, wrong_percent
+from protocol.site.geometry import CellWindow
+from protocol.site.ground_classes import UNKNOWN, resistance_class, wrong_percent
 
 SERVER = "soft_votes"
 SOURCES = ("mapserver", "protocol", *(f"evaluation/merge{part}.py" for part in ("", "_cases", "_methods", "_samples")))

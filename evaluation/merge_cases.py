@@ -13,7 +13,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.errors import ConfigError
-from protocol.ground import ZONES
+from protocol.site.ground_classes import ZONES
 
 CELL_M = 1.0
 DRY_CONCRETE, GRAVEL, DRY_DIRT, WET_DIRT, SAND = range(len(ZONES))

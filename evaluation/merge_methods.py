@@ -18,7 +18,7 @@ from mapserver.evidence.votes import FoldConfig
 from mapserver.query.views import read_cells, view_of
 from mapserver.trust.auditor import Auditor, TrustConfig
 from protocol.arrays import Bools, Floats, Ints, Table
-from protocol.geometry import CellWindow
+from protocol.site.geometry import CellWindow
 
 Layers = dict[str, Floats]  # (rows, columns) by name, NaN where unknown
 SERVER_LAYERS = ("resistance", "grade_east", "grade_north", "confidence")

@@ -25,7 +25,7 @@ from evaluation.merge_methods import METHODS, Layers
 from evaluation.plots import DPI, STYLE, WIDTH_IN
 from evaluation.workers import each
 from protocol.arrays import Bools, Floats, Ints
-from protocol.ground import UNKNOWN, ZONES, resistance_class
+from protocol.site.ground_classes import UNKNOWN, ZONES, resistance_class
 
 SHOWN = (SERVER, "last_write")
 ZONE_RGB: Floats = np.array([zone.bgr[::-1] for zone in ZONES]) / 255

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from evaluation.merge_cases import CELL_M, PASSES_BEFORE, Case, Machine, Site, lay, parking_place
 from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Bools, Floats, Ints, Table
-from protocol.samples import empty
+from protocol.machine.samples import empty
 
 PERIOD_NS = 200_000_000  # 5 Hz
 SPEED_MPS = 3.0

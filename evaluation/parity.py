@@ -14,9 +14,9 @@ from typing import Any
 
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from evaluation.reallog import refitted
-from protocol.logfolder import LogFolder, open_log
-from protocol.readings import Reading
-from protocol.site import Projection
+from protocol.machine.log_folder import LogFolder, open_log
+from protocol.machine.readings import Reading
+from protocol.site.site_config import Projection
 
 LOGS = Path(__file__).parent / "logs"
 STEP_S = 0.02

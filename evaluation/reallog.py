@@ -33,10 +33,10 @@ from evaluation.configurations import Configuration, pipeline_options
 from evaluation.replay import Trace, Truth, errors, replay, root_mean_square, score
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError, LogFolderError
-from protocol.logfolder import MANIFEST, LogFolder, open_log
-from protocol.machine import MachineConfig
-from protocol.readings import Reading
-from protocol.site import Projection
+from protocol.machine.log_folder import MANIFEST, LogFolder, open_log
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Reading
+from protocol.site.site_config import Projection
 from protocol.units import stamp_ns, stamp_scale
 
 SIDE_FILE = "evaluation.toml"

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from evaluation.replay import Truth, read_track
-from protocol.logfolder import open_log
-from protocol.machine import MachineConfig
-from protocol.readings import Reading
-from protocol.site import SiteConfig
+from protocol.machine.log_folder import open_log
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Reading
+from protocol.site.site_config import SiteConfig
 from sim.config import SimConfig
 from sim.recorder import record
 from sim.scenario.file import load_scenario

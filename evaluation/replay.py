@@ -19,7 +19,7 @@ from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import Locates
 from evaluation.consistency import normalised_square, summarise
 from protocol.arrays import Floats, Ints
-from protocol.readings import Reading
+from protocol.machine.readings import Reading
 
 STEP_NS = 100_000_000
 

@@ -21,7 +21,7 @@ from mapserver.query.answers import Answers, reads_past
 from protocol.errors import ConfigError, QueryError
 from protocol.queries.parameters import split_selector
 from protocol.queries.requests import encode_change, encode_error
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import encode_reply
 from protocol.wire.messages import Ack, Refused

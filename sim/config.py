@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
-from protocol.readings import MAX_STAMP_NS
-from protocol.site import NAME
+from protocol.machine.readings import MAX_STAMP_NS
+from protocol.site.site_config import NAME
 from sim.scenario.file import check, load_scenario
 from sim.scenario.tables import MAX_MACHINES, FleetConfig, Scenario
 

@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from protocol.errors import LinkError
-from protocol.readings import Reading
+from protocol.machine.readings import Reading
 from protocol.wire import keys
 from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle

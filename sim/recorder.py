@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from protocol.errors import ConfigError
-from protocol.logfolder import write_log
-from protocol.readings import Reading
+from protocol.machine.log_folder import write_log
+from protocol.machine.readings import Reading
 from sim.config import SimConfig
 from sim.simulator import Simulator
 from sim.truth import MAP_FILE, save_tracks

@@ -8,9 +8,9 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.errors import ConfigError
-from protocol.machine import MachineConfig
-from protocol.readings import Reading
-from protocol.site import Projection, SiteConfig
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Reading
+from protocol.site.site_config import Projection, SiteConfig
 from sim.config import STEP_MS, SimConfig, resolve
 from sim.machines.model import MachineModel
 from sim.machines.vehicle import Bodies

@@ -14,7 +14,6 @@ from typing import Any
 import zenoh
 
 from protocol.errors import LinkError
-from protocol.geometry import Bounds
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
 from protocol.queries.requests import (
@@ -42,6 +41,7 @@ from protocol.queries.requests import (
     decode_region,
     encode_query,
 )
+from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.listener import Listener

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
 
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.version import UNKNOWN
 from protocol.wire.credentials import Identity
 from protocol.wire.messages import Ack, Refused

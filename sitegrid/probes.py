@@ -19,8 +19,8 @@ import zenoh
 
 from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
 from protocol.errors import ConfigError, LinkError, MessageError, StoreError
+from protocol.machine.samples import SAMPLE_DTYPE, empty
 from protocol.queries.requests import decode_info
-from protocol.samples import SAMPLE_DTYPE, empty
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_reply, encode_batch
 from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, SIGNING_FILE, load_credentials

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from protocol.errors import ConfigError
-from protocol.readings import MAX_STAMP_NS
+from protocol.machine.readings import MAX_STAMP_NS
 
 STAMP_HELP = "ISO 8601 (UTC unless it names a zone) or a stamp in ns"
 HELP = f"{STAMP_HELP}, or before the site's now: -2h, -30m, -90s"

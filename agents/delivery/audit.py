@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from protocol.arrays import Table
-from protocol.samples import content_hash
+from protocol.machine.samples import content_hash
 
 Identity = tuple[int, int]  # spool_id, seq
 

@@ -22,7 +22,7 @@ from agents.delivery.audit import AuditLog
 from agents.delivery.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
 from protocol.arrays import Table
 from protocol.errors import StoreError
-from protocol.samples import SAMPLE_DTYPE, empty
+from protocol.machine.samples import SAMPLE_DTYPE, empty
 
 KEPT_RUNS = 16  # earlier runs that are declared again: a server restored from a backup learns what it has lost
 

@@ -19,7 +19,7 @@ import zenoh
 
 from agents.delivery.spool import Head, Spool
 from protocol.errors import MessageError, Refusal
-from protocol.samples import empty
+from protocol.machine.samples import empty
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch

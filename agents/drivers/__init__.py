@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from protocol.readings import Reading
+from protocol.machine.readings import Reading
 
 
 class Driver(Protocol):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from protocol.logfolder import LogFolder
-from protocol.readings import Reading
+from protocol.machine.log_folder import LogFolder
+from protocol.machine.readings import Reading
 
 SPAN_NS = 50_000_000  # readings of 50 ms are handed on together, as a live bundle does
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from enum import Enum
 
-from protocol.readings import Reading
+from protocol.machine.readings import Reading
 
 LATE_LIMIT = 200  # so many late readings in a row are a clock that was set back, not a late sensor
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import zenoh
 
 from protocol.errors import MessageError
-from protocol.readings import Reading
+from protocol.machine.readings import Reading
 from protocol.wire import keys
 from protocol.wire.codec import decode_bundle
 

@@ -22,8 +22,8 @@ from agents.estimation.resistance import Push, Resistance
 from agents.estimation.resistance_kalman import KalmanConfig, KalmanResistance
 from agents.estimation.resistance_rls import RecursiveConfig, RecursiveGrade, RecursiveResistance
 from protocol.config import require_positive
-from protocol.machine import MachineConfig, SensorConfig
-from protocol.readings import Reading
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import Reading
 
 ESTIMATORS = ("kalman", "rls")
 MASSES = ("message", "known", "estimated")

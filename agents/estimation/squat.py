@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from agents.physics import GRAVITY_MPS2
-from protocol.machine import MachineConfig
+from protocol.machine.machine_config import MachineConfig
 
 
 def front_share(machine: MachineConfig, payload_kg: float, force_mps2: float) -> float:

@@ -24,9 +24,9 @@ from agents.localisation.filters.state import Layout
 from agents.localisation.measurements import SensingConfig
 from agents.localisation.modes import Told, rate, referred, renewed
 from protocol.arrays import Floats
-from protocol.machine import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
-from protocol.readings import Gps
-from protocol.site import Projection
+from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
+from protocol.machine.readings import Gps
+from protocol.site.site_config import Projection
 
 MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
 

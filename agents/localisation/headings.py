@@ -20,7 +20,7 @@ from agents.localisation.imu_steps import Step
 from agents.localisation.measurements import SensingConfig
 from agents.localisation.modes import Told, rate, referred
 from protocol.arrays import Floats
-from protocol.machine import ABSOLUTE, RELATIVE, SensorConfig
+from protocol.machine.machine_config import ABSOLUTE, RELATIVE, SensorConfig
 
 UNKNOWN_STD = 1e4  # of what a sensor does not give
 

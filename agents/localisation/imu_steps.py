@@ -11,8 +11,8 @@ import numpy as np
 from agents.dead_reckoning import STALE_S, DeadReckoning, WheelTracker, turn_source
 from agents.localisation.modes import Told
 from protocol.arrays import Floats
-from protocol.machine import ABSOLUTE, FRONT, MachineConfig, SensorConfig
-from protocol.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
+from protocol.machine.machine_config import ABSOLUTE, FRONT, MachineConfig, SensorConfig
+from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
 
 NOTHING = (0.0,) * 7  # count and sums
 MIN_NORM = 0.5  # a reference that has not found itself yet sends a quaternion of zeros

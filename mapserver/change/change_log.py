@@ -19,7 +19,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.layers import cell_layers
 from protocol.arrays import Bools, Floats32, Ints
-from protocol.geometry import BLOCK_CELLS
+from protocol.site.geometry import BLOCK_CELLS
 
 KIND = "change"  # of the journal's events
 SAME_NS = 6 * 3600 * 10**9  # changes next to each other within this time are one

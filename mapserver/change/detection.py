@@ -19,7 +19,7 @@ from mapserver.evidence.pages import moments
 from mapserver.evidence.timeline import TimedPage
 from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_positive
-from protocol.geometry import BLOCK_CELLS
+from protocol.site.geometry import BLOCK_CELLS
 
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
 ALIKE_BINS = 1.0  # kinds of ground nearer to each other are the same; cells whose pages are nearer did not change

@@ -12,7 +12,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.pages import pick
 from mapserver.evidence.timeline import Block, TimedPage
 from protocol.arrays import AnyArray, Ints
-from protocol.geometry import BLOCK_CELLS
+from protocol.site.geometry import BLOCK_CELLS
 
 Pages = Mapping[Block, Sequence[TimedPage]]
 

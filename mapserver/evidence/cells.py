@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.arrays import Ints
-from protocol.geometry import BLOCK_CELLS
+from protocol.site.geometry import BLOCK_CELLS
 
 SCHEMA = 3  # of everything below; a snapshot of another schema is folded again from the journal
 

@@ -10,7 +10,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.open_blocks import FREE, Hot, code_of
 from mapserver.evidence.votes import TABLE, TABLE_LAST, TABLE_PER_UNIT, FoldConfig, Votes, is_foldable, prepare
 from protocol.arrays import Ints, Table
-from protocol.geometry import BLOCK_CELLS
+from protocol.site.geometry import BLOCK_CELLS
 
 WEIGHT_SHIFT = 32  # shares of a weight are exact to 2**-32 before they are rounded down
 

@@ -15,8 +15,8 @@ from mapserver.evidence.pages import Page
 from mapserver.evidence.timeline import Block, Ladder, TimedPage, rungs
 from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Table
-from protocol.geometry import BLOCK_CELLS, CellWindow
-from protocol.samples import SAMPLE_DTYPE
+from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 PIECE = 4096  # samples that are folded at once; their weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache

@@ -28,7 +28,7 @@ from mapserver.journal.rows import Wanted
 from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.decisions import AUDIT, KIND, PERSON, Decision, Decisions
 from protocol.errors import QueryError, Refusal, SitegridError
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 
 LOOK_BLOCKS = 256  # at a time
 ARCHIVE_S = 60.0  # between two looks for rows that are old enough

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from protocol.errors import MessageError, Refusal
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_batch
 from protocol.wire.messages import SampleBatch
 

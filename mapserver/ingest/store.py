@@ -24,7 +24,7 @@ from mapserver.journal.rows import Wanted
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import Decisions
 from protocol.errors import MessageError, Refusal, StoreError
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store, Verify
 from protocol.errors import QueryError, Refusal
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import Ack, Refused
 
 T = TypeVar("T")

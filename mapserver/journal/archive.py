@@ -26,8 +26,8 @@ from mapserver.journal.rows import ALL, JournalRow, Wanted
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.config import from_table
 from protocol.errors import ConfigError, StoreError
-from protocol.samples import COLUMNS, SAMPLE_DTYPE
-from protocol.site import SiteConfig
+from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
+from protocol.site.site_config import SiteConfig
 
 FOLDER = "archive"  # in the folder of a store
 SCHEMA = 1

@@ -24,7 +24,7 @@ from mapserver.journal.journal import LAST, ArchivedError, Journal, JournalReads
 from mapserver.journal.rows import ALL, JournalRow, Mark, Wanted
 from protocol.arrays import Bools, Table
 from protocol.errors import StoreError
-from protocol.geometry import BLOCK_CELLS, Bounds, CellWindow, GridGeometry
+from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow, GridGeometry
 from protocol.wire.messages import SampleBatch
 
 Spool = tuple[str, int]  # machine, spool_id

@@ -13,9 +13,9 @@ import msgpack
 import numpy as np
 
 from protocol.arrays import Table
-from protocol.geometry import Bounds
-from protocol.readings import MAX_STAMP_NS
-from protocol.samples import SAMPLE_DTYPE
+from protocol.machine.readings import MAX_STAMP_NS
+from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.site.geometry import Bounds
 
 _EXTENT = struct.Struct("<3q4d")
 

@@ -18,10 +18,10 @@ import numpy as np
 from mapserver.evidence import cells as ev
 from mapserver.layers.gap_filling import AREA_LAYERS, Area
 from mapserver.layers.statistics import linear_count, ratio, robust_centre, robust_spread
-from protocol import ground
 from protocol.arrays import AnyArray, Bools, Floats, Floats32
 from protocol.config import require_positive
 from protocol.errors import QueryError, Refusal
+from protocol.site import ground_classes
 
 LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # between resistance bins
 GRADE_STEP = float(ev.GRADE_CENTRES[1] - ev.GRADE_CENTRES[0])
@@ -38,7 +38,7 @@ class ReadConfig:
     """
 
     min_weight_m: float = 0.1
-    boundaries: tuple[float, ...] = ground.BOUNDARIES
+    boundaries: tuple[float, ...] = ground_classes.BOUNDARIES
     fill_reach_m: float = 5.0
 
     def __post_init__(self) -> None:
@@ -131,7 +131,7 @@ def grade_std(reading: Reading) -> Floats:
 
 def slope_class(reading: Reading) -> Floats:
     """0 flat, 1 slope (the paper's: steeper than 7.5 degrees)."""
-    return _known_class(ground.slope_class(*reading.gradient))
+    return _known_class(ground_classes.slope_class(*reading.gradient))
 
 
 def heading(reading: Reading) -> Floats:
@@ -261,7 +261,7 @@ def _seconds_ago(stamp_ns: AnyArray, now_ns: int) -> Floats:
 
 
 def _known_class(classes: AnyArray) -> Floats:
-    return np.where(classes == ground.UNKNOWN, np.nan, classes.astype(np.float64))
+    return np.where(classes == ground_classes.UNKNOWN, np.nan, classes.astype(np.float64))
 
 
 def _cells(evidence: ev.Evidence, which: Bools) -> ev.Evidence:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.geometry import Bounds
+from protocol.site.geometry import Bounds
 
 Image = NDArray[np.uint8]  # (height, width, 3), BGR
 Colour = tuple[int, int, int]

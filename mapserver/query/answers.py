@@ -17,7 +17,6 @@ from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.views import Past, View, cropped, read_cells, view_now, widened
 from protocol.errors import QueryError, Refusal
-from protocol.geometry import Bounds, CellWindow
 from protocol.queries.commands import TrustCommand, parse_command
 from protocol.queries.requests import (
     MAX_SPANS,
@@ -42,7 +41,8 @@ from protocol.queries.requests import (
     encode_region,
     parse_query,
 )
-from protocol.site import SiteConfig
+from protocol.site.geometry import Bounds, CellWindow
+from protocol.site.site_config import SiteConfig
 
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 

@@ -21,7 +21,7 @@ from mapserver.journal.rows import Wanted
 from mapserver.layers import cell_layers
 from protocol.arrays import Floats32
 from protocol.errors import QueryError, Refusal, StoreError
-from protocol.geometry import BLOCK_CELLS, CellWindow
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from protocol.arrays import Floats, Floats32
 from protocol.errors import MessageError, QueryError, Refusal
-from protocol.geometry import MAX_CELLS, Bounds
+from protocol.site.geometry import MAX_CELLS, Bounds
 from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_plain, unpack
 
 MAX_REPLY_BYTES = 2**30

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries import parameters as ps
-from protocol.site import NAME
+from protocol.site.site_config import NAME
 
 MAX_WAIT_S = 60.0
 _WORDS = {"yes": True, "no": False, "auto": None}

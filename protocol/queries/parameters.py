@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from urllib.parse import quote, unquote
 
 from protocol.errors import QueryError, Refusal
-from protocol.readings import MAX_STAMP_NS
+from protocol.machine.readings import MAX_STAMP_NS
 
 MAX_TEXT = 200  # characters of a text that a person writes
 

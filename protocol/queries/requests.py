@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from protocol.errors import QueryError, Refusal
-from protocol.geometry import MAX_CELLS, Bounds
 from protocol.queries import parameters as ps
 from protocol.queries.answers import (
     HistoryAnswer,
@@ -35,6 +34,7 @@ from protocol.queries.answers import (
     encode_point,
     encode_region,
 )
+from protocol.site.geometry import MAX_CELLS, Bounds
 
 # fmt: off
 __all__ = [  # queries, and the answers to them

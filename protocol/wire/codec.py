@@ -11,9 +11,9 @@ import numpy as np
 
 from protocol.arrays import Table
 from protocol.errors import MessageError, Refusal
-from protocol.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
-from protocol.samples import COLUMNS, SAMPLE_DTYPE, check_samples
-from protocol.site import NAME
+from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
+from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples
+from protocol.site.site_config import NAME
 from protocol.wire.messages import VERSION, Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
 MAX_BATCH_BYTES = 4 * 2**20

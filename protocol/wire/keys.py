@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from protocol.errors import ConfigError
-from protocol.site import NAME
+from protocol.site.site_config import NAME
 
 ROOT = "sitegrid"
 

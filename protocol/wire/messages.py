@@ -8,7 +8,7 @@ from typing import Any
 
 from protocol.arrays import Table
 from protocol.errors import one_line
-from protocol.readings import Reading
+from protocol.machine.readings import Reading
 
 VERSION = 1
 

@@ -11,7 +11,7 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
-from protocol.machine import BASE, FRONT, Mount
+from protocol.machine.machine_config import BASE, FRONT, Mount
 from sim.machines.urdf import Mass, Pose, Robot, joined, read_urdf, rpy_rad
 
 FOLDER = Path(__file__).parent / "models"

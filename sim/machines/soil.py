@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocol.ground import ZONES
+from protocol.site.ground_classes import ZONES
 
 
 @dataclass(frozen=True)

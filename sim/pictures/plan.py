@@ -12,8 +12,8 @@ import numpy as np
 
 from mapserver.pictures.frame import Axes, Colour, Entry, Image, compose
 from protocol.arrays import Floats
-from protocol.geometry import Bounds
-from protocol.ground import ZONES
+from protocol.site.geometry import Bounds
+from protocol.site.ground_classes import ZONES
 from sim.machines.model import MachineModel
 from sim.operators.routes import Leg, Route
 from sim.pictures.canvas import INK, Canvas, beside

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from protocol.arrays import AnyArray, Floats, Ints
-from protocol.ground import ZONES
+from protocol.site.ground_classes import ZONES
 from sim.machines.model import FOLDER, MachineModel
 from sim.worlds.pybullet_import import pybullet
 from sim.worlds.terrain import Terrain

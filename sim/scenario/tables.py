@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from protocol.site import NAME, SiteConfig
+from protocol.site.site_config import NAME, SiteConfig
 from sim.machines.model import load_model
 from sim.operators.routes import ROUNDING_M, Leg, Route, tour, way
 from sim.scenario.ground import GroundConfig, Point, Zone

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
-from protocol.site import Projection
+from protocol.site.site_config import Projection
 from sim.frames import map_from_base
 from sim.sensors.datasheets import BASE_RATE_HZ
 from sim.sensors.noise import Draws, GaussMarkov, generator, site_generator

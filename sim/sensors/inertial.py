@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from protocol.machine import BASE, FRONT
+from protocol.machine.machine_config import BASE, FRONT
 from sim.frames import compose, cross, quaternion, rotation, seen_turned, turned
 from sim.sensors.noise import Draws, GaussMarkov
 from sim.sensors.sensor_group import Bank, Unit

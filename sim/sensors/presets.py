@@ -10,7 +10,7 @@ from typing import Any
 
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
-from protocol.site import NAME
+from protocol.site.site_config import NAME
 from sim.sensors.datasheets import (
     ArticulationNoise,
     AttitudeNoise,

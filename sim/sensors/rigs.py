@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocol.machine import MachineConfig, Mount, SensorConfig
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from sim.machines.model import MachineModel
 from sim.machines.vehicle import Bodies
 from sim.sensors.datasheets import GpsNoise

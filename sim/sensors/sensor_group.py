@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
-from protocol.machine import SensorConfig
-from protocol.readings import KINDS, Reading, columns
+from protocol.machine.machine_config import SensorConfig
+from protocol.machine.readings import KINDS, Reading, columns
 from sim.sensors.datasheets import BASE_RATE_HZ
 from sim.sensors.rigs import Rig
 from sim.worlds.world import STEP_S, FleetState
@@ -31,7 +31,7 @@ class Block:
     """Readings of one bank as columns: r instants by u sensors.
 
     machines (u,), names: whose reading and of which sensor. values: (r, u, c), the kind's columns in the order of
-    `protocol.readings.columns`. heard: (r, u), false where a sensor is silent.
+    `protocol.machine.readings.columns`. heard: (r, u), false where a sensor is silent.
     """
 
     kind: str

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from protocol.arrays import Ints
-from protocol.readings import Reading
-from protocol.site import Projection
+from protocol.machine.readings import Reading
+from protocol.site.site_config import Projection
 from sim.sensors.drivetrain import ArticulationBank, EncoderBank, PayloadBank, TorqueBank
 from sim.sensors.gps import GpsBank
 from sim.sensors.inertial import AttitudeBank, ImuBank

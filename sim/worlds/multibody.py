@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from protocol.arrays import Floats
-from protocol.machine import BASE, FRONT
+from protocol.machine.machine_config import BASE, FRONT
 from sim.machines.model import PAYLOAD, WHEELS, MachineModel
 from sim.machines.urdf import rigid_urdf
 from sim.machines.vehicle import GRAVITY

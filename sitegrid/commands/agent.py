@@ -18,9 +18,9 @@ from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
 from agents.presence import Owner, find_namesake, this_process
 from protocol.errors import ConfigError, LinkError
-from protocol.logfolder import LogFolder, open_log
-from protocol.machine import MachineConfig
-from protocol.site import SiteConfig, load_site
+from protocol.machine.log_folder import LogFolder, open_log
+from protocol.machine.machine_config import MachineConfig
+from protocol.site.site_config import SiteConfig, load_site
 from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.process import note, plain, say, stop_flag

@@ -18,9 +18,9 @@ from evaluation.mapscore import DrivenScore, MapScore, score, score_driven
 from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
-from protocol.logfolder import LogFolder, open_log
+from protocol.machine.log_folder import LogFolder, open_log
 from protocol.queries.requests import Region
-from protocol.site import load_site
+from protocol.site.site_config import load_site
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig, resolve
 from sim.recorder import TRACKS_FOLDER

@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from protocol.errors import ConfigError, SitegridError, StoreError
-from protocol.site import SiteConfig, load_site
+from protocol.site.site_config import SiteConfig, load_site
 from protocol.version import UNKNOWN, package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials

@@ -23,9 +23,9 @@ from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, Mark, Wanted
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
-from protocol.machine import plain_lines
-from protocol.readings import MAX_STAMP_NS
-from protocol.site import SiteConfig, load_site
+from protocol.machine.machine_config import plain_lines
+from protocol.machine.readings import MAX_STAMP_NS
+from protocol.site.site_config import SiteConfig, load_site
 from sitegrid.process import say
 from sitegrid.progress import Display
 

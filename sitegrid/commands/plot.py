@@ -10,8 +10,8 @@ import numpy as np
 from mapserver.pictures.frame import Image
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
-from protocol.geometry import Bounds
 from protocol.queries.requests import Region
+from protocol.site.geometry import Bounds
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.process import note, say, stop_flag

@@ -15,7 +15,7 @@ from mapserver.ingest.store import Verify
 from mapserver.monitoring.exporter import Exporter, HealthEar, text_of
 from mapserver.server import Server
 from protocol.config import from_table, load_toml
-from protocol.site import load_site
+from protocol.site.site_config import load_site
 from protocol.version import package_version
 from protocol.wire.session import open_session
 from sitegrid.process import return_large_blocks, say, stop_flag

@@ -8,7 +8,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from protocol.errors import ConfigError
-from protocol.machine import machine_toml, plain_lines
+from protocol.machine.machine_config import machine_toml, plain_lines
 from sim.config import SimConfig, load_sim, resolve
 from sim.publisher import run as publish
 from sim.recorder import record

@@ -20,8 +20,8 @@ from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.rows import Wanted
 from protocol.errors import StoreError
-from protocol.samples import content_hash
-from protocol.site import load_site
+from protocol.machine.samples import content_hash
+from protocol.site.site_config import load_site
 from tests.chaos.chaos_site import ROUTER, SERVER, Site
 from tests.chaos.outcome import Outcome
 from tests.chaos.scenario import Scenario

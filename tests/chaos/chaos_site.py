@@ -16,9 +16,9 @@ from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from protocol.errors import StoreError
-from protocol.logfolder import open_log
-from protocol.machine import plain_lines
-from protocol.site import load_site
+from protocol.machine.log_folder import open_log
+from protocol.machine.machine_config import plain_lines
+from protocol.site.site_config import load_site
 from protocol.wire.session import free_endpoint
 from tests.chaos.leashed import Process
 from tests.chaos.outcome import Outcome, Span, Told, longest_pause

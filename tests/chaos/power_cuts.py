@@ -18,7 +18,7 @@ from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.history import History, history_rows
 from protocol.errors import StoreError
-from protocol.samples import content_hash, empty
+from protocol.machine.samples import content_hash, empty
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from tests.chaos import power_worker as work

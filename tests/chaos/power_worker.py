@@ -20,8 +20,8 @@ from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table
 from protocol.errors import StoreError
-from protocol.samples import content_hash, empty
-from protocol.site import SiteConfig
+from protocol.machine.samples import content_hash, empty
+from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 

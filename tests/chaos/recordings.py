@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 
-from protocol.logfolder import open_log, write_log
+from protocol.machine.log_folder import open_log, write_log
 from sim.config import SimConfig
 from sim.recorder import record
 

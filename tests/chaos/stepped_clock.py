@@ -15,7 +15,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 from agents.drivers.replay import Replay
-from protocol.readings import Reading
+from protocol.machine.readings import Reading
 
 OFF = struct.Struct("<q")
 

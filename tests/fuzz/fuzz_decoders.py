@@ -20,14 +20,14 @@ from agents.estimation.calibration import Calibration
 from mapserver.config import ServerConfig
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
-from protocol.geometry import Bounds
-from protocol.logfolder import open_log, write_log
-from protocol.machine import MachineConfig, SensorConfig
+from protocol.machine.log_folder import open_log, write_log
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import Gps, Imu
 from protocol.queries import requests
 from protocol.queries.commands import TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
-from protocol.readings import Gps, Imu
-from protocol.site import load_site
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import load_site
 from protocol.wire.credentials import check_valid, load_credentials
 from sim.config import load_sim
 from sitegrid.register import Entry, Register, load_register, register_toml

@@ -12,7 +12,7 @@ from mapserver.journal.archive import FOLDER, ArchiveFile, next_file
 from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow
 from protocol.errors import StoreError
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch
 from tests.fuzz.fuzz_bytes import files
 from tests.fuzz.fuzz_messages import messages

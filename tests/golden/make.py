@@ -14,9 +14,9 @@ import msgpack
 import numpy as np
 
 from protocol.errors import QueryError, Refusal
+from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu, Odometry, Torque
+from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries import requests
-from protocol.readings import Articulation, Attitude, Encoder, Gps, Imu, Odometry, Torque
-from protocol.samples import SAMPLE_DTYPE
 from protocol.wire import codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 

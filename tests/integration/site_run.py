@@ -7,7 +7,7 @@ from pathlib import Path
 
 from evaluation.audit import AuditResult, audit_store
 from mapserver.config import ServerConfig
-from protocol.site import load_site
+from protocol.site.site_config import load_site
 from sim.config import SimConfig, resolve
 from sitegrid import Client, connect
 from sitegrid.commands.sim import write_configs

@@ -12,9 +12,9 @@ import zenoh
 from site_run import READY_S, SiteRun  # beside this file
 
 from protocol.errors import Refusal
+from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.requests import decode_error
-from protocol.samples import SAMPLE_DTYPE
-from protocol.site import load_site
+from protocol.site.site_config import load_site
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, decode_health, decode_reply, encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
@@ -225,9 +225,9 @@ def words(sim: SimConfig) -> list[str]:
 
 def middle_of(log: Any, run: SiteRun) -> float:
     """The extent that about half of a recorded drive lies within [m]."""
-    from protocol.logfolder import open_log
-    from protocol.readings import Gps
-    from protocol.site import Projection
+    from protocol.machine.log_folder import open_log
+    from protocol.machine.readings import Gps
+    from protocol.site.site_config import Projection
 
     to_map = Projection(load_site(run.site_file)).to_map
     fixes = [r for r in open_log(log).readings() if isinstance(r, Gps)]

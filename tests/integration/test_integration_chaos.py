@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from agents.delivery.spool import Spool, SpoolConfig
-from protocol.samples import empty
+from protocol.machine.samples import empty
 from sitegrid.processes import wait_until
 from tests.chaos import __main__ as command
 from tests.chaos import bit_flips, power_cuts, process_faults, stepped_clock, write_faults

@@ -14,8 +14,8 @@ import pytest
 from site_run import READY_S, SiteRun, kill  # beside this file
 
 from protocol.arrays import Table
-from protocol.samples import empty
-from protocol.site import load_site
+from protocol.machine.samples import empty
+from protocol.site.site_config import load_site
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch

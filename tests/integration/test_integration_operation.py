@@ -24,8 +24,8 @@ from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
-from protocol.samples import SAMPLE_DTYPE
-from protocol.site import SiteConfig, load_site
+from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.site.site_config import SiteConfig, load_site
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch

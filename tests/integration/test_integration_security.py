@@ -19,9 +19,9 @@ import pytest
 import zenoh
 
 from protocol.errors import LinkError
-from protocol.samples import SAMPLE_DTYPE
+from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.signing import Signer
-from protocol.site import load_site
+from protocol.site.site_config import load_site
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
 from protocol.wire.credentials import SIGNING_FILE, Credentials, Identity, load_credentials

@@ -15,7 +15,7 @@ from mapserver.ingest.admission import Admission, GapError
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
 from protocol.errors import MessageError, Refusal
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import Ack, Refused
 from tests.simulation.faults import Fault, FaultyConnection, Killed, Plan
 

@@ -24,9 +24,9 @@ from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
 from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol.errors import LinkError
-from protocol.machine import MachineConfig, SensorConfig
-from protocol.samples import SAMPLE_DTYPE
-from protocol.site import SiteConfig
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_pose
 from protocol.wire.session import SessionConfig, free_endpoint, open_session

@@ -22,8 +22,8 @@ from agents.delivery.uplink import UplinkConfig, UplinkState
 from mapserver.ingest.store import Incoming
 from protocol.arrays import Table
 from protocol.errors import StoreError
-from protocol.samples import SAMPLE_DTYPE
-from protocol.site import SiteConfig
+from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_reply, encode_reply
 from protocol.wire.messages import Ack, Refused
 from tests.simulation.faults import Fault, FaultySpool, Killed, Plan

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.site import load_site
+from protocol.site.site_config import load_site
 from sitegrid.process import END_S
 
 ROOT = Path(__file__).parents[2]

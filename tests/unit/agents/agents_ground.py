@@ -17,8 +17,8 @@ from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEst
 from agents.estimation.resistance import Push, Resistance
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
-from protocol.machine import MachineConfig
-from protocol.readings import Reading
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Reading
 
 STEP_S = 0.05
 

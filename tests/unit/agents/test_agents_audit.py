@@ -7,7 +7,7 @@ from agents_drives import made_up_samples
 from agents.delivery.audit import AuditLog, parse, read_audit
 from agents.delivery.spool import Spool, SpoolConfig
 from protocol.errors import StoreError
-from protocol.samples import content_hash
+from protocol.machine.samples import content_hash
 
 ROWS = made_up_samples(20)
 HASHES = [content_hash(row) for row in ROWS]

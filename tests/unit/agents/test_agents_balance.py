@@ -9,8 +9,8 @@ from agents_drives import START_NS, Drive, Ground, Leg, changed_sensor, drive, m
 from agents_ground import balances
 
 from agents.physics import GRAVITY_MPS2
-from protocol.machine import FRONT, MachineConfig, Mount, SensorConfig
-from protocol.readings import Encoder, Imu, Odometry, Payload, Torque
+from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Encoder, Imu, Odometry, Payload, Torque
 
 FORWARDS = [Leg(2), Leg(4, 0.5), Leg(10)]
 REVERSE = [Leg(2), Leg(4, -0.5), Leg(10)]

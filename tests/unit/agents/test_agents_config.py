@@ -10,8 +10,8 @@ from agents.config import AgentConfig, load_agent
 from agents.estimation.ground import NOTHING_KNOWN
 from agents.estimation.plausibility import FAULTS
 from protocol.errors import ConfigError
-from protocol.machine import MachineConfig, Mount, SensorConfig
-from protocol.site import SiteConfig, load_site
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.site.site_config import SiteConfig, load_site
 from sim.scenario.file import load_scenario
 
 CONFIG = Path(__file__).resolve().parents[3] / "config"

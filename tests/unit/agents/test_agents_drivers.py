@@ -14,8 +14,8 @@ from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
 from agents.estimation.calibration_file import load
 from agents.physics import GRAVITY_MPS2
-from protocol.logfolder import open_log, write_log
-from protocol.readings import Articulation, Imu, Reading
+from protocol.machine.log_folder import open_log, write_log
+from protocol.machine.readings import Articulation, Imu, Reading
 from protocol.wire import keys
 from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle

@@ -20,8 +20,8 @@ from agents.estimation.ground import (
 )
 from agents.estimation.plausibility import PlausibilityConfig
 from agents.physics import GRAVITY_MPS2
-from protocol.machine import MachineConfig, Mount, SensorConfig
-from protocol.readings import Encoder, Imu, Reading, Torque
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Encoder, Imu, Reading, Torque
 
 SLOPE_RAD = math.radians(15)
 STAND, START = Leg(2), Leg(4, 0.5)

@@ -8,9 +8,9 @@ from agents_drives import S_BEND, SITE, Drive, drive, fix, machine
 
 from agents.holdout import Holdout, HoldoutConfig
 from agents.pipeline import Pipeline, PipelineConfig
-from protocol.logfolder import open_log
-from protocol.machine import MachineConfig
-from protocol.readings import Gps, Reading
+from protocol.machine.log_folder import open_log
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Gps, Reading
 
 ROOT = Path(__file__).resolve().parents[3]
 HUSKY = ROOT.parent / "shared" / "data" / "rl_test1_husky"

@@ -18,7 +18,7 @@ from agents.localisation.filters.state import (
     Layout,
 )
 from protocol.arrays import Floats
-from protocol.machine import Mount
+from protocol.machine.machine_config import Mount
 
 PAPER, FULL = Layout(), Layout(imus=2, wheel_scale=True, receivers=2)
 ERRORS = (GpsError(3.0, 45.0), GpsError(1.5, 20.0))

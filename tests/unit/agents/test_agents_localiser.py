@@ -24,9 +24,9 @@ from agents.localisation.filters.state import ATTITUDE, BASE_STATES, SPEED, YAW,
 from agents.localisation.localiser import POSITIVE, LocalisationConfig, Localiser
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
-from protocol.machine import FRONT, MachineConfig, Mount, SensorConfig
-from protocol.readings import Attitude, Encoder, Gps, Imu, Reading, Torque
-from protocol.site import Projection
+from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Attitude, Encoder, Gps, Imu, Reading, Torque
+from protocol.site.site_config import Projection
 
 GYRO_BIAS = Layout(imus=1).gyro_bias(0)
 FILTERS = pytest.mark.parametrize("engine", ["ekf", "ukf"])

@@ -27,8 +27,8 @@ from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.localisation.modes import PAIR_S, Told, rate, referred, renewed
 from agents.pipeline import Pipeline, PipelineConfig
 from protocol.arrays import Floats
-from protocol.machine import MachineConfig, SensorConfig
-from protocol.readings import Attitude, Encoder, Gps, Reading
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import Attitude, Encoder, Gps, Reading
 
 START = (10.0, 20.0, 0.7)  # where made-up drives start
 SECOND = 1_000_000_000

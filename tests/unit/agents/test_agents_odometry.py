@@ -7,8 +7,8 @@ from agents_drives import START_NS, Drive, Leg, changed_sensor, drive, machine
 
 from agents.dead_reckoning import DeadReckoning, WheelTracker, align, mean_std
 from agents.physics import GRAVITY_MPS2
-from protocol.machine import MachineConfig, Mount, SensorConfig
-from protocol.readings import Encoder, Odometry, Torque
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Encoder, Odometry, Torque
 
 
 def reckon(of: MachineConfig, made: Drive, slip: float = 0.0) -> DeadReckoning:

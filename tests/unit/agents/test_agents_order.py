@@ -1,7 +1,7 @@
 import pytest
 
 from agents.drivers.stream_order import LATE_LIMIT, Order, Verdict
-from protocol.readings import Articulation, Reading
+from protocol.machine.readings import Articulation, Reading
 
 MS = 1_000_000
 T0 = 10**18

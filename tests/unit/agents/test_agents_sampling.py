@@ -8,8 +8,8 @@ from agents.estimation.ground import NOTHING_KNOWN, GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
 from agents.sampling import PoseHistory, Sampler, SamplingConfig, Way
 from protocol.arrays import Table
-from protocol.readings import Encoder, Imu, Odometry, Reading
-from protocol.samples import check_samples
+from protocol.machine.readings import Encoder, Imu, Odometry, Reading
+from protocol.machine.samples import check_samples
 
 S = 10**9
 ESTIMATE = GroundEstimate(0.05, 1e-4, 0.2, 0.1, 1e-3, "")

@@ -13,7 +13,7 @@ from agents.delivery.audit import AuditLog, read_audit
 from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
 from agents.delivery.spool_file import connect
 from protocol.errors import StoreError
-from protocol.samples import content_hash
+from protocol.machine.samples import content_hash
 
 ROWS = made_up_samples(60)
 ROOT = Path(__file__).resolve().parents[3]

@@ -5,7 +5,7 @@ import pytest
 
 from agents.estimation.squat import front_share, squat_rad
 from agents.physics import GRAVITY_MPS2
-from protocol.machine import MachineConfig
+from protocol.machine.machine_config import MachineConfig
 
 LOADER = MachineConfig(
     "loader-1",

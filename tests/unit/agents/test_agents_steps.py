@@ -10,8 +10,8 @@ from agents.localisation.filters.motion import map_from_base
 from agents.localisation.imu_steps import Step, Steps
 from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
-from protocol.machine import FRONT, MachineConfig, Mount, SensorConfig
-from protocol.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Torque
+from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Torque
 
 MS = 1_000_000
 WHEELS, TORQUE = SensorConfig("wheels", "encoder"), SensorConfig("torque", "torque")

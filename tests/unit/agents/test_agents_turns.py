@@ -14,8 +14,8 @@ from agents.localisation.filters.state import YAW, YAW_RATE, Layout
 from agents.localisation.imu_steps import Step, Steps
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.localisation.measurements import SensingConfig
-from protocol.machine import MachineConfig, Mount, SensorConfig
-from protocol.readings import Encoder, Gps, Odometry, Reading, Steering
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Encoder, Gps, Odometry, Reading, Steering
 
 WHEELBASE_M = 2.5
 EIGHT = [Leg(6, 0.5), Leg(4), *[Leg(25, 0, 0.25), Leg(25, 0, -0.25)] * 2]  # at 3 m/s, circles of 12 m

@@ -13,7 +13,7 @@ from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import BLOCKING, PASSING, UplinkConfig, UplinkState, linger
 from mapserver.ingest.admission import GapError, admit, parse
 from protocol.errors import MessageError, Refusal
-from protocol.samples import content_hash
+from protocol.machine.samples import content_hash
 from protocol.wire.codec import decode_batch, decode_reply, encode_reply
 from protocol.wire.messages import Ack, Refused, SampleBatch
 

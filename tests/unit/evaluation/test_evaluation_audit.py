@@ -17,8 +17,8 @@ from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, checksum, pack
 from mapserver.trust.decisions import KIND, PERSON, Decision
 from protocol.arrays import Table
-from protocol.samples import content_hash, empty
-from protocol.site import SiteConfig
+from protocol.machine.samples import content_hash, empty
+from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 

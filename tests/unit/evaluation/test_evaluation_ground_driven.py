@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from evaluation.mapscore import by_border_distance, driven_cells, score_driven
-from protocol.ground import UNKNOWN
 from protocol.queries.requests import Region
+from protocol.site.ground_classes import UNKNOWN
 
 NAN = np.nan
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from evaluation.mapscore import score
-from protocol.ground import SLOPE_LIMIT
 from protocol.queries.requests import Region
+from protocol.site.ground_classes import SLOPE_LIMIT
 
 NAN = np.nan
 

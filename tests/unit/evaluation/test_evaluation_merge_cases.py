@@ -22,7 +22,7 @@ from evaluation.merge_samples import (
     simulate,
     sweep,
 )
-from protocol.samples import SAMPLE_DTYPE, check_samples
+from protocol.machine.samples import SAMPLE_DTYPE, check_samples
 
 
 def case(name: str, columns: int = 60, rows: int = 40, index: int = 0) -> Case:

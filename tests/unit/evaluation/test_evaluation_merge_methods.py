@@ -16,8 +16,8 @@ from evaluation.merge_methods import (
     soft_votes,
 )
 from evaluation.merge_samples import Delivery
-from protocol.geometry import CellWindow
-from protocol.samples import empty
+from protocol.machine.samples import empty
+from protocol.site.geometry import CellWindow
 
 NAN = np.nan
 WINDOW = CellWindow(0, 0, 20, 18)

@@ -9,9 +9,9 @@ import pytest
 from evaluation import reallog
 from evaluation.configurations import Configuration, select
 from protocol.errors import ConfigError, LogFolderError
-from protocol.logfolder import open_log
-from protocol.readings import Gps
-from protocol.site import Projection
+from protocol.machine.log_folder import open_log
+from protocol.machine.readings import Gps
+from protocol.site.site_config import Projection
 
 ROOT = Path(__file__).parents[3]
 LOGS = ROOT / "evaluation" / "logs"

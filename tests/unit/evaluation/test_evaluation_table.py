@@ -16,7 +16,7 @@ from evaluation import campaign, recordings, table
 from evaluation.configurations import Configuration, UnsupportedError
 from evaluation.workers import each
 from protocol.errors import ConfigError, SitegridError
-from protocol.machine import MachineConfig
+from protocol.machine.machine_config import MachineConfig
 
 ONE, TWO = (Configuration("ukf", gps, 1, "default") for gps in (1, 2))
 NEVER = Configuration("ukf", 9, 1, "default")

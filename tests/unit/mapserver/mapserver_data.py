@@ -18,8 +18,8 @@ from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from protocol.arrays import Table
-from protocol.samples import empty
-from protocol.site import SiteConfig
+from protocol.machine.samples import empty
+from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session

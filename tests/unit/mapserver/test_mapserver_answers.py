@@ -11,8 +11,8 @@ from mapserver.layers.cell_layers import LAYERS, ReadConfig
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.answers import Answers
 from protocol.errors import QueryError, Refusal
-from protocol.geometry import Bounds
 from protocol.queries.requests import PointQuery, RegionQuery, decode_info, decode_point, decode_region
+from protocol.site.geometry import Bounds
 
 # One sample in each cell of two diagonals, the value tells the cell.
 STEPS = np.arange(-40, 40)

@@ -12,7 +12,6 @@ from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answers import Answers, Nobody, reads_past
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
-from protocol.geometry import Bounds
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
 from protocol.queries.requests import (
@@ -33,6 +32,7 @@ from protocol.queries.requests import (
     encode_change,
     encode_query,
 )
+from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch
 

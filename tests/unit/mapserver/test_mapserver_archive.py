@@ -21,8 +21,8 @@ from mapserver.journal.archive import HOUR_NS, Archive, ArchiveFile, archive, ne
 from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import ALL, JournalRow, Wanted
 from protocol.errors import ConfigError, StoreError
-from protocol.geometry import Bounds
-from protocol.site import KnownGround
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import KnownGround
 
 pq = pytest.importorskip("pyarrow.parquet")
 ROOT = Path(__file__).parents[3]
@@ -435,7 +435,7 @@ import os, signal, sys
 from pathlib import Path
 from mapserver import archive as ar
 from mapserver.journal.journal import Journal, JournalReader
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 
 site = SiteConfig("pit", 48.0, 11.0)
 folder, step, calls = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])

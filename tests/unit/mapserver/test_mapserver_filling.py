@@ -12,7 +12,7 @@ from mapserver.layers.gap_filling import (
     filled_std,
     sparse_kernel,
 )
-from protocol.ground import BOUNDARIES, resistance_class
+from protocol.site.ground_classes import BOUNDARIES, resistance_class
 
 ROWS, COLUMNS = 24, 40
 RESISTANCE_STD, GRADE_STD = 0.1, 0.01  # the first of log(c_rr)

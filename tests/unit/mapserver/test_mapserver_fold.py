@@ -11,8 +11,8 @@ from mapserver.evidence.fold import fold_numpy, kernel
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import TABLE, TABLE_LAST, FoldConfig, prepare, split_grade, split_resistance
 from protocol.errors import MessageError
-from protocol.ground import ZONES
-from protocol.samples import check_samples
+from protocol.machine.samples import check_samples
+from protocol.site.ground_classes import ZONES
 
 UNITS = ev.WEIGHT_UNITS_PER_M
 KERNELS = ("numpy", "numba")

@@ -5,7 +5,7 @@ from mapserver_data import NOW_NS, filled_to, folded, random_samples, same, samp
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks
 from mapserver.evidence.votes import FoldConfig
-from protocol.geometry import CellWindow
+from protocol.site.geometry import CellWindow
 
 EVERYTHING = CellWindow(-(2**20), -(2**20), 2**21, 2**21)
 

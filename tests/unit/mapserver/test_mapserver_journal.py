@@ -12,8 +12,8 @@ from mapserver.journal import journal as journal_module
 from mapserver.journal.journal import ArchivedError, Journal, JournalReader, JournalReads
 from mapserver.journal.rows import ALL, Event, Mark, Wanted
 from protocol.errors import StoreError
-from protocol.geometry import Bounds
-from protocol.samples import SAMPLE_DTYPE
+from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.site.geometry import Bounds
 
 
 def open_journal(folder: Path, site: str = SITE.name, frame: str = SITE.frame) -> Journal:

@@ -15,7 +15,7 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER
 from mapserver.trust.auditor import TrustConfig
 from protocol.errors import QueryError
-from protocol.ground import ZONES
+from protocol.site.ground_classes import ZONES
 
 QUICK: dict[str, Any] = {"turn_s": 0.01, "judge_s": 0.02, "archive_after_h": 0.0}
 HOUR_NS = 3600 * 10**9

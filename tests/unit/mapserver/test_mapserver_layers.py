@@ -11,7 +11,7 @@ from mapserver.layers.cell_layers import LAYERS, ReadConfig, derive_area, margin
 from mapserver.layers.gap_filling import AREA_LAYERS
 from protocol.config import from_table
 from protocol.errors import ConfigError, QueryError, Refusal
-from protocol.ground import BOUNDARIES, SLOPE_LIMIT, ZONES
+from protocol.site.ground_classes import BOUNDARIES, SLOPE_LIMIT, ZONES
 
 CELL = 8 * 16 + 8  # of the usual sample in its block
 RESISTANCE_LAYERS = ("resistance", "resistance_std", "resistance_class", "confidence")

@@ -16,7 +16,7 @@ from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, Wanted
 from protocol.arrays import Table
 from protocol.errors import StoreError
-from protocol.geometry import Bounds, CellWindow
+from protocol.site.geometry import Bounds, CellWindow
 
 pytest.importorskip("pyarrow.parquet")
 FOLD = FoldConfig()

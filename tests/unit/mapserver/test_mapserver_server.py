@@ -8,7 +8,6 @@ from mapserver_data import CONFIG, SITE, WAIT_S, batch, now_ns, routed, samples
 
 from mapserver.server import Server
 from protocol.errors import Refusal
-from protocol.geometry import Bounds
 from protocol.queries.requests import (
     Freshness,
     InfoQuery,
@@ -20,6 +19,7 @@ from protocol.queries.requests import (
     decode_region,
     encode_query,
 )
+from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack

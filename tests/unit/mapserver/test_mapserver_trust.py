@@ -10,8 +10,8 @@ from scipy.signal import lfilter
 from mapserver.evidence.votes import FoldConfig
 from mapserver.trust.auditor import Auditor, Reason, TrustConfig, Verdict
 from protocol.arrays import Table
-from protocol.ground import ZONES
-from protocol.samples import empty
+from protocol.machine.samples import empty
+from protocol.site.ground_classes import ZONES
 
 WIDTH_M, HEIGHT_M, STEP_M, STEP_S = 150, 100, 0.6, 0.2
 C_RR = np.array([zone.c_rr for zone in ZONES])

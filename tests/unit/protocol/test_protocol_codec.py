@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol.errors import MessageError, Refusal
+from protocol.machine.readings import KINDS, Encoder, Imu, columns
+from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.queries import requests
-from protocol.readings import KINDS, Encoder, Imu, columns
-from protocol.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.wire import codec
 from protocol.wire.codec import decode_batch, encode_batch
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle

@@ -9,13 +9,13 @@ import pytest
 
 from protocol.config import from_table
 from protocol.errors import Refusal
-from protocol.geometry import MAX_CELLS
-from protocol.logfolder import open_log
-from protocol.machine import GIVES, MODES
+from protocol.machine.log_folder import open_log
+from protocol.machine.machine_config import GIVES, MODES
+from protocol.machine.readings import KINDS, MAX_STAMP_NS, columns
+from protocol.machine.samples import COLUMNS
 from protocol.queries import commands, parameters, requests
-from protocol.readings import KINDS, MAX_STAMP_NS, columns
-from protocol.samples import COLUMNS
-from protocol.site import KnownGround
+from protocol.site.geometry import MAX_CELLS
+from protocol.site.site_config import KnownGround
 from protocol.units import _NS, _UNITS
 from protocol.wire import codec
 from protocol.wire.messages import Pose

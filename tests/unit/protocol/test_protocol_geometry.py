@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.geometry import Bounds, CellWindow, GridGeometry
+from protocol.site.geometry import Bounds, CellWindow, GridGeometry
 
 cells = st.sampled_from([0.05, 0.1, 0.2, 0.25, 1 / 3, 0.5, 1.0, 3.0, 100.0])
 index, size = st.integers(-10_000, 10_000), st.integers(1, 500)

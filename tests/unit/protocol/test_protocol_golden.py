@@ -39,7 +39,7 @@ def test_unknown_field_and_column_of_a_newer_agent_are_ignored(golden):
 
 
 def test_columns_and_types_are_the_specified_ones():
-    from protocol.samples import SAMPLE_DTYPE
+    from protocol.machine.samples import SAMPLE_DTYPE
 
     assert SAMPLE_DTYPE.names[:3] == ("stamp_ns", "x_m", "y_m")
     assert [SAMPLE_DTYPE[name].str for name in SAMPLE_DTYPE.names] == ["<i8", "<f8", "<f8", *["<f4"] * 11]

@@ -4,7 +4,16 @@ import math
 import numpy as np
 import pytest
 
-from protocol.ground import BOUNDARIES, FLAT, SLOPE, UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
+from protocol.site.ground_classes import (
+    BOUNDARIES,
+    FLAT,
+    SLOPE,
+    UNKNOWN,
+    ZONES,
+    resistance_class,
+    slope_class,
+    wrong_percent,
+)
 
 
 def test_boundaries_are_midway_between_zones():

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import ConfigError, LogFolderError, Refusal
-from protocol.logfolder import open_log, write_log
-from protocol.machine import MachineConfig, Mount, SensorConfig
-from protocol.readings import KINDS, Articulation, Encoder, Gps, Imu, Torque
-from protocol.site import KnownGround, SiteConfig
+from protocol.machine.log_folder import open_log, write_log
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import KINDS, Articulation, Encoder, Gps, Imu, Torque
+from protocol.site.site_config import KnownGround, SiteConfig
 
 T0 = 1_750_000_000_000_000_000
 MANIFEST = f"""

@@ -7,8 +7,8 @@ import pytest
 
 from protocol.config import from_table
 from protocol.errors import ConfigError
-from protocol.machine import GIVES, MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
-from protocol.readings import KINDS
+from protocol.machine.machine_config import GIVES, MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
+from protocol.machine.readings import KINDS
 
 GPS = SensorConfig("gps-1", "gps", Mount((1.5, -0.5, 3.25), (0.0, 0.0, 180.0)), drift_share=0.5, use=False)
 MACHINE = MachineConfig("loader-1", mass_kg=16_000.0, sensors=(GPS, SensorConfig("imu-1", "imu")))

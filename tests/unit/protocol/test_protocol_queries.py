@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import MessageError, QueryError, Refusal
-from protocol.geometry import MAX_CELLS, Bounds
+from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries.commands import TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
 from protocol.queries.requests import (
@@ -44,7 +44,7 @@ from protocol.queries.requests import (
     encode_region,
     parse_query,
 )
-from protocol.readings import MAX_STAMP_NS
+from protocol.site.geometry import MAX_CELLS, Bounds
 from protocol.wire.codec import pack
 
 positions = st.floats(-1e15, 1e15)

@@ -3,7 +3,7 @@ import math
 import pytest
 
 from protocol.errors import MessageError, Refusal
-from protocol.readings import KINDS, MAX_STAMP_NS, columns, parse_reading
+from protocol.machine.readings import KINDS, MAX_STAMP_NS, columns, parse_reading
 
 MIDDLE = {kind: tuple((low + high) / 2 for low, high in cls.limits.values()) for kind, cls in KINDS.items()}
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import MessageError, Refusal
-from protocol.samples import COLUMNS, LIMITS, check_samples, content_hash, empty
+from protocol.machine.samples import COLUMNS, LIMITS, check_samples, content_hash, empty
 
 
 def good(n: int) -> np.ndarray:

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from protocol.readings import KINDS, columns
+from protocol.machine.readings import KINDS, columns
 from protocol.units import _UNITS, factor, stamp_ns, stamp_scale
 
 

@@ -7,7 +7,7 @@ from dataclasses import fields, is_dataclass, replace
 import numpy as np
 import pytest
 
-from protocol.site import Projection, SiteConfig
+from protocol.site.site_config import Projection, SiteConfig
 from sim.machines.model import load_model
 from sim.sensors.datasheets import GpsNoise
 from sim.sensors.presets import Preset, load_preset

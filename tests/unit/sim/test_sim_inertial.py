@@ -18,7 +18,7 @@ from sim_sensor_rigs import (
     values,
 )
 
-from protocol.machine import BASE, FRONT, Mount
+from protocol.machine.machine_config import BASE, FRONT, Mount
 from sim.sensors.presets import Preset
 from sim.worlds.world import FleetState
 

@@ -5,7 +5,7 @@ import pytest
 from sim_bullet_worlds import LOADER, TRUCK
 
 from protocol.errors import ConfigError
-from protocol.machine import MachineConfig, Mount
+from protocol.machine.machine_config import MachineConfig, Mount
 from sim.machines.model import BASE, FOLDER, FRONT, PAYLOAD, WHEELS, MachineModel, load_model
 from sim.machines.urdf import Mass, Pose, joined, read_urdf, rigid_urdf, rpy_rad
 

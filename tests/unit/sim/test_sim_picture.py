@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.ground import ZONES
+from protocol.site.ground_classes import ZONES
 from sim.config import SimConfig, resolve
 from sim.pictures import picture
 from sim.pictures.canvas import WRITTEN, Canvas

@@ -9,7 +9,7 @@ from sim_sensor_rigs import DGPS, LOADER, noisy, perfect, rig
 
 from protocol.config import load_toml
 from protocol.errors import ConfigError
-from protocol.machine import BASE, FRONT
+from protocol.machine.machine_config import BASE, FRONT
 from sim.sensors.datasheets import EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise
 from sim.sensors.presets import LIBRARY, load_preset, parse_preset
 from sim.sensors.rigs import Rig, draw_bodies, machine_config

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from protocol.errors import LinkError
-from protocol.logfolder import open_log
+from protocol.machine.log_folder import open_log
 from protocol.wire import keys
 from protocol.wire.codec import decode_bundle
 from protocol.wire.messages import SensorBundle

@@ -5,7 +5,7 @@ import pytest
 
 from protocol.config import load_toml
 from protocol.errors import ConfigError
-from protocol.ground import ZONES
+from protocol.site.ground_classes import ZONES
 from sim.machines.model import load_model
 from sim.operators.driver import bend
 from sim.operators.routes import tour

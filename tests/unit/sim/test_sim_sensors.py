@@ -21,7 +21,7 @@ from sim_sensor_rigs import (
     values,
 )
 
-from protocol.readings import Reading, columns, parse_reading
+from protocol.machine.readings import Reading, columns, parse_reading
 from sim.sensors.rigs import Faults, Rig
 from sim.sensors.sensors import Sensors
 from sim.worlds.world import FleetState

@@ -12,9 +12,9 @@ import pybullet
 import pytest
 
 from protocol.errors import ConfigError, StoreError
-from protocol.logfolder import open_log
-from protocol.readings import Gps, Imu, Reading, parse_reading
-from protocol.site import Projection
+from protocol.machine.log_folder import open_log
+from protocol.machine.readings import Gps, Imu, Reading, parse_reading
+from protocol.site.site_config import Projection
 from sim.config import SimConfig
 from sim.recorder import record
 from sim.sensors.presets import load_preset

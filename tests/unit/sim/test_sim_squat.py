@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sim_bullet_worlds import BOTH, hold_speed, idle, placed, plane
 
-from protocol.machine import MachineConfig
+from protocol.machine.machine_config import MachineConfig
 from sim.machines.model import MachineModel
 from sim.machines.vehicle import GRAVITY
 from sim.sensors.presets import load_preset

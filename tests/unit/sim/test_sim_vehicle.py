@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sim_bullet_worlds import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, nominal, placed, plane
 
-from protocol.machine import Mount
+from protocol.machine.machine_config import Mount
 from sim.machines.model import MachineModel
 from sim.machines.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
 from sim.machines.vehicle import GRAVITY, chassis_of, drive_force_n, steering_radps, weigh

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.site import load_site
+from protocol.site.site_config import load_site
 from sitegrid import progress
 from sitegrid.cli import build_parser
 from sitegrid.commands import demo

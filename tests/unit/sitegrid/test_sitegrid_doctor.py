@@ -25,9 +25,9 @@ from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
+from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.requests import InfoQuery, encode_info
-from protocol.samples import SAMPLE_DTYPE
-from protocol.site import SiteConfig
+from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_health
 from protocol.wire.credentials import Identity
@@ -331,7 +331,7 @@ def test_a_spool_is_read_without_a_trace(tmp_path: Path):
 def test_a_spool_that_was_killed_is_read_with_its_log(tmp_path: Path):
     code = (
         "import os, sys; from pathlib import Path; from agents.delivery.spool import Spool, SpoolConfig\n"
-        "import numpy as np; from protocol.samples import SAMPLE_DTYPE\n"
+        "import numpy as np; from protocol.machine.samples import SAMPLE_DTYPE\n"
         "Spool(Path(sys.argv[1]), SpoolConfig()).record(np.ones(7, SAMPLE_DTYPE)); os._exit(0)"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "spool.db")], check=True)

@@ -20,9 +20,9 @@ from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import JournalRow
 from protocol.arrays import Table
 from protocol.config import from_table, load_toml
-from protocol.geometry import CellWindow
-from protocol.samples import COLUMNS, empty
-from protocol.site import KnownGround, SiteConfig, load_site
+from protocol.machine.samples import COLUMNS, empty
+from protocol.site.geometry import CellWindow
+from protocol.site.site_config import KnownGround, SiteConfig, load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main

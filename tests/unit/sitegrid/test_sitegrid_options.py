@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from mapserver.config import ServerConfig
-from protocol.geometry import Bounds
-from protocol.logfolder import open_log
+from protocol.machine.log_folder import open_log
+from protocol.site.geometry import Bounds
 from sim.scenario.file import FOLDER, load_scenario
 from sitegrid.cli import build_parser
 from sitegrid.commands import agent, demo, plot, server

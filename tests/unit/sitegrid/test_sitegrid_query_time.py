@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
-from protocol.geometry import Bounds
+from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries.parameters import split_selector
 from protocol.queries.requests import (
     Freshness,
@@ -34,7 +34,7 @@ from protocol.queries.requests import (
     encode_region,
     parse_query,
 )
-from protocol.readings import MAX_STAMP_NS
+from protocol.site.geometry import Bounds
 from sitegrid.cli import main
 from sitegrid.client import PAST_S, Client
 from sitegrid.commands import query

@@ -9,7 +9,7 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Bools, Floats, Table
 from protocol.errors import MessageError, Refusal
-from protocol.readings import MAX_STAMP_NS
+from protocol.machine.readings import MAX_STAMP_NS
 
 # Order, types and names are part of the wire (docs/protocol.md). Little-endian.
 SAMPLE_DTYPE = np.dtype(

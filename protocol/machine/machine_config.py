@@ -13,8 +13,8 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.config import from_table
 from protocol.errors import ConfigError
-from protocol.readings import KINDS
-from protocol.site import NAME
+from protocol.machine.readings import KINDS
+from protocol.site.site_config import NAME
 
 BASE, FRONT = "base_link", "front_link"
 # What readings of a kind say of the motion, by name. A sensor may give a part of it: an IMU without an accelerometer,

@@ -18,9 +18,9 @@ from typing import IO, Any
 
 from protocol.config import from_table, load_toml, section
 from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal
-from protocol.machine import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
-from protocol.readings import Reading, columns, parse_reading
-from protocol.site import SiteConfig
+from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
+from protocol.machine.readings import Reading, columns, parse_reading
+from protocol.site.site_config import SiteConfig
 from protocol.units import factor, stamp_ns, stamp_scale
 
 MANIFEST = "log.toml"

@@ -17,7 +17,7 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.config import from_table, load_toml
-from protocol.geometry import GridGeometry
+from protocol.site.geometry import GridGeometry
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 

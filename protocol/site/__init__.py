@@ -1,0 +1,1 @@
+"""The site: its frame, its grid of cells, and the kinds of ground."""
