@@ -17,10 +17,10 @@ from typing import TypeAlias
 
 from protocol.errors import SitegridError
 from protocol.wire.session import DEFAULT_ENDPOINT
-from sitegrid.argument_types import address, count, days, not_negative, positive, seed, withhold
-from sitegrid.logs import start_logging
-from sitegrid.times import HELP as TIME_HELP
-from sitegrid.times import STAMP_HELP, parse_stamp, parse_time
+from sitegrid.commands.arguments import address, count, days, not_negative, positive, seed, withhold
+from sitegrid.commands.times import HELP as TIME_HELP
+from sitegrid.commands.times import STAMP_HELP, parse_stamp, parse_time
+from sitegrid.process.logs import start_logging
 
 METRICS_PORT = 9464
 EXTRA = {

@@ -45,7 +45,7 @@ from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.listener import Listener
-from sitegrid.security import join
+from sitegrid.security.join import join
 
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
 

@@ -31,7 +31,7 @@ from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.client import Client, connect
-from sitegrid.processes import Child, Children
+from sitegrid.process.children import Child, Children
 
 START_NS = 1_767_225_600_000_000_000
 SITE_TOML = 'name = "soak"\norigin_lat_deg = 49.01\norigin_lon_deg = 8.4\n'

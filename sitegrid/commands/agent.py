@@ -23,8 +23,8 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig, load_site
 from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.session import SessionConfig, open_session
-from sitegrid.process import note, plain, say, stop_flag
-from sitegrid.security import join
+from sitegrid.process.lifetime import note, plain, say, stop_flag
+from sitegrid.security.join import join
 
 LINK_S = 1.0  # how long to wait for the router before starting without it
 
@@ -77,7 +77,7 @@ def _signer(keys: Path | None) -> Sign | None:
     file = keys / SIGNING_FILE if keys else None
     if not file or not file.is_file():
         return None
-    from protocol.signing import Signer  # imported here: only machines with keys need `cryptography`
+    from sitegrid.security.signing import Signer  # imported here: only machines with keys need `cryptography`
 
     return Signer(file.read_bytes()).sign
 

@@ -29,9 +29,9 @@ from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.commands.plot import draw, draw_both
 from sitegrid.commands.sim import write_configs
-from sitegrid.process import note, plain, say, stop_flag
-from sitegrid.processes import Child, Children, wait_until
-from sitegrid.progress import Display
+from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.process.lifetime import note, plain, say, stop_flag
+from sitegrid.process.progress import Display
 from sitegrid.tracks import TrackRecorder
 from sitegrid.truth import truth_layers
 

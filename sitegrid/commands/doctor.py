@@ -18,10 +18,10 @@ from protocol.version import UNKNOWN, package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials
 from protocol.wire.keys import check_name
-from sitegrid import doctor, probes
-from sitegrid.doctor import ASKS_MAP, Finding, Level, skipped
-from sitegrid.process import say
-from sitegrid.security import join
+from sitegrid.doctor import checks, probes
+from sitegrid.doctor.checks import ASKS_MAP, Finding, Level, skipped
+from sitegrid.process.lifetime import say
+from sitegrid.security.join import join
 
 ANYBODY = "doctor"  # where there are no keys, every name is as good
 
@@ -82,7 +82,7 @@ def _keys(arguments: Namespace) -> tuple[list[Finding], Patient | None]:
     except ModuleNotFoundError:
         return [skipped("certificate", "pip install 'sitegrid[security]'")], patient
     site = arguments.site or (patient.site_file.name if patient.site_file else "")
-    findings = doctor.check_certificate(found, datetime.now(UTC), site, arguments.machine or "")
+    findings = checks.check_certificate(found, datetime.now(UTC), site, arguments.machine or "")
     return findings, patient if findings[0].level != Level.FAIL else None
 
 
@@ -93,9 +93,9 @@ def _network(patient: Patient) -> list[Finding]:
     link, session = probes.open_link(join(patient.endpoint, patient.keys, probes.LINK_S))
     if session is None:
         rest = [skipped(name, "no way to the router") for name in ("server", "clock", "version", "permission")]
-        return [doctor.check_link(link), *rest, *_spool(patient, None)]
+        return [checks.check_link(link), *rest, *_spool(patient, None)]
     try:
-        return [doctor.check_link(link), *_server(patient, session), *_spool(patient, session)]
+        return [checks.check_link(link), *_server(patient, session), *_spool(patient, session)]
     finally:
         session.close()  # type: ignore[no-untyped-call]
 
@@ -106,7 +106,7 @@ def _server(patient: Patient, session: zenoh.Session) -> list[Finding]:
         return [skipped(name, f"keys of a {role} may not ask") for name in ("server", "clock", "version", "permission")]
     info, asked_ns = probes.ask_info(session, patient.site)
     is_there = info is not None or probes.is_answered(session, keys.map_query(patient.site, "info"))
-    findings = [doctor.check_server(patient.site, info, is_there=is_there, role=role)]
+    findings = [checks.check_server(patient.site, info, is_there=is_there, role=role)]
     if info is not None:
         findings += _compared(patient, info, asked_ns)
     return [*findings, _permission(patient, session, info)]
@@ -117,21 +117,21 @@ def _compared(patient: Patient, info: Mapping[str, Any], asked_ns: tuple[int, in
     site, offset = patient.site_file, probes.offset_of(info, asked_ns)
     version = info.get("version", UNKNOWN)
     return [
-        doctor.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
-        doctor.check_clock(*offset, site) if offset else skipped("clock", "the map server does not tell its own"),
-        doctor.check_version(package_version(), str(version)),
+        checks.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
+        checks.check_clock(*offset, site) if offset else skipped("clock", "the map server does not tell its own"),
+        checks.check_version(package_version(), str(version)),
     ]
 
 
 def _permission(patient: Patient, session: zenoh.Session, info: Mapping[str, Any] | None) -> Finding:
     if not patient.machine:
         return skipped("permission", "these keys send no samples")
-    frame = patient.site_file.frame if patient.site_file else doctor.table_of(info or {}, "site").get("frame")
+    frame = patient.site_file.frame if patient.site_file else checks.table_of(info or {}, "site").get("frame")
     if not frame:
         return skipped("permission", "give --site-file FILE, for the server does not tell the site's frame")
     answer = probes.ask_permission(session, patient.site, patient.machine, frame, patient.keys)
     is_there = answer is not None or probes.is_answered(session, keys.ingest(patient.site, patient.machine))
-    return doctor.check_permission(patient.machine, answer, is_there=is_there, has_keys=patient.keys is not None)
+    return checks.check_permission(patient.machine, answer, is_there=is_there, has_keys=patient.keys is not None)
 
 
 # --- disk ------------------------------------------------------------------------------------------------------------
@@ -146,11 +146,11 @@ def _spool(patient: Patient, session: zenoh.Session | None) -> list[Finding]:
 def _spool_itself(patient: Patient, path: Path, session: zenoh.Session | None) -> Finding:
     """The file, or while an agent has it open, what that says."""
     try:
-        return doctor.check_spool(probes.read_spool(path), time.time_ns())
+        return checks.check_spool(probes.read_spool(path), time.time_ns())
     except probes.InUseError:
         name = patient.machine if patient.machine != ANYBODY else ""
         if session and name and (values := probes.hear_health(session, patient.site, name)) is not None:
-            return doctor.check_health(name, values)
+            return checks.check_health(name, values)
         who = f"{name} is not heard" if session and name else "give --machine NAME to hear what it says"
         return skipped("spool", f"an agent has {path} open, and {who}")
     except StoreError as error:
@@ -161,11 +161,11 @@ def _store(folder: Path | None, site: SiteConfig | None) -> list[Finding]:
     if folder is None:
         return [skipped("store", "give --store FOLDER, where the map server runs")]
     try:
-        found = doctor.check_store(probes.read_store(folder, time.time()), site)
+        found = checks.check_store(probes.read_store(folder, time.time()), site)
     except SitegridError as error:
         found = Finding(Level.FAIL, "store", str(error))
     return [found, _disk("store", folder)]
 
 
 def _disk(what: str, path: Path) -> Finding:
-    return doctor.check_disk(what, probes.free_bytes(path))
+    return checks.check_disk(what, probes.free_bytes(path))

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from benchmarks.measure import table
-from sitegrid.process import note, plain, say
-from sitegrid.progress import Display
+from sitegrid.process.lifetime import note, plain, say
+from sitegrid.process.progress import Display
 
 Tables = dict[str, Any]
 MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side

@@ -26,8 +26,8 @@ from protocol.errors import ConfigError
 from protocol.machine.machine_config import plain_lines
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.site_config import SiteConfig, load_site
-from sitegrid.process import say
-from sitegrid.progress import Display
+from sitegrid.process.lifetime import say
+from sitegrid.process.progress import Display
 
 SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
 COMMIT_ROWS = 500

@@ -15,21 +15,13 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-from protocol.certificates import Pair, expires_at, issue, make_authority
 from protocol.errors import ConfigError
-from protocol.signing import make_signing_key
 from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, IDENTITY_FILE, KEY_FILE, SIGNING_FILE
 from protocol.wire.keys import check_name
-from sitegrid.process import say
-from sitegrid.register import (
-    REGISTER_FILE,
-    ROUTER,
-    Entry,
-    Register,
-    common_name,
-    load_register,
-    register_toml,
-)
+from sitegrid.process.lifetime import say
+from sitegrid.security.certificates import Pair, expires_at, issue, make_authority
+from sitegrid.security.register import REGISTER_FILE, ROUTER, Entry, Register, common_name, load_register, register_toml
+from sitegrid.security.signing import make_signing_key
 
 AUTHORITY = "authority"
 AUTHORITY_DAYS = 3650

@@ -14,7 +14,7 @@ from protocol.queries.requests import Region
 from protocol.site.geometry import Bounds
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.process import note, say, stop_flag
+from sitegrid.process.lifetime import note, say, stop_flag
 from sitegrid.tracks import TrackRecorder
 from sitegrid.truth import truth_layers
 

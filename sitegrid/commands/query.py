@@ -13,8 +13,8 @@ from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.queries.requests import Region
 from sitegrid.client import Client, connect
-from sitegrid.process import plain, say, stop_flag, wait
-from sitegrid.times import SiteTime, told
+from sitegrid.commands.times import SiteTime, told
+from sitegrid.process.lifetime import plain, say, stop_flag, wait
 
 HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of a table for people, unless named
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from protocol.errors import ConfigError
 from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.session import SessionConfig, open_session
-from sitegrid.access import router_settings
-from sitegrid.process import say, stop_flag, wait
-from sitegrid.register import REGISTER_FILE, ROUTER, Register, load_register
-from sitegrid.security import is_loopback, with_keys
+from sitegrid.process.lifetime import say, stop_flag, wait
+from sitegrid.security.access import router_settings
+from sitegrid.security.join import is_loopback, with_keys
+from sitegrid.security.register import REGISTER_FILE, ROUTER, Register, load_register
 
 log = logging.getLogger("sitegrid.router")
 

@@ -18,9 +18,9 @@ from protocol.config import from_table, load_toml
 from protocol.site.site_config import load_site
 from protocol.version import package_version
 from protocol.wire.session import open_session
-from sitegrid.process import return_large_blocks, say, stop_flag
-from sitegrid.register import load_register
-from sitegrid.security import join
+from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
+from sitegrid.security.join import join
+from sitegrid.security.register import load_register
 
 
 def run(arguments: Namespace) -> int:
@@ -51,7 +51,9 @@ def _verifier(keys: Path | None) -> Verify | None:
     """What checks signatures by the register in a folder of keys, as it is now."""
     if keys is None:
         return None
-    from protocol.signing import Verifier  # imported here: only a server that asks for signatures needs `cryptography`
+    from sitegrid.security.signing import (
+        Verifier,  # imported here: only a server that asks for signatures needs `cryptography`
+    )
 
     return Verifier(load_register(keys).signing_keys()).check
 

@@ -12,9 +12,9 @@ from protocol.machine.machine_config import machine_toml, plain_lines
 from sim.config import SimConfig, load_sim, resolve
 from sim.publisher import run as publish
 from sim.recorder import record
-from sitegrid.process import END_S, note, say, stop_flag
-from sitegrid.progress import Display
-from sitegrid.security import join
+from sitegrid.process.lifetime import END_S, note, say, stop_flag
+from sitegrid.process.progress import Display
+from sitegrid.security.join import join
 
 OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site")
 ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}

@@ -6,7 +6,7 @@ from argparse import Namespace
 from typing import Any
 
 from sitegrid.client import Client, connect
-from sitegrid.process import plain, say
+from sitegrid.process.lifetime import plain, say
 
 
 def run(arguments: Namespace) -> int:

@@ -30,7 +30,7 @@ from protocol.site.geometry import Bounds
 from protocol.site.site_config import load_site
 from protocol.wire.credentials import check_valid, load_credentials
 from sim.config import load_sim
-from sitegrid.register import Entry, Register, load_register, register_toml
+from sitegrid.security.register import Entry, Register, load_register, register_toml
 from tests.fuzz.fuzz_bytes import files
 from tests.fuzz.fuzz_messages import messages
 from tests.fuzz.fuzz_stores import archive_decoder, journal_decoder

@@ -18,7 +18,7 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from protocol.wire.session import free_endpoint
-from sitegrid.processes import Child, Children, ProcessError
+from sitegrid.process.children import Child, Children, ProcessError
 
 _ENV = re.compile(r"^ENV (?P<pairs>(?:.*\\\n)*.*)$", re.MULTILINE)
 CHECK_S = 0.5  # between two health checks, in place of the file's own

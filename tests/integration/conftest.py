@@ -10,7 +10,7 @@ from site_run import SiteRun  # beside this file
 
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
-from sitegrid.processes import Children
+from sitegrid.process.children import Children
 
 
 @pytest.fixture

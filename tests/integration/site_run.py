@@ -11,7 +11,7 @@ from protocol.site.site_config import load_site
 from sim.config import SimConfig, resolve
 from sitegrid import Client, connect
 from sitegrid.commands.sim import write_configs
-from sitegrid.processes import Child, Children, wait_until
+from sitegrid.process.children import Child, Children, wait_until
 
 READY_S = 40.0
 

@@ -20,7 +20,7 @@ from protocol.wire.codec import MAX_BATCH_BYTES, decode_health, decode_reply, en
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
-from sitegrid.processes import Children, wait_until
+from sitegrid.process.children import Children, wait_until
 
 pytestmark = pytest.mark.processes
 

@@ -16,7 +16,7 @@ import pytest
 
 from agents.delivery.spool import Spool, SpoolConfig
 from protocol.machine.samples import empty
-from sitegrid.processes import wait_until
+from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
 from tests.chaos import bit_flips, power_cuts, process_faults, stepped_clock, write_faults
 from tests.chaos.disk_model import Disk, Kind, Operation

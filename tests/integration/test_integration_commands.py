@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from site_run import SiteRun  # beside this file
 
-from sitegrid.processes import wait_until
+from sitegrid.process.children import wait_until
 
 pytestmark = pytest.mark.processes
 

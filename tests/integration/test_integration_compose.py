@@ -10,7 +10,7 @@ import pytest
 
 from protocol.errors import SitegridError
 from sitegrid import Client, connect
-from sitegrid.processes import Children, wait_until
+from sitegrid.process.children import Children, wait_until
 
 compose_run = pytest.importorskip("compose_run", reason="needs ruamel.yaml, which comes with check-jsonschema")
 pytestmark = pytest.mark.processes

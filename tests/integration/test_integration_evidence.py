@@ -20,7 +20,7 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import Client
-from sitegrid.processes import Child, wait_until
+from sitegrid.process.children import Child, wait_until
 
 START_NS, HOUR_NS, SIZE = 1_767_225_600 * 10**9, 3600 * 10**9, 48
 BAD, OLD, NEW = 1.6, 0.06, 0.02

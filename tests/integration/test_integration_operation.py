@@ -31,7 +31,7 @@ from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
-from sitegrid.processes import Child, Children, wait_until
+from sitegrid.process.children import Child, Children, wait_until
 
 pytestmark = pytest.mark.processes
 

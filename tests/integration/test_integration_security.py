@@ -20,7 +20,6 @@ import zenoh
 
 from protocol.errors import LinkError
 from protocol.machine.samples import SAMPLE_DTYPE
-from protocol.signing import Signer
 from protocol.site.site_config import load_site
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
@@ -29,12 +28,13 @@ from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid import connect
-from sitegrid.access import SPARE_BYTES
 from sitegrid.cli import main
 from sitegrid.commands.sim import write_configs
-from sitegrid.processes import Child, Children, wait_until
+from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.security.access import SPARE_BYTES
+from sitegrid.security.signing import Signer
 
-certificates = pytest.importorskip("protocol.certificates", reason="cryptography is not installed")
+certificates = pytest.importorskip("sitegrid.security.certificates", reason="cryptography is not installed")
 pytestmark = pytest.mark.processes
 
 READY_S = 40.0

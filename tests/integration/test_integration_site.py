@@ -11,7 +11,7 @@ from site_run import SiteRun, kill  # beside this file
 from protocol.errors import LinkError, QueryError
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
-from sitegrid.processes import Children, wait_until
+from sitegrid.process.children import Children, wait_until
 
 pytestmark = pytest.mark.processes
 

@@ -31,7 +31,7 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_pose
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.commands.agent import _claim_name, _open
-from sitegrid.processes import wait_until
+from sitegrid.process.children import wait_until
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 MACHINE = MachineConfig("loader-1", sensors=(SensorConfig("imu", "imu"), SensorConfig("wheels", "encoder")))

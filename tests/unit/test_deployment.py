@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from protocol.site.site_config import load_site
-from sitegrid.process import END_S
+from sitegrid.process.lifetime import END_S
 
 ROOT = Path(__file__).parents[2]
 COMPOSE, DOCKERFILE = ROOT / "compose.yaml", ROOT / "Dockerfile"

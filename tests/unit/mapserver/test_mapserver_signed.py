@@ -4,9 +4,9 @@ import pytest
 from mapserver_data import CONFIG, SITE, Incoming, incoming, now_ns, samples
 
 from mapserver.ingest.store import Store
-from protocol.signing import Signer, Verifier, make_signing_key
 from protocol.wire import keys
 from protocol.wire.messages import Ack
+from sitegrid.security.signing import Signer, Verifier, make_signing_key
 
 PRIVATE, PUBLIC = make_signing_key()
 OTHER, _ = make_signing_key()

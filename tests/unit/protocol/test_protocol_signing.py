@@ -7,7 +7,7 @@ import pytest
 from protocol.errors import ConfigError, MessageError, Refusal
 from protocol.wire import keys
 
-signing = pytest.importorskip("protocol.signing", reason="cryptography is not installed")
+signing = pytest.importorskip("sitegrid.security.signing", reason="cryptography is not installed")
 
 KEY = keys.ingest("paper", "loader-1")
 BATCH = b"\x83 a batch"

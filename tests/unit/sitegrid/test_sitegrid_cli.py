@@ -12,7 +12,7 @@ import pytest
 
 from protocol.errors import ConfigError
 from sitegrid import cli
-from sitegrid.process import plain
+from sitegrid.process.lifetime import plain
 
 COMMANDS = ("demo", "router", "server", "sim", "agent", "query", "plot", "trust", "fold", "keys", "doctor", "eval")
 

@@ -10,10 +10,10 @@ import pytest
 
 from protocol.errors import ConfigError
 from protocol.site.site_config import load_site
-from sitegrid import progress
 from sitegrid.cli import build_parser
 from sitegrid.commands import demo
-from sitegrid.progress import Display
+from sitegrid.process import progress
+from sitegrid.process.progress import Display
 
 
 def plan(tmp_path: Path, *words: str) -> demo.Plan:

@@ -33,9 +33,9 @@ from protocol.wire.codec import encode_batch, encode_health
 from protocol.wire.credentials import Identity
 from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from sitegrid import doctor, probes
 from sitegrid.cli import main
-from sitegrid.doctor import Certificate, Finding, Level, Link, SpoolState, StoreState
+from sitegrid.doctor import checks, probes
+from sitegrid.doctor.checks import Certificate, Finding, Level, Link, SpoolState, StoreState
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 NOW_NS = 1_767_225_600_000_000_000
@@ -71,29 +71,29 @@ def samples(n: int) -> np.ndarray:
     ],
 )
 def test_router(link: Link, level: Level, words: str):
-    found = doctor.check_link(link)
+    found = checks.check_link(link)
     assert (found.level, words in str(found)) == (level, True)
 
 
 def test_an_empty_answer_of_the_server_is_told_apart():
-    assert doctor.check_server("pit", INFO, is_there=True).level is Level.PASS
-    behind = doctor.check_server("pit", {**INFO, "merged": 10}, is_there=True)
+    assert checks.check_server("pit", INFO, is_there=True).level is Level.PASS
+    behind = checks.check_server("pit", {**INFO, "merged": 10}, is_there=True)
     assert "journal row 12, merged only up to 10" in behind.found
-    denied = doctor.check_server("pit", None, is_there=True, role="visitor")
+    denied = checks.check_server("pit", None, is_there=True, role="visitor")
     assert denied.level is Level.FAIL
     assert "the router denies the question" in denied.advice
-    absent = doctor.check_server("pit", None, is_there=False)
+    absent = checks.check_server("pit", None, is_there=False)
     assert "start `sitegrid server`" in absent.advice
     assert "revoked" not in absent.advice
-    assert "revoked" in doctor.check_server("pit", None, is_there=False, role="machine").advice
+    assert "revoked" in checks.check_server("pit", None, is_there=False, role="machine").advice
 
 
 def test_site_files_are_compared():
-    assert doctor.check_site(SITE, INFO).level is Level.PASS
-    moved = doctor.check_site(replace(SITE, origin_lat_deg=48.1), INFO)
+    assert checks.check_site(SITE, INFO).level is Level.PASS
+    moved = checks.check_site(replace(SITE, origin_lat_deg=48.1), INFO)
     assert moved.level is Level.FAIL
     assert SITE.frame in moved.found
-    assert doctor.check_site(replace(SITE, name="hill"), INFO).level is Level.FAIL
+    assert checks.check_site(replace(SITE, name="hill"), INFO).level is Level.FAIL
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_site_files_are_compared():
     ],
 )
 def test_permission(answer: Any, is_there: bool, has_keys: bool, level: Level, words: str):
-    found = doctor.check_permission("loader-1", answer, is_there=is_there, has_keys=has_keys)
+    found = checks.check_permission("loader-1", answer, is_there=is_there, has_keys=has_keys)
     assert (found.level, words in str(found)) == (level, True)
 
 
@@ -125,7 +125,7 @@ def test_permission(answer: Any, is_there: bool, has_keys: bool, level: Level, w
     ],
 )
 def test_clock(offset_s: float, error_s: float, site: SiteConfig | None, level: Level, words: str):
-    found = doctor.check_clock(offset_s, error_s, site)
+    found = checks.check_clock(offset_s, error_s, site)
     assert (found.level, words in str(found)) == (level, True)
 
 
@@ -136,9 +136,9 @@ def test_the_offset_is_taken_at_the_middle_of_the_question():
 
 
 def test_versions():
-    assert doctor.check_version("1.0", "1.0").level is Level.PASS
-    assert doctor.check_version("1.0", "1.1").level is Level.WARN
-    assert doctor.check_version("1.0", "unknown").level is Level.SKIP
+    assert checks.check_version("1.0", "1.0").level is Level.PASS
+    assert checks.check_version("1.0", "1.1").level is Level.WARN
+    assert checks.check_version("1.0", "unknown").level is Level.SKIP
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------
@@ -155,12 +155,12 @@ GOOD = Certificate(
 
 
 def level_of(found: Certificate, check: str, **given: str) -> tuple[Level, str]:
-    finding = next(f for f in doctor.check_certificate(found, NOW, **given) if f.check == check)
+    finding = next(f for f in checks.check_certificate(found, NOW, **given) if f.check == check)
     return finding.level, str(finding)
 
 
 def test_a_good_certificate_passes():
-    findings = doctor.check_certificate(GOOD, NOW, "pit", "loader-1")
+    findings = checks.check_certificate(GOOD, NOW, "pit", "loader-1")
     assert [f.level for f in findings] == [Level.PASS] * 3
 
 
@@ -258,7 +258,7 @@ def test_keys_that_soon_expire_are_told_of_and_their_name_is_used(key_folder: Pa
 
 
 def test_free_space(tmp_path: Path):
-    levels = [doctor.check_disk("spool", free).level for free in (2**25, 2**29, 2**31)]
+    levels = [checks.check_disk("spool", free).level for free in (2**25, 2**29, 2**31)]
     assert levels == [Level.FAIL, Level.WARN, Level.PASS]
     assert probes.free_bytes(tmp_path / "not" / "there" / "yet.db") > 0
 
@@ -274,24 +274,24 @@ def test_free_space(tmp_path: Path):
     ],
 )
 def test_spool(state: SpoolState, age_s: int, level: Level, words: str):
-    found = doctor.check_spool(state, NOW_NS + age_s * 10**9)
+    found = checks.check_spool(state, NOW_NS + age_s * 10**9)
     assert (found.level, words in str(found)) == (level, True)
 
 
 def test_an_agent_that_runs_is_taken_at_its_word():
     good = {"spool": {"depth": 3, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
-    assert doctor.check_health("loader-1", good).level is Level.PASS
-    stuck = doctor.check_health("loader-1", {**good, "uplink": {"problem": "no answer"}})
+    assert checks.check_health("loader-1", good).level is Level.PASS
+    stuck = checks.check_health("loader-1", {**good, "uplink": {"problem": "no answer"}})
     assert (stuck.level, stuck.advice) == (Level.WARN, "no answer")
-    lost = doctor.check_health("loader-1", {**good, "spool": {"depth": 3, "dropped": 1}})
+    lost = checks.check_health("loader-1", {**good, "spool": {"depth": 3, "dropped": 1}})
     assert lost.level is Level.WARN
 
 
 def test_what_others_say_may_be_anything():
     for values in ({}, {"spool": 7, "uplink": "no"}, {"spool": [], "spool_problem": None}):
-        assert doctor.check_health("loader-1", values).level is Level.PASS
-    assert doctor.check_server("pit", {}, is_there=True).level is Level.PASS
-    assert doctor.check_site(SITE, {"site": 3}).level is Level.FAIL
+        assert checks.check_health("loader-1", values).level is Level.PASS
+    assert checks.check_server("pit", {}, is_there=True).level is Level.PASS
+    assert checks.check_site(SITE, {"site": 3}).level is Level.FAIL
 
 
 STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
@@ -308,7 +308,7 @@ STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
     ],
 )
 def test_store(state: StoreState, site: SiteConfig | None, level: Level, words: str):
-    found = doctor.check_store(state, site)
+    found = checks.check_store(state, site)
     assert (found.level, words in str(found)) == (level, True)
 
 

@@ -27,7 +27,7 @@ from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main
 from sitegrid.commands import fold
-from sitegrid.times import parse_stamp
+from sitegrid.commands.times import parse_stamp
 
 pytest.importorskip("pyarrow.parquet")
 SITE = SiteConfig("pit", 48.0, 11.0)

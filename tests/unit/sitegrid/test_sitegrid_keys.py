@@ -18,10 +18,10 @@ from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES
 from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
-from sitegrid.access import access_control, router_settings
 from sitegrid.cli import build_parser, main
-from sitegrid.register import ROLES, Entry, Register, common_name, load_register, register_toml
-from sitegrid.security import is_loopback, join
+from sitegrid.security.access import access_control, router_settings
+from sitegrid.security.join import is_loopback, join
+from sitegrid.security.register import ROLES, Entry, Register, common_name, load_register, register_toml
 
 x509 = pytest.importorskip("cryptography.x509", reason="cryptography is not installed")
 
@@ -101,7 +101,7 @@ def lifetime(of: x509.Certificate) -> timedelta:
 
 
 def test_no_certificate_outlives_its_authority():
-    from protocol.certificates import expires_at, issue, make_authority
+    from sitegrid.security.certificates import expires_at, issue, make_authority
 
     authority = make_authority(SITE, NOW, NOW + timedelta(days=10))
     assert expires_at(issue(authority, "loader-1", NOW, NOW + timedelta(days=99))) == NOW + timedelta(days=10)
@@ -225,7 +225,7 @@ def test_wrong_usage_exits_with_2():
 def test_without_cryptography_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    for name in ("protocol.certificates", "sitegrid.commands.keys"):
+    for name in ("sitegrid.security.certificates", "sitegrid.commands.keys"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     assert act(tmp_path, "list") == 1
@@ -233,10 +233,10 @@ def test_without_cryptography_it_says_what_to_install(
 
 
 def test_whoever_only_has_keys_needs_no_cryptography():
-    code = "import sys, sitegrid.client, sitegrid.security, sitegrid.commands.router; print(*sorted(sys.modules))"
+    code = "import sys, sitegrid.client, sitegrid.security.join, sitegrid.commands.router; print(*sorted(sys.modules))"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "cryptography" not in modules
-    assert "sitegrid.access" in modules
+    assert "sitegrid.security.access" in modules
 
 
 # --- the register ----------------------------------------------------------------------------------------------------
@@ -270,7 +270,7 @@ def test_a_wrong_register_is_refused(folder: Path, old: str, new: str, problem: 
 
 
 def test_only_machines_have_signing_keys_and_the_register_knows_them(folder: Path):
-    from protocol.signing import Signer, Verifier
+    from sitegrid.security.signing import Signer, Verifier
 
     for name, role in (("loader-1", "machine"), ("guest", "visitor")):
         assert act(folder, "add", name, "--role", role) == 0

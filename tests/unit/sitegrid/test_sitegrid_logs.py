@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from sitegrid.logs import JsonLines, Lines, start_logging
+from sitegrid.process.logs import JsonLines, Lines, start_logging
 
 
 def record(message: str, *values: object, error: bool = False) -> logging.LogRecord:

@@ -15,8 +15,8 @@ from sitegrid.cli import build_parser
 
 STUBBORN = """
 import sys, time
-from sitegrid.logs import start_logging
-from sitegrid.process import stop_flag
+from sitegrid.process.logs import start_logging
+from sitegrid.process.lifetime import stop_flag
 start_logging(verbose=False)
 stop = stop_flag({end_s})
 print("ready", flush=True)
@@ -28,7 +28,7 @@ sys.exit(3)
 # A lock that is never released, waited for in C: handlers of Python do not run, as inside of Zenoh.
 STUCK = """
 import ctypes, os
-from sitegrid.process import stop_flag
+from sitegrid.process.lifetime import stop_flag
 stop_flag(0.3)
 print("ready", flush=True)
 mutex = ctypes.create_string_buffer(256)
@@ -40,7 +40,7 @@ pthread.pthread_mutex_lock(mutex)
 GREEDY = """
 import os, sys
 import numpy as np
-from sitegrid.process import return_large_blocks
+from sitegrid.process.lifetime import return_large_blocks
 
 def resident_mib():
     with open("/proc/self/statm") as file:

@@ -17,7 +17,7 @@ from typing import Any
 END_S = 2.5  # from the signal to the end of the process
 LARGE_BYTES = 2**20  # a block of memory that is worth a system call
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of malloc.h
-log = logging.getLogger("sitegrid.process")
+log = logging.getLogger("sitegrid.process.lifetime")
 
 
 def stop_flag(end_s: float | None = END_S) -> threading.Event:

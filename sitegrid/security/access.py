@@ -11,7 +11,7 @@ from typing import Any
 
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_SMALL_BYTES
-from sitegrid.register import Register, common_name
+from sitegrid.security.register import Register, common_name
 
 POSE_HZ, HEALTH_HZ = 50.0, 10.0  # of one link; poses come with 5 Hz, at ten times real time with 50
 SPARE_BYTES = 4096  # for what goes along with a payload, as a signature

@@ -7,7 +7,7 @@ import time
 from types import TracebackType
 from typing import Any
 
-from sitegrid.process import note
+from sitegrid.process.lifetime import note
 
 EVERY_S = 5.0  # between two plain lines
 

@@ -26,7 +26,7 @@ from protocol.wire.codec import decode_health, decode_reply, encode_batch
 from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, SIGNING_FILE, load_credentials
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, open_session
-from sitegrid.doctor import Certificate, Link, SpoolState, StoreState
+from sitegrid.doctor.checks import Certificate, Link, SpoolState, StoreState
 
 ANSWER_S = 5.0
 LINK_S = 3.0
@@ -121,7 +121,7 @@ def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | N
 def _signature(folder: Path | None, key: str, payload: bytes) -> bytes | None:
     if folder is None or not (folder / SIGNING_FILE).is_file():
         return None
-    from protocol.signing import Signer  # imported here: needs the `security` extra
+    from sitegrid.security.signing import Signer  # imported here: needs the `security` extra
 
     return Signer((folder / SIGNING_FILE).read_bytes()).sign(key, payload)
 

@@ -1,0 +1,1 @@
+"""What a long-running command needs: signals, children, logs, progress."""

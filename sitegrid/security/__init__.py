@@ -1,0 +1,1 @@
+"""Who is let in: certificates, the register of names, access rules, signatures."""
