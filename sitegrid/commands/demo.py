@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.audit import AuditResult, audit_store
-from evaluation.ground_truth import read_way
-from evaluation.localisation import position_rmse
-from evaluation.mapscore import DrivenScore, MapScore, score, score_driven
+from evaluation.ground.truth import read_way
+from evaluation.maps.score import DrivenScore, MapScore, score, score_driven
+from evaluation.positions.live_error import position_rmse
 from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError

@@ -40,9 +40,9 @@ def _physics(arguments: Namespace) -> Tables:
 
 
 def _localisation(arguments: Namespace) -> Tables:
-    from evaluation import table
-    from evaluation.configurations import HEADLINE, SENSORS, configurations
-    from evaluation.workers import cores
+    from evaluation.campaign.workers import cores
+    from evaluation.positions import table
+    from evaluation.positions.configurations import HEADLINE, SENSORS, configurations
 
     plan = table.Plan(
         seeds=tuple(_seeds(arguments)),
@@ -54,63 +54,63 @@ def _localisation(arguments: Namespace) -> Tables:
     with Display("machines drive, filters follow", headless=arguments.json) as display:
         result, outcomes = table.run(plan, display.show)
     if arguments.plots:
-        from evaluation import plots  # imported here: only pictures need matplotlib
+        from evaluation.positions import plots  # imported here: only pictures need matplotlib
 
         result["plots"] = [str(path) for path in plots.draw(result, outcomes, arguments.plots)]
     return result
 
 
 def _ground(arguments: Namespace) -> Tables:
-    from evaluation import ground
-    from evaluation.workers import cores
+    from evaluation.campaign.workers import cores
+    from evaluation.ground import experiment
 
-    plan = ground.Plan(
+    plan = experiment.Plan(
         seeds=tuple(_seeds(arguments)),
         seconds=arguments.seconds,
         cache=arguments.out,
         processes=arguments.processes or cores(),
     )
     with Display("loaders work, estimators follow", headless=arguments.json) as display:
-        result, outcomes = ground.run(plan, display.show)
+        result, outcomes = experiment.run(plan, display.show)
     if arguments.plots:
-        from evaluation import ground_plots  # imported here: only pictures need matplotlib
+        from evaluation.ground import plots  # imported here: only pictures need matplotlib
 
-        result["plots"] = [str(path) for path in ground_plots.draw(outcomes, arguments.plots)]
+        result["plots"] = [str(path) for path in plots.draw(outcomes, arguments.plots)]
     return result
 
 
 def _merge(arguments: Namespace) -> Tables:
-    from evaluation import merge
-    from evaluation.merge_cases import select
-    from evaluation.workers import cores
+    from evaluation.campaign.workers import cores
+    from evaluation.maps import experiment
+    from evaluation.maps.cases import select
 
-    plan = merge.Plan(
+    plan = experiment.Plan(
         seeds=tuple(_seeds(arguments)),
         cache=arguments.out,
         processes=arguments.processes or cores(),
         cases=select([name for name in arguments.cases.split(",") if name]),
     )
     with Display("machines drive, their samples are merged", headless=arguments.json) as display:
-        result = merge.run(plan, display.show)
+        result = experiment.run(plan, display.show)
     if arguments.plots:
-        from evaluation import merge_plots  # imported here: only pictures need matplotlib
+        from evaluation.maps import plots  # imported here: only pictures need matplotlib
 
-        result["plots"] = [str(path) for path in merge_plots.draw(result, plan, arguments.plots)]
+        result["plots"] = [str(path) for path in plots.draw(result, plan, arguments.plots)]
     return result
 
 
 def _log(arguments: Namespace) -> Tables:
-    from evaluation import reallog
-    from evaluation.configurations import Configuration, select
+    from evaluation.positions import real_logs
+    from evaluation.positions.configurations import Configuration, select
 
-    with reallog.opened(arguments.manifest, arguments.data) as log:
+    with real_logs.opened(arguments.manifest, arguments.data) as log:
         machine = select(log.machine, gps=arguments.gps)
-        row = Configuration(arguments.filter, reallog.receivers(machine), 1, arguments.profile)
-        return reallog.run(log, machine, row, arguments.withhold or reallog.WITHHOLD, on_progress=note)
+        row = Configuration(arguments.filter, real_logs.receivers(machine), 1, arguments.profile)
+        return real_logs.run(log, machine, row, arguments.withhold or real_logs.WITHHOLD, on_progress=note)
 
 
 def _parity(arguments: Namespace) -> Tables:
-    from evaluation import parity
+    from evaluation.positions import parity
 
     return parity.run(arguments.data, on_progress=note)
 

@@ -3,7 +3,8 @@
 import pytest
 
 from agents.pipeline import PipelineConfig
-from evaluation.configurations import (
+from evaluation.campaign.recordings import Drive
+from evaluation.positions.configurations import (
     FILTERS,
     HEADLINE,
     PAPER_NET_M,
@@ -17,7 +18,6 @@ from evaluation.configurations import (
     select,
     started_at,
 )
-from evaluation.recordings import Drive
 
 ROW = Configuration("ukf", 2, 1, "default")
 

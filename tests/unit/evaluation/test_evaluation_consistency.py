@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from evaluation.consistency import (
+from evaluation.positions.consistency import (
     ellipse_limit,
     independent_values,
     mean_interval,

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation import campaign, ground, recordings
-from evaluation.recordings import Setup
+from evaluation.campaign import recordings, tasks
+from evaluation.campaign.recordings import Setup
+from evaluation.ground import experiment
 from protocol.errors import SitegridError
 from sitegrid import cli
 
 FAST = Setup("paper_site", ("west", "east"), gps=(1, 2), imu=(3,), world="fast")
-CALIBRATED, HARSH = ground.Row("kalman", "calibrated"), ground.Row("kalman", "harsh")
+CALIBRATED, HARSH = experiment.Row("kalman", "calibrated"), experiment.Row("kalman", "harsh")
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +24,13 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def plan(cache: Path) -> ground.Plan:
-    return ground.Plan(seeds=(4,), seconds=40.0, cache=cache, processes=1, rows=(CALIBRATED, HARSH), setup=FAST)
+def plan(cache: Path) -> experiment.Plan:
+    return experiment.Plan(seeds=(4,), seconds=40.0, cache=cache, processes=1, rows=(CALIBRATED, HARSH), setup=FAST)
 
 
-def test_every_row_is_judged_on_its_presets_recording(plan: ground.Plan):
+def test_every_row_is_judged_on_its_presets_recording(plan: experiment.Plan):
     said: list[tuple[float, float, str]] = []
-    report, outcomes = ground.run(plan, lambda *words: said.append(words))
+    report, outcomes = experiment.run(plan, lambda *words: said.append(words))
     assert [(row["estimator"], row["preset"]) for row in report["rows"]] == [
         ("kalman", "calibrated"),
         ("kalman", "harsh"),
@@ -42,18 +43,18 @@ def test_every_row_is_judged_on_its_presets_recording(plan: ground.Plan):
         assert row["right_class_ci95"] is None  # of a single seed
         assert len(row["c_rr_bias_by_seed"]) == 1
     assert report["judged_from_s"] == 16.0
-    assert {goal["name"] for goal in report["goals"]} == {name for name, _, _ in ground.GOALS}
+    assert {goal["name"] for goal in report["goals"]} == {name for name, _, _ in experiment.GOALS}
     assert (outcomes[0].run.samples["stamp_ns"] > 0).all()
 
 
-def test_an_interrupted_run_goes_on_where_it_was(plan: ground.Plan, monkeypatch: pytest.MonkeyPatch):
-    first, outcomes = ground.run(plan)
-    ground.run_file(outcomes[1].task).unlink()
+def test_an_interrupted_run_goes_on_where_it_was(plan: experiment.Plan, monkeypatch: pytest.MonkeyPatch):
+    first, outcomes = experiment.run(plan)
+    experiment.run_file(outcomes[1].task).unlink()
     done: list[str] = []
-    work = ground._estimate
-    monkeypatch.setattr(ground, "_estimate", lambda job: (done.append(job[0].row.name), work(job)))
-    monkeypatch.setattr(campaign, "make", lambda *_: pytest.fail("recorded again"))
-    again, _ = ground.run(plan)
+    work = experiment._estimate
+    monkeypatch.setattr(experiment, "_estimate", lambda job: (done.append(job[0].row.name), work(job)))
+    monkeypatch.setattr(tasks, "make", lambda *_: pytest.fail("recorded again"))
+    again, _ = experiment.run(plan)
     assert done == [outcomes[1].task.row.name]
     for rows in (first["rows"], again["rows"]):
         for row in rows:
@@ -61,24 +62,24 @@ def test_an_interrupted_run_goes_on_where_it_was(plan: ground.Plan, monkeypatch:
     np.testing.assert_equal(again, first)  # NaN is itself
 
 
-def test_other_code_or_rows_never_meet_old_samples(plan: ground.Plan, monkeypatch: pytest.MonkeyPatch):
+def test_other_code_or_rows_never_meet_old_samples(plan: experiment.Plan, monkeypatch: pytest.MonkeyPatch):
     task = plan.task(4, CALIBRATED)
-    files = {ground.run_file(task), ground.run_file(replace(task, row=ground.Row("rls", "calibrated")))}
-    files |= {ground.run_file(replace(task, row=ground.Row("kalman", "nominal")))}
-    monkeypatch.setattr(ground, "code_version", lambda *_: "other")
-    files |= {ground.run_file(task)}
+    files = {experiment.run_file(task), experiment.run_file(replace(task, row=experiment.Row("rls", "calibrated")))}
+    files |= {experiment.run_file(replace(task, row=experiment.Row("kalman", "nominal")))}
+    monkeypatch.setattr(experiment, "code_version", lambda *_: "other")
+    files |= {experiment.run_file(task)}
     monkeypatch.setattr(recordings, "code_version", lambda *_: "other")
-    files |= {ground.run_file(task)}
+    files |= {experiment.run_file(task)}
     assert len(files) == 5
 
 
-def test_sources_that_change_during_a_run_end_it(plan: ground.Plan):
+def test_sources_that_change_during_a_run_end_it(plan: experiment.Plan):
     with pytest.raises(SitegridError, match="start it again"):
-        ground._estimate((plan.task(4, CALIBRATED), Path("named-by-other-code.npz")))
+        experiment._estimate((plan.task(4, CALIBRATED), Path("named-by-other-code.npz")))
 
 
 def test_rows_configure_the_estimator_and_its_calibration():
-    found = {row.name: row.options.estimation for row in ground.ROWS}
+    found = {row.name: row.options.estimation for row in experiment.ROWS}
     assert len(found) == 6
     assert {(e.estimator, e.calibrate) for e in found.values()} == {
         (name, calibrate) for name in ("kalman", "rls") for calibrate in (True, False)
@@ -87,9 +88,9 @@ def test_rows_configure_the_estimator_and_its_calibration():
 
 
 def test_goals_say_what_is_met():
-    row = dict.fromkeys((name for name, _, _ in ground.GOALS), 0.0)
+    row = dict.fromkeys((name for name, _, _ in experiment.GOALS), 0.0)
     row |= {"right_class_pct": 96.0, "grade_bias_deg": -0.2, "grade_std_deg": math.nan}
-    met = {g["name"]: g["met"] for g in ground.goals({"estimator": "kalman", "preset": "calibrated", **row})}
+    met = {g["name"]: g["met"] for g in experiment.goals({"estimator": "kalman", "preset": "calibrated", **row})}
     assert met["right_class_pct"]
     assert met["wrong_cells_pct"]
     assert not met["grade_bias_deg"]  # by its size
@@ -99,11 +100,11 @@ def test_goals_say_what_is_met():
 
 @pytest.mark.parametrize(("seconds", "settled"), [(600.0, 240.0), (1200.0, 240.0), (100.0, 40.0)])
 def test_a_machine_has_time_to_settle(seconds, settled):
-    assert ground.settle_s(seconds) == settled
+    assert experiment.settle_s(seconds) == settled
 
 
 def test_loaders_take_the_routes_of_the_work_in_turn():
-    drives = [recordings.Drive(seed, 1.0, "dgps", ground.LOADING) for seed in range(5)]
+    drives = [recordings.Drive(seed, 1.0, "dgps", experiment.LOADING) for seed in range(5)]
     assert [drive.tour for drive in drives] == ["west", "east", "middle", "yard", "west"]
     sensors = {sensor.name for sensor in drives[0].machine.sensors}
     assert {"gps-1", "gps-2", "imu-3", "torque"} <= sensors
@@ -113,13 +114,13 @@ def test_loaders_take_the_routes_of_the_work_in_turn():
 
 
 def test_the_command_prints_one_object_and_draws(
-    plan: ground.Plan, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    plan: experiment.Plan, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
     cv2 = pytest.importorskip("cv2")
     pytest.importorskip("matplotlib", reason="needs the extra `eval`")
     plans = []
-    run = ground.run
-    monkeypatch.setattr(ground, "run", lambda asked, show: (plans.append(asked), run(plan, show))[1])
+    run = experiment.run
+    monkeypatch.setattr(experiment, "run", lambda asked, show: (plans.append(asked), run(plan, show))[1])
     words = ["eval", "ground", "--seeds", "1", "--first-seed", "4", "--seconds", "40", "--out", str(plan.cache)]
     assert cli.main([*words, "--processes", "1", "--json", "--plots", str(tmp_path)]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -130,7 +131,7 @@ def test_the_command_prints_one_object_and_draws(
         assert picture.shape[1] > 800
         assert picture.std() > 10
     assert (plans[0].seeds, plans[0].seconds, plans[0].processes) == ((4,), 40.0, 1)
-    assert plans[0].setup == ground.LOADING
+    assert plans[0].setup == experiment.LOADING
     assert cli.main(words) == 0
     shown = capsys.readouterr().out
     assert "kalman calibrated" in shown
@@ -138,14 +139,14 @@ def test_the_command_prints_one_object_and_draws(
     assert (len(plans[1].rows), plans[1].processes > 0) == (6, True)
 
 
-def test_a_tour_without_samples_still_has_rows_and_pictures(plan: ground.Plan, tmp_path: Path):
-    ground_plots = pytest.importorskip("evaluation.ground_plots", reason="needs the extra `eval`")
-    _, outcomes = ground.run(plan)
+def test_a_tour_without_samples_still_has_rows_and_pictures(plan: experiment.Plan, tmp_path: Path):
+    ground_plots = pytest.importorskip("evaluation.ground.plots", reason="needs the extra `eval`")
+    _, outcomes = experiment.run(plan)
     nothing = replace(outcomes[0].run, samples=outcomes[0].run.samples[:0])
     way, here, task = outcomes[0].way, outcomes[0].ground, outcomes[0].task
-    judged = ground.judge(nothing.samples, way, here, task.row.options.sampling, outcomes[0].from_ns)
+    judged = experiment.judge(nothing.samples, way, here, task.row.options.sampling, outcomes[0].from_ns)
     silent = replace(outcomes[0], run=nothing, judged=judged)
-    row = ground.summarise(CALIBRATED, [silent, silent])
+    row = experiment.summarise(CALIBRATED, [silent, silent])
     assert row["cells"] == 0
     assert math.isnan(row["right_class_pct"])
     assert [p.name for p in ground_plots.draw([silent], tmp_path)] == ["summary.png"]

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from agents.sampling import SamplingConfig
-from evaluation.ground_lag import crossings, known_ns, lags
-from evaluation.ground_score import Judged, c_rr_bias, figures, gather, judge, place, pool, soils
-from evaluation.ground_truth import Ground, Way, border_distance, lay_ground, read_way
+from evaluation.ground.lag import crossings, known_ns, lags
+from evaluation.ground.score import Judged, c_rr_bias, figures, gather, judge, place, pool, soils
+from evaluation.ground.truth import Ground, Way, border_distance, lay_ground, read_way
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.ground_classes import UNKNOWN
 from sim.scenario.ground import GroundConfig, Ramp, Zone

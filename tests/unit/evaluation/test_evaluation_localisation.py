@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.localisation import position_rmse
+from evaluation.positions.live_error import position_rmse
 from protocol.wire.messages import Pose
 
 START_NS = 1_767_225_600_000_000_000

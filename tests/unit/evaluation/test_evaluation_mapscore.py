@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from evaluation.mapscore import score
+from evaluation.maps.score import score
 from protocol.queries.requests import Region
 from protocol.site.ground_classes import SLOPE_LIMIT
 

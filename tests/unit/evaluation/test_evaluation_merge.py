@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation import merge
-from evaluation.merge_cases import CASES, Machine, lay, select
-from evaluation.merge_samples import Scene
+from evaluation.maps import experiment
+from evaluation.maps.cases import CASES, Machine, lay, select
+from evaluation.maps.samples import Scene
 from protocol.errors import SitegridError
 from sitegrid import cli
 
@@ -26,8 +26,8 @@ def small(name: str):
     return next(case for case in SMALL if case.name == name)
 
 
-def plan(cache: Path, *names: str, seeds=(3, 4)) -> merge.Plan:
-    return merge.Plan(seeds, cache, processes=1, cases=tuple(small(name) for name in names))
+def plan(cache: Path, *names: str, seeds=(3, 4)) -> experiment.Plan:
+    return experiment.Plan(seeds, cache, processes=1, cases=tuple(small(name) for name in names))
 
 
 def scene_of(case, driven=None) -> Scene:
@@ -36,15 +36,15 @@ def scene_of(case, driven=None) -> Scene:
 
 
 def test_every_case_and_method_has_a_row_with_all_keys(tmp_path: Path):
-    everything = merge.Plan((3,), tmp_path, processes=1, cases=SMALL)
+    everything = experiment.Plan((3,), tmp_path, processes=1, cases=SMALL)
     said: list[tuple[float, float, str]] = []
-    report = merge.run(everything, lambda *words: said.append(words))
+    report = experiment.run(everything, lambda *words: said.append(words))
     assert [(row["case"], row["method"]) for row in report["rows"]] == [(c.name, m) for c in CASES for m in METHODS]
     assert all(set(row) == KEYS for row in report["rows"])
     assert report["seeds"] == [3]
     assert len(said) == len(CASES)
     assert said[-1][0] == pytest.approx(said[-1][1])
-    assert len(report["goals"]) == len(merge.GOALS)
+    assert len(report["goals"]) == len(experiment.GOALS)
     for row in report["rows"]:
         server = row["method"] == "soft_votes"
         assert (row["changed_wrong_pct"] is None) == (row["passes_after"] is None) == (row["case"] != "repaved")
@@ -68,7 +68,7 @@ def test_rows_are_medians_over_seeds():
         }
         for n, w in ((10, 1.0), (30, 4.0), (20, 2.0))
     ]
-    row = merge.summarise(small("1x1"), "mean", outcomes)
+    row = experiment.summarise(small("1x1"), "mean", outcomes)
     assert (row["wrong_pct"], row["wrong_min_pct"], row["wrong_max_pct"]) == (2.0, 1.0, 4.0)
     assert row["wrong_by_seed_pct"] == [1.0, 4.0, 2.0]
     assert (row["samples"], row["known_pct"], row["near_wrong_pct"], row["distrusted"]) == (20, 50.0, None, None)
@@ -80,7 +80,7 @@ def test_machines_that_the_server_left_out_are_counted_over_seeds():
         {"samples": 1, "cells": 8, "distrusted": names, "methods": {"soft_votes": figures}}
         for names in (["b"], [], ["b", "a"])
     ]
-    assert merge.summarise(small("1x1"), "soft_votes", outcomes)["distrusted"] == {"a": 1, "b": 2}
+    assert experiment.summarise(small("1x1"), "soft_votes", outcomes)["distrusted"] == {"a": 1, "b": 2}
 
 
 def test_a_map_of_the_truth_is_right_and_only_driven_cells_count():
@@ -90,39 +90,39 @@ def test_a_map_of_the_truth_is_right_and_only_driven_cells_count():
     scene = scene_of(case, driven)
     found = scene.site.c_rr_later.copy()
     found[10:] = 0.25
-    assert merge.figures(case, scene, {"resistance": found}) == {"wrong_pct": 0.0, "known_pct": 100.0}
+    assert experiment.figures(case, scene, {"resistance": found}) == {"wrong_pct": 0.0, "known_pct": 100.0}
     found[0, :9], found[1] = 0.25, np.nan
-    figures = merge.figures(case, scene, {"resistance": found})
+    figures = experiment.figures(case, scene, {"resistance": found})
     assert figures == {"wrong_pct": pytest.approx(100 * 9 / 45), "known_pct": 50.0}
 
 
 def test_changed_and_unchanged_cells_are_judged_apart_by_how_the_site_was_left():
     case = small("repaved")
     scene = scene_of(case)
-    figures = merge.figures(case, scene, {"resistance": scene.site.c_rr})
+    figures = experiment.figures(case, scene, {"resistance": scene.site.c_rr})
     assert (figures["changed_wrong_pct"], figures["unchanged_wrong_pct"]) == (100.0, 0.0)
     assert figures["wrong_pct"] == pytest.approx(100 * scene.site.repaved.mean())
-    left = merge.figures(case, scene, {"resistance": scene.site.c_rr_later})
+    left = experiment.figures(case, scene, {"resistance": scene.site.c_rr_later})
     assert left["changed_wrong_pct"] == 0.0
 
 
 def test_of_a_narrow_road_only_the_road_is_judged():
     case = small("narrow_road")
     scene = scene_of(case)
-    assert merge.figures(case, scene, {"resistance": np.full((30, 45), 0.008)})["wrong_pct"] == 0.0
-    assert merge.figures(case, scene, {"resistance": np.full((30, 45), 0.06)})["wrong_pct"] == 100.0
+    assert experiment.figures(case, scene, {"resistance": np.full((30, 45), 0.008)})["wrong_pct"] == 0.0
+    assert experiment.figures(case, scene, {"resistance": np.full((30, 45), 0.06)})["wrong_pct"] == 100.0
 
 
 def test_cells_beside_a_parked_machine_are_judged_apart():
     case = replace(small("parked_bad_machine"), columns=90, rows=60)
-    near = merge.near_parked(case)
-    assert near.sum() == pytest.approx(np.pi * merge.NEAR_M**2, rel=0.1)
+    near = experiment.near_parked(case)
+    assert near.sum() == pytest.approx(np.pi * experiment.NEAR_M**2, rel=0.1)
     assert near[15, 70]  # three metres east of where it truly stands
     assert not near[15, 65]
     scene = scene_of(case)
     found = np.where(near, 0.06, scene.site.c_rr)
-    assert merge.figures(case, scene, {"resistance": found})["near_wrong_pct"] == 100.0
-    assert not merge.near_parked(replace(case, machines=(Machine(),))).any()
+    assert experiment.figures(case, scene, {"resistance": found})["near_wrong_pct"] == 100.0
+    assert not experiment.near_parked(replace(case, machines=(Machine(),))).any()
 
 
 def test_sure_cells_are_judged_apart():
@@ -130,21 +130,28 @@ def test_sure_cells_are_judged_apart():
     scene = scene_of(case)
     found, confidence = scene.site.c_rr.copy(), np.full((30, 45), 0.9)
     found[0], confidence[0] = 0.25, 0.59
-    figures = merge.figures(case, scene, {"resistance": found, "confidence": confidence})
+    figures = experiment.figures(case, scene, {"resistance": found, "confidence": confidence})
     assert figures["share60_wrong_pct"] == 0.0
     assert figures["share60_cells_pct"] == pytest.approx(100 * 29 / 30)
     confidence[0] = 0.6
-    assert merge.figures(case, scene, {"resistance": found, "confidence": confidence})["share60_wrong_pct"] > 0
+    assert experiment.figures(case, scene, {"resistance": found, "confidence": confidence})["share60_wrong_pct"] > 0
 
 
 def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
     case = small("slope_15")
     scene = scene_of(case)
     east, north = np.moveaxis(scene.site.gradient, -1, 0)
-    assert merge.figures(case, scene, {"grade_east": east + 0.007, "grade_north": north + 0.007})["wrong_pct"] == 0.0
-    assert merge.figures(case, scene, {"grade_east": east + 0.008, "grade_north": north - 0.008})["wrong_pct"] == 100.0
+    assert (
+        experiment.figures(case, scene, {"grade_east": east + 0.007, "grade_north": north + 0.007})["wrong_pct"] == 0.0
+    )
+    assert (
+        experiment.figures(case, scene, {"grade_east": east + 0.008, "grade_north": north - 0.008})["wrong_pct"]
+        == 100.0
+    )
     unknown = np.where(np.arange(45) < 9, np.nan, east)
-    assert merge.figures(case, scene, {"grade_east": unknown, "grade_north": north})["known_pct"] == pytest.approx(80)
+    assert experiment.figures(case, scene, {"grade_east": unknown, "grade_north": north})["known_pct"] == pytest.approx(
+        80
+    )
 
 
 def test_goals_are_met_or_not_and_what_is_not_known_is_not():
@@ -155,7 +162,7 @@ def test_goals_are_met_or_not_and_what_is_not_known_is_not():
         {"case": "4x4", "method": "last_write", "wrong_pct": 0.5},
     ]
     rows = [{"method": "soft_votes", "passes_after": None, **row} for row in rows]
-    met = {(goal["row"], goal["name"], goal["goal"]): goal["met"] for goal in merge.goals(rows)}
+    met = {(goal["row"], goal["name"], goal["goal"]): goal["met"] for goal in experiment.goals(rows)}
     assert met == {
         ("1x1 soft_votes", "wrong_pct", "<= 0.4"): True,
         ("1x1 soft_votes", "share60_wrong_pct", "<= 0.2"): False,
@@ -168,13 +175,13 @@ def test_goals_are_met_or_not_and_what_is_not_known_is_not():
 
 def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     asked = plan(tmp_path, "1x1", "slope_15")
-    first = merge.run(asked)
-    gone = merge.Task(small("slope_15"), 4, tmp_path)
-    merge.result_file(gone).unlink()
+    first = experiment.run(asked)
+    gone = experiment.Task(small("slope_15"), 4, tmp_path)
+    experiment.result_file(gone).unlink()
     done = []
-    work = merge.solve
-    monkeypatch.setattr(merge, "solve", lambda case, seed: (done.append((case.name, seed)), work(case, seed))[1])
-    again = merge.run(asked)
+    work = experiment.solve
+    monkeypatch.setattr(experiment, "solve", lambda case, seed: (done.append((case.name, seed)), work(case, seed))[1])
+    again = experiment.run(asked)
     assert done == [("slope_15", 4)]
     for report in (first, again):
         for row in report["rows"]:
@@ -184,25 +191,25 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, monkeypatch: py
 
 
 def test_other_code_and_other_cases_have_other_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    task = merge.Task(small("1x1"), 3, tmp_path)
+    task = experiment.Task(small("1x1"), 3, tmp_path)
     wider = replace(task, case=replace(task.case, columns=46))
-    assert len({merge.result_file(t) for t in (task, wider, replace(task, seed=4))}) == 3
-    before = merge.result_file(task)
-    monkeypatch.setattr(merge, "code_version", lambda *_: "another")
-    assert merge.result_file(task) != before
+    assert len({experiment.result_file(t) for t in (task, wider, replace(task, seed=4))}) == 3
+    before = experiment.result_file(task)
+    monkeypatch.setattr(experiment, "code_version", lambda *_: "another")
+    assert experiment.result_file(task) != before
     with pytest.raises(SitegridError, match="sources changed"):
-        merge._work((task, before))
+        experiment._work((task, before))
 
 
 def test_results_depend_on_the_server_and_on_everything_that_makes_samples():
-    for source in merge.SOURCES:
-        assert (merge.Path(merge.__file__).parents[1] / source).exists()
-    assert {"mapserver", "protocol", "evaluation/merge_samples.py"} <= set(merge.SOURCES)
+    for source in experiment.SOURCES:
+        assert (experiment.Path(experiment.__file__).parents[1] / source).exists()
+    assert {"mapserver", "protocol", "evaluation/maps/samples.py"} <= set(experiment.SOURCES)
 
 
 def test_worker_processes_find_what_one_process_finds(tmp_path: Path):
-    one = merge.run(plan(tmp_path / "one", "1x1", seeds=(3, 4)))
-    two = merge.run(replace(plan(tmp_path / "two", "1x1", seeds=(3, 4)), processes=2))
+    one = experiment.run(plan(tmp_path / "one", "1x1", seeds=(3, 4)))
+    two = experiment.run(replace(plan(tmp_path / "two", "1x1", seeds=(3, 4)), processes=2))
     assert [row["wrong_by_seed_pct"] for row in one["rows"]] == [row["wrong_by_seed_pct"] for row in two["rows"]]
 
 
@@ -210,8 +217,8 @@ def test_worker_processes_find_what_one_process_finds(tmp_path: Path):
 
 
 def test_options_become_a_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    plans: list[merge.Plan] = []
-    monkeypatch.setattr(merge, "run", lambda asked, _: (plans.append(asked), {"rows": [{"wrong_pct": None}]})[1])
+    plans: list[experiment.Plan] = []
+    monkeypatch.setattr(experiment, "run", lambda asked, _: (plans.append(asked), {"rows": [{"wrong_pct": None}]})[1])
     words = ["eval", "merge", "--seeds", "2", "--first-seed", "7", "--cases", "repaved,1x1", "--out", "x"]
     assert cli.main([*words, "--processes", "3", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"rows": [{"wrong_pct": None}]}
@@ -232,10 +239,10 @@ def test_an_unknown_case_is_one_line(capsys: pytest.CaptureFixture[str]):
 def test_the_command_runs_from_end_to_end_and_draws(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    from evaluation import merge_cases
+    from evaluation.maps import cases
 
     names = ("parked_bad_machine", "repaved", "narrow_road", "slope_15")  # each has a picture of its own kind
-    monkeypatch.setattr(merge_cases, "CASES", [small(name) for name in names])
+    monkeypatch.setattr(cases, "CASES", [small(name) for name in names])
     words = ["eval", "merge", "--seeds", "1", "--cases", ",".join(names)]
     words += ["--out", str(tmp_path), "--processes", "1", "--plots", str(tmp_path / "plots"), "--json"]
     assert cli.main(words) == 0

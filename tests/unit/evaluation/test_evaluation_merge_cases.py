@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation.merge_cases import CASES, CELL_M, Case, Machine, lay, parking_place, select
-from evaluation.merge_samples import (
+from evaluation.maps.cases import CASES, CELL_M, Case, Machine, lay, parking_place, select
+from evaluation.maps.samples import (
     BATCH_ROWS,
     BUCKET_NS,
     C_RR_STD,

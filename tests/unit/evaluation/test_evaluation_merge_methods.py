@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluation.merge_methods import (
+from evaluation.maps.methods import (
     GATE_SIGMA,
     Hits,
     hits_of,
@@ -15,7 +15,7 @@ from evaluation.merge_methods import (
     merge_hard,
     soft_votes,
 )
-from evaluation.merge_samples import Delivery
+from evaluation.maps.samples import Delivery
 from protocol.machine.samples import empty
 from protocol.site.geometry import CellWindow
 

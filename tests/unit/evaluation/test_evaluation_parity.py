@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation import parity
+from evaluation.positions import parity
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 

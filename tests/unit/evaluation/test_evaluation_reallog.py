@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation import reallog
-from evaluation.configurations import Configuration, select
+from evaluation.positions import real_logs
+from evaluation.positions.configurations import Configuration, select
 from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import open_log
 from protocol.machine.readings import Gps
@@ -98,8 +98,8 @@ def circle(tmp_path: Path) -> Path:
 
 
 def run(folder: Path, *patterns: tuple[float, float], data: Path | None = None) -> dict:
-    with reallog.opened(folder, data) as log:
-        return reallog.run(log, log.machine, ROW, patterns or reallog.WITHHOLD)
+    with real_logs.opened(folder, data) as log:
+        return real_logs.run(log, log.machine, ROW, patterns or real_logs.WITHHOLD)
 
 
 def test_errors_against_fixes_and_against_truth_are_told_apart(circle: Path):
@@ -124,7 +124,7 @@ def test_without_a_side_file_there_is_no_truth(circle: Path):
 
 
 def test_planar_fixes_come_back_as_the_metres_that_they_were(circle: Path):
-    with reallog.opened(circle / "log.toml") as log:
+    with real_logs.opened(circle / "log.toml") as log:
         to_map = Projection(log.log.site).to_map
         fixes = [r for r in log.log.readings() if isinstance(r, Gps)]
         places = np.array([to_map(f.lat_deg, f.lon_deg, 0.0)[:2] for f in fixes])
@@ -136,9 +136,9 @@ def test_planar_fixes_come_back_as_the_metres_that_they_were(circle: Path):
 
 
 def test_receivers_in_use_are_counted_and_chosen(circle: Path):
-    with reallog.opened(circle) as log:
-        assert reallog.receivers(log.machine) == 1
-        assert reallog.receivers(select(log.machine, gps=2)) == 2
+    with real_logs.opened(circle) as log:
+        assert real_logs.receivers(log.machine) == 1
+        assert real_logs.receivers(select(log.machine, gps=2)) == 2
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_receivers_in_use_are_counted_and_chosen(circle: Path):
 )
 def test_a_wrong_side_file_is_refused_in_one_line(circle: Path, old: str, new: str, problem: str):
     (circle / "evaluation.toml").write_text(SIDE.replace(old, new))
-    with pytest.raises((ConfigError, LogFolderError), match=problem), reallog.opened(circle):
+    with pytest.raises((ConfigError, LogFolderError), match=problem), real_logs.opened(circle):
         pass
 
 
@@ -161,7 +161,7 @@ def test_a_wrong_side_file_is_refused_in_one_line(circle: Path, old: str, new: s
 def test_every_manifest_is_valid(folder: str):
     log = open_log(LOGS / folder)
     assert log.name == folder
-    side = LOGS / folder / reallog.SIDE_FILE
+    side = LOGS / folder / real_logs.SIDE_FILE
     assert not side.exists() or "truth" in side.read_text()
 
 
@@ -170,7 +170,7 @@ def test_every_row_of_a_real_log_is_read(folder: str):
     data = DATA / folder
     if not data.is_dir():
         pytest.skip(f"the log is not beside the project (../shared/data/{folder})")
-    with reallog.opened(LOGS / folder, data) as log:
+    with real_logs.opened(LOGS / folder, data) as log:
         sensors = {r.sensor for r in log.log.readings()}
         assert sensors == {s.name for s in log.machine.sensors if s.use}
         assert not log.log.refused
@@ -180,6 +180,6 @@ def test_mower_against_its_truth():
     data = DATA / "plaza2_mower"
     if not data.is_dir():
         pytest.skip("the log is not beside the project (../shared/data/plaza2_mower)")
-    with reallog.opened(LOGS / "plaza2_mower", data) as log:
-        row = reallog.run(log, log.machine, ROW, [(0.0, 1.0)])["rows"][0]
+    with real_logs.opened(LOGS / "plaza2_mower", data) as log:
+        row = real_logs.run(log, log.machine, ROW, [(0.0, 1.0)])["rows"][0]
     assert row["truth_net_m"] < 3.0  # one fix of the first receiver alone is off by 3.3 m

@@ -10,7 +10,7 @@ import pytest
 from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import Locates, Pipeline, PipelineConfig, Positioning
-from evaluation.replay import STEP_NS, Trace, Truth, read_track, replay, score
+from evaluation.positions.replay import STEP_NS, Trace, Truth, read_track, replay, score
 from protocol.machine.readings import Articulation, Reading
 from sim.config import SimConfig
 from sim.simulator import Simulator

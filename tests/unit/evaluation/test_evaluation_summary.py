@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from evaluation.configurations import Configuration
-from evaluation.replay import Score
-from evaluation.summary import half_width, paired_ratio, ratios, summarise
+from evaluation.positions.configurations import Configuration
+from evaluation.positions.replay import Score
+from evaluation.positions.summary import half_width, paired_ratio, ratios, summarise
 
 ROW = Configuration("ukf", 1, 1, "default")
 

@@ -12,9 +12,10 @@ from typing import Any
 
 import pytest
 
-from evaluation import campaign, recordings, table
-from evaluation.configurations import Configuration, UnsupportedError
-from evaluation.workers import each
+from evaluation.campaign import recordings, tasks
+from evaluation.campaign.workers import each
+from evaluation.positions import table
+from evaluation.positions.configurations import Configuration, UnsupportedError
 from protocol.errors import ConfigError, SitegridError
 from protocol.machine.machine_config import MachineConfig
 
@@ -61,7 +62,7 @@ def test_an_interrupted_run_goes_on_where_it_was(plan: table.Plan, monkeypatch: 
     done: list[str] = []
     work = table._replay
     monkeypatch.setattr(table, "_replay", lambda job: (done.append(job[0].row.name), work(job)))
-    monkeypatch.setattr(campaign, "make", lambda *_: pytest.fail("recorded again"))
+    monkeypatch.setattr(tasks, "make", lambda *_: pytest.fail("recorded again"))
     again, _ = table.run(plan)
     assert done == [TWO.name]
     timeless = [[{k: v for k, v in row.items() if k != "us_per_second"} for row in r["rows"]] for r in (first, again)]
@@ -143,7 +144,7 @@ def test_sources_that_change_during_a_run_end_it(plan: table.Plan):
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at /proc")
 def test_workers_end_with_a_parent_that_is_killed():
-    code = "import time; from evaluation.workers import each\nlist(each(time.sleep, [90, 90], 2))"
+    code = "import time; from evaluation.campaign.workers import each\nlist(each(time.sleep, [90, 90], 2))"
     parent = subprocess.Popen([sys.executable, "-c", code])
     listed = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
     workers = wait_for(lambda: found if len(found := listed.read_text().split()) >= 3 else None)
@@ -172,7 +173,7 @@ def wait_for(found: Callable[[], Any]) -> Any:
 
 def test_pictures_are_drawn(plan: table.Plan, tmp_path: Path):
     cv2 = pytest.importorskip("cv2")
-    plots = pytest.importorskip("evaluation.plots", reason="needs the extra `eval`")
+    plots = pytest.importorskip("evaluation.positions.plots", reason="needs the extra `eval`")
     paths = plots.draw(*table.run(plan), tmp_path)
     assert [p.name for p in paths] == ["table.png", "errors.png", "tracks_seed3.png"]
     for path in paths:
@@ -192,7 +193,7 @@ def test_a_configuration_that_never_had_a_pose_still_has_a_row(
     row = report["rows"][0]
     assert row["covered"] == 0.0
     assert row["net_m"] != row["net_m"]  # NaN; the command prints null
-    assert pytest.importorskip("evaluation.plots").draw(report, outcomes, tmp_path) == []
+    assert pytest.importorskip("evaluation.positions.plots").draw(report, outcomes, tmp_path) == []
 
 
 def _deaf(machine: MachineConfig, row: Configuration) -> object:

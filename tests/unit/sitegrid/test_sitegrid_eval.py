@@ -32,7 +32,7 @@ def parse(*words: str) -> argparse.Namespace:
 
 
 def test_options_of_the_table_become_a_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    from evaluation import table
+    from evaluation.positions import table
 
     plans = []
     nan = float("nan")

@@ -10,8 +10,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from evaluation.recordings import Drive, Recording, load, make
-from evaluation.workers import each
+from evaluation.campaign.recordings import Drive, Recording, load, make
+from evaluation.campaign.workers import each
 from protocol.errors import SitegridError
 
 Progress = Callable[[float, float, str], None]  # simulated seconds done, all of them, what was done last

@@ -29,8 +29,8 @@ import numpy as np
 
 from agents.holdout import Holdout, HoldoutConfig
 from agents.pipeline import Pipeline
-from evaluation.configurations import Configuration, pipeline_options
-from evaluation.replay import Trace, Truth, errors, replay, root_mean_square, score
+from evaluation.positions.configurations import Configuration, pipeline_options
+from evaluation.positions.replay import Trace, Truth, errors, replay, root_mean_square, score
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import MANIFEST, LogFolder, open_log

@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 
 from agents.pipeline import Positioning
-from evaluation.campaign import Progress, carry_out, check_name, loaded
-from evaluation.configurations import Configuration, UnsupportedError, configure, started_at
-from evaluation.recordings import Drive, code_version, digest, gps_error
-from evaluation.replay import Score, Trace, Truth, errors, replay, score
-from evaluation.summary import ratios, summarise
+from evaluation.campaign.recordings import Drive, code_version, digest, gps_error
+from evaluation.campaign.tasks import Progress, carry_out, check_name, loaded
+from evaluation.positions.configurations import Configuration, UnsupportedError, configure, started_at
+from evaluation.positions.replay import Score, Trace, Truth, errors, replay, score
+from evaluation.positions.summary import ratios, summarise
 from protocol.arrays import Floats
 
 TRACE_S = 1.0  # between two points of the curves that plots draw
-RESULT_SOURCES = ("agents", "protocol", "evaluation/replay.py", "evaluation/consistency.py")
+RESULT_SOURCES = ("agents", "protocol", "evaluation/positions/replay.py", "evaluation/positions/consistency.py")
 
 
 @dataclass(frozen=True)

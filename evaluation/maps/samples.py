@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from evaluation.merge_cases import CELL_M, PASSES_BEFORE, Case, Machine, Site, lay, parking_place
+from evaluation.maps.cases import CELL_M, PASSES_BEFORE, Case, Machine, Site, lay, parking_place
 from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.machine.samples import empty

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from evaluation.reallog import refitted
+from evaluation.positions.real_logs import refitted
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection

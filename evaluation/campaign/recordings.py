@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.replay import Truth, read_track
+from evaluation.positions.replay import Truth, read_track
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evaluation.merge_cases import CELL_M
-from evaluation.merge_samples import Delivery
+from evaluation.maps.cases import CELL_M
+from evaluation.maps.samples import Delivery
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig

@@ -18,12 +18,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from evaluation.campaign import Progress, check_name
-from evaluation.merge_cases import CASES, CELL_M, Case, parking_place
-from evaluation.merge_methods import METHODS, Layers, in_order, merge_hard, soft_votes
-from evaluation.merge_samples import LANE_M, SPEED_MPS, Scene, simulate
-from evaluation.recordings import code_version, digest
-from evaluation.workers import each
+from evaluation.campaign.recordings import code_version, digest
+from evaluation.campaign.tasks import Progress, check_name
+from evaluation.campaign.workers import each
+from evaluation.maps.cases import CASES, CELL_M, Case, parking_place
+from evaluation.maps.methods import METHODS, Layers, in_order, merge_hard, soft_votes
+from evaluation.maps.samples import LANE_M, SPEED_MPS, Scene, simulate
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.geometry import CellWindow
 from protocol.site.ground_classes import UNKNOWN, resistance_class, wrong_percent

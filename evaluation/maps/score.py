@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.ground_truth import border_distance
+from evaluation.ground.truth import border_distance
 from mapserver.pictures.plotter import Layers
 from protocol.arrays import Bools, Floats, Ints
 from protocol.queries.requests import Region

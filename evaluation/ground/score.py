@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from agents.sampling import SamplingConfig
-from evaluation.ground_lag import C_RR, crossings, lags
-from evaluation.ground_truth import CELL_M, Ground, Way
-from evaluation.mapscore import by_border_distance
+from evaluation.ground.lag import C_RR, crossings, lags
+from evaluation.ground.truth import CELL_M, Ground, Way
+from evaluation.maps.score import by_border_distance
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.site.ground_classes import UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from evaluation.configurations import Configuration
-from evaluation.consistency import CONFIDENCE
-from evaluation.replay import Score
+from evaluation.positions.configurations import Configuration
+from evaluation.positions.consistency import CONFIDENCE
+from evaluation.positions.replay import Score
 from protocol.arrays import Floats
 
 Row = dict[str, Any]

@@ -19,11 +19,11 @@ import numpy as np
 
 from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline, PipelineConfig
-from evaluation.campaign import Progress, carry_out, check_name, loaded
-from evaluation.ground_score import Judged, by_border, c_rr_bias, figures, judge, pool, soils
-from evaluation.ground_truth import Ground, Way, lay_ground, read_way
-from evaluation.recordings import Drive, Recording, Setup, code_version, digest, track_file
-from evaluation.summary import half_width, rounded
+from evaluation.campaign.recordings import Drive, Recording, Setup, code_version, digest, track_file
+from evaluation.campaign.tasks import Progress, carry_out, check_name, loaded
+from evaluation.ground.score import Judged, by_border, c_rr_bias, figures, judge, pool, soils
+from evaluation.ground.truth import Ground, Way, lay_ground, read_way
+from evaluation.positions.summary import half_width, rounded
 from protocol.arrays import Floats, Table
 
 LOADING = Setup("loading", ("west", "east", "middle", "yard"), gps=(1, 2), imu=(3,))

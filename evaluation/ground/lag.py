@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.sampling import SamplingConfig
-from evaluation.ground_truth import Ground, Way
+from evaluation.ground.truth import Ground, Way
 from protocol.arrays import Floats, Ints, Table
 from protocol.site.ground_classes import ZONES
 

@@ -19,11 +19,23 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
-from evaluation.merge import GOALS, GRADE_TOLERANCE, NEAR_M, SERVER, Maps, Plan, Row, Task, classes, figures, solve
-from evaluation.merge_cases import CELL_M, Case, parking_place
-from evaluation.merge_methods import METHODS, Layers
-from evaluation.plots import DPI, STYLE, WIDTH_IN
-from evaluation.workers import each
+from evaluation.campaign.workers import each
+from evaluation.maps.cases import CELL_M, Case, parking_place
+from evaluation.maps.experiment import (
+    GOALS,
+    GRADE_TOLERANCE,
+    NEAR_M,
+    SERVER,
+    Maps,
+    Plan,
+    Row,
+    Task,
+    classes,
+    figures,
+    solve,
+)
+from evaluation.maps.methods import METHODS, Layers
+from evaluation.positions.plots import DPI, STYLE, WIDTH_IN
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.ground_classes import UNKNOWN, ZONES, resistance_class
 

@@ -19,11 +19,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from evaluation.ground import GOAL_ROW, ROWS, Outcome, Row
-from evaluation.ground_lag import C_RR
-from evaluation.ground_score import INTERIOR_M, Judged, Placed, by_border, place, pool
-from evaluation.ground_truth import Way
-from evaluation.plots import DPI, STYLE, WIDTH_IN
+from evaluation.ground.experiment import GOAL_ROW, ROWS, Outcome, Row
+from evaluation.ground.lag import C_RR
+from evaluation.ground.score import INTERIOR_M, Judged, Placed, by_border, place, pool
+from evaluation.ground.truth import Way
+from evaluation.positions.plots import DPI, STYLE, WIDTH_IN
 from protocol.arrays import AnyArray, Bools, Floats, Ints
 from protocol.site.ground_classes import ZONES, resistance_class
 

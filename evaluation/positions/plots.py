@@ -17,10 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from evaluation.configurations import Configuration
-from evaluation.recordings import track_file
-from evaluation.replay import Truth, read_track
-from evaluation.table import TRACE_S, Outcome
+from evaluation.campaign.recordings import track_file
+from evaluation.positions.configurations import Configuration
+from evaluation.positions.replay import Truth, read_track
+from evaluation.positions.table import TRACE_S, Outcome
 from protocol.arrays import Floats
 
 WIDTH_IN, DPI = 11.0, 110

@@ -17,7 +17,7 @@ import numpy as np
 from agents.holdout import Holdout
 from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import Locates
-from evaluation.consistency import normalised_square, summarise
+from evaluation.positions.consistency import normalised_square, summarise
 from protocol.arrays import Floats, Ints
 from protocol.machine.readings import Reading
 

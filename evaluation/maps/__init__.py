@@ -1,0 +1,1 @@
+"""How right merged maps are, by method and case."""
