@@ -21,7 +21,7 @@ STEP_MS = 10  # the world runs at 100 Hz
 class SimConfig:
     """What is simulated, and how fast. Options that are None are as the scenario says.
 
-    scenario: a name of `sim/scenarios/`, or the path of a TOML file. machines: of the scenario's first fleet. names: of
+    scenario: a name of `sim/scenario/`, or the path of a TOML file. machines: of the scenario's first fleet. names: of
     all machines. seconds: simulated time, 0 runs until stopped. preset, drive_mps, gps, imu, attitude, payload: of
     every fleet. speed: times real time, 0 as fast as possible. wait_s: how long to wait for a subscriber of every
     machine before driving.

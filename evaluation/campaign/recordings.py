@@ -24,7 +24,7 @@ from sim.scenario.file import load_scenario
 from sim.scenario.tables import FleetConfig, Scenario
 from sim.sensors.presets import load_preset
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 MACHINE = "loader"
 
 

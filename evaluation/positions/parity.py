@@ -18,7 +18,7 @@ from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection
 
-LOGS = Path(__file__).parent / "logs"
+LOGS = Path(__file__).parents[1] / "logs"
 STEP_S = 0.02
 
 

@@ -15,8 +15,7 @@ from typing import Any
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.ingest import admission
-from mapserver.ingest.admission import Admission, GapError
+from mapserver.ingest.admission import Admission, GapError, admit, parse
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import Journal
@@ -187,8 +186,8 @@ class Store:
         try:
             if self._verify:
                 self._check_signature(self._verify, incoming)
-            batch = admission.parse(incoming.payload, incoming.machine, self.site, self._now_ns)
-            admission = admission.admit(batch, self._journal.mark(batch.machine, batch.spool_id).seq)
+            batch = parse(incoming.payload, incoming.machine, self.site, self._now_ns)
+            admission = admit(batch, self._journal.mark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None

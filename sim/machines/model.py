@@ -14,14 +14,14 @@ from protocol.errors import ConfigError
 from protocol.machine.machine_config import BASE, FRONT, Mount
 from sim.machines.urdf import Mass, Pose, Robot, joined, read_urdf, rpy_rad
 
-FOLDER = Path(__file__).parent / "models"
+FOLDER = Path(__file__).parent
 PAYLOAD = "payload_link"
 WHEELS = tuple(f"{place}_wheel_link" for place in ("front_left", "front_right", "rear_left", "rear_right"))
 
 
 @dataclass(frozen=True)
 class MachineModel:
-    """One kind of articulated machine on four wheels, as it leaves the works; `sim/models/*.toml` explain the values.
+    """One kind of articulated machine on four wheels, as it leaves the works; `sim/machines/*.toml` explain the values.
 
     urdf: file beside the TOML file. mass_kg: empty. payload_kg: the most it carries. load_centre_m: how far ahead of
     the rear axle the wheel loads' centre lies, empty.

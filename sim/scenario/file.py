@@ -19,7 +19,7 @@ from sim.scenario.tables import FleetConfig, Scenario
 from sim.sensors.presets import parse_preset
 from sim.sensors.rigs import machine_config
 
-FOLDER = Path(__file__).parent / "scenarios"
+FOLDER = Path(__file__).parent
 MARGIN_M = 3.0  # that a route keeps from the edges of the map
 STEERING_SHARE = 0.9  # of a machine's steering that a route may need: the rest is for corrections
 MAX_GAP_M, MAX_BEND_DEG = 0.5, 10.0  # between the end of a leg and the start of the next

@@ -37,8 +37,8 @@ from tests.fuzz.fuzz_stores import archive_decoder, journal_decoder
 from tests.fuzz.fuzz_texts import texts
 from tests.fuzz.fuzz_verdict import Decoder
 from tests.golden.make import EXTENT_M, FOLDER, GOLDEN, NEWER, T0
+from tests.paths import CONFIG
 
-CONFIG = Path(__file__).parents[2] / "config"
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 PLAIN = ("health", "info", "machines", "machine", "changes", "change")  # people see these as JSON
 
@@ -106,7 +106,7 @@ def _selectors() -> Iterator[Decoder]:
         requests.ChangesQuery(3),
         requests.InfoQuery(fresh),
     )
-    seeds = tuple(f"{query.name}?{selector_of(queries.encode_query(query))}".encode() for query in asked)
+    seeds = tuple(f"{query.name}?{selector_of(requests.encode_query(query))}".encode() for query in asked)
     yield Decoder("query", seeds, _query, (QueryError,), texts)
     commands = (TrustCommand("loader-2", False, "moved; x = 3", 60.0), TrustCommand("loader-2", None))
     seeds = tuple(f"{command.name}?{selector_of(encode_command(command))}".encode() for command in commands)

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from site_run import SiteRun  # beside this file
 
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.process.children import Children
+from tests.integration.site_run import SiteRun  # beside this file
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import msgpack
 import numpy as np
 import pytest
 import zenoh
-from site_run import READY_S, SiteRun  # beside this file
 
 from protocol.errors import Refusal
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -21,6 +20,7 @@ from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid.process.children import Children, wait_until
+from tests.integration.site_run import READY_S, SiteRun  # beside this file
 
 pytestmark = pytest.mark.processes
 

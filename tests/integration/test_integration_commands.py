@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from site_run import SiteRun  # beside this file
 
 from sitegrid.process.children import wait_until
+from tests.integration.site_run import SiteRun  # beside this file
 
 pytestmark = pytest.mark.processes
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from site_run import READY_S, SiteRun, kill  # beside this file
 
 from protocol.arrays import Table
 from protocol.machine.samples import empty
@@ -21,6 +20,7 @@ from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import Client
 from sitegrid.process.children import Child, wait_until
+from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
 
 START_NS, HOUR_NS, SIZE = 1_767_225_600 * 10**9, 3600 * 10**9, 48
 BAD, OLD, NEW = 1.6, 0.06, 0.02

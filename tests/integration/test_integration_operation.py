@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from site_run import READY_S, SiteRun  # beside this file
 
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
@@ -32,6 +31,7 @@ from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid.process.children import Child, Children, wait_until
+from tests.integration.site_run import READY_S, SiteRun  # beside this file
 
 pytestmark = pytest.mark.processes
 

@@ -6,12 +6,12 @@ import os
 
 import numpy as np
 import pytest
-from site_run import SiteRun, kill  # beside this file
 
 from protocol.errors import LinkError, QueryError
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.process.children import Children, wait_until
+from tests.integration.site_run import SiteRun, kill  # beside this file
 
 pytestmark = pytest.mark.processes
 

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mapserver.config import ServerConfig
-from mapserver.ingest import admission
-from mapserver.ingest.admission import Admission, GapError
+from mapserver.ingest.admission import Admission, GapError, admit, parse
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
 from protocol.errors import MessageError, Refusal
@@ -111,9 +110,9 @@ class ModelServer:
 
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
         try:
-            batch = admission.parse(incoming.payload, incoming.machine, self._site, self._now_ns)
+            batch = parse(incoming.payload, incoming.machine, self._site, self._now_ns)
             seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
-            admission = admission.admit(batch, seq)
+            admission = admit(batch, seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected)

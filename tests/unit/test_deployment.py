@@ -11,8 +11,8 @@ import pytest
 
 from protocol.site.site_config import load_site
 from sitegrid.process.lifetime import END_S
+from tests.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 COMPOSE, DOCKERFILE = ROOT / "compose.yaml", ROOT / "Dockerfile"
 MACHINES = ["loader-1", "loader-2", "loader-3"]
 

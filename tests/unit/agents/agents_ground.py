@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from agents_drives import START_NS
+from tests.unit.agents.drives import START_NS
 
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import AttitudeConfig

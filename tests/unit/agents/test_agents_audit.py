@@ -2,7 +2,7 @@ import contextlib
 from pathlib import Path
 
 import pytest
-from agents_drives import made_up_samples
+from tests.unit.agents.drives import made_up_samples
 
 from agents.delivery.audit import AuditLog, parse, read_audit
 from agents.delivery.spool import Spool, SpoolConfig

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agents_drives import START_NS, Drive, Ground, Leg, changed_sensor, drive, machine, noisy
-from agents_ground import balances
+from tests.unit.agents.drives import START_NS, Drive, Ground, Leg, changed_sensor, drive, machine, noisy
+from tests.unit.agents.ground import balances
 
 from agents.physics import GRAVITY_MPS2
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig

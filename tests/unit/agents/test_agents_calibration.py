@@ -7,8 +7,8 @@ from typing import cast
 
 import numpy as np
 import pytest
-from agents_drives import START_NS
-from agents_ground import STEADY, STEP_S
+from tests.unit.agents.drives import START_NS
+from tests.unit.agents.ground import STEADY, STEP_S
 
 from agents.dead_reckoning import Dead, DeadReckoning
 from agents.estimation.balance import Balance

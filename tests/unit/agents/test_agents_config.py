@@ -13,8 +13,7 @@ from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.site.site_config import SiteConfig, load_site
 from sim.scenario.file import load_scenario
-
-CONFIG = Path(__file__).resolve().parents[3] / "config"
+from tests.paths import CONFIG
 
 
 def table(name: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from agents_drives import SITE, START_NS, Leg, drive, machine
+from tests.unit.agents.drives import SITE, START_NS, Leg, drive, machine
 
 from agents.agent import Agent, Places
 from agents.config import AgentConfig

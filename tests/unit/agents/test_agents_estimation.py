@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agents_drives import START_NS, Drive, Ground, Leg, drive, machine, noisy
-from agents_ground import STEADY, Run
+from tests.unit.agents.drives import START_NS, Drive, Ground, Leg, drive, machine, noisy
+from tests.unit.agents.ground import STEADY, Run
 
 from agents.estimation.calibration import Calibration, CalibrationConfig
 from agents.estimation.ground import (

@@ -1,18 +1,17 @@
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
-from agents_drives import S_BEND, SITE, Drive, drive, fix, machine
+from tests.unit.agents.drives import S_BEND, SITE, Drive, drive, fix, machine
 
 from agents.holdout import Holdout, HoldoutConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, Reading
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 HUSKY = ROOT.parent / "shared" / "data" / "rl_test1_husky"
 CONFIG = HoldoutConfig(period_s=5.0, off_s=1.0, settle_s=10.0)
 

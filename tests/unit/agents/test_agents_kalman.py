@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agents_drives import START_NS
-from agents_ground import STEP_S, noise_of, pushed, pushes
+from tests.unit.agents.drives import START_NS
+from tests.unit.agents.ground import STEP_S, noise_of, pushed, pushes
 
 from agents.estimation.resistance import Push
 from agents.estimation.resistance_kalman import FIRST_C_RR, FIRST_STD, KalmanConfig, KalmanResistance

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agents_drives import (
+from tests.unit.agents.drives import (
     PROJECTION,
     S_BEND,
     SITE,

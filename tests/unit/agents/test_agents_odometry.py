@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agents_drives import START_NS, Drive, Leg, changed_sensor, drive, machine
+from tests.unit.agents.drives import START_NS, Drive, Leg, changed_sensor, drive, machine
 
 from agents.dead_reckoning import DeadReckoning, WheelTracker, align, mean_std
 from agents.physics import GRAVITY_MPS2

@@ -9,7 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agents_drives import S_BEND, SITE, START_NS, Drive, Ground, Leg, changed_sensor, drive, machine, noisy, simulated
+from tests.unit.agents.drives import (
+    S_BEND,
+    SITE,
+    START_NS,
+    Drive,
+    Ground,
+    Leg,
+    changed_sensor,
+    drive,
+    machine,
+    noisy,
+    simulated,
+)
 
 import agents
 import protocol

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agents_ground import STEADY, after
+from tests.unit.agents.ground import STEADY, after
 
 from agents.estimation.balance import Balance
 from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility, PlausibilityConfig

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from agents_drives import START_NS
-from agents_ground import STEP_S, noise_of, pushed, pushes
+from tests.unit.agents.drives import START_NS
+from tests.unit.agents.ground import STEP_S, noise_of, pushed, pushes
 
 from agents.estimation.resistance_rls import MultipleForgetting, RecursiveConfig, RecursiveGrade, RecursiveResistance
 from protocol.arrays import Floats

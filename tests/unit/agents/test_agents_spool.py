@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from agents_drives import made_up_samples
+from tests.unit.agents.drives import made_up_samples
 
 from agents.delivery.audit import AuditLog, read_audit
 from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
 from agents.delivery.spool_file import connect
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
+from tests.paths import ROOT
 
 ROWS = made_up_samples(60)
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def opened(path: Path, max_samples: int = 1000, audit: AuditLog | None = None) -> Spool:
@@ -146,7 +146,7 @@ def test_spool_that_another_process_has_open_is_refused(tmp_path: Path) -> None:
 WRITER = """
 import sys
 from pathlib import Path
-from agents_drives import made_up_samples
+from tests.unit.agents.drives import made_up_samples
 from agents.delivery.audit import AuditLog
 from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
 folder = Path(sys.argv[1])

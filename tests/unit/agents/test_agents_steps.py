@@ -3,7 +3,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
-from agents_drives import START_NS, Leg, drive, machine
+from tests.unit.agents.drives import START_NS, Leg, drive, machine
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.filters.motion import map_from_base

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agents_drives import LEVER_M, PROJECTION, START_NS, Drive, Leg, beliefs_of, drive
+from tests.unit.agents.drives import LEVER_M, PROJECTION, START_NS, Drive, Leg, beliefs_of, drive
 
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.filters.belief import Belief

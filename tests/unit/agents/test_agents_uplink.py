@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agents_drives import SITE, made_up_samples
+from tests.unit.agents.drives import SITE, made_up_samples
 
 from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import BLOCKING, PASSING, UplinkConfig, UplinkState, linger

@@ -1,10 +1,9 @@
-from pathlib import Path
-
 import pytest
 
 from evaluation.positions import parity
+from tests.paths import SHARED_DATA
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
+DATA = SHARED_DATA
 
 
 @pytest.mark.skipif(not (DATA / "rl_test2_jackal").is_dir(), reason="robot_localization's recordings are not here")

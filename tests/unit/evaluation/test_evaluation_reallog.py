@@ -12,8 +12,8 @@ from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import open_log
 from protocol.machine.readings import Gps
 from protocol.site.site_config import Projection
+from tests.paths import ROOT
 
-ROOT = Path(__file__).parents[3]
 LOGS = ROOT / "evaluation" / "logs"
 DATA = ROOT.parent / "shared" / "data"
 ROW = Configuration("ukf", 1, 1, "default")

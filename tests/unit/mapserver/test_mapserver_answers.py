@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapserver_data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
 
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer

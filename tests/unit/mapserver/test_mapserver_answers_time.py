@@ -4,7 +4,19 @@ import threading
 
 import numpy as np
 import pytest
-from mapserver_data import CONFIG, NOW_NS, SITE, WAIT_S, batch, incoming, now_ns, random_samples, routed, samples, send
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    WAIT_S,
+    batch,
+    incoming,
+    now_ns,
+    random_samples,
+    routed,
+    samples,
+    send,
+)
 
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer

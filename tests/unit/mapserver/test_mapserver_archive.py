@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples, samples
 
 from mapserver.ingest.admission import Admission
 from mapserver.journal import archive as ar
@@ -23,9 +23,9 @@ from mapserver.journal.rows import ALL, JournalRow, Wanted
 from protocol.errors import ConfigError, StoreError
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
+from tests.paths import ROOT
 
 pq = pytest.importorskip("pyarrow.parquet")
-ROOT = Path(__file__).parents[3]
 FUTURE = NOW_NS + 1000 * HOUR_NS
 
 

@@ -1,14 +1,14 @@
 import dataclasses
 import tomllib
-from pathlib import Path
 
 import pytest
 
 from mapserver.config import ServerConfig, StoreConfig
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
+from tests.paths import CONFIG
 
-FILE = Path(__file__).parents[3] / "config" / "server.toml"
+FILE = CONFIG / "server.toml"
 
 
 def names(cls: type) -> dict[str, object]:

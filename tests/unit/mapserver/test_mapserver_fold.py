@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapserver_data import APART, NOW_NS, filled_to, folded, merged, random_samples, same, samples, total
+from tests.unit.mapserver.data import APART, NOW_NS, filled_to, folded, merged, random_samples, same, samples, total
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import fold_numpy, kernel

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, filled_to, folded, random_samples, same, samples
+from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks

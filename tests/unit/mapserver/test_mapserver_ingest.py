@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mapserver_data import NOW_NS, SITE, batch, now_ns, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, now_ns, samples
 
 from mapserver.ingest.admission import GapError, admit, parse
 from protocol.errors import MessageError, Refusal

@@ -5,7 +5,7 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, SITE, batch, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples, samples
 
 from mapserver.ingest.admission import Admission
 from mapserver.journal import journal as journal_module

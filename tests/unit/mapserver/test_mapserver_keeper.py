@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, SITE, incoming, now_ns, random_samples, same, samples, send, wait_for
+from tests.unit.mapserver.data import NOW_NS, SITE, incoming, now_ns, random_samples, same, samples, send, wait_for
 
 from mapserver.config import KeepConfig, ServerConfig
 from mapserver.evidence.grid import Grid

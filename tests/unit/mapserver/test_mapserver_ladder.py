@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapserver_data import same_page
+from tests.unit.mapserver.data import same_page
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.pages import Page, merge, pack

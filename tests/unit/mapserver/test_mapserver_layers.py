@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, folded, samples
+from tests.unit.mapserver.data import NOW_NS, folded, samples
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid

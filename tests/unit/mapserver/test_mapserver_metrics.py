@@ -13,7 +13,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from mapserver_data import CONFIG, NOW_NS, SITE, now_ns, routed, samples  # beside this file
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, now_ns, routed, samples  # beside this file
 
 from mapserver.monitoring.exporter import MOST_AGENTS, Exporter, HealthEar, look, text_of
 from mapserver.monitoring.metrics import Heard, Host, Metric, metrics_of, render

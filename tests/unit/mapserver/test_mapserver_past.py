@@ -4,7 +4,7 @@ from threading import Thread
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, SITE, WAIT_S, batch, folded, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, folded, random_samples, samples
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, folded, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, folded, random_samples, samples
 
 from mapserver.change.detection import ChangeConfig
 from mapserver.change.validity import around, evidence, valid_pages

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import zenoh
-from mapserver_data import CONFIG, SITE, WAIT_S, batch, now_ns, routed, samples
+from tests.unit.mapserver.data import CONFIG, SITE, WAIT_S, batch, now_ns, routed, samples
 
 from mapserver.server import Server
 from protocol.errors import Refusal

@@ -1,7 +1,7 @@
 """A store that asks for signatures takes what the machine signed for its own key, and nothing else."""
 
 import pytest
-from mapserver_data import CONFIG, SITE, Incoming, incoming, now_ns, samples
+from tests.unit.mapserver.data import CONFIG, SITE, Incoming, incoming, now_ns, samples
 
 from mapserver.ingest.store import Store
 from protocol.wire import keys

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mapserver_data import APART, CONFIG, folded, incoming, merged, open_store, random_samples, same, samples
+from tests.unit.mapserver.data import APART, CONFIG, folded, incoming, merged, open_store, random_samples, same, samples
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot

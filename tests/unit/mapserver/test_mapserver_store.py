@@ -9,7 +9,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, SITE, Incoming, folded, incoming, open_store, random_samples, same, samples
+from tests.unit.mapserver.data import (
+    NOW_NS,
+    SITE,
+    Incoming,
+    folded,
+    incoming,
+    open_store,
+    random_samples,
+    same,
+    samples,
+)
 
 from mapserver.evidence import snapshot
 from protocol.errors import Refusal, StoreError
@@ -209,7 +219,7 @@ import signal
 import sys
 from pathlib import Path
 import numpy as np
-from mapserver_data import incoming, open_store
+from tests.unit.mapserver.data import incoming, open_store
 
 folder, stuck, saved = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 store = open_store(folder / "store")

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS
 from scipy.signal import lfilter
+from tests.unit.mapserver.data import NOW_NS
 
 from mapserver.evidence.votes import FoldConfig
 from mapserver.trust.auditor import Auditor, Reason, TrustConfig, Verdict

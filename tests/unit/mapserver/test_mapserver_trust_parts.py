@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, random_samples, samples
 
 from mapserver.trust.auditor import Auditor, TrustConfig
 from mapserver.trust.clock import ClockWatch

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapserver_data import NOW_NS, samples
+from tests.unit.mapserver.data import NOW_NS, samples
 
 from mapserver.change.change_log import Change, ChangeWatch
 from mapserver.change.detection import ChangeConfig

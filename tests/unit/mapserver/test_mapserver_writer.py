@@ -6,7 +6,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from mapserver_data import (
+from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
     SITE,

@@ -1,14 +1,13 @@
 import importlib.util
 import sys
-from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from tests.paths import GOLDEN
+
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=100)
 settings.load_profile("repeatable")
-
-GOLDEN = Path(__file__).parents[2] / "golden"
 
 
 @pytest.fixture(scope="session")

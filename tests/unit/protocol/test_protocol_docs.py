@@ -3,7 +3,6 @@
 import itertools
 import re
 import tomllib
-from pathlib import Path
 
 import pytest
 
@@ -19,8 +18,8 @@ from protocol.site.site_config import KnownGround
 from protocol.units import _NS, _UNITS
 from protocol.wire import codec
 from protocol.wire.messages import Pose
+from tests.paths import DOCS
 
-DOCS = Path(__file__).parents[3] / "docs"
 WIRE, LOGS = ((DOCS / name).read_text() for name in ("protocol.md", "log-folders.md"))
 
 
@@ -56,7 +55,7 @@ def test_every_parameter_and_limit_of_a_command_is_documented():
     assert re.findall(r"`(.*?)`", row) == [*commands._NAMES]
     assert [word for word in commands._WORDS if f"`{word}`" not in WIRE] == []
     assert f"at most {parameters.MAX_TEXT} characters" in WIRE
-    assert f"More than {queries.MAX_SPANS} spans" in WIRE
+    assert f"More than {requests.MAX_SPANS} spans" in WIRE
     assert requests.MAX_WAIT_S == commands.MAX_WAIT_S == 60
 
 

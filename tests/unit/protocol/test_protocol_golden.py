@@ -1,12 +1,13 @@
 """The wire does not change by accident: stored bytes, records, and the code agree both ways."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-FOLDER = Path(__file__).parents[2] / "golden"
+from tests.paths import GOLDEN
+
+FOLDER = GOLDEN
 NAMES = sorted(path.name for path in FOLDER.glob("*.bin"))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import pybullet
 import pytest
-from sim_bullet_worlds import BOTH, LOADER, TRUCK, hold_speed, idle, placed, plane
+from tests.unit.sim.bullet_worlds import BOTH, LOADER, TRUCK, hold_speed, idle, placed, plane
 
 from protocol.arrays import Floats
 from sim.machines.model import MachineModel

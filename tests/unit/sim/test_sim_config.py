@@ -7,8 +7,9 @@ import pytest
 from protocol.errors import ConfigError
 from sim.config import SimConfig, load_sim, resolve
 from sim.scenario.file import load_scenario
+from tests.paths import CONFIG
 
-EXAMPLE = Path(__file__).parents[3] / "config" / "sim.toml"
+EXAMPLE = CONFIG / "sim.toml"
 
 
 def test_example_has_the_defaults_and_names_every_option() -> None:

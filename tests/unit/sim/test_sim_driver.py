@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sim_drives import Driven, drive
+from tests.unit.sim.drives import Driven, drive
 
 from sim.config import SimConfig
 from sim.machines.vehicle import GRAVITY

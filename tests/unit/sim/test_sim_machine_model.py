@@ -2,7 +2,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from sim_bullet_worlds import LOADER, TRUCK
+from tests.unit.sim.bullet_worlds import LOADER, TRUCK
 
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, Mount

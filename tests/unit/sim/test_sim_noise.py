@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from sim_sensor_rigs import check_correlation, check_deviation
+from tests.unit.sim.sensor_rigs import check_correlation, check_deviation
 
 from sim.sensors.noise import BLOCK_ROWS, STREAMS, Draws, GaussMarkov, generator, site_generator
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sim_sensor_rigs import DGPS, LOADER, noisy, perfect, rig
+from tests.unit.sim.sensor_rigs import DGPS, LOADER, noisy, perfect, rig
 
 from protocol.config import load_toml
 from protocol.errors import ConfigError

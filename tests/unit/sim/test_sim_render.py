@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from sim_bullet_worlds import LOADER, placed, plane
+from tests.unit.sim.bullet_worlds import LOADER, placed, plane
 
 from sim.machines.soil import GRAVEL
 from sim.pictures.render import SKY_RGB, Camera, closeup, overview, render

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from sim_sensor_rigs import (
+from tests.unit.sim.sensor_rigs import (
     DGPS,
     PROJECTION,
     SEED,

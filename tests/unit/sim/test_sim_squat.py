@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from sim_bullet_worlds import BOTH, hold_speed, idle, placed, plane
+from tests.unit.sim.bullet_worlds import BOTH, hold_speed, idle, placed, plane
 
 from protocol.machine.machine_config import MachineConfig
 from sim.machines.model import MachineModel

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from sim_bullet_worlds import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, nominal, placed, plane
+from tests.unit.sim.bullet_worlds import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, nominal, placed, plane
 
 from protocol.machine.machine_config import Mount
 from sim.machines.model import MachineModel

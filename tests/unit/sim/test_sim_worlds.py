@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from sim_bullet_worlds import BOTH, EACH, GRADE_15, LOADER, TRUCK, hold_speed, idle, placed, plane
+from tests.unit.sim.bullet_worlds import BOTH, EACH, GRADE_15, LOADER, TRUCK, hold_speed, idle, placed, plane
 
 from sim.machines.model import MachineModel
 from sim.machines.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT

@@ -20,9 +20,10 @@ from sim.scenario.file import load_scenario
 from sim.truth import TruthMap
 from sitegrid.cli import build_parser, main
 from sitegrid.commands import agent, sim
+from tests.paths import ROOT
 
 MACHINE = load_scenario("paper_site").rigs()[0].machine
-MANIFEST = Path(__file__).parents[3] / "evaluation/logs/rl_test1_husky/log.toml"
+MANIFEST = ROOT / "evaluation/logs/rl_test1_husky/log.toml"
 
 
 def parse(*words: object) -> Namespace:

@@ -14,6 +14,7 @@ from sitegrid.cli import build_parser
 from sitegrid.commands import demo
 from sitegrid.process import progress
 from sitegrid.process.progress import Display
+from tests.paths import ROOT
 
 
 def plan(tmp_path: Path, *words: str) -> demo.Plan:
@@ -64,7 +65,7 @@ def test_an_earlier_run_is_cleared_away(tmp_path: Path):
 def test_the_default_log_is_used_only_where_its_data_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     assert plan(tmp_path).log is None
-    manifest = Path(__file__).parents[3] / demo.DEFAULT_MANIFEST
+    manifest = ROOT / demo.DEFAULT_MANIFEST
     monkeypatch.setattr(demo, "DEFAULT_MANIFEST", manifest)
     monkeypatch.setattr(demo, "DEFAULT_DATA", tmp_path)
     assert plan(tmp_path).log.name == "rl_test1_husky"
@@ -72,7 +73,7 @@ def test_the_default_log_is_used_only_where_its_data_lies(tmp_path: Path, monkey
 
 
 def test_a_log_of_ones_own_needs_no_default(tmp_path: Path):
-    manifest = Path(__file__).parents[3] / demo.DEFAULT_MANIFEST
+    manifest = ROOT / demo.DEFAULT_MANIFEST
     found = plan(tmp_path, "--log", str(manifest), "--data", str(tmp_path))
     assert found.log.data == tmp_path
     with pytest.raises(ConfigError, match=r"nowhere.toml: no such file"):

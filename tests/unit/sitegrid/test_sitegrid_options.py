@@ -13,8 +13,7 @@ from protocol.site.geometry import Bounds
 from sim.scenario.file import FOLDER, load_scenario
 from sitegrid.cli import build_parser
 from sitegrid.commands import agent, demo, plot, server
-
-ROOT = Path(__file__).parents[3]
+from tests.paths import ROOT
 
 
 class Stop:
