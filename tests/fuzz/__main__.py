@@ -10,9 +10,9 @@ import argparse
 import logging
 import sys
 
-from tests.fuzz.fuzz_campaign import Result, fuzz_for, save
-from tests.fuzz.fuzz_decoders import decoders
-from tests.fuzz.fuzz_verdict import watched
+from tests.fuzz.campaign import Result, fuzz_for, save
+from tests.fuzz.decoders import decoders
+from tests.fuzz.verdict import watched
 
 LINE = "{:<14} {:>9} {:>9} {:>9} {:>7}"
 

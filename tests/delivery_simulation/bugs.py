@@ -1,0 +1,151 @@
+"""Bugs to plant: mistakes that somebody could make. A simulation that does not find them proves nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from agents.delivery.spool import Run, Spool
+from agents.delivery.uplink import UplinkState
+from mapserver.ingest import admission
+from mapserver.ingest.admission import Admission
+from protocol.wire.messages import Ack, Refused, SampleBatch
+from tests.delivery_simulation.faults import KILLS, Fault
+from tests.delivery_simulation.servers import ModelServer
+
+Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+def ack_before_commit(patch: pytest.MonkeyPatch) -> None:
+    """The server answers first, and dies or finds its disk full then."""
+
+    def commit(self: ModelServer, new: Any, answers: list[Ack | Refused], fault: Fault | None) -> list[Ack | Refused]:
+        if fault is None or fault == Fault.KILLED_AFTER:
+            self.disk = new
+        return answers
+
+    assert KILLS
+    patch.setattr(ModelServer, "commit", commit)
+
+
+def watermark_one_too_low(patch: pytest.MonkeyPatch) -> None:
+    """The server takes the last committed sample for the next that it expects."""
+    admit = admission.admit
+    patch.setattr(admission, "admit", lambda batch, watermark: admit(batch, max(0, watermark - 1)))
+
+
+def watermark_one_too_high(patch: pytest.MonkeyPatch) -> None:
+    """The acknowledgement names the next sample, not the last."""
+    patch.setattr(Admission, "watermark", property(lambda self: self.batch.last_seq + 1))
+
+
+def delete_before_ack(patch: pytest.MonkeyPatch) -> None:
+    """The agent deletes what it has sent, not what has arrived."""
+    next_payload = UplinkState.next_payload
+
+    def sent_is_done(self: UplinkState) -> bytes | None:
+        payload = next_payload(self)
+        if self._head and len(self._head.rows):
+            self._spool.acknowledge(self._head.spool_id, self._head.first_seq + len(self._head.rows) - 1)
+        return payload
+
+    patch.setattr(UplinkState, "next_payload", sent_is_done)
+
+
+def _plant_admit(patch: pytest.MonkeyPatch, wrong: Callable[[SampleBatch, int], SampleBatch]) -> None:
+    admit = admission.admit
+
+    def admit_wrongly(batch: SampleBatch, watermark: int) -> Admission:
+        overlaps = len(batch.rows) and batch.first_seq <= watermark < batch.last_seq
+        return Admission(wrong(batch, watermark), 0, 0) if overlaps else admit(batch, watermark)
+
+    patch.setattr(admission, "admit", admit_wrongly)
+
+
+def trim_whole_batch(patch: pytest.MonkeyPatch) -> None:
+    """A batch that begins with known samples is taken for known altogether, and acknowledged."""
+
+    def known(batch: SampleBatch, watermark: int) -> SampleBatch:
+        return replace(batch, first_seq=batch.last_seq + 1, rows=batch.rows[:0])
+
+    _plant_admit(patch, known)
+
+
+def trim_nothing(patch: pytest.MonkeyPatch) -> None:
+    """A batch that ends with new samples is taken for new altogether."""
+    _plant_admit(patch, lambda batch, watermark: batch)
+
+
+def gap_is_taken(patch: pytest.MonkeyPatch) -> None:
+    """A batch beyond the next expected sample is taken, and what is missing is not counted."""
+    admit = admission.admit
+
+    def admit_gap(batch: SampleBatch, watermark: int) -> Admission:
+        is_gap = len(batch.rows) and batch.first_seq - watermark - 1 > batch.lost_before
+        return Admission(batch, 0, 0) if is_gap else admit(batch, watermark)
+
+    patch.setattr(admission, "admit", admit_gap)
+
+
+def one_identity_for_ever(patch: pytest.MonkeyPatch) -> None:
+    """A spool keeps its spool_id when it is opened again, also as a copy of another one."""
+    start_run = Spool._start_run
+
+    def go_on(self: Spool) -> list[Run]:
+        found = self._db.execute("SELECT spool_id, acknowledged FROM run WHERE base = 0").fetchone()
+        if not found:
+            return start_run(self)
+        return [Run(0, int(found[0], 16), found[1])]
+
+    patch.setattr(Spool, "_start_run", go_on)
+
+
+def commit_is_assumed(patch: pytest.MonkeyPatch) -> None:
+    """The spool counts its numbers on although the disk took nothing."""
+    insert = Spool._insert
+
+    def count_first(self: Spool, rows: Any, *, final: bool) -> None:
+        try:
+            insert(self, rows, final=final)
+        except Exception:
+            self._meta = replace(self._meta, newest=self._meta.newest + len(rows))
+            raise
+
+    patch.setattr(Spool, "_insert", count_first)
+
+
+def failed_commit_stays_open(patch: pytest.MonkeyPatch) -> None:
+    """A transaction whose commit fails is not rolled back."""
+
+    def leave(self: Any, kind: object, *_: object) -> None:
+        self._db.execute("ROLLBACK" if kind else "COMMIT")
+
+    patch.setattr("agents.delivery.spool_file.transaction.__exit__", leave)
+
+
+def drops_are_silent(patch: pytest.MonkeyPatch) -> None:
+    """A full spool drops without counting."""
+    save = Spool._save
+    patch.setattr(Spool, "_save", lambda self, meta: save(self, replace(meta, dropped=0)))
+    patch.setattr(Spool, "counters", lambda self: {"depth": self._depth, "dropped": 0, "put_aside": self._aside})
+
+
+BUGS: dict[str, Plant] = {
+    plant.__name__: plant
+    for plant in (
+        ack_before_commit,
+        watermark_one_too_low,
+        watermark_one_too_high,
+        delete_before_ack,
+        trim_whole_batch,
+        trim_nothing,
+        gap_is_taken,
+        one_identity_for_ever,
+        commit_is_assumed,
+        failed_commit_stays_open,
+        drops_are_silent,
+    )
+}

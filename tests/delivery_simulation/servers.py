@@ -1,0 +1,196 @@
+"""Two map servers for the simulation: a model of the journal that is fast, and the real store on files."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from mapserver.config import ServerConfig
+from mapserver.ingest.admission import Admission, GapError, admit, parse
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
+from mapserver.journal.journal import Journal
+from protocol.errors import MessageError, Refusal
+from protocol.site.site_config import SiteConfig
+from protocol.wire.messages import Ack, Refused
+from tests.delivery_simulation.faults import Fault, FaultyConnection, Killed, Plan
+
+Run = tuple[str, int]  # machine, spool_id
+
+
+@dataclass(frozen=True)
+class Taken:
+    """One sample in the journal."""
+
+    machine: str
+    spool_id: int
+    seq: int
+    row: bytes
+
+
+class MapServer(Protocol):
+    """What the simulation needs of a server. Each method leaves it usable, also after a kill."""
+
+    def take(self, group: list[Incoming], plan: Plan) -> list[Ack | Refused]:
+        """Answer a group of batches in one commit; Killed if the plan says so."""
+
+    def back_up(self) -> None:
+        """Keep a copy of all that is committed."""
+
+    def restore(self) -> None:
+        """Go back to the copy."""
+
+    def samples(self) -> Iterator[Taken]:
+        """Everything in the journal."""
+
+    def marks(self) -> dict[Run, tuple[int, int]]:
+        """Watermark and samples declared lost, by run."""
+
+
+@dataclass
+class _Disk:
+    """What is committed."""
+
+    rows: list[Admission] = field(default_factory=list)
+    marks: dict[Run, tuple[int, int]] = field(default_factory=dict)
+
+    def copy(self) -> _Disk:
+        return _Disk(list(self.rows), dict(self.marks))
+
+
+class ModelServer:
+    """Admits as the map server does, and commits or forgets as its journal does; the rules of identity are its own."""
+
+    def __init__(self, site: SiteConfig, now_ns: Callable[[], int]) -> None:
+        self.disk = _Disk()
+        self._site = site
+        self._now_ns = now_ns
+        self._backup = _Disk()
+
+    def take(self, group: list[Incoming], plan: Plan) -> list[Ack | Refused]:
+        """As Store.take."""
+        fault = plan.fault
+        plan.disarm()
+        new = self.disk.copy()
+        answers = [self._take_one(new, incoming) for incoming in group]
+        return self.commit(new, answers, fault)
+
+    def commit(self, new: _Disk, answers: list[Ack | Refused], fault: Fault | None) -> list[Ack | Refused]:
+        """Put the transaction on disk, and only then answer."""
+        if fault == Fault.KILLED_BEFORE:
+            raise Killed
+        if fault in (Fault.FULL, Fault.FULL_ROLLED_BACK):
+            return [Refused(Refusal.STORE, "the server cannot write: disk full") for _ in answers]
+        self.disk = new
+        if fault == Fault.KILLED_AFTER:
+            raise Killed
+        return answers
+
+    def back_up(self) -> None:
+        """Keep a copy."""
+        self._backup = self.disk.copy()
+
+    def restore(self) -> None:
+        """Go back to the copy."""
+        self.disk = self._backup.copy()
+
+    def samples(self) -> Iterator[Taken]:
+        """Everything in the journal."""
+        for admission in self.disk.rows:
+            batch = admission.batch
+            for i, row in enumerate(batch.rows):
+                yield Taken(batch.machine, batch.spool_id, batch.first_seq + i, row.tobytes())
+
+    def marks(self) -> dict[Run, tuple[int, int]]:
+        """Watermark and lost, by run."""
+        return self.disk.marks
+
+    def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
+        try:
+            batch = parse(incoming.payload, incoming.machine, self._site, self._now_ns)
+            seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
+            admission = admit(batch, seq)
+        except MessageError as error:
+            expected = error.expected if isinstance(error, GapError) else 0
+            return Refused(error.reason, str(error), expected)
+        if len(admission.batch.rows):
+            disk.rows.append(admission)
+        if len(admission.batch.rows) or admission.lost:
+            disk.marks[batch.machine, batch.spool_id] = (admission.watermark, lost + admission.lost)
+        return Ack(admission.watermark, len(disk.rows), admission.trimmed)
+
+
+class RealServer:
+    """The map server's own store, in a folder."""
+
+    def __init__(self, folder: Path, site: SiteConfig, now_ns: Callable[[], int]) -> None:
+        self._folder, self._backup = folder / "store", folder / "store-backup"
+        self._site = site
+        self._now_ns = now_ns
+        self._plan = Plan()
+        self._open()
+        self.back_up()
+
+    def take(self, group: list[Incoming], plan: Plan) -> list[Ack | Refused]:
+        """As Store.take; a killed one is started again."""
+        if plan.fault:
+            self._plan.arm(plan.fault, plan.left)
+        plan.disarm()
+        try:
+            return self._store.take(group)
+        except Killed:
+            self._close()
+            self._open()
+            raise
+        finally:
+            self._plan.disarm()
+
+    def back_up(self) -> None:
+        """Copy the folder between two commits."""
+        shutil.rmtree(self._backup, ignore_errors=True)
+        shutil.copytree(self._folder, self._backup)
+
+    def restore(self) -> None:
+        """Put the copy in the folder's place."""
+        self._close()
+        shutil.rmtree(self._folder)
+        shutil.copytree(self._backup, self._folder)
+        self._open()
+
+    def samples(self) -> Iterator[Taken]:
+        """Everything in the journal."""
+        for row in self._journal.read():
+            for i, sample in enumerate(row.rows):
+                yield Taken(row.machine, row.spool_id, row.first_seq + i, sample.tobytes())
+
+    def marks(self) -> dict[Run, tuple[int, int]]:
+        """Watermark and lost, by run."""
+        return {run: (mark.seq, mark.lost) for run, mark in self._journal.marks().items()}
+
+    def close(self) -> None:
+        """End the server."""
+        self._close()
+
+    @property
+    def _journal(self) -> Journal:
+        return self._store._journal
+
+    def _open(self) -> None:
+        self._plan = Plan()
+        self._store = Store(self._folder, self._site, ServerConfig(), self._now_ns)
+        path = self._folder / JOURNAL_FILE
+        self._journal._db.close()
+        db: Any = sqlite3.connect(path, isolation_level=None, check_same_thread=False, factory=FaultyConnection)
+        db.execute("PRAGMA synchronous=FULL")
+        db.plan = self._plan
+        self._journal._db = db
+
+    def _close(self) -> None:
+        """Let go of the files without a word to SQLite: what was not committed is gone."""
+        self._plan.dead = False
+        self._plan.disarm()
+        self._journal._db.rollback()
+        self._store.close()

@@ -1,0 +1,63 @@
+"""Delivery under faults that a seed draws; and the proof that the simulation would see a mistake."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from tests.delivery_simulation.bugs import BUGS
+from tests.delivery_simulation.campaign import run_one, run_seeds
+
+
+@pytest.fixture(autouse=True)
+def _quiet() -> Iterator[None]:
+    logging.disable()
+    yield
+    logging.disable(logging.NOTSET)
+
+
+def test_nothing_is_lost_or_double_in_any_world() -> None:
+    told: list[str] = []
+    sums = run_seeds(0, 250, say=told.append)
+    assert not told, told[0]
+    assert sums["recorded"] > 5000
+    assert sums["journalled"] > 0.6 * sums["recorded"]
+    events = sums["events"]
+    for name in ("agent_kills", "server_kills", "disk_full", "late", "clones", "spool_restores", "server_restores"):
+        assert events[name] > 0, f"no {name} in these seeds"
+
+
+def test_nothing_is_lost_or_double_with_the_real_store() -> None:
+    told: list[str] = []
+    sums = run_seeds(0, 25, real=True, say=told.append)
+    assert not told, told[0]
+    assert sums["recorded"] > 500
+
+
+@pytest.mark.parametrize("name", BUGS)
+def test_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    BUGS[name](monkeypatch)
+    told: list[str] = []
+    sums = run_seeds(0, 200, say=told.append, stop_at_failure=True)
+    assert sums["failed"] == 1
+    assert f"replay: python -m tests.simulation --seed {sums['failed_seeds'][0]} --trace" in told[0]
+
+
+def test_same_seed_is_the_same_world() -> None:
+    traces: list[list[str]] = [[], []]
+    for trace in traces:
+        run_one(3, say=trace.append)
+    assert traces[0] == traces[1]
+    assert len(traces[0]) > 20
+
+
+def test_command_prints_one_object_last() -> None:
+    command = [sys.executable, "-m", "tests.simulation", "--seeds", "3", "--json"]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
+    table = json.loads(found.stdout.splitlines()[-1])
+    assert (table["seeds"], table["lost"], table["double"], table["failed"]) == (3, 0, 0, 0)

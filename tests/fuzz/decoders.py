@@ -1,0 +1,231 @@
+"""Every decoder of the project, with valid inputs to start from and the law that an accepted input has to keep.
+
+The law is that what was read can be written and read again, and is the same then.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import tempfile
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from agents.config import load_agent
+from agents.estimation import calibration_file
+from agents.estimation.calibration import Calibration
+from mapserver.config import ServerConfig
+from protocol.config import from_table, load_toml
+from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
+from protocol.machine.log_folder import open_log, write_log
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import Gps, Imu
+from protocol.queries import requests
+from protocol.queries.commands import TrustCommand, encode_command, parse_command
+from protocol.queries.parameters import selector_of, split_selector
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import load_site
+from protocol.wire.credentials import check_valid, load_credentials
+from sim.config import load_sim
+from sitegrid.security.register import Entry, Register, load_register, register_toml
+from tests.fuzz.messages import messages
+from tests.fuzz.mutations import files
+from tests.fuzz.stores import archive_decoder, journal_decoder
+from tests.fuzz.texts import texts
+from tests.fuzz.verdict import Decoder
+from tests.golden.make import EXTENT_M, FOLDER, GOLDEN, NEWER, T0
+from tests.paths import CONFIG
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+PLAIN = ("health", "info", "machines", "machine", "changes", "change")  # people see these as JSON
+
+
+@cache
+def workshop() -> Path:
+    """A folder for files that are read by name; it goes with the process."""
+    folder = tempfile.TemporaryDirectory(prefix="sitegrid-fuzz-")
+    _KEPT.append(folder)
+    return Path(folder.name)
+
+
+_KEPT: list[tempfile.TemporaryDirectory[str]] = []
+
+
+@cache
+def decoders() -> tuple[Decoder, ...]:
+    """All of them."""
+    return (*_messages(), *_selectors(), *_configs(), *_logs(), *_kept())
+
+
+# --- messages --------------------------------------------------------------------------------------------------------
+
+
+def _messages() -> Iterator[Decoder]:
+    batches = ("batch.bin", "batch_lost.bin", "batch_empty.bin", NEWER)
+    golden = {name: ((FOLDER / f"{name}.bin").read_bytes(),) for name in _SINGLE}
+    several = {"batch": tuple((FOLDER / name).read_bytes() for name in batches)}
+    several["reply"] = tuple((FOLDER / name).read_bytes() for name in ("ack.bin", "refused.bin"))
+    for name, seeds in {**golden, **several}.items():
+        file = {"batch": "batch.bin", "reply": "ack.bin"}.get(name, f"{name}.bin")
+        encode, decode = GOLDEN[file].encode, GOLDEN[file].decode
+        yield Decoder(name, seeds, partial(_again, name, encode, decode), (MessageError,), messages)
+
+
+_SINGLE = ("bundle", "pose", "health", "point", "region", "history", *PLAIN[1:], "error")
+
+
+def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], Any], data: bytes) -> None:
+    value = decode(data)
+    if name == "batch":
+        assert abs(value.rows["x_m"]).max(initial=0) <= EXTENT_M
+    if name == "region":
+        assert isinstance(value.bounds, Bounds)
+    if name == "error":
+        assert str(value).isprintable()
+    if name == "reply":
+        assert getattr(value, "problem", "").isprintable()
+    if name in PLAIN:
+        json.dumps(value.values if name == "health" else value)
+    written = encode(value)
+    assert encode(decode(written)) == written
+
+
+# --- selectors -------------------------------------------------------------------------------------------------------
+
+
+def _selectors() -> Iterator[Decoder]:
+    fresh, when = requests.Freshness(17, 2.5), requests.When(T0, T0 - 10**9)
+    asked = (
+        requests.PointQuery(12.0, -40.5, ("resistance", "visits"), fresh, when),
+        requests.RegionQuery(Bounds(0.0, 0.0, 200.0, 150.0), ("resistance",), fresh, when),
+        requests.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
+        requests.MachinesQuery(fresh),
+        requests.ChangesQuery(3),
+        requests.InfoQuery(fresh),
+    )
+    seeds = tuple(f"{query.name}?{selector_of(requests.encode_query(query))}".encode() for query in asked)
+    yield Decoder("query", seeds, _query, (QueryError,), texts)
+    commands = (TrustCommand("loader-2", False, "moved; x = 3", 60.0), TrustCommand("loader-2", None))
+    seeds = tuple(f"{command.name}?{selector_of(encode_command(command))}".encode() for command in commands)
+    yield Decoder("command", seeds, _command, (QueryError,), texts)
+
+
+def _split(data: bytes) -> tuple[str, dict[str, str]]:
+    name, _, text = data.decode(errors="replace").partition("?")
+    return name, split_selector(text)
+
+
+def _query(data: bytes) -> None:
+    query = requests.parse_query(*_split(data))
+    sent = split_selector(selector_of(requests.encode_query(query)))
+    known = requests.parse_query(query.name, sent)
+    assert requests.encode_query(known) == requests.encode_query(query)
+
+
+def _command(data: bytes) -> None:
+    command = parse_command(*_split(data))
+    sent = split_selector(selector_of(encode_command(command)))
+    assert parse_command(command.name, sent) == command
+
+
+# --- configurations --------------------------------------------------------------------------------------------------
+
+
+def _configs() -> Iterator[Decoder]:
+    shipped = {name: (CONFIG / f"{name}.toml").read_bytes() for name in ("site", "server", "agent", "sim")}
+    ground = b'[[known_ground]]\nname = "pad"\nc_rr = 0.02\noutline = [[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]\n'
+    yield _config(
+        "site",
+        (shipped["site"], shipped["site"].replace(b"known_ground = []", b"") + ground),
+        lambda path: load_site(path).frame,
+    )
+    yield _config("server", (shipped["server"],), lambda path: from_table(ServerConfig, load_toml(path), str(path)))
+    yield _config("agent", (shipped["agent"],), load_agent)
+    yield _config("sim", (shipped["sim"],), load_sim)
+    entry = Entry("machine", "1f", NOW, signing="A" * 43 + "=")
+    register = register_toml(Register("paper", ("localhost",), {"loader-1": entry, "router": entry}))
+    yield _config("register", (register.encode(),), _register, "register.toml")
+    identity = b'site = "paper"\nname = "loader-1"\nrole = "machine"\nexpires = 2030-01-01T00:00:00Z\n'
+    yield _config("identity", (identity,), _identity, "identity.toml", place="")
+
+
+def _config(
+    name: str, seeds: tuple[bytes, ...], load: Callable[[Path], object], file: str = "", place: str | None = None
+) -> Decoder:
+    path = workshop() / name / (file or f"{name}.toml")
+    path.parent.mkdir()
+
+    def decode(data: bytes) -> None:
+        path.write_bytes(data)
+        load(path)
+
+    return Decoder(name, seeds, decode, (ConfigError,), texts, path.name if place is None else place)
+
+
+def _register(path: Path) -> None:
+    register = load_register(path.parent)
+    path.write_text(register_toml(register), encoding="utf-8")
+    assert load_register(path.parent).names.keys() == register.names.keys()
+
+
+def _identity(path: Path) -> None:
+    for name in ("ca.pem", "cert.pem", "key.pem"):
+        (path.parent / name).touch()
+    check_valid(load_credentials(path.parent), NOW)
+
+
+# --- logs ------------------------------------------------------------------------------------------------------------
+
+MACHINE = MachineConfig("loader-1", sensors=(SensorConfig("imu-1", "imu"), SensorConfig("gps-1", "gps")))
+READINGS = [
+    *(Imu("imu-1", T0 + i * 10**7, 0.001, -0.002, 0.25, 0.1, -0.2, 9.80665) for i in range(8)),
+    *(Gps("gps-1", T0 + i * 10**9, 49.5, 8.25, 112.5, 1.5, 1.5, 4.0) for i in range(4)),
+]
+
+
+def _logs() -> Iterator[Decoder]:
+    folder = workshop() / "log"
+    (workshop() / "paper.toml").write_bytes((CONFIG / "site.toml").read_bytes())
+    write_log(folder, "drive", load_site(workshop() / "paper.toml"), MACHINE, READINGS)
+    manifest, csv = (folder / "log.toml").read_bytes(), (folder / "imu-1.csv").read_bytes()
+    converted = manifest.replace(b'gyro_x_radps = "', b'gyro_x_radps = { value = 0.5, unit = "deg/s" }\n#"')
+    errors = (ConfigError, LogFolderError)
+    yield Decoder("manifest", (manifest, converted), partial(_log, folder, "log.toml"), errors, texts, str(folder))
+    other = workshop() / "csv"
+    write_log(other, "drive", load_site(workshop() / "paper.toml"), MACHINE, READINGS)
+    yield Decoder("csv", (csv,), partial(_log, other, "imu-1.csv"), (LogFolderError,), texts, "imu-1.csv")
+    packed = workshop() / "gzip"
+    write_log(packed, "drive", load_site(workshop() / "paper.toml"), MACHINE, READINGS)
+    (packed / "log.toml").write_bytes(manifest.replace(b"imu-1.csv", b"imu-1.csv.gz"))
+    seeds = (gzip.compress(csv, mtime=0),)
+    yield Decoder("csv_gzip", seeds, partial(_log, packed, "imu-1.csv.gz"), (LogFolderError,), files, "imu-1.csv.gz")
+
+
+def _log(folder: Path, file: str, data: bytes) -> None:
+    (folder / file).write_bytes(data)
+    log = open_log(folder)
+    stamps = [reading.stamp_ns for reading in log.readings()]
+    assert stamps == sorted(stamps)
+
+
+# --- what is kept on disk --------------------------------------------------------------------------------------------
+
+
+def _kept() -> Iterator[Decoder]:
+    path = workshop() / "loader-1.calibration.json"
+    calibration = Calibration(0.0031, -0.02, ((1e-6, -2e-7), (-2e-7, 1e-4)), T0, 41)
+    calibration_file.save(path, "loader-1", calibration)
+
+    def decode(data: bytes) -> None:
+        path.write_bytes(data)
+        found = calibration_file.load(path, "loader-1")
+        assert found is not None
+        calibration_file.save(path, "loader-1", found)
+        assert calibration_file.load(path, "loader-1") == found
+
+    yield Decoder("calibration", (path.read_bytes(),), decode, (StoreError,), texts, path.name)
+    yield journal_decoder(workshop() / "journal")
+    yield archive_decoder(workshop() / "archive")

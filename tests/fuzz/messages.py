@@ -1,0 +1,148 @@
+"""Valid MessagePack messages, edited where it hurts: fields dropped, retyped, nested, doubled, columns cut and swapped.
+
+A message is taken apart into a tree whose maps are lists of pairs, so that a key can stand twice; a leaf that is `Raw`
+is bytes as they are, so that a header can claim what is not there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import msgpack
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.strategies import DrawFn, SearchStrategy
+
+from tests.fuzz.mutations import damaged
+
+
+class Map(list[list[Any]]):
+    """Pairs of key and value."""
+
+
+class Raw(bytes):
+    """Bytes that stand in the message as they are."""
+
+
+_CLAIM = b"\xff\xff\xff\xff"
+NASTY: tuple[Any, ...] = (
+    *(None, True, False, [], [[]], Map(), b"", b"\xff" * 8, "", "a\nb\x1b[0m", "*", "x" * 70, "ä\u2028", "1"),
+    *(0, 1, 2, -1, 20_001, 2**62, 2**62 + 1, 2**63, 2**64 - 1, -(2**63), 4_102_444_800_000_000_001),
+    *(float("nan"), float("inf"), -float("inf"), 1e308, -0.0, 5e-324),
+    *(Raw(b"\x91" * depth + b"\x01") for depth in (20, 600, 2000)),
+    *(Raw(b"\x81\xa1v" * depth + b"\x01") for depth in (20, 600)),
+    *(Raw(header + _CLAIM) for header in (b"\xdd", b"\xdf", b"\xc6", b"\xdb", b"\xc9")),
+    Raw(b"\xdd\x00\x01\x86\xa0" * 1000),  # a thousand lists in each other, each said to have 100,000 items
+    Raw(b"\xdc\xff\xff"),
+    Raw(b"\xd6\xff\xff\xff\xff\xff"),  # an instant, which is no plain value
+    Raw(b"\xd4\x05\x00"),  # a type of its own
+    Raw(b"\xa2\xff\xfe"),  # no UTF-8
+    Raw(b"\xc1"),  # reserved
+)
+_KEYS: tuple[Any, ...] = ("v", "n", "cols", "zzz", "", "a\nb", "k" * 5000, b"n", 1, None, Raw(b"\x90"))
+_ELEMENTS = {
+    4: tuple(np.array(v, "<f4").tobytes() for v in (np.nan, np.inf, -np.inf, -1.0, 3e38, 1e-45)),
+    8: (
+        *(np.array(v, "<f8").tobytes() for v in (np.nan, np.inf, 1e308, -1e5, 5e-324)),
+        *(np.array(v, "<i8").tobytes() for v in (0, -1, 2**63 - 1, -(2**63))),
+    ),
+}
+
+
+def messages(seeds: Sequence[bytes]) -> SearchStrategy[bytes]:
+    """Edited copies of these messages; some of them are damaged as bytes, too."""
+
+    @st.composite
+    def strategy(draw: DrawFn) -> bytes:
+        root = [_tree(msgpack.unpackb(draw(st.sampled_from(seeds))))]
+        for _ in range(draw(st.integers(1, 3))):
+            _edit(draw, root)
+        data = pack_tree(root[0])
+        return draw(damaged(data)) if draw(st.integers(0, 3)) == 0 else data
+
+    return strategy()
+
+
+def pack_tree(node: Any) -> bytes:
+    """A tree as bytes; what was edited to lie outside of MessagePack stays outside."""
+    if isinstance(node, Raw):
+        return bytes(node)
+    if isinstance(node, Map):
+        return _header(0x80, b"\xdf", len(node)) + b"".join(pack_tree(part) for pair in node for part in pair)
+    if isinstance(node, list):
+        return _header(0x90, b"\xdd", len(node)) + b"".join(map(pack_tree, node))
+    packed: bytes = msgpack.packb(node)
+    return packed
+
+
+def _header(short: int, long: bytes, n: int) -> bytes:
+    return bytes([short | n]) if n < 16 else long + n.to_bytes(4, "big")
+
+
+def _tree(value: Any) -> Any:
+    if isinstance(value, dict):
+        return Map([key, _tree(of)] for key, of in value.items())
+    return [_tree(of) for of in value] if isinstance(value, list) else value
+
+
+def _places(node: Any) -> list[tuple[list[Any], int]]:
+    """Every value of a tree, as the list that holds it and the place there."""
+    found: list[tuple[list[Any], int]] = []
+    if isinstance(node, list) and not isinstance(node, Map):
+        found += [(node, i) for i in range(len(node))]
+    for pair in node if isinstance(node, Map) else ():
+        found.append((pair, 1))
+    below = (holder[i] for holder, i in list(found))
+    return found + [place for part in below if isinstance(part, list) for place in _places(part)]
+
+
+def _maps(node: Any) -> list[Map]:
+    parts = node if isinstance(node, list) else []
+    below = [found for part in parts for found in _maps(part)]
+    return [node, *below] if isinstance(node, Map) else below
+
+
+def _edit(draw: DrawFn, root: list[Any]) -> None:
+    """Change one thing of a tree, in place."""
+    maps = [found for found in _maps(root) if found]
+    if maps and draw(st.booleans()):
+        _edit_map(draw, draw(st.sampled_from(maps)))
+        return
+    holder, i = draw(st.sampled_from(_places(root)))
+    value = holder[i]
+    if isinstance(value, bytes) and not isinstance(value, Raw) and draw(st.integers(0, 3)):
+        holder[i] = _column(draw, value)
+    elif draw(st.integers(0, 5)) == 0:
+        holder[i] = Map([["v", value]]) if draw(st.booleans()) else [value] * draw(st.sampled_from((1, 2, 30)))
+    else:
+        holder[i] = draw(st.sampled_from(NASTY))
+
+
+def _edit_map(draw: DrawFn, table: Map) -> None:
+    at = draw(st.integers(0, len(table) - 1))
+    match draw(st.sampled_from(("drop", "rename", "twice", "more"))):
+        case "drop":
+            del table[at]
+        case "rename":
+            table[at] = [draw(st.sampled_from(_KEYS)), table[at][1]]
+        case "twice":
+            table.append([table[at][0], draw(st.sampled_from(NASTY))])
+        case "more":
+            table.append([draw(st.sampled_from(_KEYS)), draw(st.sampled_from(NASTY))])
+
+
+def _column(draw: DrawFn, data: bytes) -> bytes:
+    """A column that is cut, too long, in the other order of bytes, or has one impossible number."""
+    width = draw(st.sampled_from((4, 8)))
+    what = draw(st.sampled_from(("cut", "longer", "swapped", "number")))
+    if what == "cut":
+        return data[: draw(st.integers(0, len(data)))]
+    if what == "longer":
+        return data + bytes(draw(st.sampled_from((1, 4, 8, 4096))))
+    if len(data) < width or len(data) % width:
+        return data[1:]
+    if what == "swapped":
+        return np.frombuffer(data, f"<u{width}").byteswap().tobytes()
+    at = draw(st.integers(0, len(data) // width - 1)) * width
+    return data[:at] + draw(st.sampled_from(_ELEMENTS[width])) + data[at + width :]

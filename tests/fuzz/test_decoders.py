@@ -1,0 +1,71 @@
+"""A short, repeatable form of `python -m tests.fuzz`: the corpus, then a few inputs for each decoder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.fuzz.campaign import CORPUS, Result, fuzz, replay
+from tests.fuzz.decoders import decoders
+from tests.fuzz.mutations import files
+from tests.fuzz.verdict import Decoder, FaultError, judge, watched
+
+NAMES = [decoder.name for decoder in decoders()]
+INPUTS = 15
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _watched() -> Iterator[None]:
+    with watched():
+        yield
+
+
+@pytest.mark.parametrize("decoder", decoders(), ids=NAMES)
+def test_an_input_is_read_or_refused_by_name(decoder: Decoder):
+    result = replay(decoder)
+    fuzz(decoder, result, INPUTS, 0)
+    assert not result.faults, [problem for problem, _ in result.faults.values()]
+
+
+def test_every_saved_input_belongs_to_a_decoder():
+    assert {path.name for path in CORPUS.iterdir()} <= set(NAMES)
+
+
+def crash(data: bytes) -> None:
+    raise KeyError(data)
+
+
+def two_lines(data: bytes) -> None:
+    raise ValueError("a\nb")
+
+
+def hang(data: bytes) -> None:
+    while True:
+        pass
+
+
+def fill(data: bytes) -> None:
+    bytearray(200 * 2**20)
+
+
+@pytest.mark.parametrize(
+    ("decode", "signature"),
+    [(crash, "KeyError in crash"), (two_lines, "no plain line in ValueError"), (hang, "hang"), (fill, "memory")],
+)
+def test_a_planted_fault_is_found(decode, signature: str):
+    planted = Decoder("planted", (b"x",), decode, (ValueError,), files)
+    with pytest.raises(FaultError) as found:
+        judge(planted, b"x")
+    assert found.value.signature == signature
+
+
+def test_a_failing_input_is_made_shorter():
+    def decode(data: bytes) -> None:
+        if b"\xff" in data:
+            raise KeyError
+
+    planted, result = Decoder("planted", (b"seed" * 20,), decode, (ValueError,), files), Result("planted")
+    fuzz(planted, result, 500, 1)
+    ((_, data),) = result.faults.values()
+    assert len(data) < 80

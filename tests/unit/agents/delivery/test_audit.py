@@ -1,0 +1,140 @@
+import contextlib
+from pathlib import Path
+
+import pytest
+
+from agents.delivery.audit import AuditLog, parse, read_audit
+from agents.delivery.spool import Spool, SpoolConfig
+from protocol.errors import StoreError
+from protocol.machine.samples import content_hash
+from tests.unit.agents.drives import made_up_samples
+
+ROWS = made_up_samples(20)
+HASHES = [content_hash(row) for row in ROWS]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "logs" / "audit.txt"
+
+
+def numbered(spool_id: int, first: int, hashes: list[str]) -> dict[tuple[int, int], str]:
+    return {(spool_id, first + i): h for i, h in enumerate(hashes)}
+
+
+def test_what_is_recorded_is_read_back(path: Path) -> None:
+    audit = AuditLog(path)
+    audit.recorded(2**64 - 1, 1, ROWS[:3])
+    audit.recorded(2**64 - 1, 4, ROWS[3:4])
+    assert read_audit(path) == numbered(2**64 - 1, 1, HASHES[:4])  # on disk without a close
+    audit.close()
+
+
+def test_later_line_of_the_same_sample_replaces_it(path: Path) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.recorded(7, 2, ROWS[9:10])
+    audit.close()
+    assert read_audit(path) == numbered(7, 1, [HASHES[0], HASHES[9], HASHES[2]])
+
+
+def test_renumbered_samples_lose_their_old_identity(path: Path) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:5])
+    audit.renumbered(7, [4, 5], 8, ROWS[3:5])
+    audit.close()
+    assert read_audit(path) == numbered(7, 1, HASHES[:3]) | numbered(8, 1, HASHES[3:5])
+
+
+def test_what_a_crash_kept_from_being_noted_is_added(path: Path) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.close()
+    again = AuditLog(path)
+    again.complete([(7, 3, ROWS[2]), (7, 4, ROWS[3]), (8, 1, ROWS[4])])
+    again.close()
+    assert read_audit(path) == numbered(7, 1, HASHES[:4]) | numbered(8, 1, HASHES[4:5])
+    assert path.read_text().count("\n") == 5, "what is known is not repeated"
+
+
+def test_sample_that_is_on_disk_with_another_content_is_noted_so(path: Path) -> None:
+    """It was pending when the process was killed: its final value never came to the disk, or was not noted."""
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.complete([(7, 2, ROWS[12])])
+    audit.close()
+    assert read_audit(path) == numbered(7, 1, [HASHES[0], HASHES[12], HASHES[2]])
+
+
+@pytest.mark.parametrize("cut", [1, 5, 10, 18])
+def test_line_that_a_crash_cut_off_counts_for_nothing(path: Path, cut: int) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.close()
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert read_audit(path) == numbered(7, 1, HASHES[:2])
+    again = AuditLog(path)
+    again.complete([(7, 3, ROWS[2])])
+    again.recorded(7, 4, ROWS[3:4])
+    again.close()
+    assert read_audit(path) == numbered(7, 1, HASHES[:4])
+
+
+def test_void_line_that_was_cut_off_voids_no_other_sample(path: Path) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:12])
+    audit.close()
+    with path.open("a") as file:
+        file.write("- 0000000000000007 1")  # of "12"
+    assert len(read_audit(path)) == 12
+
+
+def test_other_lines_are_left_out() -> None:
+    assert parse(["", "+", "# a remark", "+ 07 1", "- 07", "* 07 1 aa", "+ 07 1 aa", "+ 07 2 bb # cut off"]) == {
+        (7, 1): "aa"
+    }
+
+
+def test_spool_notes_what_it_records_finalises_and_numbers_anew(tmp_path: Path, path: Path) -> None:
+    spool = Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([5, 6]).__next__)
+    spool.record(ROWS[:2])
+    spool.record(ROWS[2:4], final=False)
+    spool.finalise(3, ROWS[12:14])
+    spool.finalise(1, ROWS[15:16])  # is final already
+    assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14]])
+    spool.acknowledge(5, 1)
+    spool.fork()
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14]])
+    spool.close()
+
+
+def test_sample_that_the_disk_did_not_take_is_not_in_the_audit(tmp_path: Path, path: Path) -> None:
+    spool = Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path))
+    spool._db.execute("PRAGMA query_only = ON")
+    with pytest.raises(StoreError):
+        spool.record(ROWS[:2])
+    assert read_audit(path) == {}
+    spool.close()
+
+
+def test_audit_on_a_full_disk_keeps_no_sample_from_the_spool(tmp_path: Path, path: Path) -> None:
+    audit = AuditLog(path)
+    audit._file.close()
+    with Path("/dev/full").open("w", encoding="ascii", buffering=1) as full:
+        audit._file = full
+        spool = Spool(tmp_path / "spool.db", SpoolConfig(), None, iter([5, 6]).__next__)
+        spool._audit = audit
+        assert spool.record(ROWS[:2]) == 1
+        spool._db.close()
+        with contextlib.suppress(OSError):
+            full.close()
+    Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([6]).__next__).close()
+    assert read_audit(path) == numbered(5, 1, HASHES[:2])
+
+
+def test_dropped_samples_stay_in_the_audit(tmp_path: Path, path: Path) -> None:
+    """They were recorded and never reached the server: an audit must show them as lost."""
+    spool = Spool(tmp_path / "spool.db", SpoolConfig(max_samples=2), AuditLog(path))
+    spool.record(ROWS[:5])
+    spool.close()
+    assert len(read_audit(path)) == 5

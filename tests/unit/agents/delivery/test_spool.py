@@ -1,0 +1,580 @@
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.delivery.audit import AuditLog, read_audit
+from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
+from agents.delivery.spool_file import connect
+from protocol.errors import StoreError
+from protocol.machine.samples import content_hash
+from tests.paths import ROOT
+from tests.unit.agents.drives import made_up_samples
+
+ROWS = made_up_samples(60)
+
+
+def opened(path: Path, max_samples: int = 1000, audit: AuditLog | None = None) -> Spool:
+    return Spool(path / "spool.db", SpoolConfig(max_samples), audit)
+
+
+def kill(spool: Spool) -> None:
+    """End the process that has it open."""
+    spool._db.close()
+
+
+def hashes(rows: np.ndarray) -> list[str]:
+    return [content_hash(row) for row in rows]
+
+
+def test_samples_are_numbered_from_one_and_come_out_in_order(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    assert spool.head(10) is None
+    assert spool.record(ROWS[:4]) == 1
+    assert spool.record(ROWS[4:9]) == 5
+    head = spool.head(7)
+    assert head
+    assert (head.spool_id, head.first_seq, head.lost_before) == (spool.spool_id, 1, 0)
+    assert hashes(head.rows) == hashes(ROWS[:7])
+    assert spool.newest == 9
+    spool.close()
+
+
+def test_commits_are_full_and_logged_ahead(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    assert spool._db.execute("PRAGMA synchronous").fetchone()[0] == 2
+    assert spool._db.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
+    spool.close()
+
+
+def test_acknowledged_samples_are_deleted_and_stay_so(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:10])
+    spool.acknowledge(spool.spool_id, 6)
+    assert (spool.acknowledged, spool.counters()["depth"]) == (6, 4)
+    earlier = spool.spool_id
+    spool.close()
+    again = opened(tmp_path)
+    head = again.head(99)
+    assert head
+    assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 7, 4, 0)
+    assert again.counters()["depth"] == 4
+    again.close()
+
+
+def test_every_opening_has_an_identity_of_its_own(tmp_path: Path) -> None:
+    ids = set()
+    for name in ("a", "a", "a", "b"):
+        spool = opened(tmp_path / name)
+        assert spool.record(ROWS[:1]) == 1
+        ids.add(spool.spool_id)
+        spool.close()
+    assert len(ids) == 4
+    assert 0 < min(ids) <= max(ids) < 2**64
+
+
+def test_openings_that_record_nothing_leave_nothing(tmp_path: Path) -> None:
+    for _ in range(5):
+        spool = opened(tmp_path)
+        assert spool.head(9) is None
+        assert spool.is_settled()
+        assert len(spool._runs) == 1
+        spool.close()
+
+
+def test_runs_come_out_one_after_the_other_and_are_closed(tmp_path: Path) -> None:
+    ids = []
+    for i in range(3):
+        spool = opened(tmp_path)
+        spool.record(ROWS[4 * i : 4 * i + 4])
+        ids.append(spool.spool_id)
+        if i < 2:
+            kill(spool)
+    found = []
+    while head := spool.head(3):
+        found.append((ids.index(head.spool_id), head.first_seq, len(head.rows), head.lost_before))
+        spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
+    assert found == [(i, *part) for i in range(3) for part in ((1, 3, 0), (4, 1, 0))]
+    assert spool.is_settled()
+    spool.close()
+
+
+def test_runs_that_are_closed_are_declared_again_at_each_opening_and_forgotten_in_the_end(tmp_path: Path) -> None:
+    for _ in range(KEPT_RUNS + 2):
+        spool = opened(tmp_path)
+        closing = 0
+        while head := spool.head(9):
+            assert (len(head.rows), head.first_seq, head.lost_before) == (0, 3, 2)
+            spool.acknowledge(head.spool_id, 2)
+            closing += 1
+        assert closing <= KEPT_RUNS
+        spool.record(ROWS[:2])
+        spool.acknowledge(spool.spool_id, 2)
+        spool.close()
+    assert closing == KEPT_RUNS
+
+
+def test_runs_that_are_not_closed_are_never_forgotten(tmp_path: Path) -> None:
+    for i in range(KEPT_RUNS + 5):
+        spool = opened(tmp_path, max_samples=1)
+        spool.record(ROWS[i : i + 1])
+        spool.close()
+    spool = opened(tmp_path, max_samples=1)
+    closed = 0
+    while head := spool.head(9):
+        closed += not len(head.rows)
+        spool.acknowledge(head.spool_id, head.first_seq - 1 + len(head.rows))
+    assert closed == KEPT_RUNS + 4, "all but the one whose sample is left: what was dropped is declared"
+    spool.close()
+
+
+def test_spool_that_another_process_has_open_is_refused(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    script = "import sys; from pathlib import Path; from agents.delivery.spool import *; Spool(Path(sys.argv[1]), SpoolConfig())"
+    command = [sys.executable, "-c", script, str(tmp_path / "spool.db")]
+    found = subprocess.run(command, capture_output=True, text=True, env={"PYTHONPATH": str(ROOT)}, check=False)
+    assert "another agent is using this spool" in found.stderr
+    kill(spool)
+    opened(tmp_path).close()
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from tests.unit.agents.drives import made_up_samples
+from agents.delivery.audit import AuditLog
+from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
+folder = Path(sys.argv[1])
+spool = Spool(folder / "spool.db", SpoolConfig(), AuditLog(folder / "audit.txt"))
+rows = made_up_samples(100_000)
+for i in range(0, len(rows), 7):
+    spool.record(rows[i : i + 7])
+    print(i + 7, flush=True)
+"""
+
+
+def test_spool_survives_kill_in_the_middle_of_writing(tmp_path: Path) -> None:
+    paths = f"{ROOT}:{Path(__file__).parent}"
+    command = [sys.executable, "-c", WRITER, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": paths}) as writer:
+        assert writer.stdout
+        told = 0
+        for line in writer.stdout:
+            told = int(line)
+            if told >= 300:
+                writer.send_signal(signal.SIGKILL)
+                break
+        told = max([told, *map(int, writer.stdout.read().split())])
+    assert writer.returncode == -signal.SIGKILL
+    audit = AuditLog(tmp_path / "audit.txt")
+    spool = opened(tmp_path, 10**6, audit)
+    head = spool.head(10**6)
+    assert head
+    assert len(head.rows) >= told
+    assert head.first_seq == 1
+    assert hashes(head.rows) == hashes(made_up_samples(100_000)[: len(head.rows)])
+    assert len(head.rows) == spool.counters()["recorded"]
+    spool.close()
+    assert list(read_audit(tmp_path / "audit.txt").values()) == hashes(head.rows)
+
+
+def test_kill_while_the_file_is_made_leaves_no_broken_spool(tmp_path: Path) -> None:
+    def killed() -> int:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Spool(tmp_path / "spool.db", SpoolConfig(), draw_id=killed)
+    spool = opened(tmp_path)
+    assert spool.record(ROWS[:2]) == 1
+    spool.close()
+
+
+# --- pending and final -----------------------------------------------------------------------------------------------
+
+
+def test_pending_samples_wait_until_they_are_final(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:3], final=False)
+    assert spool.head(99) is None
+    better = ROWS[:2].copy()
+    better["x_m"] += 1
+    spool.finalise(1, better)
+    head = spool.head(99)
+    assert head
+    assert hashes(head.rows) == hashes(better)
+    spool.close()
+
+
+def test_final_samples_never_overtake_pending_ones(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:2])
+    spool.record(ROWS[2:4], final=False)
+    spool.record(ROWS[4:6])
+    head = spool.head(99)
+    assert head
+    assert len(head.rows) == 2
+    spool.acknowledge(spool.spool_id, 2)
+    assert spool.head(99) is None
+    spool.finalise(3, ROWS[2:4])
+    head = spool.head(99)
+    assert head
+    assert (head.first_seq, len(head.rows)) == (3, 4)
+    spool.close()
+
+
+def test_what_is_final_stays_as_it_is(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:1])
+    spool.finalise(1, ROWS[5:6])
+    head = spool.head(1)
+    assert head
+    assert hashes(head.rows) == hashes(ROWS[:1])
+    spool.close()
+
+
+def test_pending_samples_are_final_after_a_crash(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:3], final=False)
+    kill(spool)
+    again = opened(tmp_path)
+    head = again.head(99)
+    assert head
+    assert hashes(head.rows) == hashes(ROWS[:3])
+    again.close()
+
+
+# --- holes, bounds, and samples that the server refuses --------------------------------------------------------------
+
+
+def test_head_ends_before_a_hole(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:10])
+    bad = spool.head(99)
+    assert bad
+    spool.acknowledge(spool.spool_id, 3)
+    spool.put_aside(type(bad)(bad.spool_id, 6, ROWS[5:6], 0), "too bad")
+    first = spool.head(99)
+    assert first
+    assert (first.first_seq, len(first.rows), first.lost_before) == (4, 2, 0)
+    spool.acknowledge(spool.spool_id, 5)
+    rest = spool.head(99)
+    assert rest
+    assert (rest.first_seq, len(rest.rows), rest.lost_before) == (7, 4, 1)
+    assert spool.counters()["put_aside"] == 1
+    aside = spool._db.execute("SELECT seq, row, problem FROM aside").fetchall()
+    assert aside == [(6, ROWS[5].tobytes(), "too bad")]
+    spool.close()
+
+
+@pytest.mark.parametrize("limit", [1, 10])
+def test_full_spool_drops_the_oldest_counts_them_and_declares_them_lost(tmp_path: Path, limit: int) -> None:
+    spool = opened(tmp_path, limit)
+    for i in range(0, 60, 4):
+        spool.record(ROWS[i : i + 4])
+    head = spool.head(99)
+    assert head
+    assert (head.first_seq, head.lost_before) == (61 - limit, 60 - limit)
+    assert hashes(head.rows) == hashes(ROWS[-limit:])
+    expected = {"depth": limit, "dropped": 60 - limit, "put_aside": 0, "recorded": 60}
+    assert spool.counters() == expected
+    spool.close()
+    again = opened(tmp_path, limit)
+    assert again.counters() == expected
+    again.close()
+
+
+def test_damaged_samples_are_put_aside_and_never_sent(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:10])
+    for number in (1, 2, 3, 6):
+        spool._db.execute("UPDATE sample SET row = zeroblob(68) WHERE number = ?", (number,))
+    first = spool.head(2)
+    assert first
+    assert (first.first_seq, first.lost_before) == (4, 3)
+    assert hashes(first.rows) == hashes(ROWS[3:5])
+    spool.acknowledge(spool.spool_id, 5)
+    rest = spool.head(99)
+    assert rest
+    assert (rest.first_seq, rest.lost_before) == (7, 1)
+    assert hashes(rest.rows) == hashes(ROWS[6:10])
+    assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10}
+    aside = spool._db.execute("SELECT seq, problem FROM aside ORDER BY seq").fetchall()
+    assert aside == [(seq, "damaged on the machine's disk") for seq in (1, 2, 3, 6)]
+    spool.close()
+
+
+# --- servers and files that are set back ------------------------------------------------------------------------------
+
+
+def test_server_that_knows_less_than_it_acknowledged_is_told_what_is_lost(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:10])
+    spool.acknowledge(spool.spool_id, 8)
+    assert spool.fall_back(spool.spool_id, 5)
+    assert not spool.fall_back(spool.spool_id, 5)
+    head = spool.head(99)
+    assert head
+    assert (head.first_seq, head.lost_before) == (9, 3)
+    spool.close()
+
+
+def test_earlier_runs_are_declared_again_to_a_server_that_was_set_back(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    earlier = spool.spool_id
+    spool.record(ROWS[:3])
+    spool.acknowledge(earlier, 3)
+    spool.close()
+    spool = opened(tmp_path)
+    spool.acknowledge(earlier, 3)
+    spool.record(ROWS[3:5])
+    spool.acknowledge(spool.spool_id, 1)
+    assert spool.fall_back(spool.spool_id, 0)
+    head = spool.head(9)
+    assert head
+    assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 4, 0, 3)
+    spool.close()
+
+
+def test_ack_never_goes_back_nor_beyond_the_end(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:6])
+    for watermark, expected in ((4, 4), (2, 4), (99, 6)):
+        spool.acknowledge(spool.spool_id, watermark)
+        assert spool.acknowledged == expected
+    spool.close()
+
+
+def drain(spool: Spool, journal: dict[tuple[int, int], str]) -> None:
+    """Deliver everything to a journal that takes each identity once."""
+    while head := spool.head(4):
+        for i, row in enumerate(head.rows):
+            journal.setdefault((head.spool_id, head.first_seq + i), content_hash(row))
+        spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
+
+
+@pytest.mark.parametrize("restarts", [0, 2])
+def test_restored_copy_gives_no_identity_twice(tmp_path: Path, restarts: int) -> None:
+    """Also if the copy is opened more than once before it meets the server, which only the runs tell apart."""
+    audit, journal = tmp_path / "audit.txt", {}
+    spool = opened(tmp_path / "now", audit=AuditLog(audit))
+    spool.record(ROWS[:10])
+    (tmp_path / "copy").mkdir()
+    for suffix in ("", "-wal"):
+        shutil.copy(tmp_path / f"now/spool.db{suffix}", tmp_path / f"copy/spool.db{suffix}")
+    spool.record(ROWS[10:15])
+    drain(spool, journal)
+    spool.close()
+    for _ in range(restarts):
+        restored = opened(tmp_path / "copy", audit=AuditLog(audit))
+        restored.record(ROWS[30:32])
+        restored.close()
+    restored = opened(tmp_path / "copy", audit=AuditLog(audit))
+    restored.record(ROWS[20:23])
+    drain(restored, journal)
+    restored.close()
+    twice = ROWS[30:32] if restarts else ROWS[:0]
+    expected = [*hashes(ROWS[:15]), *restarts * hashes(twice), *hashes(ROWS[20:23])]
+    assert sorted(journal.values()) == sorted(expected)
+    assert read_audit(audit) == journal
+
+
+def test_two_clones_that_both_send_lose_and_double_nothing(tmp_path: Path) -> None:
+    journal: dict[tuple[int, int], str] = {}
+    spool = opened(tmp_path / "a")
+    spool.record(ROWS[:8])
+    spool.close()
+    (tmp_path / "b").mkdir()
+    shutil.copy(tmp_path / "a/spool.db", tmp_path / "b/spool.db")
+    a, b = opened(tmp_path / "a"), opened(tmp_path / "b")
+    for i in range(10, 30, 4):
+        a.record(ROWS[i : i + 2])
+        b.record(ROWS[i + 2 : i + 4])
+        for clone in (a, b):
+            head = clone.head(3)
+            assert head
+            for j, row in enumerate(head.rows):
+                journal.setdefault((head.spool_id, head.first_seq + j), content_hash(row))
+            clone.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
+    for clone in (a, b):
+        drain(clone, journal)
+        clone.close()
+    assert sorted(journal.values()) == sorted(hashes(ROWS[:8]) + hashes(ROWS[10:30]))
+
+
+def test_spool_of_schema_1_goes_on(tmp_path: Path) -> None:
+    """Its samples keep their identity; what is recorded from now on is a new run."""
+    db = sqlite3.connect(tmp_path / "spool.db", isolation_level=None)
+    db.execute("CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID")
+    db.execute("CREATE TABLE sample (seq INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL)")
+    db.execute("CREATE TABLE aside (spool_id TEXT, seq INTEGER, row BLOB, problem TEXT)")
+    meta = {"spool_id": f"{77:016x}", "newest": "5", "acknowledged": "2", "dropped": "1", "recorded": "5"}
+    db.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
+    db.executemany("INSERT INTO sample VALUES (?, ?, 1)", [(i + 1, ROWS[i].tobytes()) for i in range(3, 5)])
+    db.execute("PRAGMA user_version=1")
+    db.close()
+    spool = opened(tmp_path)
+    head = spool.head(9)
+    assert head
+    assert (head.spool_id, head.first_seq, head.lost_before) == (77, 4, 1)
+    assert hashes(head.rows) == hashes(ROWS[3:5])
+    assert spool.counters() == {"depth": 2, "dropped": 1, "put_aside": 0, "recorded": 5}
+    assert spool.record(ROWS[5:6]) == 1
+    spool.close()
+    opened(tmp_path).close()
+
+
+# --- errors ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "damage", [b"no database at all, but long enough to be taken for one", b"SQLite format 3\0" * 9]
+)
+def test_damaged_file_is_a_store_error(tmp_path: Path, damage: bytes) -> None:
+    (tmp_path / "spool.db").write_bytes(damage)
+    with pytest.raises(StoreError, match=r"spool\.db"):
+        opened(tmp_path)
+
+
+def test_spool_of_another_schema_is_a_store_error(tmp_path: Path) -> None:
+    opened(tmp_path).close()
+    db = sqlite3.connect(tmp_path / "spool.db")
+    db.execute("PRAGMA user_version=99")
+    db.close()
+    with pytest.raises(StoreError, match="schema 99"):
+        opened(tmp_path)
+
+
+def test_spool_that_has_lost_its_numbers_is_a_store_error(tmp_path: Path) -> None:
+    opened(tmp_path).close()
+    db = sqlite3.connect(tmp_path / "spool.db", isolation_level=None)
+    db.execute("DELETE FROM meta WHERE key = 'newest'")
+    db.close()
+    with pytest.raises(StoreError):
+        opened(tmp_path)
+
+
+def test_failed_record_changes_nothing(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:2])
+    spool._db.execute("INSERT INTO sample VALUES (4, x'00', 1, NULL)")  # in the way
+    with pytest.raises(StoreError, match="UNIQUE"):
+        spool.record(ROWS[2:5])
+    spool._db.execute("DELETE FROM sample WHERE number = 4")
+    assert spool.newest == 2
+    assert spool.record(ROWS[2:5]) == 3
+    assert spool.counters()["recorded"] == 5
+    spool.close()
+
+
+class Full(sqlite3.Connection):
+    """A disk that is full when it comes to a commit; SQLite rolls back by itself, or does not."""
+
+    rolls_back = False
+    full = False
+
+    def execute(self, statement: str, *values: object) -> sqlite3.Cursor:
+        if self.full and statement == "COMMIT":
+            if self.rolls_back:
+                super().execute("ROLLBACK")
+            raise sqlite3.OperationalError("database or disk is full")
+        return super().execute(statement, *values)
+
+
+@pytest.mark.parametrize("rolls_back", [False, True])
+def test_failed_commit_leaves_no_transaction_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rolls_back: bool
+) -> None:
+    class OnFull(Spool):
+        def _connect(self, path: Path) -> sqlite3.Connection:
+            return connect(path, Full)
+
+    monkeypatch.setattr(Full, "rolls_back", rolls_back)
+    spool = OnFull(tmp_path / "spool.db", SpoolConfig())
+    spool.record(ROWS[:4])
+    monkeypatch.setattr(Full, "full", True)
+    with pytest.raises(StoreError, match="disk is full"):
+        spool.record(ROWS[4:6])
+    head = spool.head(9)
+    assert head
+    attempts = (
+        lambda: spool.acknowledge(spool.spool_id, 2),
+        lambda: spool.put_aside(head, "bad"),
+        lambda: spool.finalise(1, ROWS[:1]),
+        lambda: spool.fall_back(spool.spool_id, -1),
+        spool.fork,
+    )
+    identity = spool.spool_id
+    for attempt in attempts:
+        with pytest.raises(sqlite3.OperationalError, match="disk is full"):
+            attempt()
+        assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 0, "recorded": 4}
+        assert (spool.spool_id, spool.newest, spool.acknowledged) == (identity, 4, 0)
+    monkeypatch.setattr(Full, "full", False)
+    assert spool.record(ROWS[4:6]) == 5
+    spool.close()
+
+
+def test_bad_spool_option_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="max_samples"):
+        SpoolConfig(max_samples=0)
+
+
+def test_disk_that_takes_nothing_is_named(tmp_path: Path) -> None:
+    spool = Spool(tmp_path / "spool.db", SpoolConfig())
+    spool._db.execute("PRAGMA query_only = ON")
+    with pytest.raises(StoreError, match=r"spool\.db: cannot be written: .*; look at the machine's disk"):
+        spool.record(made_up_samples(2))
+    assert spool.newest == 0
+    spool._db.execute("PRAGMA query_only = OFF")
+    assert spool.record(made_up_samples(2)) == 1
+    spool.close()
+
+
+# --- damage that SQLite does not see ---------------------------------------------------------------------------------
+
+
+def changed(path: Path, statement: str) -> Path:
+    db = sqlite3.connect(path / "spool.db")
+    db.execute(statement)
+    db.commit()
+    db.close()
+    return path
+
+
+@pytest.mark.parametrize("column", ["spool_id = '00000000000000ff'", "acknowledged = 2", "closed = 1", "crc32 = 5"])
+def test_a_run_that_is_not_what_was_written_is_no_reason_to_send_under_another_identity(
+    tmp_path: Path, column: str
+) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:3])
+    spool.close()
+    with pytest.raises(StoreError, match="is damaged; move the file away"):
+        opened(changed(tmp_path, f"UPDATE run SET {column}"))
+
+
+@pytest.mark.parametrize("row", ["x''", "x'0102'", "5", "'text'"])
+def test_a_sample_that_is_none_is_put_aside_and_the_others_are_sent(tmp_path: Path, row: str) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:3])
+    spool.close()
+    spool = opened(changed(tmp_path, f"UPDATE sample SET row = {row} WHERE number = 1"))
+    head = spool.head(10)
+    assert (head.first_seq, len(head.rows), head.lost_before) == (2, 2, 1)
+    assert spool.counters()["put_aside"] == 1
+    spool.close()
+
+
+def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.record(ROWS[:3])
+    spool._db.execute("UPDATE sample SET crc32 = 1 WHERE number = 2")
+    spool._db.execute("CREATE TRIGGER stays BEFORE DELETE ON sample BEGIN SELECT RAISE(IGNORE); END")
+    with pytest.raises(sqlite3.DatabaseError, match="the file is damaged"):
+        spool.head(10)
+    assert spool.counters()["put_aside"] == 0
+    spool.close()

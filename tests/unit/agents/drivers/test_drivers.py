@@ -1,0 +1,323 @@
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agents.agent import Agent, Places
+from agents.config import AgentConfig
+from agents.delivery.uplink import UplinkConfig
+from agents.drivers.replay import Replay
+from agents.drivers.zenoh import ZenohDriver
+from agents.estimation.calibration_file import load
+from agents.physics import GRAVITY_MPS2
+from protocol.machine.log_folder import open_log, write_log
+from protocol.machine.readings import Articulation, Imu, Reading
+from protocol.wire import keys
+from protocol.wire.codec import encode_bundle
+from protocol.wire.messages import SensorBundle
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from tests.unit.agents.drives import SITE, START_NS, Leg, drive, machine
+
+OF = machine()
+
+
+class Time:
+    """A clock that only moves when somebody waits."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+        self.waits: list[float] = []
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def wait(self, seconds: float) -> None:
+        self.waits.append(seconds)
+        self.now_s += seconds
+
+
+# --- replay ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of driving, two of silence, one of driving."""
+    path = tmp_path_factory.mktemp("log")
+    made = drive([Leg(5, 0.5)], OF)
+    silent = (START_NS + 2 * 10**9, START_NS + 4 * 10**9)
+    write_log(path, "lot", SITE, OF, [r for r in made.readings if not silent[0] < r.stamp_ns < silent[1]])
+    return path
+
+
+def replay(folder: Path, speed: float) -> tuple[list[Reading], list[float], Time, int]:
+    """All readings, the time at which each was handed on, and how many reads gave nothing."""
+    time_ = Time()
+    driver = Replay(open_log(folder), speed, time_.clock, time_.wait)
+    readings: list[Reading] = []
+    at: list[float] = []
+    empty = 0
+    while (span := driver.read(0.2)) is not None:
+        readings += span
+        at += [time_.now_s - 1000.0] * len(span)
+        empty += not span
+    driver.close()
+    assert driver.read(0.2) is None
+    return readings, at, time_, empty
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0, 10.0])
+def test_replay_hands_on_every_reading_in_order(folder: Path, speed: float) -> None:
+    assert replay(folder, speed)[0] == list(open_log(folder).readings())
+
+
+@pytest.mark.parametrize("speed", [1.0, 10.0])
+def test_replay_keeps_pace(folder: Path, speed: float) -> None:
+    readings, at, _, empty = replay(folder, speed)
+    due = [(r.stamp_ns - readings[0].stamp_ns) * 1e-9 / speed for r in readings]
+    early = [d - a for d, a in zip(due, at, strict=True)]
+    assert max(early) <= 0.05 / speed + 1e-6  # at most what is handed on together
+    assert min(early) >= -1e-6
+    assert empty or speed > 1  # the silence is longer than a read may take
+
+
+def test_replay_as_fast_as_possible_never_waits(folder: Path) -> None:
+    assert replay(folder, 0.0)[2].waits == []
+
+
+def test_replay_never_waits_longer_than_a_read_may_take(folder: Path) -> None:
+    assert max(replay(folder, 1.0)[2].waits) <= 0.2
+
+
+def test_replay_counts_rows_that_were_left_out(folder: Path, tmp_path: Path) -> None:
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    with (tmp_path / "torque.csv").open("a") as file:
+        file.write(f"{START_NS + 9 * 10**9},1e9\n{START_NS + 9 * 10**9},nan\n{START_NS},0.0\nwhat,0.0\n")
+    driver = Replay(open_log(tmp_path), 0.0, lambda: 0.0, lambda _: None)
+    while driver.read(0.2) is not None:
+        pass
+    expected = {"log_out_of_range": 1, "log_not_finite": 1, "log_stamp_goes_back": 1, "log_wrong_type": 1}
+    assert driver.counters() == expected
+
+
+def test_replay_of_an_empty_log_ends_at_once(tmp_path: Path) -> None:
+    write_log(tmp_path, "lot", SITE, OF, [])
+    assert Replay(open_log(tmp_path), 1.0, lambda: 0.0, lambda _: None).read(0.2) is None
+
+
+# --- Zenoh -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sessions() -> Iterator[tuple[Any, Any]]:
+    """A router in this process, and a client of it."""
+    endpoint = free_endpoint()
+    router: Any = open_session(SessionConfig(endpoint, mode="router"))
+    client: Any = open_session(SessionConfig(endpoint))
+    yield router, client
+    client.close()
+    router.close()
+
+
+class Stream:
+    """A driver, and what a machine sends to it."""
+
+    def __init__(self, sessions: tuple[Any, Any], name: str) -> None:
+        self.driver = ZenohDriver(sessions[1], SITE.name, name)
+        self._publisher = sessions[0].declare_publisher(keys.sensors(SITE.name, name))
+        deadline_s = time.monotonic() + 10
+        while not self._publisher.matching_status.matching:
+            assert time.monotonic() < deadline_s, "the router does not know of the subscriber"
+
+    def put(self, payload: bytes) -> None:
+        self._publisher.put(payload)
+
+    def read(self) -> Any:
+        return self.driver.read(10.0)
+
+    def close(self) -> None:
+        self.driver.close()
+        self._publisher.undeclare()
+
+
+@pytest.fixture
+def stream(sessions: tuple[Any, Any]) -> Iterator[Stream]:
+    stream = Stream(sessions, "loader-1")
+    yield stream
+    stream.close()
+
+
+def reading(i: int) -> Reading:
+    return Articulation("articulation", START_NS + i, 0.1 * i)
+
+
+def bundle(counter: int, n: int = 2, machine: str = "loader-1", *, last: bool = False) -> bytes:
+    return encode_bundle(SensorBundle(machine, counter, tuple(map(reading, range(1, n + 1))), last))
+
+
+def test_bundles_come_in_as_readings(stream: Stream) -> None:
+    assert stream.driver.read(0.0) == ()
+    stream.put(bundle(1))
+    assert list(stream.read()) == [reading(1), reading(2)]
+    assert stream.driver.counters() == {}
+
+
+def test_missing_bundles_are_counted(stream: Stream) -> None:
+    for counter in (5, 6, 9, 10, 12):
+        stream.put(bundle(counter))
+        assert stream.read()
+    assert stream.driver.counters() == {"bundles_missing": 3}
+
+
+def test_stream_that_starts_anew_is_no_gap(stream: Stream) -> None:
+    for counter in (7, 1, 2):
+        stream.put(bundle(counter))
+        assert stream.read()
+    assert stream.driver.counters() == {}
+    stream.put(bundle(4))
+    assert stream.read()
+    assert stream.driver.counters() == {"bundles_missing": 1}
+
+
+def test_malformed_bundles_and_those_of_others_are_counted(stream: Stream) -> None:
+    for payload in (b"\xc1nonsense", bundle(1)[:-3], bundle(1, machine="loader-2"), bundle(1)):
+        stream.put(payload)
+    assert [len(stream.read()) for _ in range(4)] == [0, 0, 0, 2]
+    assert stream.driver.counters() == {"refused_bundle_not_msgpack": 2, "refused_bundle_wrong_machine": 1}
+
+
+def test_implausible_reading_is_left_out_and_counted(stream: Stream) -> None:
+    readings = (reading(1), Articulation("articulation", START_NS + 2, 99.0))
+    stream.put(encode_bundle(SensorBundle("loader-1", 1, readings)))
+    assert list(stream.read()) == [reading(1)]
+    assert stream.driver.counters() == {"refused_reading_out_of_range": 1}
+
+
+def test_last_bundle_ends_the_stream(stream: Stream) -> None:
+    stream.put(bundle(1, last=True))
+    assert len(stream.read()) == 2
+    assert stream.read() is None
+
+
+def test_driver_hears_no_other_machine(sessions: tuple[Any, Any], stream: Stream) -> None:
+    other = Stream(sessions, "loader-2")
+    other.put(bundle(1, machine="loader-2"))
+    assert other.read()
+    assert stream.driver.read(0.0) == ()
+    other.close()
+
+
+# --- the agent around them -------------------------------------------------------------------------------------------
+
+
+class Given:
+    """A driver that hands on what it was given, and ends."""
+
+    def __init__(self, *spans: list[Reading]) -> None:
+        self._spans = list(spans)
+        self.closed = False
+
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        return self._spans.pop(0) if self._spans else None
+
+    def counters(self) -> dict[str, int]:
+        return {"given": 1}
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def run_agent(session: Any, folder: Path, config: AgentConfig, driver: Given, *, stopped: bool = False) -> Any:
+    time_ = Time()
+    agent = Agent(session, SITE, OF, config, Places(folder / "spool.db", folder / "audit.txt"))
+    try:
+        return agent.run(driver, lambda: stopped and driver.closed, time_.clock, time_.wait), time_
+    finally:
+        agent.close()
+
+
+@pytest.mark.parametrize("linger_s", [3.0, 0.0])
+def test_agent_lingers_for_the_last_samples(sessions: tuple[Any, Any], tmp_path: Path, linger_s: float) -> None:
+    """Nobody acknowledges: the samples stay in the spool, and the report says so."""
+    config = AgentConfig(linger_s=linger_s, uplink=UplinkConfig(timeout_s=0.2))
+    driver = Given(drive([Leg(4, 0.5), Leg(6)], OF).readings)
+    report, time_ = run_agent(sessions[1], tmp_path, config, driver)
+    assert driver.closed
+    assert report["samples"] > 20
+    assert report["spool"]["depth"] == report["samples"]
+    assert report["delivered"] is False
+    assert sum(time_.waits) == pytest.approx(linger_s, abs=0.06)
+    assert len((tmp_path / "audit.txt").read_text().splitlines()) == report["samples"]
+
+
+def test_agent_that_is_stopped_does_not_linger(sessions: tuple[Any, Any], tmp_path: Path) -> None:
+    driver = Given(drive([Leg(4, 0.5), Leg(6)], OF).readings)
+    report, time_ = run_agent(sessions[1], tmp_path, AgentConfig(), driver, stopped=True)
+    assert report["delivered"] is False
+    assert time_.waits == []
+
+
+OUT_AND_BACK = (Leg(4, 0.5), Leg(14), Leg(4, -0.5), Leg(2), Leg(4, -0.5), Leg(14), Leg(4, 0.5), Leg(3))
+
+
+def test_calibration_is_kept_across_restarts(sessions: tuple[Any, Any], tmp_path: Path) -> None:
+    """Whoever drives out and back learns the accelerometer's zero, and the next agent starts with it."""
+    zero_mps2, made = 0.05, drive(OUT_AND_BACK, OF)
+    readings = [replace(r, force_x_mps2=r.force_x_mps2 + zero_mps2) if isinstance(r, Imu) else r for r in made.readings]
+    found = []
+    for spans in ([readings], [readings[:500]]):
+        time_, places = Time(), Places(tmp_path / "spool.db", calibration=tmp_path / "c.json")
+        agent = Agent(sessions[1], SITE, OF, AgentConfig(linger_s=0.0), places)
+        try:
+            found.append(agent.run(Given(*spans), lambda: False, time_.clock, time_.wait))
+        finally:
+            agent.close()
+    before, after = (report["pipeline"]["ground"]["calibration"] for report in found)
+    assert before["passages"] > 20
+    assert after["passages"] == before["passages"]
+    assert after["zero"] == pytest.approx(-zero_mps2 / GRAVITY_MPS2, abs=5e-4)
+    assert found[0]["calibration_problem"] == ""
+
+
+def test_calibration_file_that_makes_no_sense_is_reported_and_replaced(
+    sessions: tuple[Any, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "c.json").write_text("not a calibration")
+    time_, places = Time(), Places(tmp_path / "spool.db", calibration=tmp_path / "c.json")
+    agent = Agent(sessions[1], SITE, OF, AgentConfig(linger_s=0.0), places)
+    driver = Given([])
+    try:
+        assert "c.json" in agent.report(driver)["calibration_problem"]
+        driver = Given(drive(OUT_AND_BACK, OF).readings)
+        assert agent.run(driver, lambda: False, time_.clock, time_.wait)["calibration_problem"] == ""
+    finally:
+        agent.close()
+    assert load(tmp_path / "c.json", OF.name)
+
+
+def test_uplink_waits_timeout_s_for_an_acknowledgement(sessions: tuple[Any, Any], tmp_path: Path) -> None:
+    """A server that never answers: the question is given up after timeout_s."""
+    router, client = sessions
+    held: list[Any] = []
+    silent = router.declare_queryable(keys.ingest(SITE.name, OF.name), held.append)
+    began_s = time.monotonic()
+    agent = Agent(client, SITE, OF, AgentConfig(uplink=UplinkConfig(timeout_s=0.3)), Places(tmp_path / "spool.db"))
+    deadline_s = began_s + 20
+    uplink = agent._uplink
+    while not uplink.state.counters["timeouts"]:
+        assert time.monotonic() < deadline_s
+    took_s = time.monotonic() - began_s
+    for query in held:
+        query.drop()
+    silent.undeclare()
+    agent.close()
+    assert 0.25 < took_s < 5
+    assert held
+
+
+def test_bad_agent_option_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="linger_s"):
+        AgentConfig(linger_s=-1.0)

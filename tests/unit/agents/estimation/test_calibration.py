@@ -1,0 +1,427 @@
+"""Zero and scale of the balance, found by driving the same ground there and back, and on known ground."""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from agents.dead_reckoning import Dead, DeadReckoning
+from agents.estimation.balance import Balance
+from agents.estimation.calibration import RELOCK, Calibration, CalibrationConfig, Calibrator, unknown
+from protocol.arrays import Floats
+from tests.unit.agents.drives import START_NS
+from tests.unit.agents.ground import STEADY, STEP_S
+
+FLAT: Callable[[float], float] = lambda _: 0.0  # noqa: E731
+NOISE = 0.008 * math.sqrt(5)  # of a step: a stretch of 0.5 m is 5 steps
+
+
+@dataclass
+class Place:
+    """Where the machine is; stands in for dead reckoning."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    angle_rad: float = 0.0
+
+    def now(self) -> Dead:
+        return Dead(0, 0.0, self.angle_rad, self.x_m, self.y_m)
+
+
+class Course:
+    """Drives a calibrator to and fro along a line, over ground and slope by place, with errors of the sensors."""
+
+    def __init__(
+        self,
+        calibrator: Calibrator,
+        *,
+        zero: float = 0.0,
+        scale: float = 0.0,
+        c_rr: Callable[[float], float] = lambda _: 0.04,
+        slope: Callable[[float], float] = FLAT,
+        noise: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        self.calibrator = calibrator
+        self.place = Place()
+        self._zero, self._scale, self._c_rr, self._slope = zero, scale, c_rr, slope
+        self._noise, self._rng = noise, np.random.default_rng(seed)
+        self._steps = 0
+        self._way_m = 0.0
+
+    def drive(
+        self, metres: float, direction: float = 1.0, *, known_c_rr: float | None = None, speed_mps: float = 2.0
+    ) -> None:
+        """Straight on, or back, in 0.05 s steps."""
+        for _ in range(round(metres / (speed_mps * STEP_S))):
+            self._steps += 1
+            self._way_m += speed_mps * STEP_S
+            self.place.x_m += direction * speed_mps * STEP_S * math.cos(self.place.angle_rad)
+            self.place.y_m += direction * speed_mps * STEP_S * math.sin(self.place.angle_rad)
+            balance = self._balance(direction, speed_mps)
+            self.calibrator.update(balance, cast(DeadReckoning, self.place), known_c_rr)
+
+    def there_and_back(self, metres: float, times: int = 1) -> None:
+        for _ in range(times):
+            self.drive(metres)
+            self.wait(2.0)
+            self.drive(metres, -1.0)
+            self.wait(2.0)
+
+    def wait(self, seconds: float) -> None:
+        self._steps += round(seconds / STEP_S)
+        self.calibrator.interrupt()
+
+    def _balance(self, direction: float, speed_mps: float) -> Balance:
+        slope, c_rr = self._slope(self.place.x_m), self._c_rr(self.place.x_m)
+        true = direction * c_rr * math.cos(slope)
+        share = (true + math.sin(slope)) / (1 - self._scale)  # so that share (1 - scale) balances
+        noise = self._noise * self._rng.standard_normal()
+        return replace(
+            STEADY,
+            stamp_ns=START_NS + self._steps * round(STEP_S * 1e9),
+            speed_mps=direction * speed_mps,
+            way_m=self._way_m,
+            slope_x=slope,
+            share=share,
+            unbalanced=true + self._scale * share + self._zero + noise,
+        )
+
+
+def course(config: CalibrationConfig | None = None, known: Calibration | None = None, **options: object) -> Course:
+    return Course(Calibrator(config or CalibrationConfig(), known), **options)  # type: ignore[arg-type]
+
+
+# --- there and back --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("zero", [0.004, -0.008])
+@pytest.mark.parametrize("c_rr", [0.01, 0.06, 0.25])
+def test_flat_ground_there_and_back_shows_the_zero(zero: float, c_rr: float) -> None:
+    on = course(zero=zero, c_rr=lambda _: c_rr, noise=NOISE, seed=1)
+    on.there_and_back(40, 6)
+    found = on.calibrator.calibration
+    assert found.zero == pytest.approx(zero, abs=0.0012)
+    assert found.scale == pytest.approx(0.0, abs=0.045)
+    assert math.sqrt(found.covariance[0][0]) < 0.0012
+    assert math.sqrt(found.covariance[1][1]) > 0.02  # which flat ground does not show
+    assert on.calibrator.counters["pairs"] > 6 * 70
+    assert found.passages > 6 * 70
+
+
+@pytest.mark.parametrize("scale", [0.05, -0.05])
+def test_a_slope_shows_the_scale_too(scale: float) -> None:
+    """40 m of flat ground, then a ramp of 12 degrees."""
+    on = course(zero=0.004, scale=scale, slope=lambda x: math.radians(12) if x > 20 else 0.0, noise=NOISE, seed=2)
+    on.there_and_back(40, 8)
+    found = on.calibrator.calibration
+    assert found.zero == pytest.approx(0.004, abs=0.0015)
+    assert found.scale == pytest.approx(scale, abs=0.012)
+    corrected = [found.corrected(on._balance(d, 2.0)) * d for d in (1.0, -1.0)]
+    assert np.mean(corrected) == pytest.approx(0.04, abs=0.02)
+
+
+def test_ground_of_many_kinds_matters_not() -> None:
+    """Each place against itself; c_rr changes every 4 m."""
+    on = course(zero=0.005, c_rr=lambda x: 0.02 + 0.06 * (int(x / 4) % 2), noise=NOISE, seed=3)
+    on.there_and_back(40, 6)
+    assert on.calibrator.calibration.zero == pytest.approx(0.005, abs=0.0015)
+
+
+def test_one_direction_alone_shows_nothing() -> None:
+    on = course(zero=0.005)
+    for _ in range(3):
+        on.drive(40)
+        on.place.x_m = 0.0
+        on.wait(1)
+    assert on.calibrator.calibration == unknown(CalibrationConfig())
+    assert not on.calibrator.counters
+
+
+def test_a_passage_counts_once() -> None:
+    """There, back, and there again on the same 20 m: each passage is the partner of one other."""
+    on = course(zero=0.004)
+    on.drive(20)
+    on.wait(1)
+    on.drive(20, -1.0)
+    pairs = on.calibrator.counters["pairs"]
+    assert 35 <= pairs <= 40
+    on.wait(1)
+    on.drive(20)
+    assert on.calibrator.counters["pairs"] <= pairs + 6  # all but the ends are used up
+    on.wait(1)
+    on.drive(20, -1.0)
+    assert 2 * pairs - 6 <= on.calibrator.counters["pairs"] <= 2 * pairs + 6
+
+
+def test_one_way_there_pairs_with_one_way_back() -> None:
+    on = course(zero=0.004)
+    on.drive(20)
+    on.wait(1)
+    on.drive(20, -1.0)
+    pairs = on.calibrator.counters["pairs"]
+    on.wait(1)
+    on.place.x_m = 20.0  # back again, and never there
+    on.drive(20, -1.0)
+    assert on.calibrator.counters["pairs"] <= pairs + 4
+
+
+@pytest.mark.parametrize(
+    ("change", "pairs"),
+    [
+        ({}, True),
+        ({"y_m": 0.5}, True),
+        ({"y_m": 0.9}, False),
+        ({"angle_rad": 0.1}, True),
+        ({"angle_rad": 0.3}, False),
+        ({"wait_s": 90.0}, True),
+        ({"wait_s": 150.0}, False),
+    ],
+    ids=str,
+)
+def test_what_is_the_same_ground(change: dict[str, float], pairs: bool) -> None:
+    on = course(zero=0.004)
+    on.drive(6)
+    on.wait(change.pop("wait_s", 1.0))
+    for name, value in change.items():
+        setattr(on.place, name, value)
+    on.drive(3, -1.0)
+    assert bool(on.calibrator.counters["pairs"]) is pairs
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "change"),
+    [("pair_m", 0.4, {"y_m": 0.5}), ("pair_rad", 0.05, {"angle_rad": 0.1}), ("pair_s", 60.0, {"wait_s": 90.0})],
+)
+def test_options_say_what_is_the_same_ground(option: str, value: float, change: dict[str, float]) -> None:
+    on = course(CalibrationConfig(**{option: value}), zero=0.004)
+    on.drive(6)
+    on.wait(change.pop("wait_s", 1.0))
+    for name, place in change.items():
+        setattr(on.place, name, place)
+    on.drive(3, -1.0)
+    assert not on.calibrator.counters["pairs"]
+
+
+def test_turning_round_is_no_way_back() -> None:
+    """Driving home forwards: the gravity of the slope is not seen from the other side, so nothing is learnt."""
+    on = course(zero=0.004)
+    on.drive(20)
+    on.place.angle_rad = math.pi
+    on.wait(3)
+    on.drive(20)
+    assert not on.calibrator.counters["pairs"]
+
+
+def test_full_turns_of_dead_reckoning_are_no_turn() -> None:
+    on = course(zero=0.004)
+    on.drive(10)
+    on.place.angle_rad = 4 * math.pi
+    on.wait(1)
+    on.drive(10, -1.0)
+    assert on.calibrator.counters["pairs"] >= 15
+
+
+@pytest.mark.parametrize("speed_mps", [0.5, 1.0, 3.0])
+def test_speed_of_the_way_back_matters_not(speed_mps: float) -> None:
+    on = course(zero=0.004)
+    on.drive(20)
+    on.wait(1)
+    on.drive(20, -1.0, speed_mps=speed_mps)
+    assert on.calibrator.counters["pairs"] >= 25
+    assert on.calibrator.calibration.zero == pytest.approx(0.004, abs=3e-4)
+
+
+def test_pairs_across_a_border_are_left_out() -> None:
+    """Ground that became sand in between: half the difference is no zero."""
+    on = course(zero=0.004)
+    on.there_and_back(20, 2)
+    before = on.calibrator.calibration
+    on.drive(4)
+    on.wait(1)
+    on._c_rr = lambda _: 0.25
+    on.drive(4, -1.0)
+    assert on.calibrator.counters["off"] >= 5
+    assert on.calibrator.calibration.zero == pytest.approx(before.zero, abs=1e-9)
+    assert on.calibrator.calibration.passages == before.passages
+
+
+def test_gate_sigma_and_noise_say_what_is_off() -> None:
+    for config, off in ((CalibrationConfig(), True), (CalibrationConfig(gate_sigma=30.0), False)):
+        on = course(config, zero=0.05)
+        on.there_and_back(3)
+        assert bool(on.calibrator.counters["off"]) is off
+    on = course(CalibrationConfig(noise=0.1), zero=0.05)
+    on.there_and_back(3)
+    assert not on.calibrator.counters["off"]
+
+
+def test_a_zero_far_beyond_its_class_is_found_in_the_end() -> None:
+    """0.3 m/s2, ten times what accelerometers are taken for: so many pairs in a row are no border."""
+    on = course(zero=0.03, noise=NOISE, seed=5)
+    on.there_and_back(40, 6)
+    assert on.calibrator.counters["relocked"] >= 1
+    assert on.calibrator.counters["off"] >= RELOCK
+    assert on.calibrator.calibration.zero == pytest.approx(0.03, abs=0.003)
+
+
+def test_interrupted_stretches_are_not_used() -> None:
+    on = course(zero=0.004)
+    for direction in (1.0, -1.0):
+        for _ in range(40):
+            on.drive(0.4, direction)  # shorter than a stretch
+            on.calibrator.interrupt()
+    assert not on.calibrator.counters["pairs"]
+
+
+def test_stretch_m_is_the_way_of_a_stretch() -> None:
+    for stretch_m, pairs in ((0.5, 37), (2.0, 10)):
+        on = course(CalibrationConfig(stretch_m=stretch_m), zero=0.004)
+        on.there_and_back(20)
+        assert on.calibrator.counters["pairs"] == pytest.approx(pairs, abs=3)
+
+
+# --- known ground ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_known_ground_alone_shows_the_zero(direction: float) -> None:
+    on = course(zero=0.006, noise=NOISE, seed=6)
+    on.drive(120, direction, known_c_rr=0.04)
+    found = on.calibrator.calibration
+    assert found.zero == pytest.approx(0.006, abs=0.003)
+    assert on.calibrator.counters["known_ground"] >= 200
+    assert not on.calibrator.counters["pairs"]
+
+
+def test_known_ground_on_a_slope_counts_with_its_cosine() -> None:
+    on = course(zero=0.006, c_rr=lambda _: 0.2, slope=lambda _: 0.3)
+    for direction in (1.0, -1.0):
+        on.drive(60, direction, known_c_rr=0.2)
+    assert on.calibrator.calibration.zero == pytest.approx(0.006, abs=3e-4)
+
+
+def test_known_ground_that_is_not_what_it_is_said_to_be_is_off() -> None:
+    on = course()
+    on.drive(4, known_c_rr=0.2)
+    assert on.calibrator.counters["off"] >= 6
+    assert on.calibrator.calibration.passages == 0
+
+
+# --- how sure it is --------------------------------------------------------------------------------------------------
+
+
+def normalised(seeds: Iterable[int], error: Callable[[Calibration, float, float], float]) -> float:
+    """Rms over drives with zero and scale drawn from what is assumed of them."""
+    config, found = CalibrationConfig(floor=1e-9), []
+    for seed in seeds:
+        rng = np.random.default_rng(1000 + seed)
+        zero, scale = config.zero * rng.standard_normal(), config.scale * rng.standard_normal()
+        on = course(config, zero=zero, scale=scale, slope=lambda x: 0.2 if x > 10 else 0.0, noise=NOISE, seed=seed)
+        on.there_and_back(20, 2)
+        found.append(error(on.calibrator.calibration, zero, scale))
+    return float(np.sqrt(np.mean(np.square(found))))
+
+
+def test_covariance_is_honest() -> None:
+    def of_zero(c: Calibration, zero: float, _: float) -> float:
+        return (c.zero - zero) / math.sqrt(c.covariance[0][0])
+
+    def of_scale(c: Calibration, _: float, scale: float) -> float:
+        return (c.scale - scale) / math.sqrt(c.covariance[1][1])
+
+    def of_balance(c: Calibration, zero: float, scale: float) -> float:
+        return (c.zero - zero + 0.25 * (c.scale - scale)) / math.sqrt(c.variance(0.25))
+
+    for error in (of_zero, of_scale, of_balance):
+        rms = normalised(range(50), error)
+        assert 0.6 < rms < 1.5, f"{error.__name__} {rms=}"
+
+
+def test_no_number_of_pairs_gets_below_the_floor() -> None:
+    config = CalibrationConfig(floor=0.002)
+    on = course(config, slope=lambda x: 0.2 if x > 10 else 0.0)
+    assert on.calibrator.calibration.covariance == unknown(config).covariance
+    on.there_and_back(20, 20)
+    (zz, _), (_, ss) = on.calibrator.calibration.covariance
+    assert math.sqrt(zz) == pytest.approx(0.002)
+    assert math.sqrt(ss) == pytest.approx(0.02)
+
+
+def test_known_stretch_counts_as_one_and_a_pair_as_two() -> None:
+    config = CalibrationConfig(zero=1.0, scale=1e-9, floor=1e-12, zero_walk=1e-12)
+    on, known = course(config), course(config)
+    on.there_and_back(20)
+    known.drive(20, known_c_rr=0.04)
+    for course_, stretches in (
+        (on, 2 * on.calibrator.counters["pairs"]),
+        (known, known.calibrator.counters["known_ground"]),
+    ):
+        zz = course_.calibrator.calibration.covariance[0][0]
+        assert zz == pytest.approx(config.noise**2 / stretches, rel=1e-3)
+
+
+def test_variance_of_a_balance_is_that_of_zero_and_scale_together() -> None:
+    P: Floats = np.array([[4e-6, -1e-6], [-1e-6, 9e-6]])
+    known = Calibration(0.001, 0.02, ((4e-6, -1e-6), (-1e-6, 9e-6)))
+    for share in (0.0, 0.3, -0.3):
+        h = np.array([1.0, share])
+        assert known.variance(share) == pytest.approx(h @ P @ h)
+    assert known.corrected(replace(STEADY, unbalanced=0.05, share=0.1)) == pytest.approx(0.05 - 0.001 - 0.002)
+
+
+# --- given from before -----------------------------------------------------------------------------------------------
+
+
+def given(age_s: float = 0.0) -> Calibration:
+    return Calibration(0.005, 0.01, ((1e-6, 0.0), (0.0, 1e-4)), START_NS - round(age_s * 1e9), 50)
+
+
+def test_calibration_from_before_is_what_is_known_first() -> None:
+    found = Calibrator(CalibrationConfig(), given()).calibration
+    assert (found.zero, found.scale, found.passages, found.stamp_ns) == (0.005, 0.01, 50, START_NS)
+
+
+@pytest.mark.parametrize(("age_s", "std"), [(0.0, 1e-3), (400.0, math.hypot(1e-3, 1.6e-3)), (1e7, 4.5e-3)])
+def test_zero_grows_unsure_as_time_passes_but_never_more_than_at_first(age_s: float, std: float) -> None:
+    """Its random walk is 8e-5 per root of a second; the scale stays."""
+    config = CalibrationConfig(floor=1e-9, noise=1.0, gate_sigma=100.0)  # passages tell next to nothing
+    on = course(config, given(age_s))
+    on.there_and_back(1)
+    (zz, _), (_, ss) = on.calibrator.calibration.covariance
+    assert on.calibrator.counters["pairs"]
+    assert math.sqrt(zz) == pytest.approx(std, rel=0.02)
+    assert math.sqrt(ss) == pytest.approx(1e-2, rel=0.01)
+
+
+def test_zero_walk_says_how_fast() -> None:
+    config = CalibrationConfig(floor=1e-9, noise=1.0, gate_sigma=100.0, zero_walk=1e-9)
+    on = course(config, given(400.0))
+    on.there_and_back(1)
+    assert math.sqrt(on.calibrator.calibration.covariance[0][0]) == pytest.approx(1e-3, rel=0.02)
+
+
+def test_old_zero_that_moved_is_found_again() -> None:
+    on = course(zero=0.009, known=given(3600.0), noise=NOISE, seed=8)
+    on.there_and_back(40, 4)
+    assert on.calibrator.calibration.zero == pytest.approx(0.009, abs=0.0015)
+    assert on.calibrator.calibration.stamp_ns > START_NS
+
+
+# --- options ---------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_known_is_how_large_errors_usually_are() -> None:
+    found = unknown(CalibrationConfig(zero=0.01, scale=0.1))
+    assert (found.zero, found.scale, found.stamp_ns, found.passages) == (0.0, 0.0, 0, 0)
+    assert np.array(found.covariance) == pytest.approx(np.diag([1e-4, 1e-2]))
+
+
+@pytest.mark.parametrize("name", list(CalibrationConfig.__dataclass_fields__))
+@pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
+def test_bad_calibration_option_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        CalibrationConfig(**{name: value})

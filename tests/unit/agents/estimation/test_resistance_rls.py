@@ -1,0 +1,208 @@
+"""The algorithm against its formulas, and what it follows: a mass that stays and a ground that jumps."""
+
+import math
+
+import numpy as np
+import pytest
+
+from agents.estimation.resistance_rls import MultipleForgetting, RecursiveConfig, RecursiveGrade, RecursiveResistance
+from protocol.arrays import Floats
+from tests.unit.agents.drives import START_NS
+from tests.unit.agents.ground import STEP_S, noise_of, pushed, pushes
+
+
+def by_the_paper(
+    ys: Floats, hs: Floats, variance: Floats, forget: Floats, dt_s: float
+) -> tuple[list[list[float]], list[list[float]]]:
+    """The docstring's formulas, written out for two parameters; parameters and variances after each step."""
+    (p1, p2), (l1, l2) = variance, (f**dt_s for f in forget)
+    theta1 = theta2 = 0.0
+    thetas, variances = [], []
+    for y, (h1, h2) in zip(ys, hs, strict=True):
+        denominator = 1 + p1 * h1 * h1 / l1 + p2 * h2 * h2 / l2
+        off = y - h1 * theta1 - h2 * theta2
+        theta1 += p1 * h1 / l1 / denominator * off
+        theta2 += p2 * h2 / l2 / denominator * off
+        alone1 = p1 * h1 / l1 / (1 + p1 * h1 * h1 / l1)
+        alone2 = p2 * h2 / l2 / (1 + p2 * h2 * h2 / l2)
+        p1, p2 = (1 - alone1 * h1) * p1 / l1, (1 - alone2 * h2) * p2 / l2
+        thetas.append([theta1, theta2])
+        variances.append([p1, p2])
+    return thetas, variances
+
+
+def test_it_is_the_algorithm_of_the_paper() -> None:
+    seed, n = 1, 200
+    rng = np.random.default_rng(seed)
+    hs = rng.uniform(-1, 1, (n, 2))
+    ys = hs @ [0.3, 0.05] + 0.01 * rng.standard_normal(n)
+    variance, forget = np.array([0.5, 2.0]), np.array([0.99, 0.5])
+    squares = MultipleForgetting(np.zeros(2), variance, forget, np.full(2, 1e9))
+    thetas, variances = by_the_paper(ys, hs, variance, forget, STEP_S)
+    for y, h, theta, p in zip(ys, hs, thetas, variances, strict=True):
+        squares.update(STEP_S, float(y), h)
+        assert squares.parameters == pytest.approx(theta, rel=1e-9), f"{seed=}"
+        assert squares.variance == pytest.approx(p, rel=1e-9), f"{seed=}"
+
+
+def test_with_one_parameter_it_is_least_squares_with_forgetting() -> None:
+    """The mean with exponential weights, once the start is forgotten."""
+    seed, n, forget = 2, 400, 0.3
+    rng = np.random.default_rng(seed)
+    h, y = rng.uniform(0.5, 1.5, n), 0.05 + 0.01 * rng.standard_normal(n)
+    squares = MultipleForgetting(np.array([1.0]), np.ones(1), np.array([forget]), np.full(1, 1e9))
+    for i in range(n):
+        squares.update(STEP_S, float(h[i] * y[i]), h[i : i + 1])
+    weights = forget ** (STEP_S * np.arange(n)[::-1]) * h**2
+    assert squares.parameters[0] == pytest.approx((weights * y).sum() / weights.sum(), rel=1e-6), f"{seed=}"
+
+
+def test_with_equal_factors_and_separate_excitation_it_is_ordinary_least_squares() -> None:
+    """Where only one regressor is not zero at a time, sharing the denominator changes nothing."""
+    seed, n, forget = 3, 300, 0.8
+    rng = np.random.default_rng(seed)
+    hs = np.where(np.arange(n)[:, None] % 2 == [0, 1], rng.uniform(0.5, 1.5, (n, 2)), 0.0)
+    ys = hs @ [0.3, 0.05] + 0.01 * rng.standard_normal(n)
+    squares = MultipleForgetting(np.zeros(2), np.ones(2), np.full(2, forget), np.full(2, 1e9))
+    P, theta, factor = np.eye(2), np.zeros(2), forget**STEP_S
+    for y, h in zip(ys, hs, strict=True):
+        squares.update(STEP_S, float(y), h)
+        gain = P @ h / (factor + h @ P @ h)
+        theta = theta + gain * (y - h @ theta)
+        P = (P - np.outer(gain, h @ P)) / factor
+    assert squares.parameters == pytest.approx(theta, rel=1e-9), f"{seed=}"
+    assert squares.variance == pytest.approx(np.diag(P), rel=1e-9), f"{seed=}"
+
+
+def test_factors_mean_the_same_at_any_rate() -> None:
+    found = []
+    for dt_s in (0.02, 0.1):
+        squares = MultipleForgetting(np.zeros(1), np.ones(1), np.array([0.5]), np.full(1, 1e9))
+        for i in range(round(8 / dt_s)):
+            squares.update(dt_s, 0.0 if i * dt_s < 7 else 1.0, np.ones(1))
+        found.append(float(squares.parameters[0]))
+    assert found == pytest.approx([0.5, 0.5], abs=0.03)  # half of the past is forgotten in the last second
+
+
+def test_variance_stays_below_its_bound_without_excitation() -> None:
+    squares = MultipleForgetting(np.zeros(2), np.ones(2), np.full(2, 0.1), np.array([3.0, 5.0]))
+    for _ in range(1000):
+        squares.update(STEP_S, 0.0, np.zeros(2))
+    assert squares.variance.tolist() == [3.0, 5.0]
+
+
+def test_a_mass_that_stays_and_a_ground_that_jumps_are_both_followed() -> None:
+    """Parameters with factors of their own: what the paper is about."""
+    seed, scale = 4, 0.1
+    rng = np.random.default_rng(seed)
+    n = round(400 / STEP_S)
+    hs = np.column_stack([0.1 + 0.15 * np.sin(0.3 * np.arange(n)), np.ones(n)])
+    truth = np.where(np.arange(n) // 800 % 2, 0.08, 0.03)  # every 40 s
+    ys = scale * hs[:, 0] + truth + noise_of(0.002, n, rng)
+    squares = MultipleForgetting(np.zeros(2), np.ones(2), np.array([0.999, 0.6]), np.full(2, 1e9))
+    errors = []
+    for i in range(n):
+        squares.update(STEP_S, float(ys[i]), hs[i])
+        if i > n // 2 and i % 800 > 200:  # 10 s after a jump
+            errors.append(squares.parameters - [scale, truth[i]])
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert rms[0] < 0.02, f"{seed=}"
+    assert rms[1] < 0.004, f"{seed=}"
+
+
+def test_wrong_mass_is_found_where_forces_vary_faster_than_the_ground() -> None:
+    n = round(600 / STEP_S)
+    share = 0.05 + 0.2 * np.sin(0.3 * np.arange(n))
+    of = RecursiveResistance(RecursiveConfig(), estimates_mass=True)
+    pushed(of, pushes(0.05 + 0.1 * share, share=share))
+    assert 0.05 < of._squares.parameters[0] < 0.11  # slowly: ten minutes
+    found = of.at(START_NS + (n - 1) * 50_000_000)
+    assert found
+    assert found[0] == pytest.approx(0.05, abs=0.01)
+
+
+def test_ground_that_jumps_is_followed_within_seconds() -> None:
+    of = RecursiveResistance(RecursiveConfig())
+    raw = np.where(np.arange(400) < 200, 0.02, 0.06)
+    for i, push in enumerate(pushes(raw)):
+        of.update(push)
+        if i == 199 + round(1.36 / STEP_S):  # ln 2 / -ln 0.6 s: half of it
+            half = of.at(push.stamp_ns)
+    assert half
+    assert half[0] == pytest.approx(0.04, abs=2e-3)
+    last = of.at(START_NS + 399 * 50_000_000)
+    assert last
+    assert last[0] == pytest.approx(0.06, abs=1e-3)
+
+
+def test_variance_is_that_of_white_noise() -> None:
+    seed, found = 5, []
+    rng = np.random.default_rng(seed)
+    for _ in range(60):
+        of = RecursiveResistance(RecursiveConfig())
+        pushed(of, pushes(0.05 + noise_of(0.004, 300, rng)))
+        estimate = of.at(START_NS + 299 * 50_000_000)
+        assert estimate
+        found.append((estimate[0] - 0.05) / math.sqrt(estimate[1]))
+    rms = float(np.sqrt(np.mean(np.square(found))))
+    assert 0.8 < rms < 1.25, f"{seed=} {rms=}"
+
+
+def test_a_load_that_changes_at_a_stop_is_found_again_sooner() -> None:
+    n = round(600 / STEP_S)
+    share = 0.05 + 0.2 * np.sin(0.3 * np.arange(n))
+    found = []
+    for loads in (True, False):
+        of = RecursiveResistance(RecursiveConfig(), estimates_mass=True)
+        pushed(of, pushes(0.05 + 0 * share, share=share))
+        of.rest(changes_load=loads)
+        pushed(of, pushes(0.05 + 0.15 * share[:400], share=share[:400]))
+        found.append(abs(of._squares.parameters[0] - 0.15))
+    assert found[0] < found[1] - 1e-3
+
+
+def test_mass_that_is_known_stays_known() -> None:
+    of = RecursiveResistance(RecursiveConfig())
+    share = 0.1 + 0.15 * np.sin(0.05 * np.arange(400))
+    pushed(of, pushes(0.05 + 0.2 * share, share=share))
+    of.rest(changes_load=True)
+    pushed(of, pushes(0.05 + 0.2 * share, share=share))
+    assert of._squares.parameters[0] == 0.0
+    assert of._squares.variance[0] == 0.0
+
+
+def test_only_the_recent_past_has_an_estimate() -> None:
+    of = RecursiveResistance(RecursiveConfig())
+    assert of.at(START_NS) is None
+    pushed(of, pushes(np.full(20, 0.05)))
+    end = START_NS + 19 * 50_000_000
+    assert of.at(end - 10**9)
+    assert of.at(end + 490_000_000)
+    assert of.at(end + 510_000_000) is None
+
+
+@pytest.mark.parametrize("slope_rad", [0.2, -0.3])
+def test_grade_is_the_slope_of_the_mean_sine(slope_rad: float) -> None:
+    seed, grade = 6, RecursiveGrade(RecursiveConfig())
+    rng = np.random.default_rng(seed)
+    found = [grade.update(STEP_S, math.sin(slope_rad) + 0.02 * rng.standard_normal()) for _ in range(400)]
+    assert np.mean(found[200:]) == pytest.approx(slope_rad, abs=3e-3), f"{seed=}"
+    assert np.std(found[200:]) < 0.02
+    later = [grade.update(STEP_S, 0.0) for _ in range(round(2 / STEP_S))]
+    assert later[-1] == pytest.approx(0.2**2 * slope_rad, abs=0.01)
+
+
+def test_grade_survives_nonsense() -> None:
+    assert math.isfinite(RecursiveGrade(RecursiveConfig()).update(STEP_S, 40.0))
+
+
+@pytest.mark.parametrize("name", ["forget", "forget_mass", "forget_grade"])
+@pytest.mark.parametrize("value", [0.0, 1.0, math.nan])
+def test_bad_factor_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        RecursiveConfig(**{name: value})
+
+
+def test_bad_noise_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="noise"):
+        RecursiveConfig(noise=0.0)

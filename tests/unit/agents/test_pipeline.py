@@ -1,0 +1,748 @@
+import ast
+import csv
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import agents
+import protocol
+from agents.estimation.calibration import Calibration
+from agents.localisation.filters.belief import PoseBelief
+from agents.localisation.localiser import LocalisationConfig
+from agents.physics import GRAVITY_MPS2
+from agents.pipeline import Pipeline, PipelineConfig, Positioning
+from protocol.machine.log_folder import open_log
+from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import KINDS, Encoder, Gps, Imu, Reading, Torque, columns
+from protocol.machine.samples import check_samples
+from protocol.site.site_config import KnownGround, SiteConfig
+from sim.config import SimConfig
+from sim.recorder import record
+from tests.unit.agents.drives import (
+    S_BEND,
+    SITE,
+    START_NS,
+    Drive,
+    Ground,
+    Leg,
+    changed_sensor,
+    drive,
+    machine,
+    noisy,
+    simulated,
+)
+
+SECOND = 10**9
+
+
+@pytest.fixture(scope="module")
+def recorded() -> list[Reading]:
+    """A simulated drive of 40 s, with what happens on sites: a stop, outliers, a pause, a late reading.
+
+    Half of the IMU's readings are enough here, and save time.
+    """
+    _, _, readings, _ = simulated(3, 40.0)
+    return with_trouble([r for r in readings if not isinstance(r, Imu) or r.stamp_ns % 20_000_000 == 0])
+
+
+def with_trouble(readings: list[Reading]) -> list[Reading]:
+    """At 20 s the machine stands for 4 s; from 26 to 30 s fixes are 60 m off; at 32 s nothing is heard for 3 s."""
+    stop_ns, pause_ns = START_NS + 20 * SECOND, START_NS + 28 * SECOND
+    stand_ns, silent_ns = 4 * SECOND, 3 * SECOND
+    found = [r for r in readings if r.stamp_ns <= stop_ns]
+    last = {r.sensor: r for r in found}
+    for i in range(1, stand_ns // (10 * 1_000_000)):
+        stamp = stop_ns + i * 10_000_000
+        still = Imu("imu-3", stamp, 0.001, 0.001, 0.003, 0.0, 0.0, 9.81)
+        found += [still, *([replace(last["wheels"], stamp_ns=stamp)] if i % 5 == 0 else [])]
+    for r in readings:
+        if stop_ns < r.stamp_ns <= pause_ns:
+            late = r.stamp_ns + stand_ns
+            off = isinstance(r, Gps) and stop_ns + 2 * SECOND < r.stamp_ns < stop_ns + 6 * SECOND
+            found.append(replace(r, stamp_ns=late, lat_deg=r.lat_deg + 6e-4) if off else replace(r, stamp_ns=late))
+        elif r.stamp_ns > pause_ns + silent_ns:
+            found.append(replace(r, stamp_ns=r.stamp_ns + stand_ns))
+    late_fix = next(r for r in found if isinstance(r, Gps) and r.stamp_ns > START_NS + 17 * SECOND)
+    behind = next(i for i, r in enumerate(found) if r.stamp_ns > late_fix.stamp_ns + 150_000_000)
+    found.remove(late_fix)
+    found.insert(behind, late_fix)
+    return found
+
+
+def run(of: MachineConfig, readings: list[Reading], config: PipelineConfig | None = None) -> tuple[bytes, Any]:
+    """Samples, as bytes, and health."""
+    pipeline = Pipeline(simulated(3, 40.0)[0], of, config or PipelineConfig())
+    return pipeline.step(readings).tobytes(), pipeline.health()
+
+
+@pytest.fixture(scope="module")
+def of() -> MachineConfig:
+    return simulated(3, 40.0)[1]
+
+
+@pytest.fixture(scope="module")
+def base(of: MachineConfig, recorded: list[Reading]) -> tuple[bytes, Any]:
+    return run(of, recorded)
+
+
+# --- what goes in and comes out --------------------------------------------------------------------------------------
+
+
+def test_made_up_drive_gives_right_samples() -> None:
+    of = machine()
+    made = drive([*S_BEND, *S_BEND], of)
+    rows = Pipeline(SITE, of, PipelineConfig()).step(made.readings)
+    check_samples(rows, SITE.extent_m)
+    settled = rows[40:]
+    assert np.median(settled["c_rr"]) == pytest.approx(0.04, abs=0.004)
+    assert np.abs(settled["grade_e"]).max() < 0.05
+    ahead = [
+        math.dist((r["x_m"] - 1.5 * math.cos(a[2]), r["y_m"] - 1.5 * math.sin(a[2])), a[:2])
+        for r in settled
+        for a in [made.at(int(r["stamp_ns"]))]
+    ]
+    assert max(ahead) < 0.6
+
+
+def test_trouble_is_counted(base: tuple[bytes, Any]) -> None:
+    samples, health = base
+    assert len(samples) > 0
+    assert health["aligned"]
+    assert health["counters"]["gps-1_gated"] > 0
+    assert health["counters"]["standstill_used"] > 0
+    assert 0 < health["position_std_m"] < 5
+
+
+def test_every_sample_is_plausible(of: MachineConfig, recorded: list[Reading]) -> None:
+    rows = Pipeline(simulated(3, 40.0)[0], of, PipelineConfig()).step(recorded)
+    check_samples(rows, 20_000)
+    assert (np.diff(rows["stamp_ns"]) > 0).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_cutting_of_the_stream_gives_the_same_samples(
+    of: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    pipeline = Pipeline(simulated(3, 40.0)[0], of, PipelineConfig())
+    cuts = sorted(rng.choice(len(recorded), size=rng.integers(1, 2000)).tolist())
+    made = [pipeline.step(recorded[a:b]) for a, b in zip([0, *cuts], [*cuts, len(recorded)], strict=True)]
+    assert (np.concatenate(made).tobytes(), pipeline.health()) == base, f"seed={seed}"
+
+
+def test_positioning_alone_finds_the_very_poses_of_the_whole_pipeline(
+    of: MachineConfig, recorded: list[Reading]
+) -> None:
+    """To the last bit, and after a restart too: the ground and samples of it have no part in localisation."""
+    after_gap = [replace(r, stamp_ns=r.stamp_ns + 100 * SECOND) for r in recorded]
+    delayed = changed_sensor(of, "wheels", delay_s=0.02)
+    site = simulated(3, 40.0)[0]
+    whole, half = Pipeline(site, delayed, PipelineConfig()), Positioning(site, delayed, PipelineConfig())
+    stream, found = [*recorded, *after_gap], 0
+    for i in range(0, len(stream), 20):
+        whole.step(stream[i : i + 20])
+        half.step(stream[i : i + 20])
+        assert same(whole.pose, half.pose)
+        assert same(*(each.pose_at(stream[i].stamp_ns - SECOND) for each in (whole, half)))
+        found += half.pose is not None
+    assert found > 100
+    counted = whole.health()["counters"]
+    assert counted["gap_restarts"] == 1
+    assert counted.items() >= half.counters.items()
+
+
+def same(a: PoseBelief | None, b: PoseBelief | None) -> bool:
+    """Whether two poses are bit for bit the same."""
+    if a is None or b is None:
+        return a is b
+    return repr(a) == repr(b) and a.covariance_m2.tobytes() == b.covariance_m2.tobytes()
+
+
+def test_readings_of_unknown_sensors_are_counted_and_change_nothing(
+    of: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any]
+) -> None:
+    strangers = [replace(recorded[100], sensor="stranger"), Encoder("imu-3", recorded[100].stamp_ns, 0.0, 0.0)]
+    samples, health = run(of, [*recorded[:101], *strangers, *recorded[101:]])
+    assert samples == base[0]
+    assert health["counters"].pop("reading_unknown_sensor") == 2
+    assert health == base[1]
+
+
+def test_an_imu_without_accelerometer_invents_no_slope(of: MachineConfig, recorded: list[Reading]) -> None:
+    """Its columns of force are filled with something: they must not reach the map as a grade."""
+    sensors = tuple(replace(s, gives=("rate",)) if s.kind == "imu" else s for s in of.sensors)
+    rows = Pipeline(simulated(3, 40.0)[0], replace(of, sensors=sensors), PipelineConfig()).step(recorded)
+    assert len(rows) > 50
+    assert np.isnan(rows["grade_e"]).all()
+    assert np.isnan(rows["grade_n"]).all()
+
+
+def test_doubled_readings_are_counted_and_change_nothing(
+    of: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any]
+) -> None:
+    samples, health = run(of, [*recorded[:900], *recorded[850:]])
+    assert samples == base[0]
+    assert health["counters"]["reading_duplicate"] + health["counters"]["reading_late"] >= 50
+
+
+def test_long_pause_starts_localisation_anew_and_keeps_the_counts() -> None:
+    of = machine()
+    made = drive([*S_BEND, Leg(8), *S_BEND[2:]], of)
+    silent = (START_NS + 30 * SECOND, START_NS + 38 * SECOND)
+    readings = [r for r in made.readings if not silent[0] < r.stamp_ns < silent[1]]
+    pipeline = Pipeline(SITE, of, PipelineConfig())
+    before = pipeline.step([r for r in readings if r.stamp_ns <= silent[0]])
+    used = pipeline.health()["counters"]["gps-1_used"]
+    first = pipeline.step([r for r in readings if r.stamp_ns >= silent[1]][:50])
+    assert pipeline.pose is None
+    assert len(first) > 3
+    assert (first["stamp_ns"] < silent[1]).all()  # what still waited
+    after = pipeline.step([r for r in readings if r.stamp_ns >= silent[1]][50:])
+    assert len(before) > 80
+    assert len(after) > 50
+    assert int(after["stamp_ns"][0]) >= silent[1]
+    counters = pipeline.health()["counters"]
+    assert counters["gap_restarts"] == 1
+    assert counters["gps-1_used"] > used
+
+
+def test_machine_without_imu_or_torque_gives_samples_without_resistance_or_slope() -> None:
+    of = machine()
+    made = drive([Leg(4, 0.5), Leg(20)], of, without=("imu", "torque"))
+    rows = Pipeline(SITE, of, PipelineConfig()).step(made.readings)
+    check_samples(rows, SITE.extent_m)
+    assert len(rows) > 50
+    assert np.isnan(rows["c_rr"]).all()
+    assert np.isnan(rows["grade_e"]).all()
+    no_torque = Pipeline(SITE, of, PipelineConfig()).step(drive(S_BEND, of, without=("torque",)).readings)
+    check_samples(no_torque, SITE.extent_m)
+    assert np.isnan(no_torque["c_rr"]).all()
+    assert np.isfinite(no_torque["grade_e"]).all()
+
+
+def test_machine_that_aligns_late_loses_nothing_of_its_drive() -> None:
+    """GPS comes up two minutes into the drive, longer than poses are remembered."""
+    of = machine()
+    made = drive([Leg(4, 0.5), *[Leg(10), Leg(5, 0, 0.3)] * 8, *S_BEND[1:]], of)
+    readings = [r for r in made.readings if not isinstance(r, Gps) or r.stamp_ns > START_NS + 120 * SECOND]
+    pipeline = Pipeline(SITE, of, PipelineConfig())
+    rows = pipeline.step(readings)
+    assert int(rows["stamp_ns"][0]) < START_NS + 5 * SECOND
+    assert pipeline.health()["withheld"].get("no_pose", 0) <= 2
+
+
+# --- sensors that fail -----------------------------------------------------------------------------------------------
+
+LONG = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.4), Leg(3, -0.4)] * 6, Leg(6)]  # 48 s
+FAIL_S, HEAL_S = 18.0, 30.0
+
+
+@cache
+def long_drive() -> Drive:
+    return drive(LONG, machine(), ground=Ground(0.05, 0.1))
+
+
+def failing(fault: Callable[[Reading], Reading | None]) -> list[Reading]:
+    found = (fault(r) if FAIL_S < seconds(r) < HEAL_S else r for r in long_drive().readings)
+    return [r for r in found if r]
+
+
+def without(kind: type[Reading]) -> Callable[[Reading], Reading | None]:
+    return lambda r: None if isinstance(r, kind) else r
+
+
+def torque_times(factor: float) -> Callable[[Reading], Reading | None]:
+    return lambda r: replace(r, torque_nm=r.torque_nm * factor) if isinstance(r, Torque) else r
+
+
+def torque_stuck(r: Reading) -> Reading | None:
+    return replace(r, torque_nm=20_000.0) if isinstance(r, Torque) else r
+
+
+FAULTS: dict[str, tuple[Callable[[Reading], Reading | None], str]] = {
+    "torque silent": (without(Torque), "no_torque"),
+    "wheels silent": (without(Encoder), "no_wheels"),
+    "torque stuck": (torque_stuck, "torque_frozen"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_sensor_that_fails_costs_the_resistance_and_nothing_else(name: str) -> None:
+    """Places and gradients go on; the reason is counted and, while it lasts, told; then resistance is back."""
+    fault, reason = FAULTS[name]
+    readings = failing(fault)
+    pipeline = Pipeline(SITE, machine(), PipelineConfig())
+    rows = pipeline.step([r for r in readings if seconds(r) < HEAL_S - 1])
+    assert pipeline.health()["ground"]["fault"] == reason
+    rows = np.concatenate([rows, pipeline.step([r for r in readings if seconds(r) >= HEAL_S - 1]), pipeline.finish()])
+    check_samples(rows, SITE.extent_m)
+    at_s = (rows["stamp_ns"] - START_NS) * 1e-9
+    failed = rows[(at_s > FAIL_S + 4) & (at_s < HEAL_S)]
+    assert len(failed) == pytest.approx(2 * (HEAL_S - FAIL_S - 4) * 2.6, rel=0.2)  # one each 0.5 m at 2.6 m/s
+    assert np.isnan(failed["c_rr"]).all()
+    slope = np.hypot(failed["grade_e"], failed["grade_n"])
+    assert slope == pytest.approx(math.tan(0.1), abs=0.08 if reason == "no_wheels" else 0.02)
+    assert pipeline.health()["without_resistance"][reason] >= len(failed) - 2
+    back = rows[at_s > HEAL_S + 5]
+    assert np.isfinite(back["c_rr"]).sum() > 20
+    assert np.nanmedian(back["c_rr"]) == pytest.approx(0.05, abs=0.006)
+    assert pipeline.health()["ground"]["fault"] == ""
+
+
+def test_torque_in_a_wrong_unit_costs_the_resistance_and_nothing_else() -> None:
+    """In kNm where Nm are meant: known for sure once the machine has driven 20 s."""
+    legs = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.6), Leg(3, -0.6)] * 7]
+    readings = [torque_times(0.001)(r) for r in drive(legs, machine(), ground=Ground(0.05, 0.1)).readings]
+    pipeline = Pipeline(SITE, machine(), PipelineConfig())
+    rows = pipeline.step([r for r in readings if r])
+    assert pipeline.health()["ground"]["fault"] == "torque_implausible"
+    late = rows[rows["stamp_ns"] > START_NS + 30 * SECOND]
+    assert np.isnan(late["c_rr"]).all()
+    assert np.hypot(late["grade_e"], late["grade_n"]) == pytest.approx(math.tan(0.1), abs=0.02)
+    assert pipeline.health()["without_resistance"]["torque_implausible"] >= len(late)
+
+
+def test_torque_a_thousand_times_too_large_moves_no_position() -> None:
+    made = long_drive()
+    rows = Pipeline(SITE, machine(), PipelineConfig()).step(failing(torque_times(1000.0)))
+    for row in rows:
+        x, y, heading = made.at(int(row["stamp_ns"]))
+        assert math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y)) < 3
+
+
+def test_accelerometer_in_g_withholds_samples_and_is_told() -> None:
+    def in_g(r: Reading) -> Reading | None:
+        if not isinstance(r, Imu):
+            return r
+        return replace(r, force_x_mps2=r.force_x_mps2 / 9.81, force_z_mps2=r.force_z_mps2 / 9.81)
+
+    pipeline = Pipeline(SITE, machine(), PipelineConfig())
+    rows = pipeline.step([r for r in failing(in_g) if seconds(r) < HEAL_S])
+    assert pipeline.health()["ground"]["fault"] == "accelerometer"
+    assert pipeline.health()["withheld"]["accelerometer"] > 40
+    assert (rows["stamp_ns"] < START_NS + (FAIL_S + 0.3) * SECOND).all()
+
+
+def test_way_goes_on_when_wheels_fall_silent() -> None:
+    """By the filter's speed: one sample per half a metre all the same, at the right places."""
+    made = long_drive()
+    rows = Pipeline(SITE, machine(), PipelineConfig()).step(failing(without(Encoder)))
+    silent = rows[(rows["stamp_ns"] > START_NS + 19 * SECOND) & (rows["stamp_ns"] < START_NS + 29 * SECOND)]
+    assert silent["distance_m"].sum() == pytest.approx(10 * 2.6, rel=0.15)
+    for row in silent:
+        x, y, heading = made.at(int(row["stamp_ns"]))
+        off = math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y))
+        assert off < 2.5
+
+
+# --- what is carried on ----------------------------------------------------------------------------------------------
+
+
+def test_finish_gives_what_still_waits_and_counts_what_has_no_place() -> None:
+    of = machine()
+    pipeline = Pipeline(SITE, of, PipelineConfig())
+    rows = pipeline.step(drive(S_BEND, of).readings)
+    rest = pipeline.finish()
+    assert len(rest) == pytest.approx(2.0 * 2.0 / 0.5, abs=2)  # lag_s at 2 m/s
+    assert rest["stamp_ns"][0] > rows["stamp_ns"][-1]
+    assert not len(pipeline.finish())
+    unaligned = Pipeline(SITE, of, PipelineConfig())
+    assert not len(unaligned.step(drive(S_BEND, of, without=("gps-1",)).readings))
+    assert not len(unaligned.finish())
+    assert unaligned.health()["withheld"]["no_pose"] > 90
+
+
+def test_calibration_is_handed_over_a_pause_and_to_the_next_pipeline() -> None:
+    known = Calibration(0.004, 0.02, ((1e-7, 0.0), (0.0, 1e-5)), START_NS - 10**9, 80)
+    of, made = machine(), drive([*S_BEND, Leg(8), *S_BEND[2:]], machine()).readings
+    pipeline = Pipeline(SITE, of, PipelineConfig(), known)
+    pipeline.step([r for r in made if seconds(r) < 10 or seconds(r) > 20])
+    assert pipeline.health()["counters"]["gap_restarts"] == 1
+    assert pipeline.calibration.passages >= 80
+    assert pipeline.health()["ground"]["calibration"]["zero"] == pytest.approx(0.004, abs=1e-3)
+    assert Pipeline(SITE, of, PipelineConfig(), pipeline.calibration).calibration.zero == pipeline.calibration.zero
+
+
+@pytest.mark.parametrize(("half_m", "known"), [(60.0, True), (8.0, False)])
+def test_known_ground_counts_well_inside_of_it_only(half_m: float, known: bool) -> None:
+    """3 m and twice the position's deviation from its edge; the drive leads 60 m away from its middle."""
+    corners = (
+        (10 - half_m, 20 - half_m),
+        (10 + half_m, 20 - half_m),
+        (10 + half_m, 20 + half_m),
+        (10 - half_m, 20 + half_m),
+    )
+    site: SiteConfig = replace(SITE, known_ground=(KnownGround("pad", 0.04, corners),))
+    of = machine()
+    pipeline = Pipeline(site, of, PipelineConfig())
+    pipeline.step(drive([Leg(2), Leg(4, 0.5), Leg(10), Leg(8)], of).readings)
+    found = pipeline.health()["ground"]["calibration"].get("known_ground", 0)
+    assert (found > 15) is known
+    config = changed(PipelineConfig(), "estimation.calibration.edge_m", 50.0)
+    strict = Pipeline(site, of, config)
+    strict.step(drive([Leg(2), Leg(4, 0.5), Leg(10), Leg(8)], of).readings)
+    assert strict.health()["ground"]["calibration"].get("known_ground", 0) < max(found, 1)
+
+
+@pytest.mark.parametrize(("std_m", "c_rr"), [(1.0, 0.04), (3.0, None)])
+def test_known_ground_has_to_be_all_around_an_unsure_position(std_m: float, c_rr: float | None) -> None:
+    """8 m from its edge: 3 m, and twice the standard deviation."""
+    pad = KnownGround("pad", 0.04, ((0.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0)))
+    pipeline = Pipeline(replace(SITE, known_ground=(pad,)), machine(), PipelineConfig())
+    pipeline._positioning._poses.append(PoseBelief(START_NS, 8.0, 20.0, 0.0, 2.0, std_m**2 * np.eye(2)))
+    assert pipeline._known_c_rr() == c_rr
+
+
+# --- never sees the truth --------------------------------------------------------------------------------------------
+
+
+def test_samples_do_not_depend_on_the_truth(tmp_path: Path) -> None:
+    """Two recordings of the same drive, one of them with its truth moved by 100 m."""
+    config = SimConfig(world="fast", machines=1, seed=5, seconds=20.0)
+    samples: list[bytes] = []
+    for name in ("a", "b"):
+        record(config, tmp_path / name / "logs", tmp_path / name / "truth")
+        if name == "b":
+            move_truth(tmp_path / name / "truth", 100.0)
+        log = open_log(tmp_path / name / "logs" / "loader-1")
+        samples.append(Pipeline(log.site, log.machine, PipelineConfig()).step(list(log.readings())).tobytes())
+    tracks = [(tmp_path / n / "truth/tracks/loader-1.csv").read_bytes() for n in ("a", "b")]
+    assert tracks[0] != tracks[1]
+    assert samples[0] == samples[1]
+    assert len(samples[0]) > 1000
+
+
+def move_truth(folder: Path, by_m: float) -> None:
+    for path in folder.rglob("*.csv"):
+        with path.open(newline="") as text:
+            rows = list(csv.DictReader(text))
+        with path.open("w", newline="") as text:
+            writer = csv.DictWriter(text, rows[0])
+            writer.writeheader()
+            writer.writerows({**row, "x": float(row["x"]) + by_m, "y": float(row["y"]) + by_m} for row in rows)
+
+
+def imports(package: Any) -> Iterator[tuple[str, str]]:
+    for path in Path(package.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                yield from ((path.name, alias.name) for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                assert not node.level, "relative imports are not used"
+                yield path.name, node.module or ""
+
+
+def test_no_module_of_agents_or_protocol_imports_the_simulator() -> None:
+    found = [*imports(agents), *imports(protocol)]
+    assert len(found) > 100
+    forbidden = {"sim", "evaluation", "benchmarks", "mapserver", "sitegrid"}
+    assert [(where, name) for where, name in found if name.split(".")[0] in forbidden] == []
+
+
+def test_no_reading_carries_truth() -> None:
+    names = {name for kind in KINDS for name in columns(kind)}
+    assert not [n for n in names if "true" in n or "truth" in n]
+    # what only the simulator knows, by name
+    assert not names & {"x_m", "y_m", "yaw_rad", "heading_rad", "c_rr", "grade_e", "grade_n", "slip"}
+
+
+# --- every option works ----------------------------------------------------------------------------------------------
+
+# Options whose default does not matter on this drive need another value than twice the default.
+VALUES: dict[str, Any] = {
+    "gap_s": 2.0,  # the pause of 3 s restarts
+    "late_s": 0.05,  # the late fix is refused
+    "localisation.filter": "ekf",
+    "localisation.profile": "paper",
+    "localisation.start": (30.0, 20.0, 0.1),
+    "localisation.motion.two_d": True,
+    "localisation.sensing.gate_sigma": 1.0,
+    "localisation.sensing.gps_gate_sigma": 1.0,
+    "localisation.sensing.min_fix_std_m": 2.0,
+    "localisation.fusion.relock": 1,
+    "localisation.fusion.window_s": 0.02,
+    "localisation.align_spread_m": 9.0,
+    "localisation.align_way_m": 40.0,
+    "estimation.estimator": "rls",
+    "estimation.mass": "known",
+    "estimation.calibrate": False,
+    "estimation.kalman.jump_sigma": 50.0,
+    "estimation.kalman.jump": 0.5,
+    "estimation.kalman.border_steps": (10, 60),
+    "estimation.recursive.forget": 0.3,
+    "estimation.recursive.forget_mass": 0.9,
+    "estimation.recursive.forget_grade": 0.5,
+    "estimation.calibration.pair_m": 0.05,
+    "estimation.calibration.pair_rad": 1e-4,
+    "estimation.calibration.pair_s": 5.0,
+    "estimation.calibration.gate_sigma": 0.3,
+    "estimation.calibration.edge_m": 100.0,
+    "estimation.calibration.floor": 0.01,
+    "estimation.plausibility.min_gain": 1.5,
+    "estimation.plausibility.max_gain": 0.6,
+    "sampling.max_std_m": 0.8,
+}
+# What an option needs beside it to do anything.
+WITH: dict[str, dict[str, Any]] = {
+    "estimation.recursive.": {"estimation.estimator": "rls", "estimation.mass": "estimated"},
+    "estimation.kalman.scale_": {"estimation.mass": "estimated"},
+}
+# Tested on their own below.
+ELSEWHERE = {"sampling.history_s", "localisation.sensing.turn_radps"}  # the latter in test_agents_turns.py
+
+
+def options_of(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Every plain option of a nested dataclass, by dotted name, with its default."""
+    found: dict[str, Any] = {}
+    for f in fields(config):
+        value = getattr(config, f.name)
+        found |= (
+            options_of(value, f"{prefix}{f.name}.")
+            if hasattr(value, "__dataclass_fields__")
+            else {f"{prefix}{f.name}": value}
+        )
+    return found
+
+
+def changed(config: Any, dotted: str, value: Any) -> Any:
+    head, _, rest = dotted.partition(".")
+    return replace(config, **{head: changed(getattr(config, head), rest, value) if rest else value})
+
+
+OPTIONS = options_of(PipelineConfig())
+
+
+# Positions matter little for the options of estimation: the cheaper filter saves time.
+CHEAP = PipelineConfig(localisation=LocalisationConfig(filter="ekf", step_s=0.1))
+
+
+def config_for(name: str) -> PipelineConfig:
+    """What an option is tried on: with what it needs."""
+    config = CHEAP
+    for prefix, needed in WITH.items():
+        if name.startswith(prefix):
+            for option, value in needed.items():
+                config = changed(config, option, value)
+    return config
+
+
+# --- a loader at work, with all that keeps resistance from being known -----------------------------------------------
+
+# Where the machine starts, and not where it goes.
+PAD = KnownGround("pad", 0.03, ((-30.0, -30.0), (20.0, -30.0), (20.0, 70.0), (-30.0, 70.0)))
+
+
+def worker() -> MachineConfig:
+    of = machine(wheelbase_m=3.3, axle_stiffness_npm=1.8e6, cog_height_m=1.05, payload_x_m=4.7, payload_z_m=0.85)
+    return replace(of, sensors=(*of.sensors, SensorConfig("scale", "payload")))
+
+
+@cache
+def work() -> tuple[Reading, ...]:
+    """40 s: there and back on two grounds, empty and loaded, with every trouble for a moment.
+
+    Half of the readings of IMU and torque are enough here, and save time.
+    """
+    of = worker()
+    cycle = (Leg(2, 1.0), Leg(5), Leg(1, -2.0), Leg(3.5), Leg(2, -1.0), Leg(4), Leg(2, 1.0))
+    legs = [Leg(1), *cycle, Leg(0.5), *(replace(leg, payload_kg=3000) for leg in cycle)]
+    firm, soft = (drive(legs, of, ground=Ground(c_rr, 0.02)) for c_rr in (0.03, 0.09))
+    mixed = [a if seconds(a) % 20 < 5 else b for a, b in zip(firm.readings, soft.readings, strict=True)]
+    heard = [r for r in mixed if not (isinstance(r, Imu | Torque) and r.stamp_ns % 20_000_000)]
+    return tuple(troubled(r, of) for r in noisy(heard, 1) if not (isinstance(r, Torque) and 6.2 < seconds(r) < 6.9))
+
+
+def seconds(reading: Reading) -> float:
+    return (reading.stamp_ns - START_NS) * 1e-9
+
+
+def troubled(reading: Reading, of: MachineConfig) -> Reading:
+    """A share of 1.8, a bucket that digs, a torque that is stuck; a slip and a change of slope."""
+    t, full_nm = seconds(reading), of.mass_kg * GRAVITY_MPS2 * of.wheel_radius_m
+    if isinstance(reading, Torque):
+        if 3.6 < t < 4.0:
+            return replace(reading, torque_nm=1.8 * full_nm)
+        if 7.2 < t < 7.4:
+            return replace(reading, torque_nm=0.6 * full_nm)
+        if 34.6 < t < 38.5:
+            return replace(reading, torque_nm=-0.08 * full_nm)
+    elif isinstance(reading, Imu):
+        if 4.4 < t < 5.0:
+            return replace(reading, force_x_mps2=reading.force_x_mps2 + 2.0)
+        if 5.6 < t < 6.0:
+            return replace(reading, gyro_y_radps=reading.gyro_y_radps - 0.04)
+        if 35.2 < t < 37.0:
+            return replace(reading, force_x_mps2=reading.force_x_mps2 - 0.35)
+    return reading
+
+
+def run_work(config: PipelineConfig, of: MachineConfig | None = None) -> tuple[bytes, Any]:
+    """Samples and health."""
+    pipeline = Pipeline(replace(SITE, known_ground=(PAD,)), of or worker(), config)
+    return pipeline.step(work()).tobytes() + pipeline.finish().tobytes(), pipeline.health()
+
+
+@cache
+def work_as_it_is(name: str) -> tuple[bytes, Any]:
+    """With what an option of this name needs."""
+    return run_work(config_for(name))
+
+
+def test_work_has_every_reason_to_withhold_resistance() -> None:
+    _, health = work_as_it_is("")
+    found = {*health["without_resistance"], *health["withheld"]}
+    assert found >= {"torque_implausible", "digging", "slip", "pitch_transient", "no_torque", "torque_frozen"}
+    assert health["ground"]["calibration"]["known_ground"] > 0
+    assert health["ground"]["calibration"]["pairs"] > 0
+    assert health["ground"]["payload_kg"] == 3000
+
+
+def test_every_table_of_options_is_covered() -> None:
+    assert {name.rsplit(".", 1)[0] for name in OPTIONS if "." in name} == {
+        "localisation",
+        "localisation.motion",
+        "localisation.sensing",
+        "localisation.fusion",
+        "estimation",
+        "estimation.attitude",
+        "estimation.calibration",
+        "estimation.kalman",
+        "estimation.plausibility",
+        "estimation.recursive",
+        "sampling",
+    }
+    assert len(OPTIONS) > 80
+    assert set(VALUES) | ELSEWHERE <= set(OPTIONS)
+    assert all(any(name.startswith(prefix) for name in OPTIONS) for prefix in WITH)
+
+
+def other_value(name: str) -> Any:
+    value = VALUES.get(name, type(OPTIONS[name])(2 * OPTIONS[name]))
+    assert value != OPTIONS[name]
+    return value
+
+
+@pytest.mark.parametrize("name", sorted(n for n in set(OPTIONS) - ELSEWHERE if not n.startswith("estimation.")))
+def test_option_changes_samples_or_health(
+    of: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any], name: str
+) -> None:
+    assert run(of, recorded, changed(PipelineConfig(), name, other_value(name))) != base
+
+
+@pytest.mark.parametrize("name", sorted(n for n in set(OPTIONS) - ELSEWHERE if n.startswith("estimation.")))
+def test_option_of_estimation_changes_samples_or_health_of_work(name: str) -> None:
+    needed = next((prefix for prefix in WITH if name.startswith(prefix)), "")
+    assert run_work(changed(config_for(name), name, other_value(name))) != work_as_it_is(needed)
+
+
+def test_poses_are_remembered_for_history_s() -> None:
+    of = machine()
+    made = drive(S_BEND, of)
+    for history_s, known in ((3.0, False), (30.0, True)):
+        pipeline = Pipeline(SITE, of, changed(PipelineConfig(), "sampling.history_s", history_s))
+        pipeline.step(made.readings)
+        assert bool(pipeline.pose_at(START_NS + 20 * SECOND)) is known
+
+
+@pytest.mark.parametrize(("name", "value"), [("gap_s", 0.0), ("late_s", -0.1)])
+def test_bad_pipeline_option_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        PipelineConfig(**{name: value})
+
+
+# --- every option of the machine and its sensors ---------------------------------------------------------------------
+
+BODY = {
+    "mass_kg": 20_000.0,
+    "wheel_radius_m": 0.8,
+    "load_centre_m": 0.5,
+    "rotating_mass_factor": 1.2,
+    "wheelbase_m": 2.5,
+    "axle_stiffness_npm": 1e6,
+    "cog_height_m": 2.0,
+    "payload_x_m": 3.0,
+    "payload_z_m": 3.0,
+}
+SENSOR = [
+    ("gps-1", {"mount": Mount((5.0, 0.0, 3.35))}),
+    ("gps-1", {"use": False}),
+    ("gps-1", {"delay_s": 0.3}),
+    ("gps-1", {"gate_sigma": 0.3}),
+    ("imu-3", {"gate_sigma": 0.2}),
+    ("wheels", {"gate_sigma": 0.2}),
+    ("gps-1", {"drift_share": 0.1}),
+    ("gps-1", {"drift_time_s": 10.0}),
+    ("wheels", {"ticks_per_rev": 105}),
+    ("wheels", {"use": False}),
+    ("imu-3", {"mount": Mount((0.4, 0.0, 0.9), (0.0, 3.0, 0.0))}),
+    ("imu-3", {"use": False}),
+    ("imu-3", {"frame": FRONT}),
+    ("imu-3", {"gives": ("rate",)}),
+    ("torque", {"use": False}),
+    ("gps-1", {"std": {"position": 5.0}}),
+    ("imu-3", {"std": {"rate": 0.05}}),
+    ("imu-3", {"std": {"force": 9.0}}),
+    ("wheels", {"std": {"speed": 0.5}}),
+    ("gps-2", {"mode": "differential"}),
+    ("gps-2", {"mode": "relative"}),
+]
+
+
+def test_every_field_of_machine_and_sensor_is_covered() -> None:
+    assert {f.name for f in fields(MachineConfig)} == {"name", "sensors", *BODY}
+    covered = {name for _, options in SENSOR for name in options}
+    assert {f.name for f in fields(SensorConfig)} == {"name", "kind", *covered}
+    assert {f.name for f in fields(Mount)} == {"xyz_m", "rpy_deg"}
+
+
+@pytest.mark.parametrize("name", sorted(BODY))
+def test_option_of_the_body_changes_the_samples(name: str) -> None:
+    assert run_work(CHEAP, replace(worker(), **{name: BODY[name]}))[0] != work_as_it_is("")[0]
+
+
+@pytest.mark.parametrize(("sensor", "options"), SENSOR)
+def test_option_of_a_sensor_changes_the_samples(
+    of: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any], sensor: str, options: dict[str, Any]
+) -> None:
+    assert run(changed_sensor(of, sensor, **options), recorded)[0] != base[0]
+
+
+def test_sensor_that_is_not_used_is_as_if_it_were_not_there(of: MachineConfig, recorded: list[Reading]) -> None:
+    unused = run(changed_sensor(of, "gps-2", use=False), recorded)
+    without = replace(of, sensors=tuple(s for s in of.sensors if s.name != "gps-2"))
+    assert unused[0] == run(without, [r for r in recorded if r.sensor != "gps-2"])[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"name": "No"}, "name"),
+        ({"kind": "sonar"}, "kind"),
+        ({"drift_share": 1.1}, "drift_share"),
+        ({"drift_time_s": 0.0}, "drift_time_s"),
+        ({"ticks_per_rev": 0}, "ticks_per_rev"),
+    ],
+)
+def test_bad_sensor_option_is_refused_by_name(options: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        SensorConfig(**{"name": "a", "kind": "gps", **options})
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"name": ""}, "name"),
+        *(({name: 0.0}, name) for name in ("mass_kg", "wheel_radius_m")),
+        ({"rotating_mass_factor": 0.9}, "rotating_mass_factor"),
+        ({"sensors": (SensorConfig("a", "imu"), SensorConfig("a", "gps"))}, "sensors"),
+    ],
+)
+def test_bad_machine_option_is_refused_by_name(options: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        MachineConfig(**{"name": "a", **options})

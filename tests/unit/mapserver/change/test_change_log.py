@@ -1,0 +1,146 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapserver.change.change_log import Change, ChangeWatch
+from mapserver.change.detection import ChangeConfig
+from mapserver.change.validity import around
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.votes import FoldConfig
+from mapserver.layers.cell_layers import ReadConfig
+from tests.unit.mapserver.data import NOW_NS, samples
+
+HOUR_NS = 3600 * 10**9
+
+
+def sweep(west: int, south: int, east: int, north: int, c_rr: float, hour: float, grade: float = 0.0):
+    """A pass over every metre of a rectangle, a second each."""
+    x, y = (v.ravel() + 0.5 for v in np.meshgrid(np.arange(west, east), np.arange(south, north)))
+    stamps = NOW_NS + int(hour * HOUR_NS) + np.arange(len(x)) * 10**8
+    return samples(len(x), x_m=x, y_m=y, c_rr=c_rr, grade_e=grade, grade_n=0.0, stamp_ns=stamps, cov_xx_m2=0.25)
+
+
+def look(watch: ChangeWatch, grid: Grid, most: int = 1000) -> list[Change]:
+    found, blocks = [], grid.take_touched(most)
+    while blocks:
+        wide = sorted({near for block in blocks for near in around(block, 1)})
+        pages = {block: p for block, p in zip(wide, grid.pages(wide), strict=True) if p}
+        found += watch.look(blocks, pages)
+        blocks = grid.take_touched(most)
+    return found
+
+
+def watched(known=(), **options) -> ChangeWatch:
+    return ChangeWatch(1.0, ChangeConfig(**options), ReadConfig(), known)
+
+
+@pytest.fixture
+def repaved() -> Grid:
+    """40 x 40 m of wet dirt, driven twice; a part of it is gravel an hour later."""
+    grid = Grid(1.0, FoldConfig())
+    for hour in (0, 1):
+        grid.fold(sweep(0, 0, 40, 40, 0.06, hour), "a")
+    grid.fold(sweep(10, 10, 30, 25, 0.02, 2), "b")
+    return grid
+
+
+def test_ground_that_stays_as_it_is_does_not_change():
+    grid, watch = Grid(1.0, FoldConfig()), watched()
+    for hour in range(4):
+        grid.fold(sweep(0, 0, 40, 40, 0.06, hour), "a")
+        assert look(watch, grid) == []
+
+
+def test_a_change_says_where_when_and_from_what_to_what(repaved):
+    (change,) = look(watched(), repaved)
+    west, south, east, north = change.bounds
+    assert abs(np.array([west - 10, south - 10, east - 30, north - 25])).max() <= 2
+    assert 200 < change.cells < 400
+    assert NOW_NS + HOUR_NS < change.first_ns <= change.last_ns < NOW_NS + 2 * HOUR_NS + 300 * 10**9
+    assert change.resistance_before == pytest.approx(0.06, rel=0.05)
+    assert change.resistance_after == pytest.approx(0.02, rel=0.05)
+
+
+def test_a_change_is_told_once(repaved):
+    watch = watched()
+    assert len(look(watch, repaved)) == 1
+    repaved.touch_all()
+    assert look(watch, repaved) == []
+    repaved.fold(sweep(10, 10, 30, 25, 0.02, 3), "b")
+    assert [c.id for c in look(watch, repaved)] in ([], [1])  # a few cells at its edge may be new
+
+
+def test_a_change_grows_while_machines_pass():
+    grid, watch = Grid(1.0, FoldConfig()), watched()
+    for hour in (0, 1):
+        grid.fold(sweep(0, 0, 60, 20, 0.06, hour), "a")
+    look(watch, grid)
+    grid.fold(sweep(0, 0, 20, 20, 0.02, 2), "b")
+    (first,) = look(watch, grid)
+    grid.fold(sweep(20, 0, 40, 20, 0.02, 2.5), "b")
+    found = look(watch, grid)
+    assert {change.id for change in found} == {first.id}
+    assert found[-1].cells > 1.5 * first.cells
+    assert found[-1].bounds[2] > 35
+    assert [c.id for c in watch.changes()] == [first.id]
+
+
+def test_changes_far_apart_are_two(repaved):
+    for hour in (0, 1):
+        repaved.fold(sweep(200, 200, 220, 220, 0.008, hour), "a")
+    repaved.fold(sweep(200, 200, 220, 220, 0.06, 2), "b")
+    watch = watched()
+    assert sorted(change.id for change in look(watch, repaved)) == [1, 2]
+    assert [change.id for change in watch.changes(after=1)] == [2]
+
+
+def test_a_second_change_of_the_same_ground_much_later_is_another(repaved):
+    watch = watched()
+    look(watch, repaved)
+    for hour in (30, 31):
+        repaved.fold(sweep(10, 10, 30, 25, 0.25, hour), "b")
+    found = look(watch, repaved)
+    assert {change.id for change in found} == {2}
+    assert found[-1].resistance_before == pytest.approx(0.02, rel=0.3)
+    assert found[-1].resistance_after == pytest.approx(0.25, rel=0.1)
+
+
+def test_a_change_of_the_slope_alone_is_a_change():
+    grid = Grid(1.0, FoldConfig())
+    for hour in (0, 1):
+        grid.fold(sweep(0, 0, 30, 30, 0.04, hour), "a")
+    grid.fold(sweep(0, 0, 30, 30, 0.04, 2, grade=0.2), "a")
+    (change,) = look(watched(), grid)
+    assert change.grade_before == pytest.approx(0.0, abs=0.01)
+    assert change.grade_after == pytest.approx(0.2, abs=0.01)
+
+
+def test_looking_at_a_few_blocks_at_a_time_finds_the_same_area(repaved):
+    whole = watched()
+    look(whole, repaved)
+    repaved.touch_all()
+    pieces = watched()
+    look(pieces, repaved, most=1)
+    assert [replace(c, resistance_before=None, resistance_after=None) for c in whole.changes()] == [
+        replace(c, resistance_before=None, resistance_after=None) for c in pieces.changes()
+    ]
+
+
+def test_after_a_restart_nothing_is_told_again(repaved):
+    watch = watched()
+    look(watch, repaved)
+    again = watched([change.values for change in watch.changes()])
+    repaved.touch_all()
+    assert look(again, repaved) == []
+    assert again.changes() == watch.changes()
+
+
+def test_without_detection_nothing_changes(repaved):
+    assert look(watched(detect=False), repaved) == []
+
+
+def test_values_are_plain_and_come_back(repaved):
+    (change,) = look(watched(), repaved)
+    assert Change.of(change.values) == change
+    assert all(type(v) in (int, float, list, type(None)) for v in change.values.values())

@@ -1,0 +1,239 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapserver.change.detection import ChangeConfig, credible, cuts, kinds
+from mapserver.evidence import cells as ev
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.timeline import TimedPage
+from mapserver.evidence.votes import FoldConfig
+from protocol.arrays import Bools, Floats, Ints
+from tests.unit.mapserver.data import NOW_NS, samples
+
+CONFIG = ChangeConfig()
+HOUR_NS = 3600 * 10**9
+CENTRES = np.arange(16) + 0.5
+BIN = float(np.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0]))
+
+
+def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise: float = 0.0) -> list[TimedPage]:
+    """Pages of one block that is driven all over once an hour, with the ground as given."""
+    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
+    grid, draw = Grid(1.0, FoldConfig(keep_buckets=100)), np.random.default_rng(1)
+    for hour, ground in enumerate(grounds):
+        values = ground * np.exp(noise * draw.normal(size=256)) if column == "c_rr" else ground
+        usual = {"x_m": x, "y_m": y, "stamp_ns": NOW_NS + hour * HOUR_NS, "distance_m": distance_m}
+        grid.fold(samples(256, **usual | {column: values, "cov_xx_m2": 0, "cov_yy_m2": 0}), "a")
+    return grid.pages([(0, 0)])[0]
+
+
+def firsts(pages: list[TimedPage], config: ChangeConfig = CONFIG) -> Ints:
+    return np.unique(cuts(pages, config).first)
+
+
+# --- one block -------------------------------------------------------------------------------------------------------
+
+
+def test_ground_that_stays_as_it_is_keeps_all_its_evidence():
+    assert firsts(passes(0.04, 0.04, 0.04)) == [0]
+    assert firsts(passes(*[0.04] * 6, noise=0.05)) == [0]
+
+
+@pytest.mark.parametrize("old", [1, 3, 6])
+def test_ground_that_changed_is_seen_after_one_pass(old):
+    assert firsts(passes(*[0.04] * old, 0.2)) == [old]
+
+
+@pytest.mark.parametrize("column", ["c_rr", "grade_e", "grade_n"])
+def test_every_kind_of_vote_tells_a_change(column):
+    old, new = (0.04, 0.2) if column == "c_rr" else (0.1, -0.2)
+    assert firsts(passes(old, old, new, new, column=column)) == [2]
+
+
+def test_of_two_changes_the_last_counts():
+    assert firsts(passes(0.04, 0.04, 0.2, 0.2, 0.01, 0.01)) == [4]
+    assert firsts(passes(0.04, 0.04, 0.2, 0.2, 0.04)) == [4]
+    assert firsts(passes(0.04, 0.2, 0.01)) == [2]
+
+
+def test_the_later_of_a_change_of_resistance_and_one_of_grade_counts():
+    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
+    for order in ([("c_rr", 0.2), ("grade_e", -0.3)], [("grade_e", -0.3), ("c_rr", 0.2)]):
+        ground = {"c_rr": 0.04, "grade_e": 0.1}
+        grid = Grid(1.0, FoldConfig(keep_buckets=100))
+        for hour, change in enumerate([(), (), order[0], (), order[1], ()]):
+            ground |= dict([change]) if change else {}
+            rows = samples(256, x_m=x, y_m=y, stamp_ns=NOW_NS + hour * HOUR_NS, cov_xx_m2=0, cov_yy_m2=0, **ground)
+            grid.fold(rows, "a")
+        assert firsts(grid.pages([(0, 0)])[0]) == [4]
+
+
+def test_one_page_or_none_has_no_change():
+    assert cuts([], CONFIG).first.tolist() == [0] * 256
+    assert firsts(passes(0.2)) == [0]
+
+
+def test_cells_change_each_on_their_own():
+    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
+    grid = Grid(1.0, FoldConfig())
+    for hour in range(3):
+        c_rr = np.where((x > 8) & (hour == 2), 0.2, 0.04)
+        rows = samples(256, x_m=x, y_m=y, stamp_ns=NOW_NS + hour * HOUR_NS, cov_xx_m2=0, cov_yy_m2=0, c_rr=c_rr)
+        grid.fold(rows, "a")
+    first = cuts(grid.pages([(0, 0)])[0], CONFIG).first.reshape(16, 16)
+    assert (first[:, 8:] == 2).all()
+    assert (first[:, :8] == 0).all()
+
+
+def bin_of(c_rr: float) -> float:
+    """Place of a coefficient on the axis of bins."""
+    return float(np.log(c_rr / ev.RESISTANCE_CENTRES[0])) / BIN
+
+
+def test_the_kind_of_a_change_is_the_ground_after_it():
+    pages = passes(0.04, 0.04, 0.2, 0.2, 0.01)
+    assert np.allclose(cuts(pages, CONFIG).kind, bin_of(0.01), atol=0.6)
+    assert np.isnan(cuts(passes(0.04, 0.04), CONFIG).kind).all()
+    assert np.isnan(cuts(passes(0.1, -0.2, column="grade_e"), CONFIG).kind).all()
+
+
+def test_the_kind_of_a_cell_is_the_median_of_all_its_votes():
+    assert np.allclose(kinds(passes(0.04, 0.04, 0.2)), bin_of(0.04), atol=0.6)
+    assert np.isnan(kinds([])).all()
+    assert np.isnan(kinds(passes(0.1, column="grade_e")[:0])).all()
+
+
+# --- options ---------------------------------------------------------------------------------------------------------
+
+
+def test_detect_off_keeps_everything():
+    assert firsts(passes(0.04, 0.2), replace(CONFIG, detect=False)) == [0]
+
+
+def test_medians_nearer_than_bins_are_no_change():
+    pages = passes(0.04, 0.04 * np.exp(2.5 * BIN))
+    assert firsts(pages, replace(CONFIG, bins=2.4)) == [1]
+    assert firsts(pages, replace(CONFIG, bins=2.6)) == [0]
+
+
+def test_a_cell_on_a_border_that_was_repaved_with_something_between_is_changed():
+    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
+    grid = Grid(1.0, FoldConfig())
+    between = float(np.sqrt(0.02 * 0.2))
+    for hour, grounds in enumerate([{0.02: 0.55, 0.2: 0.45}, {between: 1.0}]):
+        for c_rr, distance_m in grounds.items():
+            stamp_ns = NOW_NS + hour * HOUR_NS
+            rows = samples(256, x_m=x, y_m=y, stamp_ns=stamp_ns, c_rr=c_rr, distance_m=distance_m, cov_xx_m2=0)
+            rows["cov_yy_m2"] = 0
+            grid.fold(rows, "a")
+    assert firsts(grid.pages([(0, 0)])[0]) == [1]
+
+
+def test_histograms_that_have_more_in_common_than_variation_are_no_change():
+    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
+    grid = Grid(1.0, FoldConfig())
+    for hour, distances in enumerate(((0.8, 0.2), (0.1, 0.9))):  # metres of 0.04 and of 0.2: 0.7 of them differ
+        for c_rr, distance_m in zip((0.04, 0.2), distances, strict=True):
+            stamp_ns = NOW_NS + hour * HOUR_NS
+            rows = samples(256, x_m=x, y_m=y, stamp_ns=stamp_ns, c_rr=c_rr, distance_m=distance_m, cov_xx_m2=0)
+            rows["cov_yy_m2"] = 0
+            grid.fold(rows, "a")
+    pages = grid.pages([(0, 0)])[0]
+    assert firsts(pages, replace(CONFIG, variation=0.65)) == [1]
+    assert firsts(pages, replace(CONFIG, variation=0.75)) == [0]
+
+
+@pytest.mark.parametrize("distances", [(0.25, 2.0), (2.0, 0.25)])
+def test_less_evidence_than_weight_on_either_side_is_no_change(distances):
+    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
+    grid = Grid(1.0, FoldConfig())
+    for hour, (c_rr, distance_m) in enumerate(zip((0.04, 0.2), distances, strict=True)):
+        stamp_ns = NOW_NS + hour * HOUR_NS
+        rows = samples(256, x_m=x, y_m=y, stamp_ns=stamp_ns, c_rr=c_rr, distance_m=distance_m, cov_xx_m2=0)
+        rows["cov_yy_m2"] = 0
+        grid.fold(rows, "a")
+    pages = grid.pages([(0, 0)])[0]
+    assert firsts(pages, replace(CONFIG, weight_m=0.2)) == [1]
+    assert firsts(pages, replace(CONFIG, weight_m=0.3)) == [0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("variation", 0.0), ("variation", 1.0), ("bins", 0.0), ("weight_m", -1.0), ("size_m", 0.0), ("size_m", np.nan)],
+)
+def test_bad_option_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=name):
+        ChangeConfig(**{name: value})
+
+
+# --- areas -----------------------------------------------------------------------------------------------------------
+
+# Ground of bin 10 in 80 x 80 cells, of which some are changed to bin 15.
+OLD, NEW = 10.0, 15.0
+
+
+def square(width: int, height: int | None = None, column: int = 32, row: int = 30) -> Bools:
+    image: Bools = np.zeros((80, 80), np.bool_)
+    image[row : row + (width if height is None else height), column : column + width] = True
+    return image
+
+
+def counts(changed: Bools, kind: float = NEW, beside: Bools | None = None, cell_m: float = 1.0, size_m: float = 5.0):
+    """What is credible of an area that changed to a kind, with ground that always was `NEW` somewhere beside it."""
+    now: Floats = np.full(changed.shape, OLD)
+    now[changed if beside is None else changed | beside] = NEW
+    kinds = np.where(changed, kind, np.nan)
+    return credible(changed, kinds, now, cell_m, replace(CONFIG, size_m=size_m))
+
+
+@pytest.mark.parametrize("edge", [1, 2, 3, 4, 5, 10])
+def test_an_area_of_the_least_size_is_kept_as_it_is(edge):
+    assert np.array_equal(counts(square(edge), size_m=float(edge)), square(edge))
+    assert np.array_equal(counts(square(2 * edge), kind=np.nan, size_m=float(edge)), square(2 * edge))
+
+
+@pytest.mark.parametrize("edge", [2, 3, 4, 5, 10])
+def test_an_area_narrower_than_the_least_size_is_left_out(edge):
+    for strip in (square(edge - 1, 3 * edge), square(3 * edge, edge - 1)):
+        assert not counts(strip, size_m=float(edge)).any()
+
+
+@pytest.mark.parametrize("width", [5, 9])
+@pytest.mark.parametrize("gap", [0, 3])
+def test_a_strip_of_the_kind_of_the_ground_beside_is_a_border_that_moved(width, gap):
+    beside = square(20, 40, 32 + width + gap)
+    strip = square(width, 40)
+    assert not counts(strip, beside=beside).any()
+    assert not counts(strip.T, beside=beside.T).any()
+    assert np.array_equal(counts(strip), strip)  # and without that ground, it is new
+    assert np.array_equal(counts(strip, beside=square(20, 40, 32 + width + 11)), strip)  # nor if that is far
+
+
+def test_an_area_twice_as_wide_is_believed_beside_its_like_too():
+    beside = square(20, 40, 42)
+    assert np.array_equal(counts(square(10, 40), beside=beside), square(10, 40))
+    assert not counts(square(9, 40), beside=beside).any()
+
+
+def test_a_change_without_resistance_must_be_twice_as_wide():
+    assert not counts(square(9), kind=np.nan).any()
+    assert np.array_equal(counts(square(10), kind=np.nan), square(10))
+
+
+def test_size_is_in_metres():
+    assert counts(square(6), cell_m=1.0, size_m=3.0).any()
+    assert not counts(square(6), cell_m=0.4, size_m=3.0).any()  # 8 cells, and 6 are too few
+    assert counts(square(1), cell_m=5.0, size_m=3.0).sum() == 1  # never less than a cell
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 75), (75, 0), (75, 75), (20, 75)])
+def test_an_area_at_the_images_border_is_kept_and_what_is_cut_by_it_is_not_guessed(row, column):
+    area = square(5, 5, column, row)
+    assert np.array_equal(counts(area), area)
+    assert not counts(square(4, 4, min(column, 76), min(row, 76))).any()
+
+
+def test_nothing_changed_and_nothing_known_is_nothing():
+    nothing, unknown = square(0), np.full((80, 80), np.nan)
+    assert not credible(nothing, unknown, unknown, 1.0, CONFIG).any()

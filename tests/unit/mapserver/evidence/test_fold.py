@@ -1,0 +1,467 @@
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapserver.evidence import cells as ev
+from mapserver.evidence.fold import fold_numpy, kernel
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.votes import TABLE, TABLE_LAST, FoldConfig, prepare, split_grade, split_resistance
+from protocol.errors import MessageError
+from protocol.machine.samples import check_samples
+from protocol.site.ground_classes import ZONES
+from tests.unit.mapserver.data import APART, NOW_NS, filled_to, folded, merged, random_samples, same, samples, total
+
+UNITS = ev.WEIGHT_UNITS_PER_M
+KERNELS = ("numpy", "numba")
+HOUR_NS = 3600 * 10**9
+
+
+def weight_of(grid: Grid, block: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Weight of a block's cells (rows, columns)."""
+    return grid.evidence([block]).weight[0].reshape(16, 16)
+
+
+def cell_count(grid: Grid) -> int:
+    """Largest count of any cell in any of its votes."""
+    return max(int(at.page.votes["count"].max()) for at in grid.state().pages)
+
+
+# --- weights ---------------------------------------------------------------------------------------------------------
+
+metres = st.floats(-20_000, 20_000)
+deviation = st.floats(0, 2.1)  # at most 3 m along any direction
+
+
+@settings(max_examples=60)
+@given(metres, metres, deviation, deviation, st.floats(-1, 1), st.floats(0, 100), st.sampled_from([0.25, 1.0, 100.0]))
+def test_weights_of_a_sample_sum_exactly_to_its_weight(x, y, std_x, std_y, correlation, distance, cell_m):
+    covariance = {"cov_xx_m2": std_x**2, "cov_yy_m2": std_y**2, "cov_xy_m2": 0.999 * correlation * std_x * std_y}
+    rows = samples(x_m=x, y_m=y, distance_m=distance, **covariance)
+    weight = round(float(rows["distance_m"][0]) * UNITS)
+    for name in KERNELS:
+        counts = total(folded(rows, cell_m=cell_m, kernel=name))
+        for votes in (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH, ev.HEADING):
+            assert counts[votes].sum() == weight, name
+
+
+# Rows of every kind that the door admits: what is unknown, what stands still, what is nowhere, what is at a border.
+edge = st.sampled_from([-32.0, -16.0, -0.5, 0.0, 7.5, 15.999, 16.0])
+wide = st.one_of(st.floats(-40, 40), edge)
+unknown = st.just(np.nan)
+sample = st.fixed_dictionaries({
+    "x_m": wide,
+    "y_m": wide,
+    "std_x": st.one_of(st.floats(0, 2.9), st.just(1000.0)),
+    "std_y": st.one_of(st.floats(0, 2.9), st.just(1000.0)),
+    "correlation": st.floats(-1, 1),
+    "distance_m": st.one_of(st.floats(0, 100), st.sampled_from([0.0, 1e-5, 0.5 / UNITS, 1.5 / UNITS, 100.0])),
+    "c_rr": st.one_of(st.floats(-1, 5, width=32), st.floats(0, 0.5, width=32), unknown),
+    "grade_e": st.one_of(st.floats(-5, 5, width=32), st.floats(-0.625, 0.625, width=32), unknown),
+    "heading_rad": st.floats(-7, 7, width=32),
+    "stamp_ns": st.integers(NOW_NS - 5 * HOUR_NS, NOW_NS + 5 * HOUR_NS),
+})  # fmt: skip
+
+
+def admitted(drawn: list[dict[str, float]], shrunk: float = 1.0):
+    """Samples as drawn, their standard deviations made smaller; the door admits every one of them."""
+    column = {name: np.array([one[name] for one in drawn]) for name in drawn[0]}
+    x, y = column.pop("std_x") * shrunk, column.pop("std_y") * shrunk
+    column["cov_xy_m2"] = 0.999 * column.pop("correlation") * x * y
+    rows = samples(len(drawn), cov_xx_m2=x * x, cov_yy_m2=y * y, grade_n=-0.7 * column["grade_e"], **column)
+    rows["c_rr_var"] = np.where(np.isnan(rows["c_rr"]), np.nan, 1e-4)
+    rows["grade_var"] = np.where(np.isnan(rows["grade_e"]), np.nan, 1e-4)
+    check_samples(rows, 20_000.0)
+    return rows
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(sample, min_size=1, max_size=10),
+    st.sampled_from([0.25, 0.5, 1.0, 7.3, 100.0]),
+    st.integers(1, 8),
+    st.integers(1, 8),
+)
+def test_both_kernels_agree_to_the_bit(drawn, cell_m, hot_numpy, hot_numba):
+    rows = admitted(drawn)
+    numpy = folded(rows, cell_m=cell_m, kernel="numpy", hot_blocks=hot_numpy)
+    assert same(numpy, folded(rows, cell_m=cell_m, kernel="numba", hot_blocks=hot_numba))
+    assert numpy.folded + numpy.skipped == len(rows)
+
+
+@settings(max_examples=6)
+@given(st.lists(sample, min_size=1, max_size=5), st.integers(1, 8))
+def test_both_kernels_agree_on_small_cells(drawn, hot_blocks):
+    rows = admitted(drawn, shrunk=0.1)
+    assert same(*(folded(rows, cell_m=0.05, kernel=name, hot_blocks=hot_blocks) for name in KERNELS))
+
+
+def test_both_kernels_agree_on_a_stencil_of_many_blocks():
+    rows = samples(2, x_m=[3.3, -8.1], cov_xx_m2=6.0, cov_yy_m2=2.9, cov_xy_m2=3.0, distance_m=100.0)
+    numpy = folded(rows, cell_m=0.2, kernel="numpy", hot_blocks=1)
+    assert same(numpy, folded(rows, cell_m=0.2, kernel="numba", hot_blocks=1))
+    assert len(numpy.state().pages) > 16
+    assert total(numpy)[ev.HEADING].sum() == 2 * 100 * UNITS
+
+
+@pytest.mark.parametrize("cell_m", [0.25, 1.0, 100.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_both_kernels_agree_all_over_a_site(seed, cell_m):
+    rows = random_samples(150, seed)
+    rows["distance_m"][:10] = 0.0
+    assert same(*(folded(rows, cell_m=cell_m, kernel=name) for name in KERNELS))
+
+
+def test_weight_falls_off_with_the_covariance():
+    rows = samples(cov_xx_m2=1.0, cov_yy_m2=0.04, distance_m=100.0)
+    weight = weight_of(folded(rows)).astype(float)
+    middle = weight[8, 8]
+    assert weight[8, 9] / middle == pytest.approx(np.exp(-0.5 / 1.09), rel=0.01)  # one metre off, variance 1 + 0.3**2
+    assert weight[9, 8] / middle == pytest.approx(np.exp(-0.5 / 0.13), rel=0.02)
+    assert weight[8, 7] == weight[8, 9]
+    assert weight[7, 8] == weight[9, 8]
+
+
+def test_correlation_turns_the_spread():
+    rows = samples(cov_xx_m2=1.0, cov_yy_m2=1.0, cov_xy_m2=0.9, distance_m=100.0)
+    weight = weight_of(folded(rows))
+    assert weight[9, 9] == weight[7, 7] > 10 * weight[9, 7]
+    assert weight[9, 7] == weight[7, 9]
+
+
+def test_a_parked_machine_has_no_vote():
+    grid = folded(samples(5, distance_m=0.0))
+    assert grid.known_cells() == 0
+    assert not total(grid).any()
+    assert not grid.state().pages
+
+
+def test_position_in_a_cell_decides_where_the_votes_go():
+    grid = folded(samples(2, x_m=[-0.5, 0.5], y_m=[-0.5, 0.5], distance_m=10.0))
+    south_west, north_east = grid.evidence([(-1, -1), (0, 0)]).weight
+    assert (south_west.argmax(), north_east.argmax()) == (15 * 16 + 15, 0)
+
+
+# --- order and batching ----------------------------------------------------------------------------------------------
+
+
+def spread_in_time(n: int, seed: int):
+    """Samples of a few cells over nine days, so that buckets, hours and days are all summed."""
+    rows = random_samples(n, seed, half_m=4.0)
+    rows["stamp_ns"] += np.random.default_rng(seed).integers(0, 9 * 24, n) * HOUR_NS
+    return rows
+
+
+@pytest.mark.parametrize("name", KERNELS)
+@settings(max_examples=10)
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 80), max_size=5), st.integers(1, 8))
+def test_any_order_any_batching_and_any_space_give_the_same_bits(name, seed, cuts, hot_blocks):
+    rows = spread_in_time(80, 1)
+    whole = folded(rows, kernel=name, keep_buckets=2, keep_hours=2, keep_days=2)
+    assert {at.rung for at in whole.state().pages} == {0, 1, 2, 3}
+    shuffled = rows[np.random.default_rng(seed).permutation(len(rows))]
+    grid = Grid(1.0, FoldConfig(kernel=name, keep_buckets=2, keep_hours=2, keep_days=2, hot_blocks=hot_blocks))
+    for part in np.split(shuffled, sorted(cuts)):
+        grid.fold(part, "a")
+    assert same(grid, whole)
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 120), max_size=4), st.integers(1, 3), st.integers(1, 4))
+def test_any_split_over_grids_put_together_is_the_grid_of_all(seed, cuts, keep, hot_blocks):
+    rows = spread_in_time(120, 2)
+    keeps = {"keep_buckets": keep, "keep_hours": keep, "keep_days": keep}
+    shuffled = rows[np.random.default_rng(seed).permutation(len(rows))]
+    parts = [folded(part, **APART, hot_blocks=hot_blocks) for part in np.split(shuffled, sorted(cuts))]
+    assert same(merged(parts, **keeps), folded(rows, **keeps))
+
+
+@pytest.mark.parametrize("cut", [0, 1, 100, 300])
+def test_two_grids_added_are_the_grid_of_all(cut):
+    rows = random_samples(300, 2)
+    assert same(merged([folded(rows[:cut], **APART), folded(rows[cut:], **APART)]), folded(rows))
+
+
+def test_machines_mix_in_any_order():
+    one, two = random_samples(100, 3), random_samples(100, 4)
+    there, back = Grid(1.0, FoldConfig()), Grid(1.0, FoldConfig())
+    there.fold(one, "a"), there.fold(two, "b")
+    back.fold(two, "b"), back.fold(one, "a")
+    assert same(there, back)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_counts_saturate_instead_of_wrapping(name):
+    rows = samples(3, distance_m=[100.0, 50.0, 75.0], cov_xx_m2=0, cov_yy_m2=0)
+    near_full = filled_to(folded(rows, kernel=name).state(), ev.COUNT_MAX - 1000)
+    grids = []
+    for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
+        grid = Grid.from_state(1.0, FoldConfig(kernel=name), near_full)
+        for i in order:
+            grid.fold(rows[i : i + 1], "a")
+        grids.append(grid)
+    assert cell_count(grids[0]) == ev.COUNT_MAX
+    assert same(grids[0], grids[1])
+    assert same(grids[0], grids[2])
+
+
+def test_saturation_is_the_same_in_both_kernels():
+    rows = samples(50, distance_m=100.0, cov_xx_m2=0.5, cov_yy_m2=0.5)
+    grids = []
+    for name in KERNELS:
+        near_full = filled_to(folded(rows, kernel=name).state(), ev.COUNT_MAX - 5_000_000)
+        grid = Grid.from_state(1.0, FoldConfig(kernel=name), near_full)
+        grid.fold(rows, "a")
+        counts = np.concatenate([at.page.votes["count"] for at in grid.state().pages])
+        assert (counts == ev.COUNT_MAX).any()
+        assert (counts < ev.COUNT_MAX).any()
+        grids.append(grid)
+    assert same(*grids)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize("batch", [1500, 12_000])
+def test_no_count_wraps_before_it_is_packed(name, batch):
+    """Two headings of 6000 samples fit into 32 bits, what they share does not."""
+    n, weight = 12_000, 100 * UNITS
+    heading = np.where(np.arange(n) % 2, np.pi, 0.0)
+    rows = samples(n, distance_m=100.0, cov_xx_m2=0, cov_yy_m2=0, heading_rad=heading, grade_e=0.125, stamp_ns=NOW_NS)
+    grid = Grid(1.0, FoldConfig(kernel=name))
+    for first in range(0, n, batch):
+        grid.fold(rows[first : first + batch], "a")
+        assert grid._hot.load <= ev.COUNT_MAX
+        assert int(grid._hot.counts.sum(axis=(1, 2), dtype=np.int64).max(initial=0)) <= 4 * grid._hot.load
+    counts = total(grid)
+    assert n * weight > ev.COUNT_MAX
+    assert counts[ev.HEADING][[0, 8]].tolist() == [n // 2 * weight] * 2
+    assert counts[ev.GRADE_EAST][20] == counts[ev.GRADE_EAST].sum() == ev.COUNT_MAX
+
+
+# --- what votes for what ---------------------------------------------------------------------------------------------
+
+
+def test_a_sample_without_resistance_votes_for_grade_alone():
+    counts = total(folded(samples(c_rr=np.nan, c_rr_var=np.nan)))
+    assert not counts[ev.RESISTANCE].any()
+    assert counts[ev.GRADE_EAST].sum() == counts[ev.GRADE_NORTH].sum() == counts[ev.HEADING].sum() == UNITS
+
+
+def test_a_sample_without_grade_votes_for_resistance_alone():
+    counts = total(folded(samples(grade_e=np.nan, grade_n=np.nan, grade_var=np.nan)))
+    assert not counts[ev.GRADE_EAST].any()
+    assert not counts[ev.GRADE_NORTH].any()
+    assert counts[ev.RESISTANCE].sum() == UNITS
+
+
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize(("c_rr", "bin_"), [(-0.5, 0), (0.0, 0), (0.004, 0), (0.4, 23), (5.0, 23)])
+def test_resistance_beyond_the_bins_votes_for_the_end(c_rr, bin_, name):
+    counts = total(folded(samples(c_rr=c_rr, cov_xx_m2=0, cov_yy_m2=0, distance_m=4.0), kernel=name))[ev.RESISTANCE]
+    assert counts.argmax() == bin_
+    assert counts[bin_] == counts.sum()
+
+
+@pytest.mark.parametrize(("grade", "bin_"), [(-5.0, 0), (-0.5, 0), (0.0, 16), (0.5, 32), (5.0, 32)])
+def test_grade_votes_lie_on_their_centres(grade, bin_):
+    counts = total(folded(samples(grade_e=grade, grade_n=-grade)))
+    assert counts[ev.GRADE_EAST].argmax() == bin_
+    assert counts[ev.GRADE_NORTH].argmax() == 32 - bin_
+
+
+def test_a_vote_is_split_linearly_between_two_bins():
+    lower, share = split_grade(np.array([0.25 / 32]))
+    assert (lower[0], share[0]) == (16, 64)
+    lower, share = split_resistance(np.sqrt(ev.RESISTANCE_CENTRES[3:4] * ev.RESISTANCE_CENTRES[4:5]))
+    assert (lower[0], share[0]) == (3, 128)
+    assert [int(part[0]) for part in split_grade(np.array([np.nan]))] == [-1, 0]
+
+
+def test_neighbouring_zones_are_at_least_two_bins_apart():
+    lower, share = split_resistance(np.array([zone.c_rr for zone in ZONES]))
+    assert np.diff(lower + share / ev.SHARE_ONE).min() > 1.9
+
+
+@pytest.mark.parametrize(
+    ("heading", "sector"), [(0.0, 0), (0.19, 0), (0.2, 1), (-0.19, 0), (-0.2, 15), (np.pi, 8), (-np.pi, 8), (6.9, 2)]
+)
+def test_heading_sectors_are_centred_on_east(heading, sector):
+    assert total(folded(samples(heading_rad=heading)))[ev.HEADING].argmax() == sector
+
+
+def test_a_machine_and_its_visit_set_one_bit_each_and_stay():
+    rows = samples(3, stamp_ns=NOW_NS + np.array([0, 1, 59]) * 10**9)
+    assert bits_set(folded(rows)) == [1, 1]  # within a minute: one visit
+    later = folded(samples(2, stamp_ns=NOW_NS + np.array([0, 120]) * 10**9))
+    assert bits_set(later) == [2, 1]
+
+
+def bits_set(grid: Grid) -> list[int]:
+    """Most bits that any cell's bitmaps of visits and machines have."""
+    return np.bitwise_count(grid.evidence([(0, 0)]).bitmaps).max(axis=(0, 1)).tolist()
+
+
+def test_newest_stamp_wins_in_any_order():
+    grid = folded(samples(3, stamp_ns=[NOW_NS + 5, NOW_NS + 9, NOW_NS + 7]))
+    assert grid.state().pages[0].page.cells["newest_ns"].max() == grid.newest_ns == NOW_NS + 9
+
+
+def test_a_sample_too_unsure_of_its_place_is_the_newest_too():
+    grid = folded(samples(2, stamp_ns=[NOW_NS, NOW_NS + 9], cov_xx_m2=[0.0, 100.0]))
+    assert grid.newest_ns == NOW_NS + 9
+    assert grid.evidence([(0, 0)]).newest_ns.max() == NOW_NS
+
+
+# --- options ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cap", [3.0, 1.0])
+def test_a_sample_too_unsure_of_its_place_is_counted_not_folded(cap):
+    rows = samples(4, cov_xx_m2=[cap**2, cap**2 * 1.01, 0.0, 0.0], cov_yy_m2=[0.0, 0.0, cap**2 * 1.01, 0.0])
+    grid = folded(rows, std_cap_m=cap)
+    assert (grid.folded, grid.skipped) == (2, 2)
+    oblique = samples(cov_xx_m2=0.9 * cap**2, cov_yy_m2=0.9 * cap**2, cov_xy_m2=0.5 * cap**2)
+    assert folded(oblique, std_cap_m=cap).skipped == 1  # sure east and north, but not along the diagonal
+
+
+def test_floor_spreads_a_sample_that_claims_to_be_exact():
+    rows = samples(cov_xx_m2=0.0, cov_yy_m2=0.0, distance_m=100.0)
+    cells = [folded(rows, std_floor_m=floor).known_cells() for floor in (0.3, 0.5, 1.0)]
+    assert cells[0] == 1
+    assert cells == sorted(set(cells)), cells
+
+
+def test_bucket_length_decides_the_buckets():
+    rows = samples(10, stamp_ns=NOW_NS + np.arange(10) * 60 * 10**9)
+    pages = [folded(rows, bucket_s=s, **APART).state().pages for s in (60.0, 300.0, 600.0)]
+    assert [len(found) for found in pages] == [10, 2, 1]
+    assert [at.index * 300 * 10**9 for at in pages[1]] == [NOW_NS, NOW_NS + 300 * 10**9]
+
+
+@pytest.mark.parametrize(
+    ("option", "pages"),
+    [("keep_buckets", [3, 2, 2, 1]), ("keep_hours", [1, 4, 2, 1]), ("keep_days", [1, 2, 4, 1])],
+)
+def test_so_many_spans_are_kept_apart(option, pages):
+    stamps = NOW_NS + np.arange(8 * 24 * 2) * HOUR_NS // 2
+    keeps = {"keep_buckets": 1, "keep_hours": 2, "keep_days": 2} | {option: max(pages)}
+    found = folded(samples(len(stamps), stamp_ns=stamps, cov_xx_m2=0, cov_yy_m2=0), **keeps).state().pages
+    rungs = [at.rung for at in found]
+    assert [rungs.count(rung) for rung in range(4)] == [
+        keeps["keep_buckets"],
+        keeps["keep_hours"],
+        keeps["keep_days"],
+        1,
+    ]
+
+
+def test_space_of_the_hot_blocks_is_obeyed():
+    rows = random_samples(100, 5)
+    for hot_blocks in (1, 7, 600):
+        grid = folded(rows, hot_blocks=hot_blocks, kernel="numba")
+        assert hot_blocks <= len(grid._hot.counts) <= max(hot_blocks, 4)  # a stencil of four blocks has to fit
+
+
+def test_kernel_option_is_obeyed():
+    assert kernel("numpy") is fold_numpy
+    assert kernel("numba") is kernel("auto")
+    assert kernel("numba").__name__ == "fold_numba"
+
+
+def test_auto_falls_back_to_numpy_where_numba_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mapserver.evidence.fold_numba", None)
+    assert kernel("auto") is fold_numpy
+    with pytest.raises(ImportError):
+        kernel("numba")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("bucket_s", 59.0),
+        ("bucket_s", 3601.0),
+        ("bucket_s", 7200.0),
+        ("bucket_s", 700.0),
+        ("bucket_s", 3600 / 7),
+        ("bucket_s", float("nan")),
+        ("keep_buckets", 0),
+        ("keep_buckets", 1001),
+        ("keep_hours", 0),
+        ("keep_hours", 1001),
+        ("keep_days", 0),
+        ("keep_days", 1001),
+        ("hot_blocks", 0),
+        ("hot_blocks", 100_001),
+        ("std_floor_m", 0.0),
+        ("std_floor_m", 0.009),
+        ("std_floor_m", 3.0),
+        ("std_cap_m", 0.3),
+        ("std_cap_m", 31.0),
+        ("kernel", "cuda"),
+    ],
+)
+def test_bad_option_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=name):
+        FoldConfig(**{name: value})
+
+
+def test_least_floor_keeps_every_admitted_covariance_invertible():
+    std = np.linspace(0.0, 3.0, 40)
+    xx, yy = (axis.ravel() for axis in np.meshgrid(std**2, std**2))
+    xy = np.sqrt(xx * yy) * (1 + 4e-7)  # what rounding lets pass
+    rows = samples(len(xx), cov_xx_m2=xx, cov_yy_m2=yy, cov_xy_m2=xy)
+    votes = prepare(rows, "a", 1.0, FoldConfig(std_floor_m=0.01))
+    a, b, c = votes.inverse.T
+    assert (a > 0).all()
+    assert (a * c > b * b / 4).all()
+
+
+def test_every_admitted_option_keeps_every_admitted_covariance_invertible():
+    xx = np.linspace(1.0, 449.9, 50)  # along the diagonal, twice as much
+    rows = samples(50, cov_xx_m2=xx, cov_yy_m2=xx, cov_xy_m2=xx * (1 + 4e-7))
+    check_samples(rows, 20_000.0)
+    a, b, c = prepare(rows, "a", 1.0, FoldConfig(std_floor_m=0.01, std_cap_m=30.0)).inverse.T
+    assert (a > 0).all()
+    assert (a * c > b * b / 4).all()
+
+
+def test_both_kernels_agree_on_covariances_that_only_rounding_lets_pass():
+    xx = np.linspace(1.0, 449.9, 20)
+    rows = samples(20, cov_xx_m2=xx, cov_yy_m2=xx, cov_xy_m2=xx * (1 + 4e-7))
+    options = {"cell_m": 7.3, "std_floor_m": 0.01, "std_cap_m": 30.0}
+    numpy = folded(rows, kernel="numpy", **options)
+    assert total(numpy)[ev.HEADING].sum() == 20 * UNITS
+    assert same(numpy, folded(rows, kernel="numba", **options))
+
+
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize("column", ["cov_xx_m2", "cov_xy_m2", "cov_yy_m2"])
+def test_a_covariance_that_is_no_number_has_no_vote(name, column):
+    """The door refuses it; should one come by another way, it must not reach the table."""
+    rows = samples(3)
+    with pytest.raises(MessageError):
+        check_samples(rows := rows_with(rows, column, np.nan), 20_000.0)
+    grid = folded(rows, kernel=name)
+    assert (grid.folded, grid.skipped) == (2, 1)
+
+
+def rows_with(rows, column: str, value: float):
+    rows[column][1] = value
+    return rows
+
+
+def test_heaviest_admitted_weight_does_not_overflow_its_share():
+    for cell_m in (0.05, 0.25, 100.0):
+        for name in KERNELS:
+            grid = folded(samples(distance_m=100.0, cov_xx_m2=0, cov_yy_m2=0), cell_m=cell_m, kernel=name)
+            assert total(grid)[ev.HEADING].sum() == 100 * UNITS
+            assert cell_count(grid) <= 100 * UNITS
+
+
+def test_table_falls_to_three_sigma_and_is_nothing_beyond():
+    assert len(TABLE) == TABLE_LAST + 1
+    assert TABLE[0] == 65536
+    assert (np.diff(TABLE) <= 0).all()
+    assert TABLE[-2] == round(65536 * np.exp(-4.5))
+    assert TABLE[-1] == 0

@@ -1,0 +1,226 @@
+import numpy as np
+import pytest
+
+from mapserver.evidence import cells as ev
+from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks
+from mapserver.evidence.votes import FoldConfig
+from protocol.site.geometry import CellWindow
+from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
+
+EVERYTHING = CellWindow(-(2**20), -(2**20), 2**21, 2**21)
+
+
+def test_an_empty_grid_knows_nothing():
+    grid = Grid(1.0, FoldConfig())
+    assert grid.bounds() is None
+    assert grid.known_cells() == 0
+    assert grid.blocks_in(EVERYTHING) == []
+    assert grid.evidence([(0, 0)]).counts.sum() == 0
+    grid.fold(samples(0), "a")
+    assert len(grid.state().pages) == 0
+
+
+def test_blocks_exist_only_where_somebody_drove():
+    grid = folded(samples(3, x_m=[8.0, 1000.0, -900.0], y_m=[8.0, 8.0, -5000.0]))
+    assert grid.blocks_in(EVERYTHING) == [(-57, -313), (0, 0), (62, 0)]
+
+
+def test_a_sample_at_a_corner_touches_four_blocks():
+    grid = folded(samples(x_m=0.0, y_m=0.0, cov_xx_m2=0.25, cov_yy_m2=0.25))
+    assert grid.blocks_in(EVERYTHING) == [(-1, -1), (-1, 0), (0, -1), (0, 0)]
+    weights = grid.evidence(grid.blocks_in(EVERYTHING)).weight.sum(axis=1)
+    assert weights.max() - weights.min() < 0.01 * weights.sum()
+
+
+@pytest.mark.parametrize(
+    ("window", "expected"),
+    [
+        (CellWindow(0, 0, 1, 1), [(0, 0)]),
+        (CellWindow(15, 15, 1, 1), [(0, 0)]),
+        (CellWindow(16, 0, 10, 10), []),
+        (CellWindow(-1, -1, 1, 1), []),
+        (CellWindow(-17, 0, 18, 1), [(-2, 0), (0, 0)]),
+    ],
+)
+def test_window_finds_the_blocks_that_it_touches(window, expected):
+    grid = folded(samples(2, x_m=[8.0, -24.0], y_m=[8.0, 8.0]))
+    assert grid.blocks_in(window) == expected
+
+
+def test_bounds_are_those_of_the_blocks():
+    grid = folded(samples(2, x_m=[8.0, -24.0], y_m=[8.0, 40.0]))
+    assert grid.bounds() == (-32, 0, 16, 48)
+
+
+def test_known_cells_are_counted_once_over_all_buckets():
+    once = folded(samples(1))
+    again = folded(samples(2, stamp_ns=[NOW_NS, NOW_NS + 3600 * 10**9]))
+    assert len(again.state().pages) == 2
+    assert once.known_cells() == again.known_cells() > 0
+
+
+def test_evidence_is_summed_over_buckets():
+    stamps = NOW_NS + np.array([0, 3600, 7200]) * 10**9
+    grid = folded(samples(3, stamp_ns=stamps, distance_m=[1.0, 2.0, 4.0]))
+    evidence = grid.evidence([(0, 0)])
+    assert evidence.weight.sum() == 7 * ev.WEIGHT_UNITS_PER_M
+    assert evidence.newest_ns.max() == stamps[2]
+    assert np.bitwise_count(evidence.bitmaps[..., ev.VISITS]).max() == 3
+
+
+def test_evidence_comes_in_the_order_asked_for_as_a_copy():
+    grid = folded(samples(2, x_m=[8.0, 24.0], distance_m=[1.0, 2.0]))
+    evidence = grid.evidence([(1, 0), (5, 5), (0, 0)])
+    assert evidence.weight.sum(axis=1).tolist() == [2 * 4096, 0, 4096]
+    evidence.counts[:] = 0
+    evidence.bitmaps[:] = 0
+    assert same(grid, folded(samples(2, x_m=[8.0, 24.0], distance_m=[1.0, 2.0])))
+
+
+def test_summing_buckets_does_not_wrap():
+    grid = folded(samples(4, stamp_ns=NOW_NS + np.arange(4) * 3600 * 10**9))
+    grid = Grid.from_state(1.0, FoldConfig(), filled_to(grid.state(), ev.COUNT_MAX))
+    assert grid.evidence([(0, 0)]).counts.max() == 4 * int(ev.COUNT_MAX)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_grid_from_its_state_folds_on_as_if_nothing_happened(seed):
+    rows = random_samples(400, seed)
+    whole = folded(rows)
+    first = folded(rows[:200])
+    again = Grid.from_state(1.0, FoldConfig(), first.state())
+    assert same(first, again)
+    again.fold(rows[200:], "a")
+    assert same(again, whole)
+
+
+def test_state_is_a_copy():
+    grid = folded(samples(1))
+    state = grid.state()
+    before = [(at.page.votes.copy(), at.page.cells.copy()) for at in state.pages]
+    grid.fold(samples(5), "a")
+    assert grid.known_cells()
+    for at, (votes, cells) in zip(state.pages, before, strict=True):
+        assert np.array_equal(at.page.votes, votes)
+        assert np.array_equal(at.page.cells, cells)
+
+
+def test_many_blocks_keep_their_evidence_while_room_is_made():
+    x = np.arange(-50, 50) * 40.0
+    grid = Grid(1.0, FoldConfig())
+    for i in range(len(x)):
+        grid.fold(samples(1, x_m=x[i], distance_m=1 + i % 7), "a")
+    assert same(grid, folded(samples(100, x_m=x, distance_m=1 + np.arange(100) % 7, stamp_ns=NOW_NS)))
+
+
+@pytest.mark.parametrize("cell_m", [0.05, 1.0, 100.0])
+@pytest.mark.parametrize("stamp_ns", [1, NOW_NS, 4_102_444_800_000_000_000])
+def test_the_ends_of_the_site_and_of_time_have_blocks_of_their_own(cell_m, stamp_ns):
+    corners = np.array([-100_000.0, 100_000.0])
+    x, y = (axis.ravel() for axis in np.meshgrid(corners, corners))
+    rows = samples(4, x_m=x, y_m=y, stamp_ns=stamp_ns, cov_xx_m2=0, cov_yy_m2=0)
+    grid = folded(rows, cell_m=cell_m, bucket_s=60.0)
+    for position in zip(x, y, strict=True):
+        column, row = (int(np.floor(p / cell_m)) for p in position)
+        near = grid.blocks_in(CellWindow(column - 20, row - 20, 40, 40))
+        assert grid.evidence(near).weight.sum() == 4096
+    assert {(at.rung, at.index) for at in grid.state().pages} == {(0, stamp_ns // (60 * 10**9))}
+
+
+@pytest.mark.parametrize("kernel", ["numpy", "numba"])
+def test_a_stencil_larger_than_all_hot_blocks_makes_room_for_itself(kernel):
+    row = samples(x_m=0.0, y_m=0.0, cov_xx_m2=6.0, cov_yy_m2=6.0, distance_m=50.0)
+    grid = folded(row, cell_m=0.25, hot_blocks=1, kernel=kernel)
+    assert grid.folded == 1
+    assert grid.evidence([(at.x, at.y) for at in grid.state().pages]).weight.sum() == 50 * 4096
+    assert same(grid, folded(row, cell_m=0.25, kernel=kernel))
+
+
+@pytest.mark.parametrize("hot_blocks", [1, 3])
+@pytest.mark.parametrize("kernel", ["numpy", "numba"])
+def test_pieces_are_cut_until_they_fit_and_folded_once(kernel, hot_blocks, monkeypatch):
+    monkeypatch.setattr("mapserver.evidence.grid.PIECE", 64)
+    rows = random_samples(200, 4)
+    grid = folded(rows, hot_blocks=hot_blocks, kernel=kernel)
+    assert (grid.folded, grid.skipped) == (200, 0)
+    assert same(grid, folded(rows))
+
+
+@pytest.mark.parametrize("kernel", ["numpy", "numba"])
+def test_rows_that_are_all_too_unsure_of_their_place_open_nothing(kernel):
+    grid = folded(samples(5000, cov_xx_m2=100.0), hot_blocks=1, kernel=kernel)
+    assert (grid.folded, grid.skipped) == (0, 5000)
+    assert grid.state().pages == ()
+    assert len(grid._hot) == 0
+
+
+def test_one_row_of_every_bucket_is_cut_down_to_single_rows():
+    stamps = NOW_NS + np.arange(300) * 300 * 10**9
+    rows = samples(300, stamp_ns=stamps, cov_xx_m2=0, cov_yy_m2=0)
+    assert same(folded(rows, hot_blocks=1), folded(rows))
+
+
+def test_pages_of_a_block_come_in_the_order_of_time():
+    stamps = NOW_NS + np.arange(0, 12 * 24, 2) * 1800 * 10**9
+    draw = np.random.default_rng(1)
+    grid = folded(samples(len(stamps), stamp_ns=stamps[draw.permutation(len(stamps))], cov_xx_m2=0, cov_yy_m2=0))
+    pages, nothing = grid.pages([(0, 0), (9, 9)])
+    newest = [int(timed.page.cells["newest_ns"].max()) for timed in pages]
+    assert newest == sorted(newest)
+    assert nothing == []
+    assert all(timed.first_ns <= stamp < timed.end_ns for timed, stamp in zip(pages, newest, strict=True))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cell_and_bucket_that_machines_drive_take_few_bytes(seed):
+    """Issue 6 allows 500; a page takes about 66, and this tells when that grows."""
+    draw, n = np.random.default_rng(seed), 4000
+    turn = np.cumsum(draw.normal(0, 0.02, n))
+    rows = samples(
+        n,
+        x_m=np.cumsum(0.5 * np.cos(turn)),
+        y_m=np.cumsum(0.5 * np.sin(turn)),
+        heading_rad=(turn + np.pi) % (2 * np.pi) - np.pi,
+        distance_m=0.5,
+        stamp_ns=NOW_NS + np.arange(n) * 250_000_000,
+        cov_xx_m2=1.2**2,
+        cov_yy_m2=1.2**2,
+        c_rr=0.04 * np.exp(draw.normal(0, 0.15, n)),
+        grade_e=draw.normal(0.03, 0.02, n),
+        grade_n=draw.normal(-0.02, 0.02, n),
+    )
+    pages = [at.page for at in folded(rows, keep_buckets=1000).state().pages]
+    per_cell = sum(page.nbytes for page in pages) / sum(len(page.cells) for page in pages)
+    assert per_cell <= 120
+
+
+def test_blocks_are_touched_once_until_they_are_folded_into_again():
+    grid = folded(samples(2, x_m=[8.0, 40.0]))
+    assert sorted(grid.take_touched(9)) == [(0, 0), (2, 0)]
+    assert grid.take_touched(9) == []
+    grid.fold(samples(1), "b")
+    grid.fold(samples(1), "a")
+    assert grid.take_touched(9) == [(0, 0)]
+    grid.touch_all()
+    assert len(grid.take_touched(1)) == len(grid.take_touched(1)) == 1
+    assert grid.take_touched(1) == []
+
+
+def test_a_sample_that_adds_nothing_touches_nothing():
+    grid = folded(samples(2, x_m=[8.0, 40.0], distance_m=[0.0, 1.0], cov_xx_m2=[0.0, 100.0]))
+    assert grid.take_touched(9) == []
+
+
+def test_pages_are_counted():
+    grid = folded(
+        samples(3, x_m=[8.5, 40.5, 40.5], cov_xx_m2=0, cov_yy_m2=0, stamp_ns=NOW_NS + np.array([0, 0, 3600]) * 10**9)
+    )
+    assert grid.known_cells() == 2
+    assert len(grid.state().pages) == 3
+
+
+def test_chunks_hold_every_block_once():
+    blocks = [(i, -i) for i in range(2 * READ_BLOCKS + 3)]
+    pieces = list(chunks(blocks))
+    assert [len(piece) for piece in pieces] == [READ_BLOCKS, READ_BLOCKS, 3]
+    assert [block for piece in pieces for block in piece] == blocks

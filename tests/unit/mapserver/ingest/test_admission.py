@@ -1,0 +1,163 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapserver.ingest.admission import GapError, admit, parse
+from protocol.errors import MessageError, Refusal
+from protocol.wire.codec import encode_batch
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, now_ns, samples
+
+
+def numbered(first: int, n: int, **more):
+    """A batch whose samples carry their number as their stamp."""
+    return batch(samples(n, stamp_ns=np.arange(first, first + n)), first, **more)
+
+
+def numbers(admission) -> list[int]:
+    return admission.batch.rows["stamp_ns"].tolist()
+
+
+@pytest.mark.parametrize(
+    ("first", "n", "watermark", "new", "trimmed"),
+    [
+        (1, 5, 0, [1, 2, 3, 4, 5], 0),  # the first of all
+        (4, 2, 3, [4, 5], 0),  # follows
+        (1, 5, 3, [4, 5], 3),  # overlaps
+        (1, 5, 5, [], 5),  # a whole duplicate
+        (1, 5, 9, [], 5),  # long since there
+        (3, 1, 3, [], 1),
+    ],
+)
+def test_what_is_there_already_is_trimmed(first, n, watermark, new, trimmed):
+    admission = admit(numbered(first, n), watermark)
+    assert numbers(admission) == new
+    assert (admission.trimmed, admission.lost) == (trimmed, 0)
+    assert admission.watermark == max(watermark, first + n - 1)
+    if new:
+        assert admission.batch.first_seq == new[0]
+
+
+def test_a_gap_is_refused_with_the_expected_number():
+    with pytest.raises(GapError, match="sample 4 is expected next") as caught:
+        admit(numbered(6, 2), 3)
+    assert (caught.value.expected, caught.value.reason, caught.value.field) == (4, Refusal.GAP, "first_seq")
+
+
+@pytest.mark.parametrize(("lost_before", "lost"), [(2, 2), (3, 2), (5, 2)])
+def test_a_gap_that_is_declared_lost_is_taken_and_counted(lost_before, lost):
+    admission = admit(numbered(6, 2, lost_before=lost_before), 3)
+    assert (numbers(admission), admission.lost, admission.watermark) == ([6, 7], lost, 7)
+
+
+@pytest.mark.parametrize("lost_before", [0, 1])
+def test_a_gap_of_which_too_little_is_declared_lost_is_refused(lost_before):
+    with pytest.raises(GapError):
+        admit(numbered(6, 2, lost_before=lost_before), 3)
+
+
+def test_nothing_is_lost_that_has_arrived_already():
+    admission = admit(numbered(6, 2, lost_before=5), 6)
+    assert (numbers(admission), admission.lost, admission.trimmed) == ([7], 0, 1)
+
+
+@pytest.mark.parametrize("watermark", [0, 3, 1000])
+@pytest.mark.parametrize("first", [1, 50])
+def test_an_empty_batch_asks_for_the_watermark(watermark, first):
+    admission = admit(numbered(first, 0), watermark)
+    assert (admission.watermark, admission.trimmed, admission.lost) == (watermark, 0, 0)
+
+
+@given(st.lists(st.tuples(st.integers(0, 39), st.integers(1, 15), st.integers(1, 3)), max_size=30), st.integers(1, 40))
+def test_any_cutting_and_repeating_ends_with_every_sample_once(cuts, step):
+    attempts = [(first + 1, n) for first, n, times in cuts for _ in range(times)]
+    journal: list[int] = []
+    watermark = 0
+    # Then the agent goes on as the protocol says: from the number that the server expects.
+    for first, n in [*attempts, *((None, step) for _ in range(41))]:
+        start = watermark + 1 if first is None else first
+        n = min(n, 40 - start + 1)
+        if start > watermark + 1:
+            with pytest.raises(GapError, match=f"sample {watermark + 1} is expected"):
+                admit(numbered(start, n), watermark)
+            continue
+        admission = admit(numbered(start, n), watermark)
+        journal += numbers(admission)
+        watermark = admission.watermark
+    assert journal == list(range(1, 41))
+
+
+@given(st.lists(st.tuples(st.integers(1, 8), st.integers(0, 6)), min_size=1, max_size=12))
+def test_declared_losses_and_samples_add_up(steps):
+    watermark, lost, taken, first = 0, 0, 0, 1
+    for n, dropped in steps:
+        admission = admit(numbered(first + dropped, n, lost_before=dropped), watermark)
+        watermark, lost, taken = admission.watermark, lost + admission.lost, taken + len(admission.batch.rows)
+        first = watermark + 1
+    assert taken + lost == watermark
+
+
+# --- judging ---------------------------------------------------------------------------------------------------------
+
+
+def judge(sent, machine="a", site=SITE):
+    return parse(encode_batch(sent), machine, site, now_ns)
+
+
+def test_a_good_batch_comes_through_whole():
+    sent = batch(samples(3), 5, lost_before=2)
+    got = judge(sent)
+    assert (got.machine, got.spool_id, got.first_seq, got.lost_before) == ("a", 7, 5, 2)
+    assert got.rows.tobytes() == sent.rows.tobytes()
+
+
+def test_a_batch_under_the_key_of_another_machine_is_refused():
+    with pytest.raises(MessageError, match="'a' sends under the key of 'b'") as caught:
+        judge(batch(samples()), machine="b")
+    assert caught.value.reason == Refusal.WRONG_MACHINE
+
+
+def test_a_batch_of_another_site_frame_is_refused():
+    with pytest.raises(MessageError, match="compare the site files") as caught:
+        judge(batch(samples(), frame="deadbeef"))
+    assert caught.value.reason == Refusal.WRONG_FRAME
+
+
+def test_a_position_beyond_the_extent_of_this_site_is_refused():
+    near = replace(SITE, extent_m=10.0)
+    judge(batch(samples(x_m=9.0)), site=near)
+    with pytest.raises(MessageError) as caught:
+        judge(batch(samples(2, x_m=[9.0, 11.0])), site=near)
+    assert (caught.value.reason, caught.value.field, caught.value.row) == (Refusal.OUTSIDE_SITE, "x_m", 1)
+
+
+def test_a_stamp_ahead_of_the_wall_clock_is_refused_where_the_site_says_so():
+    wall = replace(SITE, clock="wall", clock_tolerance_s=2.0)
+    at_limit, beyond = (samples(3, stamp_ns=[NOW_NS - 10**12, NOW_NS + ahead, NOW_NS]) for ahead in (2e9, 2.1e9))
+    judge(batch(at_limit), site=wall)
+    judge(batch(beyond))  # clock = "data"
+    with pytest.raises(MessageError, match=r"2\.1 s ahead") as caught:
+        judge(batch(beyond), site=wall)
+    assert (caught.value.reason, caught.value.row) == (Refusal.WALL_CLOCK, 1)
+
+
+def test_an_empty_batch_passes_a_wall_clock():
+    assert len(judge(batch(samples(0)), site=replace(SITE, clock="wall")).rows) == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "lost_before", "watermark", "expected"),
+    [
+        (8, 4, 3, (7, 4)),  # samples 4 to 7 will never come, and none after them
+        (8, 9, 3, (7, 4)),  # some of them came before
+        (8, 3, 3, (3, 0)),  # 4 is not declared: it may still come
+        (4, 3, 3, (3, 0)),
+        (2, 1, 3, (3, 0)),
+    ],
+)
+def test_an_empty_batch_declares_samples_lost_that_none_follow(first, lost_before, watermark, expected):
+    admission = admit(numbered(first, 0, lost_before=lost_before), watermark)
+    assert (admission.watermark, admission.lost) == expected
+    assert len(admission.batch.rows) == 0

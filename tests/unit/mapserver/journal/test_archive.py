@@ -1,0 +1,502 @@
+import os
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapserver.ingest.admission import Admission
+from mapserver.journal import archive as ar
+from mapserver.journal.archive import HOUR_NS, Archive, ArchiveFile, archive, next_file
+from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.rows import ALL, JournalRow, Wanted
+from protocol.errors import ConfigError, StoreError
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import KnownGround
+from tests.paths import ROOT
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples, samples
+
+pq = pytest.importorskip("pyarrow.parquet")
+FUTURE = NOW_NS + 1000 * HOUR_NS
+
+
+class Machines:
+    """Writes batches of several machines to a journal."""
+
+    def __init__(self, folder: Path) -> None:
+        self.journal = Journal(folder / "journal.db", SITE.name, SITE.frame)
+        self.reader = JournalReader(folder / "journal.db")
+        self.folder = folder / ar.FOLDER
+        self._next: dict[str, int] = {}
+
+    def send(self, n: int, received_ns: int, machine: str = "a", spool_id: int = 7, seed: int = 0) -> None:
+        first = self._next.get(machine, 1)
+        rows = random_samples(n, 100 * seed + self.journal.last_row)
+        self.journal.begin()
+        self.journal.append(Admission(batch(rows, first, machine, spool_id), 0, 0), received_ns)
+        self.journal.commit()
+        self._next[machine] = first + n
+
+    def archive(self, before_ns: int = FUTURE, forget: Callable[[int], int] | None = None) -> list[str]:
+        made = archive(self.folder, self.reader, SITE, before_ns, forget or self.journal.forget)
+        return [path.name for path in made]
+
+    def both(self, wanted: Wanted = ALL) -> list[tuple]:
+        """All rows, from archive and journal."""
+        archived = self.journal.archived_row
+        return plain([*Archive(self.folder).read(0, archived, wanted), *self.reader.read(archived, wanted=wanted)])
+
+    def close(self) -> None:
+        self.reader.close()
+        self.journal.close()
+
+
+def plain(rows: list[JournalRow] | Iterator[JournalRow]) -> list[tuple]:
+    return [(r.row, r.machine, r.spool_id, r.first_seq, r.received_ns, r.rows.tobytes()) for r in rows]
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[Machines]:
+    machines = Machines(folder)
+    yield machines
+    machines.close()
+
+
+@pytest.fixture
+def day(tmp_path) -> Iterator[Machines]:
+    """Seven batches over three hours: 1 to 3, 4 to 6, 7."""
+    with opened(tmp_path) as machines:
+        for i, (machine, spool) in enumerate(zip("aabcaba", (7, 7, 2**64 - 1, 3, 7, 2**64 - 1, 7), strict=True)):
+            machines.send(5 + i, NOW_NS + i // 3 * HOUR_NS + i, machine, spool)
+        yield machines
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def test_each_hour_of_reception_is_a_file(day):
+    before = plain(day.reader.read())
+    assert day.archive() == [
+        "2026-01-01T00_000001-000003.parquet",
+        "2026-01-01T01_000004-000006.parquet",
+        "2026-01-01T02_000007-000007.parquet",
+    ]
+    assert day.both() == before
+    assert day.journal.archived_row == 7
+    assert day.journal._number("SELECT COUNT(*) FROM journal") == 0
+
+
+@pytest.mark.parametrize(("hours", "archived"), [(0.99, 0), (1.0, 3), (1.99, 3), (2.0, 6), (3.0, 7)])
+def test_an_hour_is_archived_once_it_ended_before_the_given_time(day, hours, archived):
+    day.archive(NOW_NS + int(hours * HOUR_NS))
+    assert day.journal.archived_row == archived
+
+
+def test_files_are_contiguous_where_the_clock_steps_back(tmp_path):
+    with opened(tmp_path) as machines:
+        for hour in (5, 5, 4, 5):
+            machines.send(2, NOW_NS + hour * HOUR_NS)
+        before = machines.both()
+        assert [name[11:] for name in machines.archive()] == [
+            "05_000001-000002.parquet",
+            "04_000003-000003.parquet",
+            "05_000004-000004.parquet",
+        ]
+        assert machines.both() == before
+
+
+def test_a_full_hour_is_cut_and_row_groups_never_cut_a_batch(tmp_path, monkeypatch):
+    monkeypatch.setattr(ar, "FILE_SAMPLES", 12)
+    monkeypatch.setattr(ar, "GROUP_SAMPLES", 6)
+    with opened(tmp_path) as machines:
+        for _ in range(7):
+            machines.send(4, NOW_NS)
+        before = machines.both()
+        assert [name[14:27] for name in machines.archive()] == ["000001-000003", "000004-000006", "000007-000007"]
+        files = Archive(machines.folder).paths()
+        assert [pq.ParquetFile(path).metadata.num_row_groups for path in files] == [2, 2, 1]
+        assert machines.both() == before
+
+
+def test_a_file_stands_for_itself(day):
+    site = replace(SITE, known_ground=(KnownGround("pad", 0.01, ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))),))
+    path = next_file(day.folder, day.reader, site, FUTURE)
+    file = ArchiveFile(path)
+    assert (file.header.site, file.header.frame, file.header.crs) == (site, SITE.frame, SITE.crs)
+    assert (file.first_row, file.last_row, file.samples, file.header.machines) == (1, 3, 18, ("a", "b"))
+    assert file.first_received_ns == NOW_NS
+
+
+def test_every_sample_is_a_line_for_other_tools(day):
+    rows = list(day.reader.read(until=3))
+    path = day.folder / day.archive()[0]
+    table = pq.read_table(path, page_checksum_verification=True)
+    assert table.column("machine").to_pylist() == [row.machine for row in rows for _ in row.rows]
+    assert table.column("spool_id").to_pylist() == [row.spool_id for row in rows for _ in row.rows]
+    assert table.column("seq").to_pylist() == [row.first_seq + i for row in rows for i in range(len(row.rows))]
+    assert table.column("row").to_pylist() == [row.row for row in rows for _ in row.rows]
+    assert table.column("received_ns").to_pylist() == [row.received_ns for row in rows for _ in row.rows]
+    for name in ("stamp_ns", "x_m", "c_rr"):
+        assert table.column(name).to_numpy().tobytes() == np.concatenate([row.rows[name] for row in rows]).tobytes()
+    columns = pq.ParquetFile(path).metadata.row_group(0).to_dict()["columns"]
+    assert {column["compression"] for column in columns} == {"ZSTD"}
+
+
+def test_every_bit_of_odd_numbers_is_kept(tmp_path):
+    with opened(tmp_path) as machines:
+        rows = samples(6)
+        rows["c_rr"].view("<u4")[:] = [0x7FC00000, 0x7FC00001, 0xFFC00000, 0x7F800001, 0x80000000, 0]  # NaN, -0, 0
+        rows["x_m"] = [-0.0, 0.0, 5e-324, -1e-300, 0.1, 20_000]
+        machines.journal.begin()
+        machines.journal.append(Admission(batch(rows), 0, 0), NOW_NS)
+        machines.journal.commit()
+        before = machines.both()
+        machines.archive()
+        assert machines.both() == before
+
+
+def test_without_pyarrow_the_error_says_what_to_install(day, monkeypatch):
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr(ar, "import_module", missing)
+    with pytest.raises(ConfigError, match=r"pyarrow is not installed: pip install 'sitegrid\[archive\]'"):
+        day.archive()
+    assert day.journal.archived_row == 0
+
+
+def test_a_full_disk_leaves_the_journal_as_it_was(day, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = day.both()
+    monkeypatch.setattr(ar.os, "fsync", full)
+    with pytest.raises(StoreError, match=r"cannot be written.*No space"):
+        day.archive()
+    monkeypatch.undo()
+    assert (list(day.folder.iterdir()), day.journal.archived_row, day.both()) == ([], 0, before)
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+PLACE = Bounds(-20.0, -20.0, 10.0, 15.0)
+FILTERS = [
+    Wanted(from_ns=NOW_NS + 900 * 10**9),
+    Wanted(to_ns=NOW_NS + 200 * 10**9),
+    Wanted(bounds=PLACE),
+    Wanted(bounds=Bounds(59.0, 59.0, 60.0, 60.0)),
+    Wanted(without=frozenset({"a"})),
+    Wanted(without=frozenset({"a", "b", "c"})),
+    Wanted(to_ns=NOW_NS + 600 * 10**9, bounds=PLACE, without=frozenset({"b"})),
+]
+
+
+@pytest.mark.parametrize("wanted", FILTERS)
+def test_filters_choose_the_same_rows_in_journal_and_archive(day, wanted):
+    before = day.both(wanted)
+    day.archive(NOW_NS + 2 * HOUR_NS)
+    assert day.both(wanted) == before
+
+
+@pytest.mark.parametrize(("after", "until"), [(0, 7), (1, 7), (3, 6), (2, 5), (6, 7), (7, 7), (0, 0)])
+def test_any_span_of_rows_is_read(day, after, until):
+    before = plain(day.reader.read(after, until))
+    day.archive()
+    assert plain(Archive(day.folder).read(after, until)) == before
+
+
+def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
+    monkeypatch.setattr(ar, "GROUP_SAMPLES", 1)
+    with opened(tmp_path) as machines:
+        for i in range(4):
+            rows = samples(3, x_m=10.0 * i, stamp_ns=NOW_NS + i)
+            machines.journal.begin()
+            machines.journal.append(Admission(batch(rows, 1 + 3 * i), 0, 0), NOW_NS + i // 2 * HOUR_NS)
+            machines.journal.commit()
+        machines.archive()
+        decoded: list[int] = []
+        real = ar._batches
+        monkeypatch.setattr(ar, "_batches", lambda table, *rest: decoded.append(1) or real(table, *rest))
+        checked: list[Path] = []
+        whole = ar._checked
+        monkeypatch.setattr(ar, "_checked", lambda path: checked.append(path) or whole(path))
+        for wanted, groups, files in (
+            (ALL, 4, 2),
+            (Wanted(bounds=Bounds(9, 0, 11, 20)), 1, 1),
+            (Wanted(to_ns=NOW_NS + 2), 3, 2),
+            (Wanted(from_ns=NOW_NS + 4), 0, 0),
+            (Wanted(without=frozenset({"a"})), 0, 0),
+        ):
+            decoded.clear(), checked.clear()
+            list(Archive(machines.folder).read(0, 4, wanted))
+            assert (len(decoded), len(checked)) == (groups, files), wanted
+
+
+@settings(max_examples=8, deadline=None)
+@given(data=st.data())
+def test_rows_come_back_whatever_the_cuts(data):
+    """Whatever batches come in, whenever hours are archived and with whatever sizes of files and row groups."""
+    sized = pytest.MonkeyPatch.context()
+    with tempfile.TemporaryDirectory() as folder, opened(Path(folder)) as machines, sized as patch:
+        patch.setattr(ar, "FILE_SAMPLES", data.draw(st.integers(1, 30)))
+        patch.setattr(ar, "GROUP_SAMPLES", data.draw(st.integers(1, 30)))
+        now_ns, before = NOW_NS, []
+        for i, step in enumerate(data.draw(st.lists(st.integers(0, 6), min_size=1, max_size=8))):
+            now_ns += step * HOUR_NS // 4
+            machines.send(data.draw(st.integers(1, 9)), now_ns, data.draw(st.sampled_from("abc")), seed=i)
+            before += plain(machines.reader.read(machines.journal.last_row - 1))
+            if data.draw(st.booleans()):
+                machines.archive(now_ns - data.draw(st.integers(0, 4)) * HOUR_NS // 2)
+                assert machines.both() == before
+        for wanted in FILTERS:
+            chosen = machines.both(wanted)
+            assert [row for row in before if row in chosen] == chosen
+            machines.archive()
+            assert machines.both(wanted) == chosen
+        assert machines.both() == before
+
+
+# --- damage ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def file(day) -> tuple[Path, list[tuple]]:
+    path = day.folder / day.archive()[0]
+    return path, plain(ArchiveFile(path).read())
+
+
+def test_any_flipped_bit_is_found_and_the_file_is_named(file):
+    path, _ = file
+    data, seed = path.read_bytes(), 11
+    draw = np.random.default_rng(seed)
+    for place in {*range(16), *range(len(data) - 20, len(data)), *draw.integers(0, len(data), 100).tolist()}:
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << int(draw.integers(8))
+        path.write_bytes(damaged)
+        with pytest.raises(StoreError, match=f"{path.name}: is damaged"):
+            list(ArchiveFile(path).read())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9, 0.999])
+def test_a_file_cut_short_is_found(file, share):
+    path, _ = file
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(StoreError, match=f"{path.name}: is damaged"):
+        ArchiveFile(path)
+
+
+def test_damaged_statistics_do_not_hide_rows(file, day):
+    """A filter that passes over a file trusts its footer, so that is checked even where nothing else is read."""
+    path, _ = file
+    data = bytearray(path.read_bytes())
+    data[-60] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(StoreError, match="is damaged"):
+        list(Archive(day.folder).read(0, 7, Wanted(from_ns=FUTURE)))
+
+
+def test_a_parquet_file_of_somebody_else_is_refused(tmp_path):
+    import pyarrow as pa
+
+    path = tmp_path / "2026-01-01T00_000001-000003.parquet"
+    pq.write_table(pa.table({"x": [1]}), path)
+    with pytest.raises(StoreError, match="no file of a map server's archive"):
+        ArchiveFile(path)
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(StoreError, match=r"nothing\.parquet: cannot be read: No such file"):
+        ArchiveFile(tmp_path / "nothing.parquet")
+
+
+def test_a_file_of_a_newer_schema_is_refused(day, monkeypatch):
+    monkeypatch.setattr(ar, "asdict", lambda header: asdict(header) | {"schema": 2})
+    path = ar._write(day.folder, SITE, day.reader.read())
+    with pytest.raises(StoreError, match="has schema 2, known is 1"):
+        ArchiveFile(path)
+
+
+def test_a_renamed_file_is_found(file):
+    path, _ = file
+    other = path.rename(path.with_name("2026-01-01T00_000001-000004.parquet"))
+    with pytest.raises(StoreError, match=r"000004\.parquet: holds the rows 1 to 3"):
+        ArchiveFile(other)
+
+
+def test_a_missing_file_is_an_error(day):
+    names = day.archive()
+    (day.folder / names[1]).unlink()
+    assert len(plain(Archive(day.folder).read(0, 3))) == 3
+    for after, until in ((0, 7), (3, 6), (0, 4)):
+        with pytest.raises(StoreError, match="the file with row 4 is missing"):
+            list(Archive(day.folder).read(after, until))
+    (day.folder / names[2]).unlink()
+    with pytest.raises(StoreError, match="the file with row 7 is missing"):
+        list(Archive(day.folder).read(6, 7))
+
+
+def test_two_files_with_the_same_row_are_an_error(day):
+    names = day.archive()
+    ar._write(day.folder, SITE, iter([row for row in ArchiveFile(day.folder / names[0]).read() if row.row == 3]))
+    with pytest.raises(StoreError, match="row 3 is also in another file"):
+        list(Archive(day.folder).read(0, 7))
+
+
+def test_a_column_that_an_older_file_lacks_reads_as_nan(day, monkeypatch):
+    monkeypatch.setattr(ar, "COLUMNS", tuple(name for name in ar.COLUMNS if name != "grade_var"))
+    path = ar._write(day.folder, SITE, day.reader.read(until=3))
+    monkeypatch.undo()
+    for old, row in zip(ArchiveFile(path).read(), day.reader.read(until=3), strict=True):
+        assert np.isnan(old.rows["grade_var"]).all()
+        assert old.rows["c_rr"].tobytes() == row.rows["c_rr"].tobytes()
+
+
+# --- crashes ---------------------------------------------------------------------------------------------------------
+
+
+class Crash(BaseException):
+    """Whatever ends a process at once."""
+
+
+@pytest.mark.parametrize("step", ["_write_parquet", "_seal", "_sync_folder", "_compare"])
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_a_crash_at_any_step_loses_and_doubles_nothing(day, monkeypatch, step, when):
+    before, real = day.both(), getattr(ar, step)
+
+    def crash(*arguments: object) -> None:
+        if when == "after":
+            real(*arguments)
+        raise Crash
+
+    monkeypatch.setattr(ar, step, crash)
+    with pytest.raises(Crash):
+        day.archive()
+    assert day.both() == before
+    monkeypatch.undo()
+    assert len(day.archive()) == 3
+    assert day.both() == before
+    assert len(list(day.folder.iterdir())) == 3
+
+
+@pytest.mark.parametrize("pieces", [0, 1, 2, 4])
+def test_a_crash_while_rows_are_forgotten_is_made_good(day, pieces):
+    before, left = day.both(), pieces
+
+    def forget(until: int) -> int:
+        nonlocal left
+        if not left:
+            raise Crash
+        left -= 1
+        return day.journal.forget(until, most=1)
+
+    with pytest.raises(Crash):
+        day.archive(forget=forget)
+    assert day.journal.archived_row == pieces
+    assert day.both() == before
+    day.archive()
+    assert day.both() == before
+    assert len(list(day.folder.iterdir())) == 3
+
+
+def test_nothing_is_forgotten_before_file_and_name_are_on_disk(day, monkeypatch):
+    done = []
+
+    def spy(name: str, real: Callable) -> Callable:
+        def call(first: object, *rest: object) -> object:
+            done.append(f"{name} folder" if name == "sync" and stat.S_ISDIR(os.fstat(first).st_mode) else name)
+            return real(first, *rest)
+
+        return call
+
+    monkeypatch.setattr(ar.os, "fsync", spy("sync", os.fsync))
+    monkeypatch.setattr(Path, "rename", spy("rename", Path.rename))
+    day.archive(NOW_NS + HOUR_NS, forget=spy("forget", day.journal.forget))
+    assert done == ["sync", "rename", "sync folder", "forget"]
+
+
+def test_what_a_kill_left_half_written_is_removed(day):
+    day.folder.mkdir()
+    (day.folder / ar._TEMPORARY).write_bytes(b"half")
+    day.archive()
+    assert len(list(day.folder.iterdir())) == 3
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from mapserver import archive as ar
+from mapserver.journal.journal import Journal, JournalReader
+from protocol.site.site_config import SiteConfig
+
+site = SiteConfig("pit", 48.0, 11.0)
+folder, step, calls = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+journal = Journal(folder / "journal.db", site.name, site.frame)
+
+def killing(real):
+    def call(*arguments):
+        global calls
+        if calls == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        calls -= 1
+        return real(*arguments)
+    return call
+
+forget = lambda until: journal.forget(until, 1)
+if step == "forget":
+    forget = killing(forget)
+elif step == "delete":
+    journal._db.set_trace_callback(killing(lambda text: None))
+elif step == "rename":
+    Path.rename = killing(Path.rename)
+else:
+    setattr(ar, step, killing(getattr(ar, step)))
+for _ in ar.archive(folder / "archive", JournalReader(folder / "journal.db"), site, 2**62, forget):
+    pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("step", "calls"),
+    [("_table", 0), ("_seal", 1), ("rename", 0), ("_compare", 0), ("forget", 2), ("delete", 5), ("delete", 13)],
+)
+def test_a_killed_process_loses_and_doubles_nothing(tmp_path, step, calls):
+    with opened(tmp_path) as machines:
+        for i in range(6):
+            machines.send(5, NOW_NS + i // 3 * HOUR_NS, "ab"[i % 2])
+        before = machines.both()
+    ended = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path), step, str(calls)], cwd=ROOT, check=False, timeout=60
+    )
+    assert ended.returncode == -signal.SIGKILL
+    with opened(tmp_path) as machines:
+        assert machines.both() == before
+        machines.archive()
+        assert machines.both() == before
+        assert (machines.journal.archived_row, len(list(machines.folder.iterdir()))) == (6, 2)
+
+
+def test_a_file_that_is_not_the_journal_s_is_never_a_reason_to_forget(day):
+    """The journal was restored from a backup, and went on with other rows."""
+    path = next_file(day.folder, day.reader, SITE, FUTURE)
+    day.journal._db.execute(
+        "UPDATE journal SET received_ns = received_ns + 1,"
+        " crc32 = checksum(row, machine, spool_id, first_seq, received_ns + 1, payload) WHERE row = 3"
+    )
+    with pytest.raises(StoreError, match=r"000003\.parquet: row 3 is not the journal's; .* move this file away"):
+        day.archive()
+    day.journal._db.execute("UPDATE journal SET machine = 'c' WHERE row = 1")
+    with pytest.raises(StoreError, match="row 1 is damaged"):
+        day.archive()
+    day.journal._db.execute("UPDATE journal SET machine = 'a' WHERE row = 1")
+    assert day.journal.archived_row == 0
+    path.rename(path.with_suffix(".away"))
+    assert len(day.archive()) == 3

@@ -1,0 +1,255 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapserver.ingest.store import Store
+from mapserver.ingest.writer import Writer
+from mapserver.layers import cell_layers
+from mapserver.layers.cell_layers import LAYERS, ReadConfig
+from mapserver.layers.gap_filling import AREA_LAYERS
+from mapserver.query.answers import Answers
+from protocol.errors import QueryError, Refusal
+from protocol.queries.requests import PointQuery, RegionQuery, decode_info, decode_point, decode_region
+from protocol.site.geometry import Bounds
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
+
+# One sample in each cell of two diagonals, the value tells the cell.
+STEPS = np.arange(-40, 40)
+
+
+def diagonal() -> np.ndarray:
+    return samples(len(STEPS), x_m=STEPS + 0.5, y_m=-STEPS - 0.5, grade_e=STEPS / 100, distance_m=8.0)
+
+
+@pytest.fixture
+def answers(tmp_path):
+    writer = Writer(tmp_path, SITE, CONFIG, now_ns)
+    send(writer, [incoming(diagonal())])
+    yield Answers(writer, SITE, CONFIG)
+    writer.close()
+
+
+def region(answers: Answers, *bounds: float, names: tuple[str, ...] = ("grade_east",)):
+    return answers.region(RegionQuery(Bounds(*bounds), names))
+
+
+@pytest.mark.parametrize("step", [-40, -17, -16, -1, 0, 15, 16, 39])
+def test_a_point_is_the_cell_that_it_lies_in(answers, step):
+    for within in (0.0, 0.5, 0.999):
+        point = answers.point(PointQuery(step + within, -step - within - 0.001, ("grade_east",)))
+        assert (point.x_m, point.y_m) == (step + 0.5, -step - 0.5)
+        assert point.values["grade_east"] == pytest.approx(step / 100, abs=1e-3)
+        assert (point.merged, point.stamp_ns) == (1, NOW_NS + 79 * 10**9)
+
+
+def test_a_point_where_nobody_was_is_nan_in_every_layer(answers):
+    for x, y in ((10.0, 10.0), (1e6, -1e6), (-1e9, 1e9)):
+        values = answers.point(PointQuery(x, y)).values
+        assert tuple(values) == tuple(LAYERS)
+        assert np.isnan(list(values.values())).all()
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [(-45, -45, 45, 45), (-20, -3, 3, 20), (3, -16, 13, -3), (-16, 0, 0, 16), (0, -1, 1, 0), (-0.5, -0.5, 0.5, 0.5)],
+)
+def test_a_region_is_cut_from_its_blocks(answers, bounds):
+    here = region(answers, *bounds)
+    west, south = int(np.floor(bounds[0])), int(np.floor(bounds[1]))
+    expected = np.full((len(here.y_m), len(here.x_m)), np.nan)
+    for step in STEPS:
+        column, row = step - west, -step - 1 - south
+        if 0 <= column < expected.shape[1] and 0 <= row < expected.shape[0]:
+            expected[row, column] = step / 100
+    assert (here.x_m[0], here.y_m[0]) == (west + 0.5, south + 0.5)
+    np.testing.assert_allclose(here["grade_east"], expected, atol=1e-3)
+    assert np.isfinite(expected).any()
+
+
+def test_every_small_region_is_the_same_cut_of_a_large_one(answers):
+    whole = region(answers, -48, -48, 48, 48)["grade_east"]
+    draw = np.random.default_rng(11)
+    for _ in range(30):
+        west, south = draw.integers(-48, 47, 2)
+        east, north = draw.integers(west + 1, 49), draw.integers(south + 1, 49)
+        part = region(answers, west, south, east, north)["grade_east"]
+        expected = whole[south + 48 : north + 48, west + 48 : east + 48]
+        assert np.array_equal(part, expected, equal_nan=True), (west, south, east, north)
+
+
+def test_a_region_far_away_is_unknown(answers):
+    far = region(answers, 10_000, 10_000, 10_020, 10_010)
+    assert far["grade_east"].shape == (10, 20)
+    assert np.isnan(far["grade_east"]).all()
+    assert far.merged == 1
+
+
+def test_no_names_give_all_layers(answers):
+    here = region(answers, 0, -5, 5, 0, names=())
+    assert tuple(here.layers) == tuple(LAYERS)
+    assert all(layer.dtype == np.float32 for layer in here.layers.values())
+
+
+def test_many_blocks_are_read_in_pieces_and_put_together(tmp_path, monkeypatch):
+    monkeypatch.setattr("mapserver.evidence.grid.READ_BLOCKS", 3)
+    rows = random_samples(300, 3)
+    writer = Writer(tmp_path, SITE, CONFIG, now_ns)
+    send(writer, [incoming(rows)])
+    here = region(Answers(writer, SITE, CONFIG), -64, -64, 64, 64, names=("resistance",))
+    writer.close()
+    grid = folded(rows)
+    for x in range(-4, 4):
+        for y in range(-4, 4):
+            block = cell_layers.read(grid.evidence([(x, y)]), ["resistance"], ReadConfig())["resistance"].reshape(
+                16, 16
+            )
+            row, column = 16 * (y + 4), 16 * (x + 4)
+            cut = here["resistance"][row : row + 16, column : column + 16]
+            assert np.array_equal(cut, block, equal_nan=True)
+
+
+def test_a_region_that_no_reply_carries_is_refused(answers):
+    region(answers, 0, 0, 4000, 1)
+    with pytest.raises(QueryError, match="4001 x 4000 cells") as caught:
+        region(answers, 0, 0, 4001, 4000)
+    assert caught.value.reason == Refusal.TOO_LARGE
+
+
+def test_least_weight_of_the_read_options_is_obeyed(tmp_path):
+    writer = Writer(tmp_path, SITE, CONFIG, now_ns)
+    send(writer, [incoming(samples(distance_m=2.0))])
+    query = PointQuery(8.5, 8.5, ("resistance",))
+    configs = [replace(CONFIG, read=ReadConfig(least)) for least in (1.9, 2.1)]
+    values = [Answers(writer, SITE, config).point(query).values["resistance"] for config in configs]
+    writer.close()
+    assert np.isfinite(values[0])
+    assert np.isnan(values[1])
+
+
+def test_answers_travel_as_bytes(answers):
+    point = decode_point(answers.answer("point", {"x": "0.5", "y": "-0.5", "layers": "grade_east,visits"}))
+    assert set(point.values) == {"grade_east", "visits"}
+    here = decode_region(answers.answer("region", {"bounds": "0,-2,2,0", "layers": "grade_east"}))
+    np.testing.assert_allclose(here["grade_east"], [[np.nan, 0.01], [0.0, np.nan]], atol=1e-3)
+    info = decode_info(answers.answer("info", {"after": "1"}))
+    assert info["layers"] == [*LAYERS, *AREA_LAYERS]
+    assert info["samples_merged"] == 80
+
+
+def test_an_answer_waits_for_the_row_asked_for(answers):
+    with pytest.raises(QueryError, match="row 2 is not merged") as caught:
+        answers.answer("point", {"x": "0", "y": "0", "after": "2", "wait": "0.01"})
+    assert caught.value.reason == Refusal.AFTER_TIMEOUT
+
+
+# --- change and gaps across the borders of blocks --------------------------------------------------------------------
+
+
+def driven(
+    cell_m: float, half: int, changed: tuple[int, int, int, int], step: int = 1, c_rr: float = 0.2
+) -> list[np.ndarray]:
+    """Three passes an hour apart over a square of cells; a part (west, south, east, north) is repaved before the last.
+
+    half: half the square's edge; step: so many cells lie between two samples. Everything but step 1 leaves gaps. c_rr:
+    of the new ground; 0.04 is that of the old one, and only the gradient tells them apart.
+    """
+    places = np.arange(-half, half, step) + 0.5
+    x, y = (axis.ravel() for axis in np.meshgrid(places, places))
+    west, south, east, north = changed
+    found = []
+    for hour in range(3):
+        new = (hour == 2) & (x > west) & (x < east) & (y > south) & (y < north)
+        stamps = NOW_NS + hour * 3600 * 10**9 + np.arange(x.size) * 240 * 10**9 // x.size
+        place = {"x_m": x * cell_m, "y_m": y * cell_m, "stamp_ns": stamps, "cov_xx_m2": 0, "cov_yy_m2": 0}
+        found.append(samples(x.size, **place, c_rr=np.where(new, c_rr, 0.04), grade_e=np.where(new, -0.3, 0.1)))
+    return found
+
+
+def answers_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tuple[Writer, Answers]:
+    """The map of passes, which are folded past the door: there, a batch has so many samples at most."""
+    writer = Writer(folder, site, config, now_ns)
+
+    def fold(store: Store) -> None:
+        for part in rows:
+            store.grid.fold(part, "a")
+        store.newest_ns = store.grid.newest_ns
+
+    writer.read(fold)
+    return writer, Answers(writer, site, config)
+
+
+CHANGED = ("resistance", "weight", "changed_s", "visits", "age_s")
+FILLED = ("resistance_filled", "resistance_class_filled", "resistance")
+
+
+def assert_parts_are_cut_from_the_whole(answers: Answers, cell_m: float, half: int, names, seed: int) -> np.ndarray:
+    """Compare random windows of the site with the same cells of one window of all of it."""
+    whole = region(answers, *(np.array([-half, -half, half, half]) * cell_m), names=names)
+    draw = np.random.default_rng(seed)
+    for _ in range(25):
+        west, south = draw.integers(-half, half - 1, 2)
+        east, north = (min(half, int(low + draw.integers(1, 30))) for low in (west, south))
+        part = region(answers, *(np.array([west, south, east, north]) * cell_m), names=names)
+        for name in names:
+            expected = whole[name][south + half : north + half, west + half : east + half]
+            assert np.array_equal(part[name], expected, equal_nan=True), (name, west, south, east, north)
+    return whole
+
+
+# The repaved area lies across two and across four blocks, and along the border of one.
+@pytest.mark.parametrize("changed", [(10, 2, 22, 12), (-8, -7, 6, 9), (16, 16, 23, 22), (-23, -5, -16, 1)])
+def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, changed):
+    writer, answers = answers_of(tmp_path, driven(1.0, 40, changed))
+    whole = assert_parts_are_cut_from_the_whole(answers, 1.0, 48, CHANGED, seed=1)
+    west, south, east, north = (edge + 48 for edge in changed)
+    inside = np.zeros((96, 96), np.bool_)
+    inside[south + 1 : north - 1, west + 1 : east - 1] = True
+    assert np.allclose(whole["resistance"][inside], 0.2, rtol=0.05)
+    assert np.isfinite(whole["changed_s"][inside]).all()
+    assert np.isnan(whole["changed_s"]).sum() > 0.8 * 96 * 96
+    for x, y in zip(np.arange(changed[0], changed[2]), np.arange(changed[1], changed[3]), strict=False):
+        values = answers.point(PointQuery(x + 0.5, y + 0.5, CHANGED)).values
+        for name in CHANGED:
+            assert np.array_equal(np.float32(values[name]), whole[name][y + 48, x + 48], equal_nan=True)
+    writer.close()
+
+
+@pytest.mark.parametrize(
+    ("cell_m", "c_rr", "edge_m"),
+    [
+        (1.0, 0.2, 6.0),
+        (1.0, 0.04, 11.0),
+        (0.5, 0.2, 6.0),
+        (0.5, 0.04, 11.0),
+        (0.2, 0.2, 6.0),
+    ],
+)
+def test_a_change_is_seen_with_all_its_surroundings_in_cells_of_any_size(tmp_path, cell_m, c_rr, edge_m):
+    cells = round(edge_m / cell_m)  # a metre more than the least
+    rows = driven(cell_m, cells + 20, (-cells + 3, -4, 3, cells - 4), c_rr=c_rr)
+    writer, answers = answers_of(tmp_path, rows, replace(SITE, cell_m=cell_m))
+    try:
+        names = ("resistance", "grade_east", "changed_s")
+        whole = assert_parts_are_cut_from_the_whole(answers, cell_m, cells + 16, names, seed=2)
+    finally:
+        writer.close()
+    assert np.isfinite(whole["changed_s"]).any()
+
+
+@pytest.mark.parametrize("step", [3, 5])
+def test_gaps_are_filled_alike_in_every_window(tmp_path, step):
+    writer, answers = answers_of(tmp_path, driven(1.0, 40, (-8, -7, 6, 9), step))
+    whole = assert_parts_are_cut_from_the_whole(answers, 1.0, 48, FILLED, seed=3)
+    writer.close()
+    assert np.isfinite(whole["resistance_filled"]).sum() > 2 * np.isfinite(whole["resistance"]).sum()
+
+
+def test_the_change_options_reach_the_answer(tmp_path):
+    rows = driven(1.0, 20, (-6, -6, 6, 6))
+    writer, answers = answers_of(tmp_path, rows)
+    off = Answers(writer, SITE, replace(CONFIG, change=replace(CONFIG.change, detect=False)))
+    seen, not_seen = (region(found, -20, -20, 20, 20, names=("changed_s",))["changed_s"] for found in (answers, off))
+    writer.close()
+    assert np.isfinite(seen).any()
+    assert np.isnan(not_seen).all()

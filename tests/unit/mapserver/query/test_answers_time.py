@@ -1,0 +1,444 @@
+"""Maps as of any time, their differences, the history of a point; machines, changes and commands."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from mapserver.ingest.store import JOURNAL_FILE
+from mapserver.ingest.writer import Writer
+from mapserver.layers.cell_layers import LAYERS
+from mapserver.query.answers import Answers, Nobody, reads_past
+from mapserver.server import Server
+from protocol.errors import QueryError, Refusal
+from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.parameters import selector_of
+from protocol.queries.requests import (
+    MAX_SPANS,
+    HistoryQuery,
+    InfoQuery,
+    PointQuery,
+    RegionQuery,
+    When,
+    decode_changes,
+    decode_error,
+    decode_history,
+    decode_info,
+    decode_machine,
+    decode_machines,
+    decode_point,
+    decode_region,
+    encode_change,
+    encode_query,
+)
+from protocol.site.geometry import Bounds
+from protocol.wire import keys
+from protocol.wire.codec import encode_batch
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    WAIT_S,
+    batch,
+    incoming,
+    now_ns,
+    random_samples,
+    routed,
+    samples,
+    send,
+)
+
+S, HOUR_NS = 10**9, 3600 * 10**9
+BOX = Bounds(-40, -40, 40, 40)
+ROWS = {"a": random_samples(600, 5, std_m=1.0), "b": random_samples(600, 6, std_m=1.0)}
+ROWS["b"]["stamp_ns"] += HOUR_NS
+NEWEST_NS = int(ROWS["b"]["stamp_ns"].max())
+NAMES = (*LAYERS, "resistance_filled", "grade_filled_std")
+
+
+class Watching(Nobody):
+    """A keeper with an answer to everything."""
+
+    def __init__(self, *distrusted: str) -> None:
+        self.asked: list[object] = []
+        self._distrusted = frozenset(distrusted)
+
+    def machines(self):
+        return [{"name": "a", "trusted": True}, {"name": "b", "trusted": False}]
+
+    def changes(self, after):
+        self.asked.append(after)
+        return [{"id": after + 1}]
+
+    def trust(self, machine, trusted, reason, wait_s):
+        self.asked.append((machine, trusted, reason, wait_s))
+        if machine not in "ab":
+            return super().trust(machine, trusted, reason, wait_s)
+        return {"name": machine, "trusted": trusted is not False}
+
+    def distrusted(self):
+        return self._distrusted
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """Function that starts a writer with the samples of each machine in two rows, in a folder of its own."""
+    opened = []
+
+    def start(rows=None, keeper=None) -> Answers:
+        folder = tmp_path_factory.mktemp("store")
+        writer = Writer(folder, SITE, CONFIG, now_ns)
+        opened.append(writer)
+        for machine, table in (ROWS if rows is None else rows).items():
+            half = len(table) // 2
+            send(writer, [incoming(part, machine=machine) for part in (table[:half],) if len(part)])
+            send(writer, [incoming(table[half:], 1 + half, machine)])
+        return Answers(writer, SITE, CONFIG, keeper, folder / JOURNAL_FILE)
+
+    yield start
+    for writer in opened:
+        writer.close()
+
+
+@pytest.fixture(scope="module")
+def answers(served):
+    return served()
+
+
+def until(rows, stamp_ns: int):
+    return {name: part for name, table in rows.items() if len(part := table[table["stamp_ns"] <= stamp_ns])}
+
+
+def equal(one, other, names=NAMES) -> bool:
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)
+
+
+# --- as of -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_map_as_of_now_is_the_map_to_the_bit(answers):
+    here = answers.region(RegionQuery(BOX, NAMES))
+    then = answers.region(RegionQuery(BOX, NAMES, when=When(as_of_ns=NEWEST_NS)))
+    assert equal(here, then)
+    assert np.isfinite(here["resistance"]).any()
+    assert (then.merged, then.stamp_ns, then.bounds) == (4, NEWEST_NS, here.bounds)
+
+
+@pytest.mark.parametrize("after_s", [900, 3600, 3600 + 900])
+@pytest.mark.parametrize("bounds", [(-40, -40, 40, 40), (-3, 5, 12, 9)])
+def test_the_map_as_of_a_time_is_that_of_a_server_that_knew_no_more(answers, served, after_s, bounds):
+    stamp_ns = NOW_NS + after_s * S  # in the midst of journal rows
+    then = answers.region(RegionQuery(Bounds(*bounds), NAMES, when=When(as_of_ns=stamp_ns)))
+    known = until(ROWS, stamp_ns)
+    only = served(known).region(RegionQuery(Bounds(*bounds), NAMES))
+    # Ages count from the time that was asked for, not from the newest sample before it.
+    assert equal(then, only, [name for name in NAMES if name not in ("age_s", "changed_s")])
+    late_s = (stamp_ns - max(int(table["stamp_ns"].max()) for table in known.values())) / S
+    np.testing.assert_allclose(then["age_s"], only["age_s"] + late_s, atol=0.01)
+    assert np.isfinite(then["age_s"]).any()
+    assert then.stamp_ns == stamp_ns
+
+
+def test_before_the_first_sample_nothing_was_known(answers):
+    then = answers.region(RegionQuery(BOX, when=When(as_of_ns=NOW_NS - 1)))
+    assert tuple(then.layers) == tuple(LAYERS)
+    assert all(np.isnan(layer).all() for layer in then.layers.values())
+
+
+def repaved():
+    """An area of 20 x 20 m, driven at 0.02, and two hours later at 0.25."""
+    x, y = (axis.ravel() + 0.5 for axis in np.meshgrid(np.arange(20), np.arange(20)))
+    place = {"x_m": x, "y_m": y, "distance_m": 4.0}
+    old = samples(400, **place, c_rr=0.02, stamp_ns=NOW_NS + np.arange(400))
+    new = samples(400, **place, c_rr=0.25, stamp_ns=NOW_NS + 2 * HOUR_NS + np.arange(400))
+    return {"a": np.concatenate([old, new])}
+
+
+def test_what_changed_later_has_not_changed_yet(served):
+    answers = served(repaved())
+    names = ("resistance", "changed_s", "resistance_class")
+    stamps = (NOW_NS + HOUR_NS, NOW_NS + 3 * HOUR_NS)
+    before, after = (answers.point(PointQuery(10.0, 10.0, names, when=When(t))).values for t in stamps)
+    assert before["resistance"] == pytest.approx(0.02, rel=0.05)
+    assert np.isnan(before["changed_s"])
+    assert after["resistance"] == pytest.approx(0.25, rel=0.05)
+    assert after["changed_s"] == pytest.approx(3600, abs=301)
+    now = answers.point(PointQuery(10.0, 10.0, names)).values
+    assert now["resistance"] == after["resistance"]
+
+
+def test_machines_that_are_left_out_are_left_out_of_the_past(answers, served):
+    without = served(keeper=Watching("b"))
+    only_a = served({"a": ROWS["a"]})
+    when = When(as_of_ns=NEWEST_NS)
+    here, there = (of.region(RegionQuery(BOX, ("resistance",), when=when)) for of in (without, only_a))
+    assert equal(here, there, ["resistance"])
+    assert not equal(here, answers.region(RegionQuery(BOX, ("resistance",), when=when)), ["resistance"])
+
+
+# --- differences -----------------------------------------------------------------------------------------------------
+
+
+def test_a_difference_is_value_by_value_and_unknown_where_either_is(answers):
+    names = ("resistance", "visits", "resistance_filled")
+    middle_ns = NOW_NS + 900 * S
+    newer = answers.region(RegionQuery(BOX, names))
+    older = answers.region(RegionQuery(BOX, names, when=When(as_of_ns=middle_ns)))
+    both = answers.region(RegionQuery(BOX, names, when=When(minus_ns=middle_ns)))
+    for name in names:
+        assert np.array_equal(both[name], newer[name] - older[name], equal_nan=True)
+        assert (np.isnan(both[name]) == (np.isnan(newer[name]) | np.isnan(older[name]))).all()
+    assert (both.merged, both.stamp_ns) == (4, NEWEST_NS)
+
+
+def test_a_difference_of_two_pasts_is_as_of_the_newer(served):
+    answers = served(repaved())
+    early, late = NOW_NS + HOUR_NS, NOW_NS + 3 * HOUR_NS
+    names = ("resistance", "resistance_class")
+    point = answers.point(PointQuery(10.0, 10.0, names, when=When(late, early)))
+    assert point.values["resistance"] == pytest.approx(0.23, rel=0.05)
+    assert point.values["resistance_class"] == 3.0  # from class 1 to class 4: a number of classes
+    assert point.stamp_ns == late
+    back = answers.point(PointQuery(10.0, 10.0, names, when=When(early, late)))
+    assert back.values["resistance_class"] == -3.0
+
+
+def test_axes_have_no_difference(answers):
+    with pytest.raises(QueryError, match="`heading` has no difference; ask for it without `minus`") as caught:
+        answers.point(PointQuery(0.0, 0.0, ("visits", "heading"), when=When(minus_ns=NOW_NS)))
+    assert caught.value.reason == Refusal.OUT_OF_RANGE
+    values = answers.point(PointQuery(0.0, 0.0, when=When(minus_ns=NOW_NS))).values
+    assert set(values) == set(LAYERS) - {"heading"}
+
+
+def test_refusals_are_the_same_for_the_past(answers):
+    with pytest.raises(QueryError, match="4001 x 4000 cells"):
+        answers.region(RegionQuery(Bounds(0, 0, 4001, 4000), when=When(as_of_ns=1)))
+    with pytest.raises(QueryError, match="`colour` is not known"):
+        answers.region(RegionQuery(BOX, ("colour",), when=When(minus_ns=1)))
+
+
+# --- history ---------------------------------------------------------------------------------------------------------
+
+
+def hours(*rates: float):
+    """A cell driven for two minutes at the beginning of every hour."""
+    parts = [
+        samples(12, c_rr=c_rr, stamp_ns=NOW_NS + i * HOUR_NS + np.arange(12) * 10 * S) for i, c_rr in enumerate(rates)
+    ]
+    return {"a": np.concatenate(parts)}
+
+
+def test_a_history_reads_each_span_alone(served):
+    answers = served(hours(0.02, 0.05, 0.25))
+    got = answers.history(HistoryQuery(8.2, 8.9, ("resistance", "age_s", "changed_s")))
+    assert (got.x_m, got.y_m, got.merged) == (8.5, 8.5, 2)
+    assert got.stamp_ns == NOW_NS + 2 * HOUR_NS + 110 * S
+    assert [span.first_ns for span in got.spans] == [NOW_NS + i * HOUR_NS for i in range(3)]  # 300 s, others empty
+    assert all(span.last_ns - span.first_ns == 300 * S - 1 for span in got.spans)
+    values = [span.values["resistance"] for span in got.spans]
+    assert values == pytest.approx([0.02, 0.05, 0.25], rel=0.02)
+    assert [span.values["age_s"] for span in got.spans] == pytest.approx([190, 190, 190], abs=0.01)
+    assert np.isnan([span.values["changed_s"] for span in got.spans]).all()
+
+
+def test_a_history_is_bounded_by_its_times_and_cut_by_its_span(served):
+    answers = served(hours(0.02, 0.05, 0.25))
+    times = {"from_ns": NOW_NS + HOUR_NS, "to_ns": NOW_NS + 2 * HOUR_NS}
+    got = answers.history(HistoryQuery(8.5, 8.5, ("weight",), **times))
+    assert [span.first_ns for span in got.spans] == [NOW_NS + HOUR_NS, NOW_NS + 2 * HOUR_NS]
+    assert got.spans[0].values["weight"] > 5 * got.spans[1].values["weight"] > 0  # of that hour, the first sample
+    got = answers.history(HistoryQuery(8.5, 8.5, ("weight",), span_s=60.0))
+    assert [(span.first_ns - NOW_NS) // S for span in got.spans] == [0, 60, 3600, 3660, 7200, 7260]
+    [day] = answers.history(HistoryQuery(8.5, 8.5, span_s=86_400.0)).spans
+    assert tuple(day.values) == tuple(LAYERS)
+    assert answers.history(HistoryQuery(1000.0, 0.0)).spans == ()
+
+
+def test_too_many_spans_are_refused_before_any_is_read(served, monkeypatch):
+    answers = served(hours(0.02, 0.05))
+    to_ns = NOW_NS + MAX_SPANS * 300 * S - 1
+    assert len(answers.history(HistoryQuery(8.5, 8.5, ("weight",), NOW_NS, to_ns)).spans) == 2
+    monkeypatch.setattr("mapserver.query.views.point_history", None)
+    with pytest.raises(QueryError, match=r"2001 spans of 300 s; at most 2000 .* a longer `span`") as caught:
+        answers.history(HistoryQuery(8.5, 8.5, ("weight",), NOW_NS, to_ns + 1))
+    assert caught.value.reason == Refusal.TOO_LARGE
+
+
+def test_without_a_first_time_the_newest_spans_are_answered(served):
+    answers = served(hours(0.02, 0.05, 0.25))
+    query = HistoryQuery(8.5, 8.5, ("weight",), span_s=1.0)  # 2000 s until now, which is 7310 s after the first sample
+    spans = answers.history(query).spans
+    assert {(span.first_ns - NOW_NS) // HOUR_NS for span in spans} == {2}
+    before = answers.history(HistoryQuery(8.5, 8.5, ("weight",), to_ns=NOW_NS + HOUR_NS, span_s=2.0)).spans
+    assert {(span.first_ns - NOW_NS) // HOUR_NS for span in before} == {0, 1}
+
+
+def test_a_history_leaves_out_machines_and_filled_layers(served):
+    rows = hours(0.02, 0.05)
+    assert served(rows, Watching("a")).history(HistoryQuery(8.5, 8.5)).spans == ()
+    with pytest.raises(QueryError, match="`resistance_filled` is made from a cell's neighbours") as caught:
+        served(rows).history(HistoryQuery(8.5, 8.5, ("visits", "resistance_filled")))
+    assert caught.value.reason == Refusal.UNKNOWN_LAYER
+    with pytest.raises(QueryError, match="`colour` is not known"):
+        served(rows).history(HistoryQuery(8.5, 8.5, ("colour",)))
+
+
+def test_a_site_without_samples_has_no_history(served):
+    assert served({}).history(HistoryQuery(8.5, 8.5)).spans == ()
+    assert served({}).history(HistoryQuery(8.5, 8.5, from_ns=NOW_NS)).spans == ()
+
+
+# --- the journal -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("query", [PointQuery(0, 0, when=When(1)), HistoryQuery(0, 0)])
+def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
+    writer = Writer(tmp_path, SITE, CONFIG, now_ns)
+    for journal, words in ((None, "keeps no journal"), (tmp_path / "none.db", "no usable journal")):
+        with pytest.raises(QueryError, match=words) as caught:
+            getattr(Answers(writer, SITE, CONFIG, None, journal), query.name)(query)
+        assert caught.value.reason == Refusal.STORE
+    writer.close()
+
+
+def test_questions_about_the_past_are_told_apart():
+    assert reads_past("history", {})
+    assert reads_past("point", {"as_of": "1"})
+    assert reads_past("region", {"minus": "1"})
+    assert not reads_past("point", {"x": "1", "after": "3"})
+
+
+def test_answers_about_the_past_travel_as_bytes(answers):
+    stamp = str(NOW_NS + 900 * S)
+    region = {"bounds": "-2,-2,2,2", "layers": "visits"}
+    then = decode_region(answers.answer("region", {**region, "as_of": stamp}))
+    difference = decode_region(answers.answer("region", {**region, "minus": stamp}))
+    now = decode_region(answers.answer("region", region))
+    assert np.array_equal(difference["visits"], now["visits"] - then["visits"], equal_nan=True)
+    assert then.stamp_ns == int(stamp)
+    place = {"x": "0.5", "y": "0.5", "layers": "visits"}
+    assert decode_point(answers.answer("point", {**place, "as_of": stamp})).stamp_ns == int(stamp)
+    one = ROWS["a"][ROWS["a"]["distance_m"].argmax()]
+    there = {"x": str(one["x_m"]), "y": str(one["y_m"]), "layers": "visits"}
+    times = {"from": str(one["stamp_ns"]), "to": str(one["stamp_ns"]), "span": "600"}
+    [span] = decode_history(answers.answer("history", {**there, **times})).spans
+    assert span.last_ns - span.first_ns == 600 * S - 1
+    with pytest.raises(QueryError, match="row 9 is not merged"):
+        answers.answer("history", {**place, "after": "9", "wait": "0.01"})
+
+
+# --- machines, changes, commands -------------------------------------------------------------------------------------
+
+
+def test_the_keeper_is_asked(served):
+    keeper = Watching()
+    answers = served(keeper=keeper)
+    assert decode_machines(answers.answer("machines", {"after": "1"})) == keeper.machines()
+    assert decode_changes(answers.answer("changes", {"after": "41"})) == [{"id": 42}]
+    row = decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
+    assert row == {"name": "b", "trusted": False, "merged": 4}
+    answers.obey("trust", {"machine": "b", "trusted": "auto"})
+    assert keeper.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
+    with pytest.raises(QueryError, match="`c` is not known") as caught:
+        answers.obey("trust", {"machine": "c", "trusted": "yes"})
+    assert caught.value.reason == Refusal.UNKNOWN_MACHINE
+    with pytest.raises(QueryError, match="row 9 is not merged"):
+        answers.answer("machines", {"after": "9", "wait": "0.01"})
+
+
+def test_where_nobody_watches_nothing_is_known(answers):
+    assert decode_machines(answers.answer("machines", {})) == []
+    assert decode_changes(answers.answer("changes", {})) == []
+    with pytest.raises(QueryError, match="nobody watches"):
+        answers.obey("trust", {"machine": "a", "trusted": "yes"})
+
+
+# --- over Zenoh ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def online(tmp_path):
+    with routed() as (router, client):
+        server = Server(router, tmp_path, SITE, CONFIG, now_ns)
+        yield server, client
+        server.close()
+
+
+def get(client, key: str, parameters: dict[str, str], payload: bytes | None = None):
+    selector = f"{key}?{selector_of(parameters)}" if parameters else key
+    [reply] = client.get(selector, payload=payload, timeout=WAIT_S)
+    return reply
+
+
+def test_events_and_queries_below_the_map_do_not_meet(online):
+    server, client = online
+    heard, here = [], threading.Event()
+    subscriber = client.declare_subscriber(
+        keys.changed("pit"), lambda s: (heard.append(s.payload.to_bytes()), here.set())
+    )
+    error = decode_error(get(client, keys.changed("pit"), {}).err.payload.to_bytes())
+    assert error.reason == Refusal.UNKNOWN_QUERY
+    get(client, keys.map_query("pit", "info"), {})  # the subscription has reached the server with this answer
+    server._publish({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})
+    assert here.wait(WAIT_S)
+    assert heard == [encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
+    subscriber.undeclare()
+
+
+def test_a_command_reaches_the_keeper_with_its_reason(online):
+    _, client = online
+    get(client, keys.ingest("pit", "a"), {}, encode_batch(batch(samples(5))))
+    command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")
+    row = decode_machine(get(client, keys.admin("pit", "trust"), encode_command(command)).ok.payload.to_bytes())
+    assert (row["name"], row["trusted"], row["merged"]) == ("a", False, 1)
+    assert row["reason"] == command.reason
+    gone = {"x": "8.5", "y": "8.5", "layers": "weight"}
+    for more in ({}, {"as_of": str(NOW_NS + HOUR_NS)}):
+        point = decode_point(get(client, keys.map_query("pit", "point"), gone | more).ok.payload.to_bytes())
+        assert np.isnan(point.values["weight"])
+    [machine] = decode_machines(get(client, keys.map_query("pit", "machines"), {}).ok.payload.to_bytes())
+    assert machine["name"] == "a"
+    assert not machine["trusted"]
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "reason"),
+    [
+        ("trust", {"machine": "c", "trusted": "yes"}, Refusal.UNKNOWN_MACHINE),
+        ("trust", {"machine": "c"}, Refusal.MISSING_FIELD),
+        ("shutdown", {}, Refusal.UNKNOWN_QUERY),
+    ],
+)
+def test_a_refused_command_gets_its_reason_and_is_counted(online, name, parameters, reason):
+    _, client = online
+    assert decode_error(get(client, keys.admin("pit", name), parameters).err.payload.to_bytes()).reason == reason
+    info = decode_info(get(client, keys.map_query("pit", "info"), {}).ok.payload.to_bytes())
+    assert info["counters"] == {f"refused_query_{reason}": 1}
+
+
+@pytest.mark.parametrize("slow", ["past", "command"])
+def test_the_map_as_it_is_does_not_wait_for_what_is_slow(online, monkeypatch, slow):
+    server, client = online
+    release, entered = threading.Event(), threading.Event()
+
+    def hold(*_):
+        entered.set()
+        assert release.wait(WAIT_S)
+        raise QueryError(Refusal.STORE, "held")
+
+    monkeypatch.setattr(server.answers, "history", hold)
+    monkeypatch.setattr(server.answers, "trust", hold)
+    key, asked = {
+        "past": (keys.map_query("pit", "history"), encode_query(HistoryQuery(0, 0))),
+        "command": (keys.admin("pit", "trust"), encode_command(TrustCommand("a", True))),
+    }[slow]
+    askers = [threading.Thread(target=get, args=(client, key, asked)) for _ in range(3)]
+    for asker in askers:
+        asker.start()
+    assert entered.wait(WAIT_S)
+    for _ in range(3):
+        assert get(client, keys.map_query("pit", "info"), encode_query(InfoQuery())).ok
+    release.set()
+    for asker in askers:
+        asker.join()

@@ -1,0 +1,166 @@
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import zenoh
+
+from mapserver.server import Server
+from protocol.errors import Refusal
+from protocol.queries.requests import (
+    Freshness,
+    InfoQuery,
+    PointQuery,
+    RegionQuery,
+    decode_error,
+    decode_info,
+    decode_point,
+    decode_region,
+    encode_query,
+)
+from protocol.site.geometry import Bounds
+from protocol.wire import keys
+from protocol.wire.codec import decode_reply, encode_batch
+from protocol.wire.messages import Ack
+from tests.unit.mapserver.data import CONFIG, SITE, WAIT_S, batch, now_ns, routed, samples
+
+
+@pytest.fixture(scope="module")
+def sessions():
+    with routed() as pair:
+        yield pair
+
+
+@pytest.fixture
+def served(sessions, tmp_path):
+    router, client = sessions
+    server = Server(router, tmp_path, SITE, CONFIG, now_ns)
+    yield server, client
+    server.close()
+
+
+def get(client: zenoh.Session, key: str, parameters: dict[str, str] | None = None, payload: bytes | None = None):
+    """The one reply to a query."""
+    text = ";".join(f"{name}={value}" for name, value in (parameters or {}).items())
+    replies = list(client.get(f"{key}?{text}" if text else key, payload=payload, timeout=WAIT_S))
+    assert len(replies) == 1
+    return replies[0]
+
+
+def deliver(client: zenoh.Session, sent, machine: str = "a"):
+    return decode_reply(get(client, keys.ingest("pit", machine), payload=encode_batch(sent)).ok.payload.to_bytes())
+
+
+def ask(client: zenoh.Session, query) -> bytes:
+    return get(client, keys.map_query("pit", query.name), encode_query(query)).ok.payload.to_bytes()
+
+
+def refusal(client: zenoh.Session, name: str, parameters: dict[str, str]):
+    return decode_error(get(client, keys.map_query("pit", name), parameters).err.payload.to_bytes())
+
+
+def counters(client: zenoh.Session) -> dict[str, int]:
+    return decode_info(ask(client, InfoQuery()))["counters"]
+
+
+def test_a_batch_is_acknowledged_and_seen_by_a_query_that_waits_for_it(served):
+    _, client = served
+    ack = deliver(client, batch(samples(5, c_rr=0.25)))
+    assert ack == Ack(5, 1)
+    query = RegionQuery(Bounds(0, 0, 16, 16), ("resistance", "grade_north"), Freshness(after=ack.row))
+    region = decode_region(ask(client, query))
+    assert region["resistance"][8, 8] == pytest.approx(0.25, rel=1e-3)
+    assert np.isfinite(region["resistance"]).sum() == 1
+    assert region.merged == 1
+    point = decode_point(ask(client, PointQuery(8.2, 8.9, ("resistance",))))
+    assert point.values["resistance"] == region["resistance"][8, 8]
+
+
+def test_a_repeated_batch_is_trimmed_and_an_empty_one_asks_for_the_watermark(served):
+    _, client = served
+    deliver(client, batch(samples(5)))
+    assert deliver(client, batch(samples(7))) == Ack(7, 2, trimmed=5)
+    assert deliver(client, batch(samples(0))) == Ack(7, 2)
+    assert decode_info(ask(client, InfoQuery()))["samples_merged"] == 7
+
+
+def test_a_refused_batch_gets_its_reason(served):
+    _, client = served
+    refused = deliver(client, batch(samples(1), 4))
+    assert (refused.reason, refused.expected) == (Refusal.GAP, 1)
+    assert deliver(client, batch(samples(1)), machine="b").reason == Refusal.WRONG_MACHINE
+    reply = decode_reply(get(client, keys.ingest("pit", "a")).ok.payload.to_bytes())  # without a payload
+    assert reply.reason == Refusal.NOT_MSGPACK
+    counted = {name: n for name, n in counters(client).items() if name.startswith("refused")}
+    assert counted == {"refused_gap": 1, "refused_wrong_machine": 1, "refused_not_msgpack": 1}
+
+
+def test_a_wildcard_names_no_machine(served):
+    _, client = served
+    reply = get(client, keys.ingest_all("pit"), payload=encode_batch(batch(samples(1))))
+    assert decode_reply(reply.ok.payload.to_bytes()).reason == Refusal.WRONG_MACHINE
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "reason"),
+    [
+        ("region", {"bounds": "0,0,1,1", "colour": "red"}, Refusal.UNKNOWN_PARAMETER),
+        ("point", {"x": "0", "y": "0", "layers": "colour"}, Refusal.UNKNOWN_LAYER),
+        ("elevation", {}, Refusal.UNKNOWN_QUERY),
+        ("region", {"bounds": "0,0,10000,10000"}, Refusal.TOO_LARGE),
+        ("info", {"after": "9", "wait": "0.01"}, Refusal.AFTER_TIMEOUT),
+        ("point", {"x": "", "y": "0"}, Refusal.WRONG_TYPE),
+    ],
+)
+def test_a_refused_query_gets_its_reason_and_is_counted(served, name, parameters, reason):
+    _, client = served
+    error = refusal(client, name, parameters)
+    assert error.reason == reason
+    assert counters(client) == {f"refused_query_{reason}": 1}
+
+
+def test_a_bug_in_a_query_is_answered(served, monkeypatch):
+    server, client = served
+    monkeypatch.setattr(server.answers, "point", lambda _: 1 // 0)
+    error = refusal(client, "point", {"x": "0", "y": "0"})
+    assert error.reason == "internal"
+    assert str(error).startswith("the server failed")
+
+
+@pytest.mark.parametrize(("query_threads", "together"), [(1, False), (2, True)])
+def test_so_many_queries_are_answered_at_once(sessions, tmp_path, monkeypatch, query_threads, together):
+    router, client = sessions
+    server = Server(router, tmp_path, SITE, replace(CONFIG, query_threads=query_threads), now_ns)
+    both = threading.Barrier(2)
+    met = []
+
+    def meet(_) -> dict[str, object]:
+        try:
+            both.wait(WAIT_S if together else 0.2)
+        except threading.BrokenBarrierError:
+            met.append(False)
+        else:
+            met.append(True)
+        return {}
+
+    monkeypatch.setattr(server.answers, "info", lambda: meet(None))
+    askers = [threading.Thread(target=ask, args=(client, InfoQuery())) for _ in range(2)]
+    for asker in askers:
+        asker.start()
+    for asker in askers:
+        asker.join()
+    server.close()
+    assert met == [together] * 2
+
+
+def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
+    router, client = sessions
+    server = Server(router, tmp_path, SITE, CONFIG, now_ns)
+    deliver(client, batch(samples(5)))
+    server.close()
+    assert not server.failed
+    assert list(client.get(keys.ingest("pit", "a"), payload=b"", timeout=WAIT_S)) == []  # nobody listens
+    server = Server(router, tmp_path, SITE, CONFIG, now_ns)
+    assert deliver(client, batch(samples(0))) == Ack(5, 1)
+    assert server.answers.info()["samples_merged"] == 5
+    server.close()

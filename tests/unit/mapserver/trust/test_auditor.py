@@ -1,0 +1,216 @@
+"""Simulated fleets on five zones: bad machines are found, with the reason; nobody else is."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from mapserver.evidence.votes import FoldConfig
+from mapserver.trust.auditor import Auditor, Reason, TrustConfig, Verdict
+from protocol.arrays import Table
+from protocol.machine.samples import empty
+from protocol.site.ground_classes import ZONES
+from tests.unit.mapserver.data import NOW_NS
+
+WIDTH_M, HEIGHT_M, STEP_M, STEP_S = 150, 100, 0.6, 0.2
+C_RR = np.array([zone.c_rr for zone in ZONES])
+SITE = np.zeros((HEIGHT_M, WIDTH_M), np.int64)
+SITE[:50, 75:], SITE[50:, :50], SITE[50:, 50:100], SITE[50:, 100:] = 2, 1, 4, 3
+WETTER = np.minimum(SITE + 1, 3)
+DIRT = np.full_like(SITE, 2)
+
+
+def gauss_markov(rng: np.random.Generator, n: int, std: float, tau_s: float) -> np.ndarray:
+    decay = np.exp(-STEP_S / tau_s)
+    noise = rng.normal(0, std * np.sqrt(1 - decay**2), n)
+    noise[0] = rng.normal(0, std)
+    return lfilter([1], [1, -decay], noise)
+
+
+def drive(
+    seed: int,
+    km: float = 3.6,
+    std_m: float = 1.3,
+    gain: float = 1.0,
+    zero: float = 0.0,
+    off_m: tuple[float, float] = (0.0, 0.0),
+    stuck: float | None = None,
+    clock_s: float = 0.0,
+    start_s: float = 0.0,
+    site: np.ndarray = SITE,
+    later: tuple[float, np.ndarray] | None = None,
+) -> Table:
+    """One machine that drives from goal to goal; later: from this time on [s] the site is another one."""
+    rng = np.random.default_rng(seed)
+    n = round(km * 1000 / STEP_M)
+    goals = rng.uniform(0, (WIDTH_M, HEIGHT_M), (n // 20, 2))
+    legs = np.maximum(1, np.hypot(*np.diff(goals, axis=0).T) / STEP_M)
+    x, y = (np.interp(np.arange(n), np.r_[0, np.cumsum(legs)], goals[:, axis]) for axis in (0, 1))
+    seconds = start_s + np.arange(n) * STEP_S
+    place = y.astype(int).clip(0, HEIGHT_M - 1), x.astype(int).clip(0, WIDTH_M - 1)
+    zone = site[place] if later is None else np.where(seconds >= later[0], later[1][place], site[place])
+    rows = empty(n)
+    rows["stamp_ns"] = NOW_NS + np.rint((seconds + clock_s) * 1e9).astype(np.int64)
+    rows["x_m"] = x + gauss_markov(rng, n, std_m, 30) + off_m[0]
+    rows["y_m"] = y + gauss_markov(rng, n, std_m, 30) + off_m[1]
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = std_m**2
+    rows["distance_m"] = STEP_M
+    rows["c_rr"] = (gain * C_RR[zone] + zero if stuck is None else stuck) + rng.normal(
+        0, 0.002 if stuck is None else 5e-4, n
+    )
+    return rows
+
+
+def audit(fleet: list[Table], config: TrustConfig | None = None, batch: int = 250) -> dict[str, Verdict]:
+    """Machines a, b, c... send in turn."""
+    auditor = Auditor(config or TrustConfig(), 1.0)
+    send(auditor, "abcdefgh", fleet, batch)
+    return auditor.verdicts()
+
+
+def send(auditor: Auditor, names: str, fleet: list[Table], batch: int = 250) -> None:
+    for first in range(0, max(map(len, fleet)), batch):
+        for name, rows in zip(names, fleet, strict=False):
+            auditor.add(name, rows[first : first + batch])
+
+
+def found(verdicts: dict[str, Verdict]) -> dict[str, tuple[Reason, ...]]:
+    return {name: verdict.reasons for name, verdict in verdicts.items() if verdict.contradicts}
+
+
+def fleet(seed: int, *machines: dict[str, Any], **all_of_them: Any) -> list[Table]:
+    return [drive(100 * seed + i, **(all_of_them | machine)) for i, machine in enumerate(machines)]
+
+
+GOOD: dict[str, Any] = {}
+BAD = {
+    "gain": ([{"gain": 1.6}], [Reason.GAIN]),
+    "small gain": ([{"gain": 1.25}], [Reason.GAIN]),
+    "weak": ([{"gain": 0.7}], [Reason.GAIN]),
+    "stuck": ([{"stuck": 0.04}], [Reason.STUCK]),
+    "fast clock": ([{"clock_s": 3600.0}], [Reason.CLOCK]),
+    "slow clock": ([{"clock_s": -3600.0}], [Reason.CLOCK]),
+    "displaced": ([{"off_m": (3.5, 0.0), "km": 10.8}], [Reason.OFFSET]),
+    "two of five": ([{"gain": 1.6}, {"stuck": 0.04}], [Reason.GAIN, Reason.STUCK]),
+    "two alike of five": ([{"gain": 1.6}, {"gain": 1.6}], [Reason.GAIN, Reason.GAIN]),
+    "mirrored site": ([{"site": SITE[::-1, ::-1]}], [Reason.DISAGREES]),
+}
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_machine_is_found_with_the_reason_and_no_other(case: str, seed: int) -> None:
+    faults, reasons = BAD[case]
+    km = faults[0].get("km", 3.6)
+    verdicts = audit(fleet(seed, GOOD, GOOD, GOOD, *faults, km=km))
+    assert found(verdicts) == {name: (reason,) for name, reason in zip("de", reasons, strict=False)}
+    for name, reason in zip("de", reasons, strict=False):
+        assert verdicts[name].evidence["excess"][reason] > 1
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_gain_and_displacement_together_are_both_found_and_measured(seed: int) -> None:
+    verdicts = audit(fleet(seed, GOOD, GOOD, GOOD, {"gain": 1.6, "off_m": (0.0, 3.5)}, km=10.8))
+    assert found(verdicts) == {"d": (Reason.GAIN, Reason.OFFSET)}
+    evidence = verdicts["d"].evidence
+    assert evidence["gain"] == pytest.approx(1.6, abs=0.03)
+    assert evidence["offset_north_m"] == pytest.approx(3.5, abs=1.0)
+    assert abs(evidence["offset_east_m"]) < 1.0
+    assert evidence["agreement"] > 0.8
+    assert evidence["disagrees_with"] == ("a", "b", "c")
+
+
+HONEST = {
+    "alike": [GOOD] * 4,
+    "one far better": [{"std_m": 0.05}] + [{"std_m": 2.5}] * 3,
+    "one poorer": [GOOD] * 3 + [{"std_m": 2.5}],
+    "scales of 5 %": [{"gain": 0.95}, GOOD, GOOD, {"gain": 1.05}],
+    "zero errors": [{"zero": -0.003}, GOOD, {"zero": 0.003}, {"zero": 0.003}],
+    "zero errors on concrete": [{"zero": z, "site": 0 * SITE} for z in (0.0, 0.0, 0.003)],
+    "one class": [{"site": DIRT}] * 3,
+    "stuck where nothing varies": [{"site": DIRT}] * 3 + [{"site": DIRT, "stuck": 0.04}],
+    "repaved for all": [{"later": (600.0, WETTER)}] * 3,
+    "two only": [GOOD, {"gain": 1.6}],
+    "two against two": [GOOD, GOOD, {"gain": 1.6}, {"gain": 1.6}],
+    "most are wrong": [GOOD, GOOD, {"gain": 1.6}, {"gain": 0.6}, {"gain": 2.5}],
+    "alone": [GOOD],
+    "too little ground": [{"km": 0.12}] * 2 + [{"km": 0.12, "gain": 1.6}],
+}
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("case", HONEST)
+def test_no_machine_is_accused_without_need(case: str, seed: int) -> None:
+    assert found(audit(fleet(seed, *HONEST[case]))) == {}
+
+
+@pytest.mark.parametrize("after_s", [0.0, 3600.0])
+def test_a_machine_that_left_before_the_rain_is_not_accused(after_s: float) -> None:
+    """Unless it was there at the same time."""
+    auditor = Auditor(TrustConfig(), 1.0)
+    send(auditor, "d", [drive(1)])
+    send(auditor, "abc", fleet(0, GOOD, GOOD, GOOD, site=WETTER, start_s=after_s))
+    assert bool(found(auditor.verdicts())) == (after_s == 0)
+
+
+def test_of_two_machines_both_are_reported_as_disagreeing() -> None:
+    verdicts = audit(fleet(0, GOOD, {"gain": 1.6}))
+    assert verdicts["a"].evidence["disagrees_with"] == ("b",)
+    assert verdicts["b"].evidence["disagrees_with"] == ("a",)
+
+
+def test_a_machine_on_new_ground_is_undecided() -> None:
+    rows = drive(3)
+    rows["x_m"] += 1000
+    evidence = audit([*fleet(0, GOOD, GOOD, GOOD), rows])["d"].evidence
+    assert evidence["cells"] == 0
+    assert "gain" not in evidence
+
+
+def test_a_parked_machine_says_nothing_about_the_ground() -> None:
+    rows = drive(3, gain=1.6)
+    rows["distance_m"] = 0
+    assert audit([*fleet(0, GOOD, GOOD, GOOD), rows])["d"].evidence["cells"] == 0
+
+
+def test_samples_unsure_of_their_place_are_left_out() -> None:
+    rows = drive(3, gain=1.6)
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 4.0
+    auditor = Auditor(TrustConfig(), 1.0, FoldConfig(std_cap_m=1.9))
+    for name, part in zip("abcd", [*fleet(0, GOOD, GOOD, GOOD), rows], strict=True):
+        auditor.add(name, part)
+    assert auditor.verdicts()["d"].evidence["cells"] == 0
+
+
+def test_a_repaired_machine_is_cleared_once_its_bad_periods_are_forgotten() -> None:
+    others = fleet(0, GOOD, GOOD, GOOD, km=10.8)
+    half = len(others[0]) // 2
+    mended = np.concatenate([drive(3, km=5.4, gain=1.6), drive(4, km=5.4, start_s=half * STEP_S)])
+    assert found(audit([*others, mended], TrustConfig(period_s=900, periods=2))) == {}
+    early = [rows[:half] for rows in (*others, mended)]
+    assert found(audit(early, TrustConfig(period_s=900, periods=2))) == {"d": (Reason.GAIN,)}
+
+
+@pytest.mark.parametrize(
+    ("options", "case"),
+    [
+        ({"min_cells": 100_000}, {"gain": 1.6}),
+        ({"gain_limit": 1.7}, {"gain": 1.6}),
+        ({"share": 0.999}, {"gain": 1.6}),
+        ({"zero_error": 0.3}, {"gain": 1.6}),
+        ({"stuck_spread": 0.003}, {"stuck": 0.04}),
+        ({"min_spread": 5.0}, {"stuck": 0.04}),
+        ({"clock_limit_s": 4000.0}, {"clock_s": 3600.0}),
+        ({"clock_span_s": 5000.0}, {"clock_s": 3600.0}),
+        ({"agreement": 0.05}, {"site": SITE[::-1, ::-1]}),
+        ({"tolerance": 9.0}, {"site": SITE[::-1, ::-1]}),
+        ({"offset_limit_m": 6.0}, {"off_m": (3.5, 0.0), "km": 10.8}),
+        ({"error_length_m": 1e5}, {"off_m": (3.5, 0.0), "km": 10.8}),
+        ({"sigmas": 20.0}, {"off_m": (3.5, 0.0), "km": 10.8}),
+    ],
+)
+def test_every_limit_counts(options: dict[str, float], case: dict[str, Any]) -> None:
+    machines = fleet(0, GOOD, GOOD, GOOD, case, km=case.get("km", 3.6))
+    reason = audit(machines)["d"].reasons[0]
+    assert reason not in audit(machines, TrustConfig(**options))["d"].reasons

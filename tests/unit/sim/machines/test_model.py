@@ -1,0 +1,124 @@
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from protocol.errors import ConfigError
+from protocol.machine.machine_config import MachineConfig, Mount
+from sim.machines.model import BASE, FOLDER, FRONT, PAYLOAD, WHEELS, MachineModel, load_model
+from sim.machines.urdf import Mass, Pose, joined, read_urdf, rigid_urdf, rpy_rad
+from tests.unit.sim.bullet_worlds import LOADER, TRUCK
+
+BOTH = pytest.mark.parametrize("model", [LOADER, TRUCK], ids=lambda m: m.name)
+
+
+@BOTH
+def test_lengths_and_masses_are_those_of_the_urdf(model: MachineModel) -> None:
+    robot = model.robot
+    hubs = np.array([robot.place(wheel, BASE).xyz_m for wheel in WHEELS])
+    length, half = model.wheelbase_m, 0.5 * model.track_m
+    expected = [[length, half], [length, -half], [0, half], [0, -half]]
+    np.testing.assert_allclose(hubs, [[*xy, model.wheel_radius_m] for xy in expected], atol=1e-12)
+    np.testing.assert_allclose(robot.place(FRONT, BASE).xyz_m, [model.rear_to_joint_m, 0, model.wheel_radius_m])
+    assert model.weight().mass_kg == pytest.approx(model.mass_kg)
+    assert robot.links[PAYLOAD].mass.mass_kg == model.payload_kg
+    assert {robot.links[wheel].mass.inertia_kgm2[1, 1] for wheel in WHEELS} == {model.wheel_inertia_kgm2}
+
+
+@BOTH
+def test_what_agents_assume_follows_from_the_body(model: MachineModel) -> None:
+    assert model.load_centre_m == pytest.approx(model.front_share() * model.wheelbase_m, abs=0.01)
+    rim = 4 * model.wheel_inertia_kgm2 / model.wheel_radius_m**2
+    assert model.rotating_mass_factor == pytest.approx(1 + rim / model.mass_kg, abs=0.005)
+    assert model.weight().centre_m[1] == 0
+
+
+def test_the_loader_is_the_machine_that_configs_describe_by_default() -> None:
+    nominal = MachineConfig("x")
+    for name in ("mass_kg", "wheel_radius_m", "rotating_mass_factor"):
+        assert getattr(LOADER, name) == pytest.approx(getattr(nominal, name)), name
+
+
+@BOTH
+def test_payload_moves_the_weight_to_where_it_lies(model: MachineModel) -> None:
+    place = model.robot.place(PAYLOAD, BASE).xyz_m
+    full = model.weight(model.payload_kg)
+    empty = model.weight()
+    assert full.mass_kg == model.mass_kg + model.payload_kg
+    expected = (model.mass_kg * empty.centre_m + model.payload_kg * place) / full.mass_kg
+    np.testing.assert_allclose(full.centre_m, expected, atol=1e-9)
+    assert 0.2 < model.front_share(model.payload_kg) < 0.8
+
+
+@BOTH
+def test_sensors_stand_where_the_issue_wants_them(model: MachineModel) -> None:
+    assert len(model.gps_mounts()) == 3
+    assert min(mount.xyz_m[2] for mount in model.gps_mounts()) > 3
+    assert [frame for frame, _ in model.imu_mounts()] == [FRONT, FRONT, BASE, BASE]
+    assert model.imu_mounts()[1][1].rpy_deg == (180.0, 0.0, 0.0)
+
+
+def test_rear_frame_rolls_with_the_front_or_with_its_own_wheels() -> None:
+    assert LOADER.rolls_with_front
+    assert not TRUCK.rolls_with_front
+
+
+def test_unknown_machine_is_refused_with_those_that_exist() -> None:
+    with pytest.raises(ConfigError, match=r"no 'crane'; known: dump_truck, wheel_loader"):
+        load_model("crane")
+
+
+@pytest.mark.parametrize("name", [f.name for f in fields(MachineModel) if f.type == "float"])
+def test_values_that_no_machine_has_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        replace(LOADER, **{name: 0.0})
+
+
+def test_broken_urdf_is_refused_with_its_name(tmp_path) -> None:
+    path = tmp_path / "broken.urdf"
+    path.write_text("<robot><link/></robot>", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"broken\.urdf"):
+        read_urdf(path)
+
+
+def test_joining_masses_is_steiner_and_does_not_depend_on_the_order() -> None:
+    turned = Pose(np.array([2.0, 0, 0]), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
+    straight = Pose(np.zeros(3), np.eye(3))
+    parts = [
+        (straight, Mass(3.0, np.array([0.0, 0, 1]), np.diag([1.0, 2, 3]))),
+        (turned, Mass(1.0, np.zeros(3), np.diag([4.0, 5, 6]))),
+    ]
+    whole = joined(parts)
+    np.testing.assert_allclose(whole.centre_m, [0.5, 0, 0.75])
+    # reduced mass 0.75 kg at a distance (2, 0, -1)
+    expected = np.diag([1.0 + 5, 2 + 4, 3 + 6]) + 0.75 * np.array([[1.0, 0, 2], [0, 5, 0], [2, 0, 4]])
+    np.testing.assert_allclose(whole.inertia_kgm2, expected, atol=1e-12)
+    other = joined(parts[::-1])
+    np.testing.assert_allclose(other.inertia_kgm2, whole.inertia_kgm2, atol=1e-12)
+
+
+@BOTH
+def test_the_few_rigid_bodies_weigh_and_lie_as_the_whole(model: MachineModel, tmp_path) -> None:
+    turning = tuple(name for name, joint in model.robot.joints.items() if joint.kind == "revolute")
+    path = tmp_path / "rigid.urdf"
+    path.write_text(rigid_urdf(model.robot, (BASE, *turning), 1.1), encoding="utf-8")
+    rigid = read_urdf(path)
+    parts = [(rigid.place(name, BASE), link.mass) for name, link in rigid.links.items()]
+    whole, full = joined(parts), model.weight(model.payload_kg)
+    assert whole.mass_kg == pytest.approx(1.1 * full.mass_kg)
+    np.testing.assert_allclose(whole.centre_m, full.centre_m, atol=1e-9)
+    np.testing.assert_allclose(whole.inertia_kgm2, 1.1 * full.inertia_kgm2, rtol=1e-9, atol=1e-6)
+    boxes = sum(len(link.boxes) for link in rigid.links.values())
+    assert boxes == sum(len(link.boxes) for link in model.robot.links.values()) >= 2
+
+
+def test_angles_of_a_rotation_come_back() -> None:
+    rpy_deg = (10.0, -20.0, 130.0)
+    rotation = Mount(rpy_deg=rpy_deg).base_from_sensor()
+    np.testing.assert_allclose(np.degrees(rpy_rad(rotation)), rpy_deg)
+
+
+def test_every_model_file_loads() -> None:
+    names = [path.stem for path in FOLDER.glob("*.toml")]
+    assert len(names) >= 2
+    assert {load_model(name).name for name in names} == set(names)

@@ -1,0 +1,211 @@
+import math
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from protocol.machine.machine_config import BASE, FRONT, Mount
+from sim.sensors.presets import Preset
+from sim.worlds.world import FleetState
+from tests.unit.sim.sensor_rigs import (
+    DGPS,
+    GRAVITY,
+    LOADER,
+    SEED,
+    blocks,
+    check_correlation,
+    check_deviation,
+    noisy,
+    perfect,
+    rig,
+    still,
+    values,
+)
+
+N = 500
+AT_REST = np.array([0, 0, 0, 0, 0, GRAVITY])
+IMU_RATES = pytest.mark.parametrize("rate_hz", [100, 50])
+ATTITUDE_RATES = pytest.mark.parametrize("rate_hz", [50, 20])
+
+
+def imu_errors(preset: Preset, seconds: float, n: int = N, **states: object) -> np.ndarray:
+    return values(rig(preset, only="imu"), "imu", seconds, n, **states) - AT_REST
+
+
+# --- IMU -------------------------------------------------------------------------------------------------------------
+
+
+@IMU_RATES
+def test_imu_white_noise_is_white(rate_hz: int) -> None:
+    errors = imu_errors(noisy("imu", rate_hz=rate_hz, gyro_white_degps=0.1, force_white_mps2=0.08), 0.5)
+    for part, std in ((errors[..., :3], math.radians(0.1)), (errors[..., 3:], 0.08)):
+        check_deviation(part, std, part.size)
+        check_correlation(part, 1, 0.0, part.size)
+
+
+@IMU_RATES
+def test_imu_drift_has_its_deviation_and_correlation_time(rate_hz: int) -> None:
+    preset = noisy("imu", rate_hz=rate_hz, gyro_drift_degps=0.02, force_drift_mps2=0.01, drift_time_s=0.5)
+    errors = imu_errors(preset, 1.5)
+    for part, std in ((errors[..., :3], math.radians(0.02)), (errors[..., 3:], 0.01)):
+        check_deviation(part, std, 3 * N)
+        check_correlation(part, rate_hz // 2, math.exp(-1), 3 * N)
+
+
+def test_imu_zeros_are_drawn_once() -> None:
+    errors = imu_errors(noisy("imu", gyro_turn_on_degps=0.05, force_turn_on_mps2=0.03), 0.05, 2 * N)
+    np.testing.assert_allclose(errors, np.broadcast_to(errors[0], errors.shape))
+    check_deviation(errors[0, :, :3], math.radians(0.05), 6 * N)
+    check_deviation(errors[0, :, 3:], 0.03, 6 * N)
+
+
+def test_imu_scale_and_mounting_errors() -> None:
+    check_deviation(imu_errors(noisy("imu", scale=0.002), 0.01, 2 * N)[0, :, 5] / GRAVITY, 0.002, 2 * N)
+    tilted = imu_errors(noisy("imu", mounting_deg=1.0), 0.01, 2 * N)[0, :, 3:] / GRAVITY
+    check_deviation(tilted[:, :2], math.radians(1.0), 4 * N)
+    np.testing.assert_allclose(np.hypot(tilted[:, 0], tilted[:, 1]) ** 2 + (1 + tilted[:, 2]) ** 2, 1.0)
+
+
+@pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (0.25, 0.5), (-0.5, 1.0), (4.0, 1.0)])
+def test_imu_shakes_while_driving(speed: float, share: float) -> None:
+    preset = noisy("imu", force_white_mps2=0.08, force_vibration_mps2=0.3, vibration_speed_mps=0.5)
+    errors = imu_errors(preset, 0.1, speed_mps=speed)
+    check_deviation(errors[..., 3:], math.hypot(0.08, 0.3 * share), errors[..., 3:].size)
+    np.testing.assert_allclose(errors[..., :3], 0.0, atol=1e-12)
+
+
+def test_imu_reads_in_its_own_axes() -> None:
+    turning = {"rates_radps": (0.1, 0.2, 0.3)}
+    found = blocks([rig(perfect(), imu=(1, 2, 3, 4), only="imu")], still(1, 1, **turning))
+    assert found["imu"].names == ("imu-3", "imu-4")  # the last block: those on the front frame stand in another
+    front = [values(rig(perfect(), imu=(i,), only="imu"), "imu", 0.01, **turning)[0, 0] for i in (1, 2)]
+    rear = found["imu"].values[0]
+    for reading, signs in zip((*front, *rear), ([1, 2, 3], [1, -2, -3], [1, 2, 3], [2, -1, 3]), strict=True):
+        np.testing.assert_allclose(reading[:3], [0.1 * s for s in signs], atol=1e-8)
+        assert math.copysign(1, reading[5]) == math.copysign(1, signs[2])
+
+
+def test_imu_off_the_frames_origin_feels_the_rotation() -> None:
+    turning = {"rates_radps": (0.0, 0.0, 0.5), "rates_dot_radps2": (0.0, 0.0, 0.2)}
+    (reading,) = values(rig(perfect(), imu=(3,), only="imu"), "imu", 0.01, **turning)[0]
+    np.testing.assert_allclose(reading[3:], [-(0.5**2) * 0.4, 0.2 * 0.4, GRAVITY])
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    return Mount(rpy_deg=tuple(np.degrees([roll, pitch, yaw]))).base_from_sensor()
+
+
+def place(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of `base_link` on a made-up way."""
+    at = np.array([3 * math.sin(0.5 * t), 2 * t - 0.3 * t**2, 0.2 * math.cos(2 * t)])
+    return at, rotation(0.2 * math.sin(2 * t), -0.1 + 0.15 * math.cos(3 * t), 0.4 * t + 0.2 * math.sin(t))
+
+
+def angle(t: float) -> float:
+    return 0.5 * math.sin(1.3 * t)
+
+
+def sensor_place(t: float, number: int) -> tuple[np.ndarray, np.ndarray]:
+    frame, mount = LOADER.imu_mounts()[number - 1]
+    at, turn = place(t)
+    if frame == FRONT:
+        at, turn = at + turn @ LOADER.robot.place(FRONT, BASE).xyz_m, turn @ rotation(0, 0, angle(t))
+    return at + turn @ mount.xyz_m, turn @ mount.base_from_sensor()
+
+
+def felt(pose: object, t: float, h: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    """Angular rate and specific force of a moving frame, by finite differences."""
+    (before, r0), (now, r1), (after, r2) = (pose(t + d) for d in (-h, 0.0, h))  # type: ignore[operator]
+    spin = r1.T @ (r2 - r0) / (2 * h)
+    force = r1.T @ ((after - 2 * now + before) / h**2 + [0, 0, GRAVITY])
+    return np.array([spin[2, 1], spin[0, 2], spin[1, 0]]), force
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+@pytest.mark.parametrize("t", [0.3, 1.1])
+def test_imus_on_both_frames_agree_with_finite_differences(number: int, t: float) -> None:
+    h = 1e-3
+    rates, force = felt(place, t)
+    state = {
+        "rates_radps": rates,
+        "rates_dot_radps2": (felt(place, t + h)[0] - felt(place, t - h)[0]) / (2 * h),
+        "force_mps2": force,
+        "articulation_rad": angle(t),
+        "articulation_radps": (angle(t + h) - angle(t - h)) / (2 * h),
+        "articulation_radps2": (angle(t + h) - 2 * angle(t) + angle(t - h)) / h**2,
+    }
+    reading = values(rig(perfect(), imu=(number,), only="imu"), "imu", 0.01, **state)[0, 0]
+    np.testing.assert_allclose(reading, np.concatenate(felt(lambda s: sensor_place(s, number), t)), atol=1e-4)
+
+
+# --- attitude --------------------------------------------------------------------------------------------------------
+
+
+def turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The vector part of q v q*, written out."""
+    xyz, w = q[:3], q[3]
+    return v + 2 * w * np.cross(xyz, v) + 2 * np.cross(xyz, np.cross(xyz, v))
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_attitude_turns_vectors_of_the_sensor_into_map(number: int) -> None:
+    frame, mount = LOADER.imu_mounts()[number - 1]
+    yaw, pitch, roll, bend = 2.0, -0.3, 0.1, 0.4
+    state = {"yaw_rad": yaw, "pitch_rad": pitch, "roll_rad": roll, "articulation_rad": bend}
+    q = values(rig(perfect(), attitude=(number,), only="attitude"), "attitude", 0.02, **state)[0, 0, :4]
+    map_from_sensor = rotation(roll, pitch, yaw) @ rotation(0, 0, bend if frame == FRONT else 0)
+    map_from_sensor = map_from_sensor @ mount.base_from_sensor()
+    for vector in np.eye(3):
+        np.testing.assert_allclose(turned(q, vector), map_from_sensor @ vector, atol=1e-8)
+    assert np.linalg.norm(q) == pytest.approx(1.0)
+
+
+def attitude_errors(preset: Preset, seconds: float, n: int = N) -> np.ndarray:
+    """Roll, pitch and heading (r, n, 3) of a level sensor that looks 1 rad north of east."""
+    x, y, z, w, *_ = np.moveaxis(
+        values(rig(preset, attitude=(3,), only="attitude"), "attitude", seconds, n, yaw_rad=1.0), -1, 0
+    )
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.stack([roll, np.arcsin(2 * (w * y - z * x)), heading - 1.0], axis=-1)
+
+
+@ATTITUDE_RATES
+def test_attitude_drift_has_its_deviation_and_correlation_time(rate_hz: int) -> None:
+    preset = noisy("attitude", rate_hz=rate_hz, tilt_drift_deg=0.4, heading_drift_deg=1.0, drift_time_s=0.5)
+    errors = attitude_errors(preset, 1.5)
+    for axis, std in enumerate((0.4, 0.4, 1.0)):
+        check_deviation(errors[..., axis], math.radians(std), N)
+        check_correlation(errors[..., axis], rate_hz // 2, math.exp(-1), N)
+
+
+@ATTITUDE_RATES
+def test_attitude_white_noise_is_white(rate_hz: int) -> None:
+    errors = attitude_errors(noisy("attitude", rate_hz=rate_hz, tilt_white_deg=0.1, heading_white_deg=0.3), 0.5)
+    for axis, std in enumerate((0.1, 0.1, 0.3)):
+        check_deviation(errors[..., axis], math.radians(std), errors[..., axis].size)
+        check_correlation(errors[..., axis], 1, 0.0, errors[..., axis].size)
+
+
+def test_attitude_heading_has_a_constant_offset() -> None:
+    errors = attitude_errors(noisy("attitude", heading_offset_deg=1.5), 0.1)
+    np.testing.assert_allclose(errors, np.broadcast_to(errors[0], errors.shape), atol=1e-12)
+    np.testing.assert_allclose(errors[..., :2], 0.0, atol=1e-12)
+    check_deviation(errors[0, :, 2], math.radians(1.5), N)
+
+
+def test_attitude_states_the_variances_of_its_errors() -> None:
+    stated = values(rig(DGPS, attitude=(3,), only="attitude"), "attitude", 0.02)[0, 0, 4:]
+    tilt = math.radians(1) ** 2 * (0.4**2 + 0.1**2)
+    assert stated == pytest.approx([tilt, tilt, math.radians(1) ** 2 * (1.5**2 + 1.0**2 + 0.3**2)])
+    errors = attitude_errors(DGPS, 0.02, 4 * N)
+    for axis in range(3):
+        check_deviation(errors[..., axis], math.sqrt(stated[axis]), 4 * N)
+
+
+def test_no_reading_writes_into_the_states() -> None:
+    state = still(20, 2)
+    copies = FleetState(*(np.array(getattr(state, f.name)) for f in fields(FleetState)))
+    blocks([rig(DGPS, gps=(1, 2), imu=(1, 3), attitude=(1, 3))] * 2, copies, SEED)
+    for f in fields(FleetState):
+        np.testing.assert_array_equal(getattr(copies, f.name), getattr(state, f.name))

@@ -1,0 +1,181 @@
+import math
+import re
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.config import load_toml
+from protocol.errors import ConfigError
+from protocol.machine.machine_config import BASE, FRONT
+from sim.sensors.datasheets import EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise
+from sim.sensors.presets import LIBRARY, load_preset, parse_preset
+from sim.sensors.rigs import Rig, draw_bodies, machine_config
+from sim.sensors.sensors import _BANKS
+from tests.unit.sim.sensor_rigs import DGPS, LOADER, noisy, perfect, rig
+
+NAMES = tuple(load_toml(LIBRARY))
+HARDER = ("dgps", "harsh")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_preset_of_the_library_loads(name: str) -> None:
+    preset = load_preset(name)
+    assert preset.name == name
+    assert all(preset.rate_hz(kind) > 0 for kind in ("gps", *_BANKS))
+
+
+def test_the_library_has_the_presets_that_documents_name() -> None:
+    assert set(NAMES) == {"paper", "dgps", "standalone", "rtk", "harsh"}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_stated_rms_is_what_the_values_give(name: str) -> None:
+    stated = re.search(rf"\[{name}\.gps\] +# 2-D rms ([0-9.]+) m", LIBRARY.read_text())
+    assert stated
+    gps = load_preset(name).gps
+    rms = gps.scale * math.sqrt(2 * (gps.drift_std_m**2 + gps.white_std_m**2))
+    assert rms == pytest.approx(float(stated[1]), abs=0.5 * 10.0 ** -len(stated[1].split(".")[1]))
+
+
+def test_paper_receivers_are_2_m_off_before_their_scale_and_mostly_slowly() -> None:
+    gps = load_preset("paper").gps
+    assert (gps.shared, gps.drift_time_s) == (0.0, 45.0)
+    assert math.sqrt(2 * (gps.drift_std_m**2 + gps.white_std_m**2)) == pytest.approx(2.0, abs=0.01)
+    assert gps.white_std_m == pytest.approx(gps.drift_std_m / 3, abs=1e-3)
+    assert gps.outage_s / gps.outage_period_s == 0.1
+
+
+def test_harsh_is_nowhere_better_than_dgps() -> None:
+    better, worse = map(load_preset, HARDER)
+    for kind in ("imu", "attitude", "torque", "articulation", "payload"):
+        for field in fields(getattr(better, kind)):
+            assert getattr(getattr(worse, kind), field.name) >= getattr(getattr(better, kind), field.name), field.name
+    assert worse.gps.outage_s > better.gps.outage_s
+
+
+def test_weighing_systems_are_as_good_as_their_makers_state_and_worse_on_a_bad_day() -> None:
+    assert load_preset("dgps").payload == load_preset("paper").payload == PayloadNoise(1, 50.0, 0.02)
+    assert load_preset("harsh").payload == PayloadNoise(1, 150.0, 0.05)
+
+
+def test_a_scenario_changes_single_values_of_a_base() -> None:
+    mine = parse_preset({"name": "foggy", "base": "paper", "gps": {"scale": 1.4, "rate_hz": 10}}, "here")
+    paper = load_preset("paper")
+    assert mine == replace(paper, name="foggy", gps=replace(paper.gps, scale=1.4, rate_hz=10))
+    assert load_preset("paper") == paper
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"base": "best"}, ["'best'", "known: dgps, paper, standalone, rtk, harsh"]),
+        ({"base": 3}, ["3", "known: dgps"]),
+        ({"base": "dgps", "gps": {"drift_m": 1.0}}, ["gps", "`drift_m`", "drift_std_m"]),
+        ({"base": "dgps", "sonar": {}}, ["`sonar`"]),
+        ({"base": "dgps", "gps": 3}, ["gps", "table"]),
+        ({"base": "dgps", "gps": {"shared": 1.5}}, ["gps", "shared: 1.5"]),
+        ({"base": "dgps", "gps": {"rate_hz": 7}}, ["rate_hz: 7 does not divide 100"]),
+        ({"base": "dgps", "gps": {"rate_hz": 5.0}}, ["rate_hz", "int"]),
+        ({"base": "dgps", "imu": {"drift_time_s": 0}}, ["drift_time_s: 0"]),
+        ({"base": "dgps", "name": "Not A Name"}, ["name"]),
+        ({}, ["`gps` is missing"]),
+    ],
+)
+def test_broken_presets_are_refused_by_name(table: dict[str, Any], words: list[str]) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        parse_preset({"name": "mine", **table}, "scenario.toml [[preset]] 1")
+    for word in ("scenario.toml [[preset]] 1", *words):
+        assert word in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_unknown_preset_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match=r"'gold'.*known: dgps, paper, standalone, rtk, harsh"):
+        load_preset("gold")
+
+
+@pytest.mark.parametrize("kind", [f.name for f in fields(DGPS) if f.name != "name"])
+def test_every_value_of_a_sheet_has_its_range(kind: str) -> None:
+    sheet = getattr(DGPS, kind)
+    for field in fields(sheet):
+        for bad in (math.nan, -1, 1e9):
+            with pytest.raises(ValueError, match=rf"^{field.name}: .*"):
+                replace(sheet, **{field.name: bad})
+
+
+def test_rates_must_divide_those_of_the_world() -> None:
+    for rate_hz in (1, 2, 4, 5, 10, 20, 25, 50, 100):
+        EncoderNoise(rate_hz, 100)
+        TorqueNoise(rate_hz, 1.0, 1.0, 1.0, 0.0)
+    for rate_hz in (0, 3, 40, 200):
+        with pytest.raises(ValueError, match=f"rate_hz: {rate_hz} does not divide 100"):
+            replace(DGPS.articulation, rate_hz=rate_hz)
+
+
+def test_outage_cannot_be_longer_than_its_period() -> None:
+    with pytest.raises(ValueError, match="outage_s"):
+        GpsNoise(5, 1.0, 1.0, 1.0, 1.0, 0.0, 11.0, 10.0)
+
+
+# --- machines --------------------------------------------------------------------------------------------------------
+
+
+def test_machine_has_the_sensors_asked_for_fast_ones_first() -> None:
+    machine = machine_config("a", LOADER, DGPS, (1, 2), (3, 1), (3,))
+    names = [sensor.name for sensor in machine.sensors]
+    assert names == ["imu-3", "imu-1", "attitude-3", "torque", "wheels", "articulation", "gps-1", "gps-2"]
+    assert [sensor.frame for sensor in machine.sensors[:3]] == [BASE, FRONT, BASE]
+    assert machine.sensors[1].mount == LOADER.imu_mounts()[0][1]
+    assert machine.sensors[2].mount == LOADER.imu_mounts()[2][1]
+    assert [sensor.mount for sensor in machine.sensors[-2:]] == list(LOADER.gps_mounts()[:2])
+    weighed = machine_config("a", LOADER, DGPS, (1,), (3,), (), payload=True)
+    assert (weighed.sensors[-1].name, weighed.sensors[-1].kind) == ("payload", "payload")
+    bare = machine_config("a", LOADER, noisy("torque", rate_hz=5), (), (), ())
+    assert [sensor.name for sensor in bare.sensors] == ["wheels", "articulation", "torque"]
+
+
+def test_agents_know_the_nominal_body_and_what_a_data_sheet_says() -> None:
+    machine = machine_config("a", LOADER, load_preset("paper"), (3,), (), ())
+    for name in ("mass_kg", "wheel_radius_m", "load_centre_m", "rotating_mass_factor"):
+        assert getattr(machine, name) == getattr(LOADER, name)
+    known = (machine.wheelbase_m, machine.axle_stiffness_npm, machine.cog_height_m)
+    assert known == pytest.approx((3.3, 1.8e6, 1.05))
+    assert (machine.payload_x_m, machine.payload_z_m) == pytest.approx((4.7, 0.85))  # ahead of the front axle
+    receiver = machine.sensors[-1]
+    assert (receiver.name, receiver.drift_share, receiver.drift_time_s) == ("gps-3", 0.9, 45.0)
+    assert machine_config("a", LOADER, DGPS, (1,), (), ()).sensors[-1].drift_share == 0.75
+    assert machine_config("a", LOADER, perfect(), (1,), (), ()).sensors[-1].drift_share == 0.0
+    fine = machine_config("a", LOADER, noisy("encoder", ticks_per_rev=400), (), (), ())
+    assert [s.ticks_per_rev for s in fine.sensors if s.kind == "encoder"] == [400]
+
+
+@pytest.mark.parametrize(
+    ("gps", "imu", "attitude", "words"),
+    [
+        ((4,), (1,), (), "gps: a wheel_loader has no number 4; it has 1 to 3"),
+        ((1,), (0,), (), "imu: a wheel_loader has no number 0; it has 1 to 4"),
+        ((1,), (1,), (5,), "attitude: a wheel_loader has no number 5; it has 1 to 4"),
+        ((1, 1), (1,), (), "two are named 'gps-1'"),
+    ],
+)
+def test_sensors_that_a_model_does_not_have_are_refused(gps: Any, imu: Any, attitude: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        machine_config("a", LOADER, DGPS, gps, imu, attitude)
+
+
+def test_bodies_differ_from_nominal_by_what_the_preset_says() -> None:
+    n = 400
+    bodies = draw_bodies([rig()] * n, 3)
+    mass, radius = bodies.mass_kg / LOADER.mass_kg - 1, bodies.wheel_radius_m / LOADER.wheel_radius_m - 1
+    assert 0.029 < abs(mass).max() <= 0.03
+    assert mass.std() == pytest.approx(0.03 / math.sqrt(3), rel=5 / math.sqrt(2 * n))
+    assert radius.std() == pytest.approx(0.015, rel=5 / math.sqrt(2 * n))
+    exact = replace(rig(), preset=perfect_body(rig()))
+    np.testing.assert_array_equal(draw_bodies([exact], 3).mass_kg, [LOADER.mass_kg])
+    np.testing.assert_array_equal(draw_bodies([rig(), exact], 3).mass_kg[0], bodies.mass_kg[0])
+
+
+def perfect_body(one: Rig) -> Any:
+    return replace(one.preset, body=replace(one.preset.body, mass=0.0, wheel_radius=0.0))

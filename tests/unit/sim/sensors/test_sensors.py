@@ -1,0 +1,263 @@
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from protocol.machine.readings import Reading, columns, parse_reading
+from sim.sensors.rigs import Faults, Rig
+from sim.sensors.sensors import Sensors
+from sim.worlds.world import FleetState
+from tests.unit.sim.sensor_rigs import (
+    DGPS,
+    PROJECTION,
+    SEED,
+    WIDTHS,
+    blocks,
+    check_correlation,
+    check_deviation,
+    noisy,
+    perfect,
+    rig,
+    still,
+    to_map,
+    values,
+)
+
+N = 500
+STEPS = 600
+FULL = rig(DGPS, gps=(1, 2), imu=(1, 3), attitude=(3,), payload=True)
+
+
+def moving(k: int, n: int) -> FleetState:
+    """Any states; those of a machine do not depend on how many there are."""
+    rng = np.random.default_rng(SEED)
+    whole = {f.name: rng.standard_normal((k, 10, WIDTHS.get(f.name, 1))) for f in fields(FleetState)}
+    cut = {name: values[:, :n] if name in WIDTHS else values[:, :n, 0] for name, values in whole.items()}
+    return FleetState(**cut)
+
+
+def cut(states: FleetState, part: slice) -> FleetState:
+    return FleetState(*(getattr(states, f.name)[part] for f in fields(FleetState)))
+
+
+def run(rigs: Sequence[Rig], seed: int = SEED, span: int = 5) -> list[list[Reading]]:
+    """Readings of each machine, some steps at a time."""
+    sensors, states = Sensors(rigs, seed, PROJECTION), moving(STEPS, len(rigs))
+    readings: list[list[Reading]] = [[] for _ in rigs]
+    for start in range(0, STEPS, span):
+        part = slice(start, min(start + span, STEPS))
+        steps = np.arange(part.start, part.stop) + 1
+        seen = sensors.sample(steps, steps * 10_000_000, cut(states, part))
+        for i, of_machine in enumerate(readings):
+            of_machine += seen.readings(i)
+    return readings
+
+
+BASE = run([FULL] * 3)
+
+
+# --- all of them -----------------------------------------------------------------------------------------------------
+
+
+def test_same_seed_repeats_every_reading() -> None:
+    assert run([FULL] * 3) == BASE
+    assert run([FULL] * 3, seed=SEED + 1) != BASE
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 10])
+def test_readings_do_not_depend_on_other_machines(count: int) -> None:
+    other = rig(noisy("gps", rate_hz=10, drift_std_m=9.0), gps=(1, 2, 3), imu=(2,))
+    found = run([FULL, *[other, FULL] * 5][:count])
+    for i in range(0, min(3, count), 2):
+        assert found[i] == BASE[i]
+
+
+def test_readings_do_not_depend_on_other_sensors() -> None:
+    without = replace(DGPS, gps=replace(DGPS.gps, outage_s=0.0))  # receivers are lost in turn: their number matters
+    many = run([rig(without, gps=(1, 2, 3), imu=(1, 2, 3, 4), attitude=(1, 2, 3), payload=True)])[0]
+    few = run([rig(without, gps=(2,), imu=(3,), attitude=(2,), payload=True)])[0]
+    names = {reading.sensor for reading in few}
+    assert names == {"gps-2", "imu-3", "attitude-2", "torque", "wheels", "articulation", "payload"}
+    assert [reading for reading in many if reading.sensor in names] == few
+
+
+@pytest.mark.parametrize("span", [1, 3, 20, 600])
+def test_readings_do_not_depend_on_how_many_steps_are_sampled_at_a_time(span: int) -> None:
+    assert run([FULL] * 3, span=span) == BASE
+
+
+def test_shared_drift_does_not_depend_on_how_many_steps_are_sampled_at_a_time() -> None:
+    shared = rig(replace(DGPS, gps=replace(DGPS.gps, shared=0.5)), gps=(1, 2))
+    assert run([shared], span=7) == run([shared], span=600)
+
+
+def test_readings_come_in_the_order_of_stamps_and_of_the_machines_sensors() -> None:
+    order = [sensor.name for sensor in FULL.machine.sensors]
+    keys = [(reading.stamp_ns, order.index(reading.sensor)) for reading in BASE[1]]
+    assert keys == sorted(keys)
+
+
+def test_readings_come_at_their_rates() -> None:
+    silent = replace(DGPS, gps=replace(DGPS.gps, outage_s=0.0))
+    expected = {"imu-1": 100, "imu-3": 100, "attitude-3": 50, "torque": 50, "wheels": 20, "articulation": 20}
+    counts = Counter(r.sensor for r in run([rig(silent, imu=(1, 3), attitude=(3,))])[0])
+    assert counts == {name: 6 * rate for name, rate in {**expected, "gps-1": 5}.items()}
+    slow = replace(
+        silent,
+        gps=replace(silent.gps, rate_hz=10),
+        imu=replace(silent.imu, rate_hz=50),
+        encoder=replace(silent.encoder, rate_hz=10),
+    )
+    counts = Counter(r.sensor for r in run([rig(slow)])[0])
+    assert counts == {"imu-3": 300, "torque": 300, "articulation": 120, "wheels": 60, "gps-1": 60}
+
+
+def test_readings_are_valid_and_plain() -> None:
+    kinds = {sensor.name: sensor.kind for sensor in FULL.machine.sensors}
+    resting = Sensors([FULL], SEED, PROJECTION)
+    steps = np.arange(1, 101)
+    for reading in resting.sample(steps, steps * 10_000_000, still(100)).readings(0):
+        row = tuple(getattr(reading, name) for name in columns(reading.kind))
+        assert all(type(value) is float for value in row), reading
+        assert kinds[reading.sensor] == reading.kind
+        assert parse_reading(reading.kind, reading.sensor, reading.stamp_ns, row) == reading
+
+
+def test_blocks_say_whose_readings_they_hold() -> None:
+    steps = np.arange(1, 21)
+    span = Sensors([FULL] * 3, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(20, 3))
+    for block in span.blocks:
+        rows, units = block.stamps_ns.shape
+        assert block.values.shape == (rows, units, len(columns(block.kind)))
+        assert block.heard.shape == (rows, units)
+        assert len(block.names) == len(block.machines) == units
+        for unit, machine in enumerate(block.machines.tolist()):
+            assert set(block.readings(unit)) <= set(span.readings(machine))
+    found = {(m, name) for b in span.blocks for m, name in zip(b.machines.tolist(), b.names, strict=True)}
+    assert found == {(m, sensor.name) for m in range(3) for sensor in FULL.machine.sensors}
+
+
+# --- drive train -----------------------------------------------------------------------------------------------------
+
+
+def test_encoder_counts_whole_ticks_of_both_wheels() -> None:
+    turns = np.repeat([[0.0, 0.01], [math.pi, 6.2], [2 * math.pi + 1e-9, 7.0], [-0.01, 0.0]], 5, axis=0)[:, None]
+    ticks = blocks([rig(DGPS, only="encoder")], still(20, 1, wheel_rad=turns))["encoder"].values[:, 0]
+    assert ticks.tolist() == [[0, 0], [50, 98], [100, 111], [-1, 0]]
+    fine = blocks([rig(noisy("encoder", ticks_per_rev=1000), only="encoder")], still(20, 1, wheel_rad=turns))
+    assert fine["encoder"].values[:, 0].tolist() == [[0, 1], [500, 986], [1000, 1114], [-2, 0]]
+
+
+@pytest.mark.parametrize("rate_hz", [50, 20])
+def test_torque_noise_is_white_and_correlated(rate_hz: int) -> None:
+    preset = noisy("torque", rate_hz=rate_hz, white_nm=600.0, correlated_nm=300.0, correlation_s=0.5)
+    errors = values(rig(preset, only="torque"), "torque", 1.5, N)[..., 0]
+    check_deviation(errors, math.hypot(600, 300), N)
+    slow = 300**2 / (600**2 + 300**2)
+    check_correlation(errors, 1, slow * math.exp(-2 / rate_hz), N)
+    check_correlation(errors, rate_hz // 2, slow * math.exp(-1), N)
+    alone = values(
+        rig(noisy("torque", rate_hz=rate_hz, correlated_nm=300.0, correlation_s=0.5), only="torque"), "torque", 1.5, N
+    )
+    check_correlation(alone[..., 0], rate_hz // 2, math.exp(-1), N)
+
+
+def test_torque_has_a_scale_error() -> None:
+    scales = values(rig(noisy("torque", scale=0.03), only="torque"), "torque", 0.02, 2 * N, torque_nm=1e4)[0] / 1e4 - 1
+    check_deviation(scales, 0.03, 2 * N)
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50])
+def test_articulation_has_white_noise_and_a_zero(rate_hz: int) -> None:
+    white = values(
+        rig(noisy("articulation", rate_hz=rate_hz, white_deg=0.2), only="articulation"), "articulation", 1.0, N
+    )
+    check_deviation(white, math.radians(0.2), white.size)
+    check_correlation(white, 1, 0.0, white.size)
+    preset = noisy("articulation", rate_hz=rate_hz, zero_deg=0.3)
+    zero = values(rig(preset, only="articulation"), "articulation", 0.2, 2 * N, articulation_rad=0.4) - 0.4
+    np.testing.assert_allclose(zero, np.broadcast_to(zero[0], zero.shape))
+    check_deviation(zero[0], math.radians(0.3), 2 * N)
+
+
+@pytest.mark.parametrize("rate_hz", [1, 5])
+def test_payload_has_white_noise(rate_hz: int) -> None:
+    one = rig(noisy("payload", rate_hz=rate_hz, white_kg=50.0), only="payload", payload=True)
+    white = values(one, "payload", 4.0, N, payload_kg=4000.0) - 4000.0
+    assert len(white) == 4 * rate_hz
+    check_deviation(white, 50.0, white.size)
+    check_correlation(white, 1, 0.0, white.size)
+
+
+def test_payload_has_a_scale_error_drawn_once() -> None:
+    one = rig(noisy("payload", scale=0.02), only="payload", payload=True)
+    scales = values(one, "payload", 3.0, 2 * N, payload_kg=4000.0) / 4000.0 - 1
+    np.testing.assert_allclose(scales, np.broadcast_to(scales[0], scales.shape))
+    check_deviation(scales[0], 0.02, 2 * N)
+
+
+def test_payload_follows_what_is_carried_and_is_never_negative() -> None:
+    carried = np.repeat([0.0, 1500.0, 4000.0], 100)[:, None]
+    quiet, loud = (rig(noisy("payload", white_kg=kg), only="payload", payload=True) for kg in (0.0, 50.0))
+    assert blocks([quiet], still(300, payload_kg=carried))["payload"].values.ravel().tolist() == [0.0, 1500.0, 4000.0]
+    empty = values(loud, "payload", 2.0, N)
+    assert empty.min() == 0.0
+    assert 0.4 < (empty > 0).mean() < 0.6
+
+
+# --- faults ----------------------------------------------------------------------------------------------------------
+
+
+def faulty(**faults: object) -> list[Rig]:
+    """A machine with a fault from 2 s on, and one without."""
+    return [rig(perfect(), faults=Faults(from_s=2.0, **faults)), rig(perfect())]  # type: ignore[arg-type]
+
+
+def test_torque_scale_counts_from_its_time_on() -> None:
+    block = blocks(faulty(torque_scale=1.6), still(400, 2, torque_nm=1e4))["torque"]
+    early = np.arange(1, 201) * 0.02 < 2.0
+    np.testing.assert_allclose(block.values[early, :, 0], 1e4)
+    np.testing.assert_allclose(block.values[~early, 0, 0], 1.6e4)
+    np.testing.assert_allclose(block.values[~early, 1, 0], 1e4)
+
+
+def test_antennas_are_off_from_their_time_on() -> None:
+    block = blocks(faulty(antenna_off_m=(0.0, 3.0, 0.5)), still(400, 2, yaw_rad=math.pi / 2))["gps"]
+    fixes, early = to_map(block.values), np.arange(1, 21) * 0.2 < 2.0 - 1e-9
+    configured = np.array([0.0, 0.8, 3.35])
+    np.testing.assert_allclose(fixes[early], np.broadcast_to(configured, fixes[early].shape), atol=1e-5)
+    np.testing.assert_allclose(fixes[~early, 0] - configured, [[-3.0, 0.0, 0.5]] * 11, atol=1e-5)
+    np.testing.assert_allclose(fixes[~early, 1] - configured, 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("clock_off_s", [0.25, -0.25])
+def test_clock_is_off_from_its_time_on(clock_off_s: float) -> None:
+    rigs, steps = faulty(clock_off_s=clock_off_s), np.arange(1, 401)
+    span = Sensors(rigs, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(400, 2))
+    for block in span.blocks:
+        wrong, right = block.stamps_ns.T
+        late = right >= 2_000_000_000
+        assert (wrong - right).tolist() == (late * round(clock_off_s * 1e9)).tolist()
+    assert len(span.readings(0)) == len(span.readings(1))
+    stamps = [reading.stamp_ns for reading in span.readings(0)]
+    assert stamps == sorted(stamps)
+
+
+def test_faults_change_nothing_before_their_time() -> None:
+    faults = Faults(from_s=STEPS / 100 - 1, torque_scale=2.0, antenna_off_m=(1.0, 1.0, 1.0), clock_off_s=5.0)
+    found = run([replace(FULL, faults=faults)])[0]
+    before = [reading for reading in BASE[0] if reading.stamp_ns < (STEPS - 100) * 10_000_000]
+    assert found[: len(before)] == before
+    assert found[len(before)] not in BASE[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("from_s", -1.0), ("torque_scale", math.nan), ("clock_off_s", math.inf), ("antenna_off_m", (0.0, math.nan, 0.0))],
+)
+def test_impossible_faults_are_refused(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=name):
+        Faults(**{name: value})  # type: ignore[arg-type]

@@ -1,0 +1,131 @@
+import hashlib
+import math
+import subprocess
+import sys
+from dataclasses import dataclass, fields
+
+import numpy as np
+import pybullet
+import pytest
+
+from protocol.arrays import Floats
+from sim.machines.model import MachineModel
+from sim.machines.soil import SAND, SLIP_STIFFNESS, TRACTION
+from sim.machines.vehicle import GRAVITY, Bodies
+from sim.worlds.bullet import BulletWorld
+from sim.worlds.world import STEP_S, FleetState, stack
+from tests.unit.sim.bullet_worlds import BOTH, LOADER, TRUCK, hold_speed, idle, placed, plane
+
+
+@pytest.mark.parametrize("zone", [0, 3, SAND])
+def test_wheels_slip_as_the_soil_table_says(zone: int) -> None:
+    with placed(BulletWorld, plane(zone), LOADER) as world:
+        last = hold_speed(world, 2.0, 7.0)[-1]
+    use = last.torque_nm[0] / LOADER.wheel_radius_m / last.load_n[0]
+    slip = np.arctanh(use / TRACTION[zone]) * TRACTION[zone] / SLIP_STIFFNESS[zone]
+    measured = 1 - last.speed_mps / (last.wheel_radps[0] * LOADER.wheel_radius_m)
+    np.testing.assert_allclose(measured, slip, rtol=0.02)
+
+
+def test_head_on_collision_stays_finite_and_nobody_passes_through() -> None:
+    with placed(BulletWorld, plane(1), LOADER, LOADER, starts=[(490, 500, 0), (508, 500.3, math.pi)]) as world:
+        states = []
+        for _ in range(800):
+            push = np.clip(50e3 * (4.0 - world.state.speed_mps), -80e3, 100e3)
+            states.append(world.advance(np.zeros(2), push, np.zeros(2)))
+    run = stack(states)
+    assert all(np.isfinite(getattr(run, f.name)).all() for f in fields(FleetState))
+    gap = np.hypot(run.x_m[:, 1] - run.x_m[:, 0], run.y_m[:, 1] - run.y_m[:, 0])
+    assert run.speed_mps[:, 0].max() > 2.5
+    assert gap.min() > 2 * 5.25 - 0.3  # from rear axle to bucket, twice
+    assert abs(run.speed_mps[-1]).max() < 0.1
+    assert abs(run.roll_rad).max() < 0.2
+
+
+@BOTH
+def test_wheels_carry_what_the_machine_carries(model: MachineModel) -> None:
+    grade = 0.1
+    with placed(BulletWorld, plane(2, grade), model) as world:
+        for payload in (0.0, model.payload_kg, 0.0):
+            world.set_payload(0, payload)
+            last = idle(world, 4.0, model.max_brake_n)
+            assert last.mass_kg[0] == model.mass_kg + payload
+            assert last.load_n[0] == pytest.approx(last.mass_kg[0] * GRAVITY / math.hypot(1, grade), rel=1e-3)
+            loads = world.wheel_loads_n[0]
+            shift = grade * model.centre_height_m(payload) / model.wheelbase_m
+            assert loads[:2].sum() / loads.sum() == pytest.approx(model.front_share(payload) - shift, abs=0.004)
+
+
+@dataclass(frozen=True)
+class Front:
+    """Angular rate of the front link, and velocity and rotation of its origin, in `map`."""
+
+    rate: Floats
+    velocity: Floats
+    rotation: Floats
+
+
+def front_link(world: BulletWorld) -> Front:
+    frames = world._scene.frames
+    rotation, rate = frames.rotation[0, 1], frames.rate_radps[0, 1]
+    arm = rotation @ -world._multi.centres_m[0, 1]
+    return Front(rate, frames.velocity_mps[0, 1] + np.cross(rate, arm), rotation)
+
+
+@pytest.mark.parametrize("ahead", [150, 370])
+@BOTH
+def test_front_frame_moves_as_the_rear_frame_and_the_joint_imply(model: MachineModel, ahead: int) -> None:
+    zero = np.zeros(1)
+    with placed(BulletWorld, plane(1, 0.04), model) as world:
+        for i in range(ahead):  # at the end it steers, on the way and back again
+            old = front_link(world)
+            steer = np.array([0.4 * (100 < i < 350)])
+            state = world.advance(steer, np.array([0.1 * model.mass_kg * GRAVITY]), zero)
+        new = front_link(world)
+    c, s = math.cos(state.articulation_rad[0]), math.sin(state.articulation_rad[0])
+    front_from_base = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    up = np.array([0, 0, 1.0])
+    rates, rates_dot = state.rates_radps[0], state.rates_dot_radps2[0]
+    own_rates = front_from_base @ (rates + state.articulation_radps[0] * up)
+    arm = np.array([model.rear_to_joint_m, 0, model.wheel_radius_m])
+    force = front_from_base @ (state.force_mps2[0] + np.cross(rates_dot, arm) + np.cross(rates, np.cross(rates, arm)))
+
+    felt = new.rotation.T @ ((new.velocity - old.velocity) / STEP_S + [0, 0, GRAVITY])
+    turn, old_turn = new.rotation.T @ new.rate, old.rotation.T @ old.rate
+    assert abs(state.articulation_radps[0]) > 0.1
+    held = slice(0 if model.rolls_with_front else 1, 3)  # the truck's front frame rolls by itself
+    np.testing.assert_allclose(turn[held], own_rates[held], atol=0.002)
+    np.testing.assert_allclose(felt, force, atol=0.05)
+    dot = front_from_base @ (
+        rates_dot + state.articulation_radps2[0] * up + np.cross(rates, state.articulation_radps[0] * up)
+    )
+    np.testing.assert_allclose(((turn - old_turn) / STEP_S)[held], dot[held], atol=0.05)
+
+
+def digest() -> str:
+    """Fingerprint of a short drive of two machines, one of which is loaded on the way."""
+    with placed(BulletWorld, plane(2, 0.05), LOADER, TRUCK, starts=[(500, 500, 0.3), (500, 520, 1)]) as world:
+        states = []
+        for i in range(200):
+            if i == 100:
+                world.set_payload(1, 12_000.0)
+            states.append(world.advance(np.array([0.2, -0.3]), np.array([40e3, 60e3]), np.zeros(2)))
+        run = stack(states)
+    return hashlib.sha256(b"".join(getattr(run, f.name).tobytes() for f in fields(FleetState))).hexdigest()
+
+
+def test_a_drive_repeats_bit_for_bit_here_and_in_another_process() -> None:
+    first = digest()
+    assert digest() == first
+    code = "import sys; sys.path[:0] = sys.argv[1].split(); import test_sim_bullet as t; print(t.digest())"
+    command = [sys.executable, "-c", code, " ".join(p for p in sys.path if p and " " not in p)]
+    assert subprocess.run(command, capture_output=True, check=True, text=True).stdout.strip() == first
+
+
+def test_closed_worlds_leave_no_client_behind() -> None:
+    world = BulletWorld(plane(0), [LOADER], Bodies(np.array([17_500.0]), np.array([0.75])), np.array([[5.0, 5.0, 0.0]]))
+    client = world._multi._client
+    assert pybullet.isConnected(client)
+    world.close()
+    world.close()
+    assert not pybullet.isConnected(client)
