@@ -1,4 +1,4 @@
-"""Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers are in `protocol.queries.answers`.
+"""Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers: `answers.py`.
 
 A query is parsed once, at the server's door, into a frozen type; an unknown parameter is refused by name.
 """

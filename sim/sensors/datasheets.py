@@ -1,6 +1,6 @@
 """What sensors get wrong and how often they read: the parameters of all sensor models, as presets give them.
 
-Standard deviations are of one reading unless they say otherwise; `sim/sensors/presets.toml` holds values and their sources.
+Standard deviations are of one reading unless they say otherwise; `presets.toml` holds values and sources.
 """
 
 from __future__ import annotations

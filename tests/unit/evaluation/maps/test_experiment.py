@@ -1,3 +1,5 @@
+from tests.paths import ROOT
+
 """The comparison of merges: judged where machines drove, kept, resumed, through the command line; and its pictures."""
 
 import json
@@ -203,7 +205,7 @@ def test_other_code_and_other_cases_have_other_results(tmp_path: Path, monkeypat
 
 def test_results_depend_on_the_server_and_on_everything_that_makes_samples():
     for source in experiment.SOURCES:
-        assert (experiment.Path(experiment.__file__).parents[1] / source).exists()
+        assert (ROOT / source).exists()
     assert {"mapserver", "protocol", "evaluation/maps/samples.py"} <= set(experiment.SOURCES)
 
 

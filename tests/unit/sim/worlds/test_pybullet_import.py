@@ -16,6 +16,8 @@ def test_errors_are_still_shown_afterwards() -> None:
 
 
 def test_a_process_without_standard_error_can_simulate() -> None:
-    code = "import os; os.close(2); import sim.worlds.pybullet_import; print(sim.worlds.pybullet_import.pybullet.getAPIVersion() > 0)"
+    code = (
+        "import os; os.close(2); from sim.worlds.pybullet_import import pybullet; print(pybullet.getAPIVersion() > 0)"
+    )
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, check=True)
     assert done.stdout == b"True\n"
