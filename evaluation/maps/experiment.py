@@ -29,7 +29,11 @@ from protocol.site.geometry import CellWindow
 from protocol.site.ground_classes import UNKNOWN, resistance_class, wrong_percent
 
 SERVER = "soft_votes"
-SOURCES = ("mapserver", "protocol", *(f"evaluation/merge{part}.py" for part in ("", "_cases", "_methods", "_samples")))
+SOURCES = (
+    "mapserver",
+    "protocol",
+    *(f"evaluation/maps/{part}.py" for part in ("experiment", "cases", "methods", "samples")),
+)
 RESISTANCE, GRADE = ("resistance",), ("grade_east", "grade_north")
 GRADE_TOLERANCE = 0.01  # [m/m]; a gradient vector that is off by more is wrong
 SHARE = 0.6  # of votes: cells that are surer than this should hardly ever be wrong

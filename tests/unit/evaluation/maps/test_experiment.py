@@ -1,5 +1,3 @@
-from tests.paths import ROOT
-
 """The comparison of merges: judged where machines drove, kept, resumed, through the command line; and its pictures."""
 
 import json
@@ -14,6 +12,7 @@ from evaluation.maps.cases import CASES, Machine, lay, select
 from evaluation.maps.samples import Scene
 from protocol.errors import SitegridError
 from sitegrid import cli
+from tests.paths import ROOT
 
 METHODS = ["soft_votes", "last_write", "mean", "median", "kalman"]
 KEYS = {

@@ -216,7 +216,7 @@ FOLD_A_PART = """
 import sys
 from pathlib import Path
 import numpy as np
-from mapserver import snapshot
+from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
 

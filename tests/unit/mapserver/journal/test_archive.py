@@ -433,7 +433,7 @@ def test_what_a_kill_left_half_written_is_removed(day):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from mapserver import archive as ar
+from mapserver.journal import archive as ar
 from mapserver.journal.journal import Journal, JournalReader
 from protocol.site.site_config import SiteConfig
 

@@ -117,7 +117,7 @@ def digest() -> str:
 def test_a_drive_repeats_bit_for_bit_here_and_in_another_process() -> None:
     first = digest()
     assert digest() == first
-    code = "import sys; sys.path[:0] = sys.argv[1].split(); import test_sim_bullet as t; print(t.digest())"
+    code = "import sys; sys.path[:0] = sys.argv[1].split(); from tests.unit.sim.worlds.test_bullet import digest; print(digest())"
     command = [sys.executable, "-c", code, " ".join(p for p in sys.path if p and " " not in p)]
     assert subprocess.run(command, capture_output=True, check=True, text=True).stdout.strip() == first
 
