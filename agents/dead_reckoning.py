@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque
+from protocol.units import GRAVITY_MPS2
 
 TURNS = ("imu", "odometry", "steering")  # what tells the turn, the best first
 STALE_S = 2.0  # a steering angle, or a speed to go with it, says nothing later

@@ -14,11 +14,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from agents.physics import GRAVITY_MPS2
 from agents.pipeline import Pipeline, PipelineConfig
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Imu, Reading
 from protocol.site.site_config import Projection, SiteConfig
+from protocol.units import GRAVITY_MPS2
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 LEVERS_M = {"gps-1": (0.8, 0.5, 3.0), "gps-2": (0.8, -0.5, 3.0)}

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Floats
+from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
 from sim.machines.model import MachineModel, load_model
 from sim.machines.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
-from sim.machines.vehicle import GRAVITY, Bodies
+from sim.machines.vehicle import Bodies
 from sim.scenario.file import load_scenario
 from sim.simulator import Simulator
 from sim.worlds.bullet import BulletWorld
@@ -77,7 +78,7 @@ def _coast_down(world: str) -> list[Row]:
         _hold(one, 8.0)
         start = float(_idle(one, 1.2)[-1].speed_mps[0])  # until the engine has let go
         slower = (start - float(_idle(one, 0.5)[-1].speed_mps[0])) / 0.5
-    return [_row("gravel", slower, SOILS[GRAVEL].c_rr * GRAVITY / turning, "m/s2", relative=0.01)]
+    return [_row("gravel", slower, SOILS[GRAVEL].c_rr * GRAVITY_MPS2 / turning, "m/s2", relative=0.01)]
 
 
 def _parking(world: str) -> list[Row]:

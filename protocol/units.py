@@ -1,8 +1,10 @@
-"""Units that logs come in, and their factor to the unit that a field's suffix names."""
+"""Units that logs come in, their factor to the unit that a field's suffix names, and the one constant of nature."""
 
 from __future__ import annotations
 
 import math
+
+GRAVITY_MPS2 = 9.80665  # standard gravity (ISO 80000-3)
 
 # unit -> {suffix of a field: factor from the unit to what the suffix means}
 _UNITS: dict[str, dict[str, float]] = {
@@ -18,7 +20,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "m/s": {"_mps": 1.0},
     "km/h": {"_mps": 1 / 3.6},
     "m/s2": {"_mps2": 1.0},
-    "g": {"_mps2": 9.80665},
+    "g": {"_mps2": GRAVITY_MPS2},
     "Nm": {"_nm": 1.0},
     "kNm": {"_nm": 1e3},
     "ticks": {"_ticks": 1.0},

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from agents.physics import GRAVITY_MPS2
+from protocol.units import GRAVITY_MPS2
 
 MAX_SINE = 0.7  # steeper than any machine stands
 

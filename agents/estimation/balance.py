@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import AttitudeConfig, LeanFilter
 from agents.estimation.squat import front_share, squat_rad
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Articulation, Encoder, Imu, Odometry, Payload, Reading, Torque
+from protocol.units import GRAVITY_MPS2
 
 NOTHING = (0.0,) * 4
 

@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass
 
 from agents.estimation.balance import Balance
-from agents.physics import GRAVITY_MPS2
 from protocol.config import require_positive
+from protocol.units import GRAVITY_MPS2
 
 # Reasons that leave the slope as it is; the others withhold the whole sample.
 SLOPE_TOO = frozenset({"pitch_transient", "accelerometer"})

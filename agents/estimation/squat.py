@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from agents.physics import GRAVITY_MPS2
 from protocol.machine.machine_config import MachineConfig
+from protocol.units import GRAVITY_MPS2
 
 
 def front_share(machine: MachineConfig, payload_kg: float, force_mps2: float) -> float:

@@ -21,12 +21,12 @@ from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.headings import UNKNOWN_STD, References, counted_from_start
 from agents.localisation.imu_steps import Step, Steps
 from agents.localisation.measurements import SensingConfig
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.config import require_positive
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Reading
 from protocol.site.site_config import Projection
+from protocol.units import GRAVITY_MPS2
 
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
 START_MPS = 3.0  # how unsure the first speed is: the machine may drive already, and wheels take a moment to tell

@@ -17,8 +17,8 @@ import numpy as np
 from agents.localisation.filters.belief import Measurement
 from agents.localisation.filters.motion import EYE, map_from_base, turned_jacobian
 from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
+from protocol.units import GRAVITY_MPS2
 
 ROLL, PITCH, YAW = range(ATTITUDE.start, ATTITUDE.stop)
 PLACE = slice(POSITION.start, POSITION.start + 2)

@@ -14,6 +14,7 @@ from protocol.arrays import Floats
 from protocol.config import from_table
 from protocol.errors import ConfigError
 from protocol.machine.readings import KINDS
+from protocol.rotations import matrix_from_rpy
 from protocol.site.site_config import NAME
 
 BASE, FRONT = "base_link", "front_link"
@@ -42,14 +43,7 @@ class Mount:
 
     def base_from_sensor(self) -> Floats:
         """Return the rotation matrix (3, 3) that turns vectors of the sensor into `base_link` (yaw @ pitch @ roll)."""
-        (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in np.radians(self.rpy_deg))
-        return np.array(
-            [
-                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-                [-sp, cp * sr, cp * cr],
-            ]
-        )
+        return matrix_from_rpy(*np.radians(self.rpy_deg))
 
 
 @dataclass(frozen=True)

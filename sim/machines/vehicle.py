@@ -12,7 +12,6 @@ from protocol.arrays import Bools, Floats
 from sim.machines.model import MachineModel
 from sim.worlds.world import STEP_S
 
-GRAVITY = 9.80665
 # Of what the worst soil under a machine's wheels can take, with the torque split in proportion to the wheels' loads,
 # this is the most that traction control allows: a wheel at its peak would spin up without end.
 TRACTION_USE = 0.98

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocol.arrays import Floats
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import WHEELS, MachineModel
 from sim.machines.soil import TRACTION
-from sim.machines.vehicle import GRAVITY, SETTLE_STEPS, TRACTION_USE, Bodies, chassis_of, drive_force_n, steering_radps
+from sim.machines.vehicle import SETTLE_STEPS, TRACTION_USE, Bodies, chassis_of, drive_force_n, steering_radps
 from sim.worlds.multibody import MultiBodies
 from sim.worlds.observe import Burden, Drive, observe
 from sim.worlds.rigid import POINT_FRAME, Ground, look
@@ -172,6 +173,6 @@ def _tyres(models: Sequence[MachineModel], bodies: Bodies) -> Tyres:
 def _free_radius_m(models: Sequence[MachineModel], bodies: Bodies) -> Floats:
     """Radius of unloaded tyres (n, 4), so that the nominal machine stands level when empty, hubs at their radius."""
     share = np.array([[m.front_share()] * 2 + [1 - m.front_share()] * 2 for m in models])
-    sunk_m = np.array([0.5 * m.mass_kg * GRAVITY / m.tyre_stiffness_npm for m in models])
+    sunk_m = np.array([0.5 * m.mass_kg * GRAVITY_MPS2 / m.tyre_stiffness_npm for m in models])
     free: Floats = bodies.wheel_radius_m[:, None] + share * sunk_m[:, None]
     return free

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from protocol.arrays import Floats
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import MachineModel
 from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
 from sim.machines.vehicle import (
-    GRAVITY,
     SETTLE_STEPS,
     STANDSTILL_MPS,
     TRACTION_USE,
@@ -29,7 +29,7 @@ from sim.worlds import fast_kernels as k
 from sim.worlds.terrain import Terrain
 from sim.worlds.world import STEP_S, FleetState
 
-_CONSTANTS = k.Constants(STEP_S, GRAVITY, STANDSTILL_MPS, TRACTION_USE)
+_CONSTANTS = k.Constants(STEP_S, GRAVITY_MPS2, STANDSTILL_MPS, TRACTION_USE)
 _SOILS = np.array([C_RR, TRACTION, SLIP_STIFFNESS])
 
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, FRONT
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import PAYLOAD, WHEELS, MachineModel
 from sim.machines.urdf import rigid_urdf
-from sim.machines.vehicle import GRAVITY
 from sim.worlds.pybullet_import import pybullet
 
 OSCILLATION_NM = 2000.0  # friction of the joint that lets all wheels touch
@@ -56,7 +56,7 @@ class MultiBodies:
         """base_pose: (n, 7), place and quaternion (x, y, z, w) of each `base_link`."""
         self._client = pybullet.connect(pybullet.DIRECT)
         self.close = weakref.finalize(self, pybullet.disconnect, self._client)
-        pybullet.setGravity(0, 0, -GRAVITY, physicsClientId=self._client)
+        pybullet.setGravity(0, 0, -GRAVITY_MPS2, physicsClientId=self._client)
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=dt, numSolverIterations=20, deterministicOverlappingPairs=1, physicsClientId=self._client
         )

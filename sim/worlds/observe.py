@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats
+from protocol.units import GRAVITY_MPS2
 from sim.machines.soil import C_RR
-from sim.machines.vehicle import GRAVITY
 from sim.worlds.rigid import BASE_POINT, Scene, articulation, attitude, plane_gradient
 from sim.worlds.world import STEP_S, FleetState
 
-_GRAVITY_UP = np.array([0.0, 0.0, GRAVITY])
+_GRAVITY_UP = np.array([0.0, 0.0, GRAVITY_MPS2])
 
 
 @dataclass(frozen=True, slots=True)

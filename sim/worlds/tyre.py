@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats, Ints
+from protocol.units import GRAVITY_MPS2
 from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import GRAVITY, STANDSTILL_MPS
+from sim.machines.vehicle import STANDSTILL_MPS
 
 BRISTLE_DAMPING = 0.3  # of a wheel's share of the machine on its bristles, against critical; nothing at steady slip
 LONGEST_STRETCH = 2.5  # of a bristle, against where its tangent meets the traction limit: then the tread slides
@@ -85,7 +86,7 @@ def roll(
     load, zone, radius = motion.load_n, motion.zone, tyres.radius_m
     limit = TRACTION[zone] * load
     stiffness = SLIP_STIFFNESS[zone] * load / tyres.relaxation_m
-    damping = (2 * BRISTLE_DAMPING) * np.sqrt(stiffness * load / GRAVITY)
+    damping = (2 * BRISTLE_DAMPING) * np.sqrt(stiffness * load / GRAVITY_MPS2)
 
     # Share of the spring's force that is left near the traction limit, ahead and aside together.
     pull = stiffness * np.hypot(state.ahead_m, state.left_m) + _NO_FORCE_N

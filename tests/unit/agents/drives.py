@@ -13,12 +13,12 @@ import numpy as np
 from agents.estimation.squat import front_share, squat_rad
 from agents.localisation.filters.belief import Belief
 from agents.localisation.localiser import Localiser
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats, Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Articulation, Encoder, Gps, Imu, Payload, Reading, Torque
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import Projection, SiteConfig
+from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
 from sim.simulator import Simulator
 

@@ -14,10 +14,10 @@ from agents.estimation.attitude import AttitudeConfig
 from agents.estimation.balance import Balance, Balancer
 from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEstimator
 from agents.estimation.resistance import Push, Resistance
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
+from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS
 
 STEP_S = 0.05

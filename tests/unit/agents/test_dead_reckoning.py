@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from agents.dead_reckoning import DeadReckoning, WheelTracker, align, mean_std
-from agents.physics import GRAVITY_MPS2
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Odometry, Torque
+from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, Drive, Leg, changed_sensor, drive, machine
 
 

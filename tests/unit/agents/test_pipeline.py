@@ -15,13 +15,13 @@ import protocol
 from agents.estimation.calibration import Calibration
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.localiser import LocalisationConfig
-from agents.physics import GRAVITY_MPS2
 from agents.pipeline import Pipeline, PipelineConfig, Positioning
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import KINDS, Encoder, Gps, Imu, Reading, Torque, columns
 from protocol.machine.samples import check_samples
 from protocol.site.site_config import KnownGround, SiteConfig
+from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
 from sim.recorder import record
 from tests.unit.agents.drives import (

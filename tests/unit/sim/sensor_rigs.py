@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from protocol.site.site_config import Projection, SiteConfig
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import load_model
 from sim.sensors.datasheets import GpsNoise
 from sim.sensors.presets import Preset, load_preset
@@ -17,7 +18,6 @@ from sim.sensors.sensors import Sensors
 from sim.worlds.world import FleetState
 
 SEED = 7
-GRAVITY = 9.80665
 LOADER = load_model("wheel_loader")
 DGPS = load_preset("dgps")
 PROJECTION = Projection(SiteConfig("pit", 49.0, 8.4, 110.0))
@@ -62,7 +62,7 @@ def rig(
 def still(k: int, n: int = 1, **values: object) -> FleetState:
     """States (k, n, ...) of machines at rest at the origin, but for these values."""
     arrays = {f.name: (k, n, WIDTHS[f.name]) if f.name in WIDTHS else (k, n) for f in fields(FleetState)}
-    given = {"force_mps2": (0.0, 0.0, GRAVITY), **values}
+    given = {"force_mps2": (0.0, 0.0, GRAVITY_MPS2), **values}
     return FleetState(**{name: np.broadcast_to(given.get(name, 0.0), shape) for name, shape in arrays.items()})
 
 

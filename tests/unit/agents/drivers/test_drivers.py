@@ -12,9 +12,9 @@ from agents.delivery.uplink import UplinkConfig
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver
 from agents.estimation.calibration_file import load
-from agents.physics import GRAVITY_MPS2
 from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.readings import Articulation, Imu, Reading
+from protocol.units import GRAVITY_MPS2
 from protocol.wire import keys
 from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents.estimation.attitude import AttitudeConfig, LeanFilter
-from agents.physics import GRAVITY_MPS2
+from protocol.units import GRAVITY_MPS2
 
 # Only gyros: the accelerometer is not believed, biases are not looked for.
 GYROS_ALONE = AttitudeConfig(force_std_mps2=1e6, bias_std_radps=1e-9, bias_walk=1e-9)

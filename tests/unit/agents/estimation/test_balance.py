@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.physics import GRAVITY_MPS2
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Odometry, Payload, Torque
+from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, Drive, Ground, Leg, changed_sensor, drive, machine, noisy
 from tests.unit.agents.ground import balances
 

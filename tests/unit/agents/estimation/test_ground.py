@@ -17,9 +17,9 @@ from agents.estimation.ground import (
     GroundEstimator,
 )
 from agents.estimation.plausibility import PlausibilityConfig
-from agents.physics import GRAVITY_MPS2
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Reading, Torque
+from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, Drive, Ground, Leg, drive, machine, noisy
 from tests.unit.agents.ground import STEADY, Run
 

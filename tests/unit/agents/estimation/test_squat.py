@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 
 from agents.estimation.squat import front_share, squat_rad
-from agents.physics import GRAVITY_MPS2
 from protocol.machine.machine_config import MachineConfig
+from protocol.units import GRAVITY_MPS2
 
 LOADER = MachineConfig(
     "loader-1",

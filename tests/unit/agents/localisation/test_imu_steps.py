@@ -7,10 +7,10 @@ import pytest
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.filters.motion import map_from_base
 from agents.localisation.imu_steps import Step, Steps
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Torque
+from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, Leg, drive, machine
 
 MS = 1_000_000

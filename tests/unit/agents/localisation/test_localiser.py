@@ -9,11 +9,11 @@ from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.history import FusionConfig
 from agents.localisation.filters.state import ATTITUDE, BASE_STATES, SPEED, YAW, Layout
 from agents.localisation.localiser import POSITIVE, LocalisationConfig, Localiser
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Attitude, Encoder, Gps, Imu, Reading, Torque
 from protocol.site.site_config import Projection
+from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import (
     PROJECTION,
     S_BEND,

@@ -21,9 +21,9 @@ from agents.localisation.filters.state import (
 )
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.measurements import SensingConfig
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
 from protocol.machine.machine_config import Mount
+from protocol.units import GRAVITY_MPS2
 
 PAPER, FULL = Layout(), Layout(imus=2, wheel_scale=True, receivers=2, references=1)
 LEVER_M = np.array([0.8, -0.3, 3.0])

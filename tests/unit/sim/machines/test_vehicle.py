@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from protocol.machine.machine_config import Mount
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import MachineModel
 from sim.machines.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import GRAVITY, chassis_of, drive_force_n, steering_radps, weigh
+from sim.machines.vehicle import chassis_of, drive_force_n, steering_radps, weigh
 from sim.worlds.fast import Fleet
 from sim.worlds.terrain import Terrain
 from sim.worlds.world import STEP_S, FleetState, stack
@@ -166,7 +167,7 @@ def test_hydraulics_and_engine_follow_with_their_lags_and_limits() -> None:
 
 def test_at_rest_the_specific_force_is_gravity() -> None:
     with placed(Fleet, plane(0, 0.2, 0.1), LOADER, starts=[(500, 500, 0.7)]) as world:
-        assert np.linalg.norm(world.state.force_mps2) == pytest.approx(GRAVITY)
+        assert np.linalg.norm(world.state.force_mps2) == pytest.approx(GRAVITY_MPS2)
 
 
 def test_rates_are_those_of_the_turning_frame() -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
-from sim.machines.vehicle import GRAVITY
 from sim.operators.driver import bend
 from sim.scenario.ground import lay
 from sim.worlds.world import FleetState
@@ -51,7 +51,7 @@ def test_nobody_gets_stuck_or_lost(paper: dict[str, Driven], world: str) -> None
     assert driven.off_m[4:].max() < 0.6
     assert abs(states.articulation_rad).max() <= 0.6
     assert abs(states.rates_radps).max() < 0.6
-    assert abs(states.force_mps2[10:, :, 2] - GRAVITY).max() < 6.0
+    assert abs(states.force_mps2[10:, :, 2] - GRAVITY_MPS2).max() < 6.0
 
 
 @pytest.mark.parametrize("route", ["west", "east", "middle"])

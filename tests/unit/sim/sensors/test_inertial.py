@@ -9,7 +9,7 @@ from sim.sensors.presets import Preset
 from sim.worlds.world import FleetState
 from tests.unit.sim.sensor_rigs import (
     DGPS,
-    GRAVITY,
+    GRAVITY_MPS2,
     LOADER,
     SEED,
     blocks,
@@ -23,7 +23,7 @@ from tests.unit.sim.sensor_rigs import (
 )
 
 N = 500
-AT_REST = np.array([0, 0, 0, 0, 0, GRAVITY])
+AT_REST = np.array([0, 0, 0, 0, 0, GRAVITY_MPS2])
 IMU_RATES = pytest.mark.parametrize("rate_hz", [100, 50])
 ATTITUDE_RATES = pytest.mark.parametrize("rate_hz", [50, 20])
 
@@ -60,8 +60,8 @@ def test_imu_zeros_are_drawn_once() -> None:
 
 
 def test_imu_scale_and_mounting_errors() -> None:
-    check_deviation(imu_errors(noisy("imu", scale=0.002), 0.01, 2 * N)[0, :, 5] / GRAVITY, 0.002, 2 * N)
-    tilted = imu_errors(noisy("imu", mounting_deg=1.0), 0.01, 2 * N)[0, :, 3:] / GRAVITY
+    check_deviation(imu_errors(noisy("imu", scale=0.002), 0.01, 2 * N)[0, :, 5] / GRAVITY_MPS2, 0.002, 2 * N)
+    tilted = imu_errors(noisy("imu", mounting_deg=1.0), 0.01, 2 * N)[0, :, 3:] / GRAVITY_MPS2
     check_deviation(tilted[:, :2], math.radians(1.0), 4 * N)
     np.testing.assert_allclose(np.hypot(tilted[:, 0], tilted[:, 1]) ** 2 + (1 + tilted[:, 2]) ** 2, 1.0)
 
@@ -88,7 +88,7 @@ def test_imu_reads_in_its_own_axes() -> None:
 def test_imu_off_the_frames_origin_feels_the_rotation() -> None:
     turning = {"rates_radps": (0.0, 0.0, 0.5), "rates_dot_radps2": (0.0, 0.0, 0.2)}
     (reading,) = values(rig(perfect(), imu=(3,), only="imu"), "imu", 0.01, **turning)[0]
-    np.testing.assert_allclose(reading[3:], [-(0.5**2) * 0.4, 0.2 * 0.4, GRAVITY])
+    np.testing.assert_allclose(reading[3:], [-(0.5**2) * 0.4, 0.2 * 0.4, GRAVITY_MPS2])
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
@@ -117,7 +117,7 @@ def felt(pose: object, t: float, h: float = 1e-3) -> tuple[np.ndarray, np.ndarra
     """Angular rate and specific force of a moving frame, by finite differences."""
     (before, r0), (now, r1), (after, r2) = (pose(t + d) for d in (-h, 0.0, h))  # type: ignore[operator]
     spin = r1.T @ (r2 - r0) / (2 * h)
-    force = r1.T @ ((after - 2 * now + before) / h**2 + [0, 0, GRAVITY])
+    force = r1.T @ ((after - 2 * now + before) / h**2 + [0, 0, GRAVITY_MPS2])
     return np.array([spin[2, 1], spin[0, 2], spin[1, 0]]), force
 
 

@@ -9,9 +9,10 @@ import pybullet
 import pytest
 
 from protocol.arrays import Floats
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import MachineModel
 from sim.machines.soil import SAND, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import GRAVITY, Bodies
+from sim.machines.vehicle import Bodies
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.world import STEP_S, FleetState, stack
 from tests.unit.sim.bullet_worlds import BOTH, LOADER, TRUCK, hold_speed, idle, placed, plane
@@ -50,7 +51,7 @@ def test_wheels_carry_what_the_machine_carries(model: MachineModel) -> None:
             world.set_payload(0, payload)
             last = idle(world, 4.0, model.max_brake_n)
             assert last.mass_kg[0] == model.mass_kg + payload
-            assert last.load_n[0] == pytest.approx(last.mass_kg[0] * GRAVITY / math.hypot(1, grade), rel=1e-3)
+            assert last.load_n[0] == pytest.approx(last.mass_kg[0] * GRAVITY_MPS2 / math.hypot(1, grade), rel=1e-3)
             loads = world.wheel_loads_n[0]
             shift = grade * model.centre_height_m(payload) / model.wheelbase_m
             assert loads[:2].sum() / loads.sum() == pytest.approx(model.front_share(payload) - shift, abs=0.004)
@@ -80,7 +81,7 @@ def test_front_frame_moves_as_the_rear_frame_and_the_joint_imply(model: MachineM
         for i in range(ahead):  # at the end it steers, on the way and back again
             old = front_link(world)
             steer = np.array([0.4 * (100 < i < 350)])
-            state = world.advance(steer, np.array([0.1 * model.mass_kg * GRAVITY]), zero)
+            state = world.advance(steer, np.array([0.1 * model.mass_kg * GRAVITY_MPS2]), zero)
         new = front_link(world)
     c, s = math.cos(state.articulation_rad[0]), math.sin(state.articulation_rad[0])
     front_from_base = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
@@ -90,7 +91,7 @@ def test_front_frame_moves_as_the_rear_frame_and_the_joint_imply(model: MachineM
     arm = np.array([model.rear_to_joint_m, 0, model.wheel_radius_m])
     force = front_from_base @ (state.force_mps2[0] + np.cross(rates_dot, arm) + np.cross(rates, np.cross(rates, arm)))
 
-    felt = new.rotation.T @ ((new.velocity - old.velocity) / STEP_S + [0, 0, GRAVITY])
+    felt = new.rotation.T @ ((new.velocity - old.velocity) / STEP_S + [0, 0, GRAVITY_MPS2])
     turn, old_turn = new.rotation.T @ new.rate, old.rotation.T @ old.rate
     assert abs(state.articulation_radps[0]) > 0.1
     held = slice(0 if model.rolls_with_front else 1, 3)  # the truck's front frame rolls by itself
@@ -117,8 +118,7 @@ def digest() -> str:
 def test_a_drive_repeats_bit_for_bit_here_and_in_another_process() -> None:
     first = digest()
     assert digest() == first
-    code = "import sys; sys.path[:0] = sys.argv[1].split(); from tests.unit.sim.worlds.test_bullet import digest; print(digest())"
-    command = [sys.executable, "-c", code, " ".join(p for p in sys.path if p and " " not in p)]
+    command = [sys.executable, "-c", "from tests.unit.sim.worlds.test_bullet import digest; print(digest())"]
     assert subprocess.run(command, capture_output=True, check=True, text=True).stdout.strip() == first
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from protocol.machine.machine_config import MachineConfig
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import MachineModel
-from sim.machines.vehicle import GRAVITY
 from sim.sensors.presets import load_preset
 from sim.sensors.rigs import machine_config
 from sim.worlds.bullet import BulletWorld
@@ -26,7 +26,7 @@ def load_difference_n(machine: MachineConfig, payload_kg: float, force_x_mps2: f
 def nose_up_rad(machine: MachineConfig, payload_kg: float, force_x_mps2: float, force_z_mps2: float) -> float:
     """Nose-up angle of the frame against the ground, 0 for the empty machine that stands level."""
     more_n = load_difference_n(machine, payload_kg, force_x_mps2, force_z_mps2)
-    more_n -= load_difference_n(machine, 0.0, 0.0, GRAVITY)
+    more_n -= load_difference_n(machine, 0.0, 0.0, GRAVITY_MPS2)
     return more_n / (machine.axle_stiffness_npm * machine.wheelbase_m)
 
 
@@ -41,7 +41,7 @@ def test_squat_at_steady_speed_is_that_of_the_axles_loads(model: MachineModel, s
         idle(world, 3.0, model.max_brake_n)
         last = hold_speed(world, 2.0, 8.0)[-100:]
     found = -np.mean([state.pitch_rad[0] for state in last]) - slope
-    force_x = GRAVITY * math.sin(slope) + float(np.mean([state.accel_mps2[0] for state in last]))
-    assert found == pytest.approx(nose_up_rad(machine, payload_kg, force_x, GRAVITY * math.cos(slope)), abs=0.0005)
+    force_x = GRAVITY_MPS2 * math.sin(slope) + float(np.mean([state.accel_mps2[0] for state in last]))
+    assert found == pytest.approx(nose_up_rad(machine, payload_kg, force_x, GRAVITY_MPS2 * math.cos(slope)), abs=0.0005)
     if full or slope_deg:
         assert abs(found) > 0.002  # else there would be nothing to tell

@@ -7,9 +7,10 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import MachineModel
 from sim.machines.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
-from sim.machines.vehicle import GRAVITY, TRACTION_USE, Bodies
+from sim.machines.vehicle import TRACTION_USE, Bodies
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.fast import Fleet
 from sim.worlds.world import STEP_S, FleetState, World, stack
@@ -51,13 +52,13 @@ def test_past_states_do_not_change(kind: type) -> None:
 def test_machines_start_at_rest_where_they_are_put(kind: type, model: MachineModel) -> None:
     with placed(kind, plane(0), model, starts=[(480, 510, 0.7)]) as world:
         rest = world.state
-    np.testing.assert_allclose(rest.force_mps2[0], [0, 0, GRAVITY], atol=1e-3)
+    np.testing.assert_allclose(rest.force_mps2[0], [0, 0, GRAVITY_MPS2], atol=1e-3)
     np.testing.assert_allclose([rest.x_m[0], rest.y_m[0], rest.yaw_rad[0]], [480, 510, 0.7], atol=0.01)
     assert abs(rest.z_m[0]) < 1e-3
     assert abs(rest.rates_radps).max() < 1e-4
     assert abs(rest.speed_mps[0]) < 1e-4
     assert (rest.wheel_rad == 0).all()
-    assert rest.load_n[0] == pytest.approx(model.mass_kg * GRAVITY, rel=1e-3)
+    assert rest.load_n[0] == pytest.approx(model.mass_kg * GRAVITY_MPS2, rel=1e-3)
 
 
 @EACH
@@ -68,7 +69,7 @@ def test_steady_traction_on_the_level_is_the_rolling_resistance(kind: type, zone
     ratio = last.torque_nm / LOADER.wheel_radius_m / last.load_n
     assert ratio[0] == pytest.approx(SOILS[zone].c_rr, rel=0.01)
     assert last.c_rr[0] == pytest.approx(SOILS[zone].c_rr)
-    assert last.load_n[0] == pytest.approx(17_500 * GRAVITY, rel=1e-3)
+    assert last.load_n[0] == pytest.approx(17_500 * GRAVITY_MPS2, rel=1e-3)
 
 
 @EACH
@@ -80,7 +81,7 @@ def test_steady_traction_on_15_degrees_adds_the_slope(kind: type, model: Machine
         last = hold_speed(world, 2.0, 10.0)[-1]
     ratio = last.torque_nm / model.wheel_radius_m / last.load_n
     assert ratio[0] == pytest.approx(SOILS[zone].c_rr + uphill * GRADE_15, abs=0.002)
-    assert last.load_n[0] == pytest.approx(model.mass_kg * GRAVITY * math.cos(math.radians(15)), rel=1e-3)
+    assert last.load_n[0] == pytest.approx(model.mass_kg * GRAVITY_MPS2 * math.cos(math.radians(15)), rel=1e-3)
     assert math.degrees(last.pitch_rad[0]) == pytest.approx(-15 * uphill, abs=0.4)  # tyres give way by some mm
 
 
@@ -93,11 +94,11 @@ def test_machine_rolls_out_by_its_resistance_and_stays(kind: type, model: Machin
         hold_speed(world, 5.0, 6.0)
         start = idle(world, 1.2).speed_mps[0]  # until the engine has let go
         slower = start - idle(world, 0.5).speed_mps[0]
-        assert slower / 0.5 == pytest.approx(SOILS[zone].c_rr * GRAVITY / turning, rel=0.01)
+        assert slower / 0.5 == pytest.approx(SOILS[zone].c_rr * GRAVITY_MPS2 / turning, rel=0.01)
         if zone == SAND:
             end = idle(world, 4.0)
             assert abs(end.speed_mps[0]) < 1e-3
-            np.testing.assert_allclose(end.force_mps2[0], [0, 0, GRAVITY], atol=0.01)
+            np.testing.assert_allclose(end.force_mps2[0], [0, 0, GRAVITY_MPS2], atol=0.01)
 
 
 @EACH
@@ -119,10 +120,10 @@ def test_braked_machine_holds_on_15_degrees(kind: type, model: MachineModel, yaw
 def test_brakes_stop_a_machine_and_never_push_it_back(kind: type, model: MachineModel, direction: int) -> None:
     with placed(kind, plane(CONCRETE), model) as world:
         start = hold_speed(world, 3.0 * direction, 5.0)[-1]
-        brake = np.array([0.2 * model.mass_kg * GRAVITY])
+        brake = np.array([0.2 * model.mass_kg * GRAVITY_MPS2])
         states = stack([world.advance(np.zeros(1), np.zeros(1), brake) for _ in range(500)])
     along = direction * states.speed_mps[:, 0]
-    slowing = (0.2 + SOILS[CONCRETE].c_rr) * GRAVITY / model.rotating_mass_factor
+    slowing = (0.2 + SOILS[CONCRETE].c_rr) * GRAVITY_MPS2 / model.rotating_mass_factor
     assert (along[20] - along[90]) / 0.7 == pytest.approx(slowing, rel=0.02)
     assert start.speed_mps[0] * direction > 2.5
     assert along.min() > -0.08  # rocks on its tyres
@@ -160,7 +161,7 @@ def test_turning_radius_is_that_of_the_articulation(kind: type, model: MachineMo
     kinematic = (model.front_to_joint_m + model.rear_to_joint_m * math.cos(steer)) / math.sin(abs(steer))
     assert math.sqrt(c + a * a + b * b) == pytest.approx(kinematic, rel=0.02)
     rates, speed = states.rates_radps[-1, 0], states.speed_mps[-1, 0]
-    leaning = GRAVITY * math.sin(states.roll_rad[-1, 0])
+    leaning = GRAVITY_MPS2 * math.sin(states.roll_rad[-1, 0])
     assert states.force_mps2[-1, 0, 1] - leaning == pytest.approx(speed * rates[2], rel=0.02)
     assert states.articulation_rad[-1, 0] == pytest.approx(steer, abs=1e-3)
 
@@ -196,7 +197,7 @@ def test_a_load_weighs_on_the_wheels(kind: type, model: MachineModel) -> None:
             world.set_payload(1, payload)
             last = idle(world, 4.0, 2 * model.max_brake_n)
             np.testing.assert_allclose(last.mass_kg, [model.mass_kg, model.mass_kg + payload])
-            np.testing.assert_allclose(last.load_n, last.mass_kg * GRAVITY / math.hypot(1, 0.1), rtol=1e-3)
+            np.testing.assert_allclose(last.load_n, last.mass_kg * GRAVITY_MPS2 / math.hypot(1, 0.1), rtol=1e-3)
 
 
 @EACH
@@ -251,14 +252,14 @@ def test_grade_and_attitude_are_those_of_the_plane(kind: type, model: MachineMod
     assert rest.grade_n[0] == pytest.approx(-0.07, abs=1e-6)
     up = np.array([-0.12, 0.07, 1.0]) / math.sqrt(1 + 0.12**2 + 0.07**2)
     c, s = np.cos(yaw), np.sin(yaw)
-    felt = rest.force_mps2[0] / GRAVITY  # the vertical as the rear frame sees it
+    felt = rest.force_mps2[0] / GRAVITY_MPS2  # the vertical as the rear frame sees it
     np.testing.assert_allclose(felt[:2], [-up[0] * c - up[1] * s, up[0] * s - up[1] * c], atol=0.01)
 
 
 @EACH
 def test_true_bodies_differ_from_the_model(kind: type) -> None:
     world = kind(plane(0), [LOADER], Bodies(np.array([18_000.0]), np.array([0.76])), np.array([[500, 500, 0.0]]))
-    assert world.state.load_n[0] == pytest.approx(18_000 * GRAVITY, rel=1e-4)
+    assert world.state.load_n[0] == pytest.approx(18_000 * GRAVITY_MPS2, rel=1e-4)
     last = hold_speed(world, 2.0, 5.0)[-1]
     assert last.wheel_radps[0, 0] * 0.76 == pytest.approx(last.speed_mps[0], rel=1e-3)
     world.close()
@@ -266,7 +267,7 @@ def test_true_bodies_differ_from_the_model(kind: type) -> None:
 
 @BOTH
 def test_both_worlds_take_the_same_way_under_the_same_commands(model: MachineModel) -> None:
-    weight_n, runs = model.mass_kg * GRAVITY, []
+    weight_n, runs = model.mass_kg * GRAVITY_MPS2, []
     for kind in (Fleet, BulletWorld):
         with placed(kind, plane(2, 0.03, -0.02), model, starts=[(500, 500, 0.4)]) as world:
             states = []

@@ -13,8 +13,8 @@ from agents.localisation.filters.history import Fusion, FusionConfig
 from agents.localisation.filters.motion import MotionConfig, motion
 from agents.localisation.filters.state import POSITION, SPEED, VELOCITY, YAW, Layout
 from agents.localisation.filters.ukf import Ukf
-from agents.physics import GRAVITY_MPS2
 from protocol.arrays import Floats
+from protocol.units import GRAVITY_MPS2
 
 LAYOUT, MOTION = Layout(), MotionConfig()
 MS = 1_000_000
