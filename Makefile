@@ -3,7 +3,8 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: venv demo test check chaos fuzz soak bench
+# make quick: unit tests that are not slow, in about a minute.
+.PHONY: venv demo quick test check chaos fuzz soak bench
 
 venv: $(VENV)/.installed
 
@@ -15,8 +16,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: venv
 	$(BIN)/sitegrid demo
 
+quick: venv
+	$(BIN)/python -m pytest --quiet --numprocesses auto -m "not slow and not processes" tests/unit
+
 test: venv
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal
 
 check: venv
 	$(BIN)/ruff check .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -34,3 +35,25 @@ def husky_data() -> Path:
 def _at_root(monkeypatch: pytest.MonkeyPatch) -> None:
     """Child processes find the packages from wherever pytest was started."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+
+
+# `make quick` leaves out what takes longer than about half a second of processor time, quietly run. Three times that
+# is enforced: a loaded machine, and the first use of a library, may cost as much again.
+MOST_CPU_S = 1.5
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Fail a test that takes long and does not say so."""
+    began_s = _cpu_s()
+    outcome = yield
+    taken_s = _cpu_s() - began_s
+    if taken_s > MOST_CPU_S and not any(item.iter_markers("slow")) and not any(item.iter_markers("processes")):
+        pytest.fail(f"took {taken_s:.1f} s of processor time: make it quicker, or mark it @pytest.mark.slow")
+    return outcome
+
+
+def _cpu_s() -> float:
+    """Processor time of this process and of the children that it waited for."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system

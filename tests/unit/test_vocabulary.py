@@ -1,0 +1,139 @@
+"""One word per thing: private words that standard terms replaced do not come back (docs/glossary.md).
+
+Identifiers, options, keys of configuration files and headings are looked at; sentences are not.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import tomllib
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.paths import ROOT
+
+# The word, and what it was replaced by.
+REPLACED = {
+    "ladder": "timeline",
+    "rung": "tier",
+    "hot": "open",
+    "keeper": "follower",
+    "sheet": "frame",
+    "bank": "sensor group",
+    "told": "stated, stamped",
+    "felt": "mean of an IMU",
+    "push": "balance step",
+    "way": "distance, route",
+    "hire": "crew",
+    "board": "at_start",
+    "aside": "quarantine, lateral",
+    "renewed": "reset",
+    "referred": "anchored",
+    "dead": "dead_reckoning",
+}
+WHOLE = {
+    "found": "a noun that says what it is",
+    "of": "a noun that says what it is",
+    "gives": "measures",
+    "says": "measures",
+}
+PAIRS = {("left", "out"): "excluded", ("put", "aside"): "quarantine"}
+# Of the field, or of the language.
+COMPOUNDS = {
+    ("dead", "reckoning"),
+    ("dead", "reckoned"),
+    ("data", "sheet"),
+    ("data", "sheets"),
+    ("give", "way"),
+    ("half", "way"),
+    ("other", "way"),
+    ("both", "ways"),
+}
+
+
+def tracked(*patterns: str) -> list[Path]:
+    listed = subprocess.run(["git", "ls-files", *patterns], cwd=ROOT, capture_output=True, check=True, text=True)
+    return [path for name in listed.stdout.split() if (path := ROOT / name).exists() and path != Path(__file__)]
+
+
+def replaced(name: str) -> str:
+    """What a name should say instead, or nothing."""
+    if name in WHOLE:
+        return WHOLE[name]
+    words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+    pairs = list(pairwise([*words, ""]))
+    for pair in pairs:
+        if pair in PAIRS:
+            return PAIRS[pair]
+    in_compounds = {word for pair in pairs if pair in COMPOUNDS for word in pair}
+    for word in words:
+        singular = word.removesuffix("s") if word.removesuffix("s") in REPLACED else word
+        if singular in REPLACED and word not in in_compounds:
+            return REPLACED[singular]
+    return ""
+
+
+def identifiers(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Names that a module makes, with their lines: what it only uses of libraries is theirs."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                yield node.lineno, name
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                yield node.lineno, "" if name.startswith("test_") else name  # a sentence
+            case ast.arg(arg=name):
+                yield node.lineno, name
+            case ast.alias(asname=str(name)):
+                yield node.lineno, name
+            case ast.Call(func=ast.Attribute(attr="add_argument")):
+                options = [word.value for word in node.args if isinstance(word, ast.Constant)]
+                yield from ((node.lineno, str(option).replace("-", "_")) for option in options)
+
+
+def keys(table: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in table.items():
+        yield name
+        for inner in value if isinstance(value, list) else [value]:
+            if isinstance(inner, Mapping):
+                yield from keys(inner)
+
+
+def test_no_identifier_is_a_private_word() -> None:
+    wrong = []
+    for path in tracked("*.py"):
+        names = [(0, path.stem), *identifiers(ast.parse(path.read_text(encoding="utf-8")))]
+        wrong += [
+            f"{path.relative_to(ROOT)}:{line} {name}: {better}" for line, name in names if (better := replaced(name))
+        ]
+    assert not wrong, "\n".join(sorted(set(wrong)))
+
+
+def test_no_key_of_a_configuration_file_is_a_private_word() -> None:
+    files = {path: tomllib.loads(path.read_text(encoding="utf-8")) for path in tracked("*.toml")}
+    wrong = [f"{path.relative_to(ROOT)} {key}" for path, table in files.items() for key in keys(table) if replaced(key)]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_heading_is_made_of_private_words() -> None:
+    wrong = []
+    for path in tracked("*.md"):
+        headings = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+        words = [word for heading in headings for word in re.findall(r"[\w-]+", heading.replace("dead reckoning", ""))]
+        wrong += [f"{path.relative_to(ROOT)} {w}" for w in words if w not in WHOLE and replaced(w.replace("-", "_"))]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("name", ["Ladder", "hot_blocks", "way_m", "left_out", "imu_bank", "found", "DeadEnd", "gives"])
+def test_a_private_word_is_seen(name: str) -> None:
+    assert replaced(name)
+
+
+@pytest.mark.parametrize("name", ["dead_reckoning", "DeadReckonedPose", "data_sheet", "heappush", "founded", "always"])
+def test_a_standard_word_stays(name: str) -> None:
+    assert not replaced(name)
