@@ -87,7 +87,7 @@ def test_rows_of_machines_and_changes_are_the_documented_ones(golden):
 
 @pytest.mark.parametrize("kind", GIVES)
 def test_every_part_of_a_sensor_is_documented(kind):
-    table = LOGS[LOGS.index("## What a sensor says") : LOGS.index("## Modes")]
+    table = LOGS[LOGS.index("## What a sensor measures") : LOGS.index("## Modes")]
     rows = table[table.index(f"| `{kind}` |") :].splitlines()
     own = [rows[0], *itertools.takewhile(lambda row: row.startswith("| |"), rows[1:])]
     assert [row.split("|")[2].split("`")[1] for row in own] == [*GIVES[kind]]
