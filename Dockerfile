@@ -2,7 +2,7 @@
 FROM python:3.11-slim AS build
 WORKDIR /build
 RUN python -m venv /venv
-COPY pyproject.toml constraints.txt README.md ./
+COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY protocol protocol
 COPY agents agents
 COPY mapserver mapserver
