@@ -12,12 +12,24 @@ TOP = "|".join((*PACKAGES, "tests", "docs", "config", r"\.ci"))
 PATH = re.compile(rf"`((?:{TOP})/(?:[\w.*-]+/)*(?:[\w*-]+\.(?:py|md|toml|urdf|c|bin|png|jpg))?)`")
 MODULE = re.compile(rf"`((?:{'|'.join(PACKAGES)})(?:\.[A-Za-z_]\w*)+)`")
 FILE = re.compile(r"`(\w+\.py)`")  # a module by its name alone
-FILES = {path.name for top in (*PACKAGES, "tests") for path in (ROOT / top).rglob("*.py")}
+FILES = {path.name: path for top in ("tests", *PACKAGES) for path in (ROOT / top).rglob("*.py")}
+FUNCTION = re.compile(r"`([A-Za-z_]+)\.(?!toml|md|py)([a-z_]+)`")  # Class.method or module.function
 LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]+))?\)")
 
 
 def test_links_paths_and_modules_of_the_documents_exist():
     assert [f"{page.relative_to(ROOT)}: {name}" for page in PAGES for name in _missing(page)] == []
+
+
+def test_functions_that_the_design_names_exist():
+    product = "\n".join(path.read_text() for top in PACKAGES for path in (ROOT / top).rglob("*.py"))
+    named = FUNCTION.findall((DOCS / "design.md").read_text())
+    bodies = re.findall(r"^class (\w+)(.*?)(?=^\S)", product, re.MULTILINE | re.DOTALL)
+    bodies += [(path.stem, path.read_text()) for path in FILES.values()]
+    there = {
+        (owner, name) for owner, name in named for place, body in bodies if place == owner and f"def {name}(" in body
+    }
+    assert [pair for pair in named if pair not in there] == []
 
 
 def _missing(page: Path) -> Iterator[str]:
