@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from argparse import Namespace
+import re
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,10 +15,65 @@ from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.queries.requests import Region
 from sitegrid.client import Client, connect
-from sitegrid.commands.times import SiteTime, told
+from sitegrid.options.groups import Subparsers, add_action, add_network, add_site
+from sitegrid.options.times import HELP as TIME_HELP
+from sitegrid.options.times import SiteTime, parse_time, told
+from sitegrid.options.values import positive
 from sitegrid.process.lifetime import plain, say, stop_flag, wait
 
+HELP = "ask the map"
 HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of a table for people, unless named
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add_network(parser)
+    add_site(parser)
+    parser.add_argument(
+        "--after", type=int, default=0, help="wait until this journal row is merged; changes: those beyond this number"
+    )
+    parser.add_argument("--layers", default="", help="layers, comma-separated; default all")
+    queries = parser.add_subparsers(metavar="QUERY", required=True, dest="ask")
+    point = _add_query(queries, "point", "the cell at a position, in metres")
+    _add_place(point)
+    _add_when(point)
+    region = _add_query(queries, "region", "a rectangle of cells, in metres")
+    for side in ("west_m", "south_m", "east_m", "north_m"):
+        region.add_argument(side, type=float)
+    region.add_argument("--out", type=Path, help="write coordinates and layers as .npz")
+    _add_when(region)
+    history = _add_query(queries, "history", "the cell at a position over time")
+    _add_place(history)
+    _add_times(
+        history, ("from", "samples from this time on"), ("to", "samples up to this time; default the site's now")
+    )
+    history.add_argument("--span", type=positive, metavar="SECONDS", help="length of a span; default 5 minutes")
+    _add_query(queries, "machines", "what the map server knows of each machine")
+    changes = _add_query(queries, "changes", "where the ground changed, and when")
+    changes.add_argument("--follow", action="store_true", help="go on with each change that is found, until stopped")
+    _add_query(queries, "info", "state of the map and its server")
+
+
+def _add_query(queries: Subparsers, name: str, summary: str) -> ArgumentParser:
+    return add_action(queries, name, summary, summary[0].upper() + summary[1:] + ".")
+
+
+def _add_place(query: ArgumentParser) -> None:
+    query.add_argument("x_m", type=float)
+    query.add_argument("y_m", type=float)
+
+
+def _add_when(query: ArgumentParser) -> None:
+    _add_times(query, ("as-of", "the map as of this time"), ("minus", "less the map as of this time"))
+
+
+def _add_times(query: ArgumentParser, *options: tuple[str, str]) -> None:
+    for name, summary in options:
+        dest = f"{name.replace('-', '_')}_time"
+        query.add_argument(f"--{name}", dest=dest, type=parse_time, metavar="TIME", help=summary)
+    query.epilog = f"TIME: {TIME_HELP}."
+    # argparse knows no public way to say that -2h is a value as -2 is one, not an option
+    query._negative_number_matcher = re.compile(r"-\.?\d.*")  # noqa: SLF001
 
 
 def run(arguments: Namespace) -> int:

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import logging
 import threading
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from datetime import UTC, datetime
 from pathlib import Path
 
 from protocol.errors import ConfigError
 from protocol.wire.credentials import check_valid, load_credentials
-from protocol.wire.session import SessionConfig, open_session
+from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, open_session
 from sitegrid.process.lifetime import say, stop_flag, wait
 from sitegrid.security.access import router_settings
 from sitegrid.security.join import is_loopback, with_keys
 from sitegrid.security.register import REGISTER_FILE, ROUTER, Register, load_register
 
+HELP = "the site's Zenoh router"
 log = logging.getLogger("sitegrid.router")
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("--listen", default=DEFAULT_ENDPOINT, help="where to listen (default %(default)s)")
+    safety = parser.add_mutually_exclusive_group()
+    safety.add_argument(
+        "--keys", type=Path, metavar="KEYS", help="folder of the site's keys; it listens on tls/... then"
+    )
+    safety.add_argument("--insecure", action="store_true", help="listen beyond this host, although there are no keys")
 
 
 def run(arguments: Namespace) -> int:

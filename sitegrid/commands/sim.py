@@ -4,24 +4,56 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import machine_toml, plain_lines
-from sim.config import SimConfig, load_sim, resolve
-from sim.publisher import run as publish
-from sim.recorder import record
+from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import END_S, note, say, stop_flag
 from sitegrid.process.progress import Display
 from sitegrid.security.join import join
 
+if TYPE_CHECKING:
+    from sim.config import SimConfig
+
+HELP = "the simulator: machines drive, their sensors are published"
 OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site")
 ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
 
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add_network(parser)
+    parser.add_argument("--config", type=Path, help="options (config/sim.toml)")
+    parser.add_argument("--scenario", help="name of a scenario, or the path of its .toml file (over the config)")
+    parser.add_argument("--world", choices=("pybullet", "fast"), help="what moves the machines (over the scenario)")
+    parser.add_argument("--preset", help="paper, dgps, standalone, rtk, harsh: how bad sensors are (over the scenario)")
+    for name, kind, what in (
+        ("seconds", float, "simulated time, 0 until stopped"),
+        ("speed", float, "times real time, 0 as fast as possible"),
+        ("machines", int, "machines of the scenario's first fleet"),
+        ("seed", int, "seed"),
+    ):
+        parser.add_argument(f"--{name}", type=kind, help=f"{what} (over the config)")
+    parser.add_argument("--site", help="name of the site in keys (over the config)")
+    parser.add_argument("--truth", type=Path, help="folder to write the true map and tracks to")
+    parser.add_argument(
+        "--record", type=Path, help="folder to write a log folder per machine to, instead of publishing"
+    )
+    parser.add_argument("--all-sensors", action="store_true", help="every GPS receiver and IMU that the machines have")
+    parser.add_argument(
+        "--picture", type=Path, help="draw the site from above and in perspective into this file, and end"
+    )
+    parser.add_argument("--write-configs", type=Path, help="write site.toml and one agent file per machine, and end")
+
+
 def run(arguments: Namespace) -> int:
     """Publish, record, draw, or write the configurations that go with the simulation."""
+    from sim.config import resolve
+    from sim.publisher import run as publish
+
     stop = stop_flag(None if arguments.record else END_S)  # a recording is written at its end, whole
     config = _config(arguments)
     if arguments.write_configs:
@@ -47,6 +79,9 @@ def run(arguments: Namespace) -> int:
 
 
 def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> int:
+    from sim.config import resolve
+    from sim.recorder import record
+
     display = Display("machines drive", headless=arguments.json)
     seconds = resolve(config).seconds
     with display:
@@ -70,6 +105,8 @@ def _draw(config: SimConfig, arguments: Namespace) -> None:
 
 def write_configs(config: SimConfig, folder: Path) -> list[Path]:
     """Write `site.toml` and `<machine>.toml` for the agents: nominal values, nothing of the truth."""
+    from sim.config import resolve
+
     scenario = resolve(config)
     machines = [rig.machine for rig in scenario.rigs()]
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,6 +118,8 @@ def write_configs(config: SimConfig, folder: Path) -> list[Path]:
 
 
 def _config(arguments: Namespace) -> SimConfig:
+    from sim.config import SimConfig, load_sim
+
     config = load_sim(arguments.config) if arguments.config else SimConfig()
     over = {name: getattr(arguments, name) for name in OVER if getattr(arguments, name) is not None}
     if "machines" in over and over["machines"] != config.machines:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
+from protocol.files import write_whole
 from protocol.wire.keys import check_name
 
 REGISTER_FILE = "register.toml"
@@ -94,6 +95,19 @@ def load_register(folder: Path) -> Register:
     for name in (register.site, *register.names):
         check_name(name, str(path))
     return register
+
+
+def save_register(folder: Path, register: Register) -> None:
+    """Write the register into a folder of keys, whole or not at all."""
+    write_private(folder / REGISTER_FILE, register_toml(register).encode())
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that only its owner reads, whole or not at all; ConfigError where that is not possible."""
+    try:
+        write_whole(path, data, 0o600)
+    except OSError as error:
+        raise ConfigError(path, f"cannot be written: {error.strerror}") from None
 
 
 def register_toml(register: Register) -> str:

@@ -11,7 +11,7 @@ import pytest
 from protocol.errors import ConfigError
 from protocol.site.site_config import load_site
 from sitegrid.cli import build_parser
-from sitegrid.commands import demo
+from sitegrid.demo import run as demo
 from sitegrid.process import progress
 from sitegrid.process.progress import Display
 from tests.paths import ROOT

@@ -25,9 +25,9 @@ from protocol.site.geometry import CellWindow
 from protocol.site.site_config import KnownGround, SiteConfig, load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
+from sitegrid import refold as fold
 from sitegrid.cli import main
-from sitegrid.commands import fold
-from sitegrid.commands.times import parse_stamp
+from sitegrid.options.times import parse_stamp
 
 pytest.importorskip("pyarrow.parquet")
 SITE = SiteConfig("pit", 48.0, 11.0)

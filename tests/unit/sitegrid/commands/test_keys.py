@@ -225,10 +225,10 @@ def test_wrong_usage_exits_with_2():
 def test_without_cryptography_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    for name in ("sitegrid.security.certificates", "sitegrid.commands.keys"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
+    for name in ("certificates", "key_folder"):
+        monkeypatch.delitem(sys.modules, f"sitegrid.security.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
-    assert act(tmp_path, "list") == 1
+    assert act(tmp_path / "keys", "init") == 1
     assert "pip install 'sitegrid[security]'" in capsys.readouterr().err
 
 

@@ -470,7 +470,7 @@ def test_silence_of_a_server_that_is_there_is_called_a_denial(site: Site, capsys
 
 
 def test_clock_and_version_of_the_server_are_compared(site: Site, capsys, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sitegrid.commands.doctor.package_version", lambda: "1.0")
+    monkeypatch.setattr("sitegrid.doctor.examine.package_version", lambda: "1.0")
     info = {**INFO, "wall_ns": time.time_ns() - 3600 * 10**9, "version": "0.9"}
     with answering(site, keys.map_query("pit", InfoQuery.name), encode_info(info)):
         _, found = site.doctor(capsys, "--site", "pit")

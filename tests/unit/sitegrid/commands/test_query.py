@@ -38,7 +38,7 @@ from protocol.site.geometry import Bounds
 from sitegrid.cli import main
 from sitegrid.client import PAST_S, Client
 from sitegrid.commands import query
-from sitegrid.commands.times import SiteTime, parse_time, told
+from sitegrid.options.times import SiteTime, parse_time, told
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
 S = 10**9
