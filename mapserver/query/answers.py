@@ -17,21 +17,7 @@ from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.views import Past, View, cropped, read_cells, view_now, widened
 from protocol.errors import QueryError, Refusal
-from protocol.queries.commands import TrustCommand, parse_command
-from protocol.queries.requests import (
-    MAX_SPANS,
-    ChangesQuery,
-    HistoryAnswer,
-    HistoryQuery,
-    MachinesQuery,
-    MapQuery,
-    PointAnswer,
-    PointQuery,
-    Region,
-    RegionQuery,
-    Span,
-    When,
-    check_size,
+from protocol.queries.answer_codec import (
     encode_changes,
     encode_history,
     encode_info,
@@ -39,6 +25,19 @@ from protocol.queries.requests import (
     encode_machines,
     encode_point,
     encode_region,
+)
+from protocol.queries.answers import HistoryAnswer, PointAnswer, Region, Span
+from protocol.queries.commands import TrustCommand, parse_command
+from protocol.queries.requests import (
+    MAX_SPANS,
+    ChangesQuery,
+    HistoryQuery,
+    MachinesQuery,
+    MapQuery,
+    PointQuery,
+    RegionQuery,
+    When,
+    check_size,
     parse_query,
 )
 from protocol.site.geometry import Bounds, CellWindow

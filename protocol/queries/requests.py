@@ -10,42 +10,8 @@ from dataclasses import dataclass
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries import parameters as ps
-from protocol.queries.answers import (
-    HistoryAnswer,
-    PointAnswer,
-    Region,
-    Span,
-    decode_change,
-    decode_changes,
-    decode_error,
-    decode_history,
-    decode_info,
-    decode_machine,
-    decode_machines,
-    decode_point,
-    decode_region,
-    encode_change,
-    encode_changes,
-    encode_error,
-    encode_history,
-    encode_info,
-    encode_machine,
-    encode_machines,
-    encode_point,
-    encode_region,
-)
 from protocol.site.geometry import MAX_CELLS, Bounds
 
-# fmt: off
-__all__ = [  # queries, and the answers to them
-    "MAX_SPANS", "MAX_SPAN_S", "MAX_WAIT_S", "NOW", "ChangesQuery", "Freshness", "HistoryAnswer",
-    "HistoryQuery", "InfoQuery", "MachinesQuery", "MapQuery", "PointAnswer", "PointQuery", "Region", "RegionQuery",
-    "Span", "When", "check_size", "decode_change", "decode_changes", "decode_error", "decode_history", "decode_info",
-    "decode_machine", "decode_machines", "decode_point", "decode_region", "encode_change", "encode_changes",
-    "encode_error", "encode_history", "encode_info", "encode_machine", "encode_machines", "encode_point",
-    "encode_query", "encode_region", "parse_query",
-]
-# fmt: on
 MAX_WAIT_S = 60.0
 MAX_SPANS = 2000  # of one history
 MAX_SPAN_S = 1e9

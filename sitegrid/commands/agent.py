@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 import zenoh
 
 from protocol.errors import ConfigError, LinkError
-from protocol.machine.log_folder import LogFolder, open_log
-from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig, load_site
 from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.session import SessionConfig, open_session
@@ -28,6 +26,8 @@ if TYPE_CHECKING:
     from agents.delivery.uplink import Sign
     from agents.drivers import Driver
     from agents.presence import Owner
+    from protocol.machine.log_folder import LogFolder
+    from protocol.machine.machine_config import MachineConfig
 
 HELP = "the localisation agent of one machine"
 LINK_S = 1.0  # how long to wait for the router before starting without it
@@ -54,6 +54,7 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Run until the stream ends or the process is stopped; the router may come and go."""
     from agents.agent import Agent
+    from protocol.machine.log_folder import open_log
 
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None

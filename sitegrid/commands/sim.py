@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.errors import ConfigError
-from protocol.machine.machine_config import machine_toml, plain_lines
 from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import END_S, note, say, stop_flag
 from sitegrid.process.progress import Display
@@ -105,6 +104,7 @@ def _draw(config: SimConfig, arguments: Namespace) -> None:
 
 def write_configs(config: SimConfig, folder: Path) -> list[Path]:
     """Write `site.toml` and `<machine>.toml` for the agents: nominal values, nothing of the truth."""
+    from protocol.machine.machine_config import machine_toml, plain_lines
     from sim.config import resolve
 
     scenario = resolve(config)

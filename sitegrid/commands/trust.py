@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
-from typing import Any
 
+from protocol.queries.answers import TrustAnswer
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import add_network, add_site
 from sitegrid.options.values import not_negative
@@ -41,13 +41,13 @@ def run(arguments: Namespace) -> int:
     return decide(arguments, lambda client: client.trust(machine, wait_s=wait_s))
 
 
-def decide(arguments: Namespace, command: Callable[[Client], dict[str, Any]]) -> int:
+def decide(arguments: Namespace, command: Callable[[Client], TrustAnswer]) -> int:
     """Give the command, wait until the map follows, print what is known of the machine then."""
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
-        row = command(client)
+        machine = command(client)
     if arguments.json:
-        say(plain(row))
+        say(plain(machine))
         return 0
-    state = "is trusted" if row["trusted"] else "is left out of the map"
-    print(f"{row['name']} {state}, as of journal row {row['merged']}")
+    state = "is trusted" if machine.trusted else "is left out of the map"
+    print(f"{machine.name} {state}, as of journal row {machine.merged}")
     return 0

@@ -19,7 +19,7 @@ from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.machine.log_folder import LogFolder, open_log
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from protocol.site.site_config import load_site
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig, resolve
@@ -190,7 +190,7 @@ def _what(client: Client) -> str:
         info = client.info()
     except (LinkError, QueryError):  # shown again in a moment
         return "the map server is away"
-    return f"{info['samples_merged']} samples, {info['cells']} cells"
+    return f"{info.samples_merged} samples, {info.cells} cells"
 
 
 def _whole(plan: Plan) -> list[float]:
@@ -238,7 +238,7 @@ class _LogRun:
     def finish(self, plan: Plan) -> dict[str, Any]:
         """Wait for the agent, draw its map, compare with its audit file."""
         report = self._agent.expect("ended", 300.0)["ended"]
-        wait_until(lambda: self._client.info()["merged"] == self._client.info()["journalled"], READY_S, "log-server")
+        wait_until(lambda: self._client.info().merged == self._client.info().journalled, READY_S, "log-server")
         picture = plan.out / "log-map.png"
         draw(self._client, picture, None, self._tracks.tracks())
         self._tracks.close()

@@ -33,7 +33,7 @@ class SiteTime:
         if not now_ns:
             raise ConfigError(option, "the site has no samples yet, so no now to count from; give a time")
         if now_ns + self.ns < 1:
-            raise ConfigError(option, f"so long before the site's now, {told(now_ns)}, is before 1970")
+            raise ConfigError(option, f"so long before the site's now, {utc_text(now_ns)}, is before 1970")
         return now_ns + self.ns
 
 
@@ -52,7 +52,7 @@ def parse_stamp(text: str) -> int:
     return ns
 
 
-def told(stamp_ns: int) -> str:
+def utc_text(stamp_ns: int) -> str:
     """A stamp as people read it, to the second; `never` for 0."""
     if not stamp_ns:
         return "never"

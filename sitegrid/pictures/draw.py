@@ -10,7 +10,7 @@ import numpy as np
 from mapserver.pictures.frame import Image
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from protocol.site.geometry import Bounds
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
@@ -83,7 +83,7 @@ def _bounds(client: Client, given: list[float] | None) -> Bounds:
         except ValueError as error:
             raise ConfigError("--bounds", str(error)) from None
     info = client.info()
-    cells, cell_m = info["bounds"], info["site"]["cell_m"]
+    cells, cell_m = info.bounds, info.site.cell_m
     if cells is None:
         return Bounds(0, 0, 16 * cell_m, 16 * cell_m)
     west, south, east, north = (cell * cell_m for cell in cells)

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, is_dataclass
 from typing import Any
 
 END_S = 2.5  # from the signal to the end of the process
@@ -95,7 +96,9 @@ def note(line: str) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Replace NaN, which JSON does not know, by None."""
+    """Records as tables, and NaN, which JSON does not know, as None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, Mapping):
         return {key: plain(v) for key, v in value.items()}
     if isinstance(value, list | tuple):

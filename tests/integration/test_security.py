@@ -137,10 +137,10 @@ def put_until(heard: list[bytes], wanted: bytes, put: Callable[[], object]) -> N
 
 def test_a_machine_gets_its_acknowledgements_from_the_map_server(guarded: Guarded):
     with guarded.session("loader-1") as session, connect(guarded.endpoint, keys=guarded.keys / "loader-1") as client:
-        before = client.info()["journalled"]
+        before = client.info().journalled
         for _ in range(200):  # faster than any rate limit: these never fall under one
             assert acknowledged(session, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
-        assert client.info(after=before + 200)["journalled"] == before + 200
+        assert client.info(after=before + 200).journalled == before + 200
 
 
 def test_agent_and_simulator_work_with_keys_as_without(guarded: Guarded, tmp_path: Path):
@@ -182,7 +182,7 @@ def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_
 
 def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "guest") as client:
-        assert client.info()["site"]["name"] == SITE
+        assert client.info().site.name == SITE
         with pytest.raises(LinkError, match="or these keys may not ask this"):
             client.distrust("loader-1", "because")
         guest = client.session

@@ -82,7 +82,7 @@ def test_rows_of_machines_and_changes_are_the_documented_ones(golden):
     for title, row in (("### Machines", golden.MACHINE), ("### Changes", golden.CHANGE)):
         table = WIRE[WIRE.index(title) :].partition("\n\n")[0]
         rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
-        assert re.findall(r"`(.*?)`", "".join(rows)) == [*row]
+        assert re.findall(r"`(.*?)`", "".join(rows)) == [*vars(row)]
 
 
 @pytest.mark.parametrize("kind", GIVES)

@@ -15,33 +15,30 @@ from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
+from protocol.queries.answer_codec import encode_history, encode_info, encode_point, encode_region
+from protocol.queries.answers import HistoryAnswer, PointAnswer, Region, Span
 from protocol.queries.parameters import split_selector
 from protocol.queries.requests import (
     Freshness,
-    HistoryAnswer,
     HistoryQuery,
     InfoQuery,
     MapQuery,
-    PointAnswer,
     PointQuery,
-    Region,
     RegionQuery,
-    Span,
     When,
-    encode_history,
-    encode_info,
-    encode_point,
-    encode_region,
     parse_query,
 )
 from protocol.site.geometry import Bounds
+from protocol.site.site_config import SiteConfig
 from sitegrid.cli import main
 from sitegrid.client import PAST_S, Client
 from sitegrid.commands import query
-from sitegrid.options.times import SiteTime, parse_time, told
+from sitegrid.options.times import SiteTime, parse_time, utc_text
+from tests.unit.records import map_info
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
 S = 10**9
+SITE = SiteConfig("pit", 48.0, 11.0)
 
 
 class Session:
@@ -63,7 +60,7 @@ class Session:
 
     def _answer(self, asked: MapQuery) -> bytes:
         if isinstance(asked, InfoQuery):
-            return encode_info({"stamp_ns": self.now_ns})
+            return encode_info(map_info(SITE, stamp_ns=self.now_ns))
         if isinstance(asked, HistoryQuery):
             first = Span(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
             spans = (first, Span(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
@@ -121,11 +118,11 @@ def test_a_time_may_count_back_from_the_sites_now(text: str, s: int):
 @given(st.integers(S, MAX_STAMP_NS))
 def test_every_stamp_is_a_time_and_is_told_to_the_second(ns: int):
     assert parse_time(str(ns)).stamp("--as-of", lambda: pytest.fail("not needed")) == ns
-    assert parse_time(told(ns)).ns == ns // S * S
+    assert parse_time(utc_text(ns)).ns == ns // S * S
 
 
 def test_a_stamp_is_told_for_people():
-    assert (told(T0 + 999_999_999), told(0)) == ("2025-06-15 15:06:40Z", "never")
+    assert (utc_text(T0 + 999_999_999), utc_text(0)) == ("2025-06-15 15:06:40Z", "never")
 
 
 @pytest.mark.parametrize(

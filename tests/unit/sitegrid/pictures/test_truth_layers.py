@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from sim.truth import TruthMap
 from sitegrid.pictures.truth_layers import truth_layers
 
