@@ -47,14 +47,15 @@ from sitegrid.listener import Listener
 from sitegrid.security.join import join
 
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
-TIMED_OUT = b"Timeout"  # what Zenoh says itself where nobody answered in time
+TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 
 
 class Client:
-    """Asks the map server of one site. Every call may raise QueryError (refused) or LinkError (no answer).
+    """Asks the map server of one site.
 
-    Wherever they stand: layers: names, none for all. after: answer once this journal row is merged, waiting for it at
-    most wait_s. Times are stamps: UTC in nanoseconds, as samples carry them.
+    Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read).
+    Arguments of several methods: layers: names, none for all. after: answer once this journal row is merged, and wait
+    for it at most wait_s [s]. Times are stamps, UTC in nanoseconds.
     """
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float = 10.0) -> None:
@@ -114,7 +115,7 @@ class Client:
         after: int = 0,
         wait_s: float = 10.0,
     ) -> tuple[Span, ...]:
-        """Layers of the cell at a position in `map`, span by span, oldest first; spans without samples are left out.
+        """Layers of the cell at a position in `map`, span by span, oldest first; spans without samples are skipped.
 
         from_ns, to_ns: both included; without them the newest 2000 spans until now. span_s: default one bucket.
         """
@@ -160,7 +161,7 @@ class Client:
         return self._command(TrustCommand(machine, None, "", wait_s))
 
     def close(self) -> None:
-        """Close the session, and whatever listens to it."""
+        """Close the session and its listeners."""
         for listener in self._listeners:
             listener.close()
         self.session.close()  # type: ignore[no-untyped-call]

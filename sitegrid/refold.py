@@ -23,9 +23,8 @@ from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, Mark, Wanted
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
-from protocol.machine.machine_config import plain_lines
 from protocol.machine.readings import MAX_STAMP_NS
-from protocol.site.site_config import SiteConfig, load_site
+from protocol.site.site_config import SiteConfig, load_site, site_toml
 from sitegrid.process.lifetime import say
 from sitegrid.process.progress import Display
 
@@ -82,7 +81,7 @@ def _build(
         raise ConfigError(part, "is left from a fold that was killed; remove it") from None
     try:
         copier = _copy(part, sources, site, wanted, headless=arguments.json)
-        (part / SITE_FILE).write_text("\n".join(_site_lines(site)) + "\n", encoding="utf-8")
+        (part / SITE_FILE).write_text(site_toml(site), encoding="utf-8")
         (part / CONFIG_FILE).write_text(text, encoding="utf-8")
         info = _fold(part, site, config)
         part.replace(arguments.out)
@@ -202,15 +201,6 @@ def _fold(part: Path, site: SiteConfig, config: ServerConfig) -> dict[str, Any]:
     with closing(Store(part, site, config, time.time_ns)) as store:
         store.save_snapshot()
         return store.info()
-
-
-def _site_lines(site: SiteConfig) -> list[str]:
-    """A site as TOML."""
-    grounds = [
-        f"{{ name = {json.dumps(g.name)}, c_rr = {g.c_rr}, outline = {json.dumps(g.outline)} }}"
-        for g in site.known_ground
-    ]
-    return [*plain_lines(site), f"known_ground = [{', '.join(grounds)}]"]
 
 
 def _by_machine(kept: Mapping[Spool, int]) -> dict[str, int]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import gzip
 import heapq
-import json
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -16,11 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from protocol.config import from_table, load_toml, section
+from protocol.config import from_table, load_toml, section, toml_lines
 from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal
 from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
 from protocol.machine.readings import Reading, columns, parse_reading
-from protocol.site.site_config import SiteConfig
+from protocol.site.site_config import SiteConfig, site_toml
 from protocol.units import factor, stamp_ns, stamp_scale
 
 MANIFEST = "log.toml"
@@ -48,7 +47,7 @@ class Source:
 
 @dataclass
 class LogFolder:
-    """A described recording. `refused` counts, while it is read, the rows that were left out, by reason."""
+    """A described recording. `refused` counts the rows that were skipped while it is read, by reason."""
 
     name: str
     data: Path
@@ -212,30 +211,9 @@ def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig,
 
 
 def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
-    lines = [
-        "[log]",
-        f"name = {json.dumps(name, ensure_ascii=False)}",
-        "",
-        "[site]",
-        *plain_lines(site),
-        *_known_ground(site),
-        "",
-        "[machine]",
-        *plain_lines(machine),
-    ]
+    head = "\n".join(["[log]", *toml_lines({"name": name}), "", "[site]"])
+    lines = [head, site_toml(site), "[machine]", *plain_lines(machine)]
     for sensor in machine.sensors:
         lines += ["", "[[sensor]]", *sensor_lines(sensor), f'file = "{sensor.name}.csv"', "[sensor.columns]"]
         lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(sensor.kind))]
     return "\n".join(lines) + "\n"
-
-
-def _known_ground(site: SiteConfig) -> list[str]:
-    areas = [
-        f"{{ name = {json.dumps(area.name)}, c_rr = {float(area.c_rr)!r}, outline = {_floats(area.outline)} }}"
-        for area in site.known_ground
-    ]
-    return [f"known_ground = [{', '.join(areas)}]"] if areas else []
-
-
-def _floats(points: Iterable[Iterable[float]]) -> list[list[float]]:
-    return [[float(value) for value in point] for point in points]

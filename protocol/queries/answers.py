@@ -80,7 +80,6 @@ class SiteInfo:
     origin_lon_deg: float
     origin_height_m: float
     cell_m: float
-    tile_cells: int
     extent_m: float
     clock: str
     clock_tolerance_s: float

@@ -1,7 +1,7 @@
-"""What a process proves its name with: one folder of files that `sitegrid keys` makes. The base install is enough.
+"""Credentials of a process: one folder of files that `sitegrid keys` makes. The base install can read it.
 
-identity.toml says in plain words what the certificate says, so that a wrong or outdated folder is named at once: a
-router that refuses only lets the time run out (EVIDENCE: denials are silent).
+identity.toml repeats the certificate's role, name and end as text, so that a wrong or outdated folder is reported at
+once: a router that refuses a certificate does not answer at all.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Credentials:
             "root_ca_certificate": str(self.folder / AUTHORITY_FILE),
             f"{end}_certificate": str(self.folder / CERTIFICATE_FILE),
             f"{end}_private_key": str(self.folder / KEY_FILE),
-            "enable_mtls": True,  # on both ends (EVIDENCE: a client without it shows no certificate)
+            "enable_mtls": True,  # on both ends: a client without it shows no certificate
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
         }

@@ -1,4 +1,4 @@
-"""All key expressions, built and parsed here and nowhere else (DESIGN, "Keys")."""
+"""All key expressions, built and parsed here and nowhere else (docs/protocol.md, "Keys")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zenoh sessions as this project uses them (EVIDENCE: shared memory bypasses namespaces and can drop queries)."""
+"""Zenoh sessions as this project uses them: no scouting, and no shared memory, which can drop queries."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def open_session(config: SessionConfig) -> zenoh.Session:
 
 
 def _aim(config: SessionConfig) -> str:
-    """What could not be done, and what may be the reason: a link that is refused looks like one that is not there."""
+    """What failed, and the likely reasons: a link that is refused looks like one that is not there."""
     if config.mode == "router":
         return "listen here"
     if config.credentials:

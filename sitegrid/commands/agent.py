@@ -89,7 +89,7 @@ def _open(settings: SessionConfig) -> zenoh.Session:
 
 
 def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) -> Owner:
-    """Refuse to start beside a live agent of the same name."""
+    """Refuse to start while another agent of the same name runs."""
     from agents.presence import find_namesake, this_process
 
     owner = this_process()

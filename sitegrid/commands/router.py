@@ -1,4 +1,4 @@
-"""`sitegrid router`: a Zenoh session in router mode is a full site router (EVIDENCE, Zenoh)."""
+"""`sitegrid router`: the site's router, which is a Zenoh session in router mode."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None:
-    """Without keys whoever gets here may do everything: so nobody from elsewhere does, unless that is asked for."""
+    """Route without keys: whoever connects may do everything, so only this host may, unless --insecure is given."""
     on_this_host = is_loopback(endpoint)
     if not (on_this_host or insecure):
         advice = "pass --keys (`sitegrid keys init`), listen on tcp/127.0.0.1:7447, or say --insecure"
@@ -54,10 +54,10 @@ def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None
 
 
 def _route_guarded(folder: Path, endpoint: str, stop: threading.Event) -> None:
-    """With keys. Zenoh reads rules when a session opens, so a changed register means a new session.
+    """Route with keys. Zenoh reads its rules when a session opens, so a changed register needs a new session.
 
-    Links are cut for half a second then; whoever may, is back by itself. A register that cannot be read changes
-    nothing.
+    All links are cut for half a second then; those that are allowed connect again by themselves. A register that cannot
+    be read changes nothing.
     """
     text, register = _text(folder), load_register(folder)
     session = open_session(_guarded(folder, endpoint, register))
@@ -74,7 +74,7 @@ def _route_guarded(folder: Path, endpoint: str, stop: threading.Event) -> None:
             continue
         session.close()  # type: ignore[no-untyped-call]
         session = open_session(config)
-        say({"renewed": "rules", "names": len(register.admitted())})
+        say({"reloaded": "rules", "names": len(register.admitted())})
     session.close()  # type: ignore[no-untyped-call]
 
 

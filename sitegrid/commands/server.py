@@ -81,9 +81,7 @@ def _verifier(keys: Path | None) -> Verify | None:
     """What checks signatures by the register in a folder of keys, as it is now."""
     if keys is None:
         return None
-    from sitegrid.security.signing import (
-        Verifier,  # imported here: only a server that asks for signatures needs `cryptography`
-    )
+    from sitegrid.security.signing import Verifier  # only a server that asks for signatures needs `cryptography`
 
     return Verifier(load_register(keys).signing_keys()).check
 

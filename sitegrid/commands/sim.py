@@ -1,4 +1,4 @@
-"""`sitegrid sim`: simulated machines publish what their sensors say."""
+"""`sitegrid sim`: simulated machines publish the readings of their sensors."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.errors import ConfigError
+from protocol.site.site_config import site_toml
 from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import END_S, note, say, stop_flag
 from sitegrid.process.progress import Display
@@ -104,13 +105,13 @@ def _draw(config: SimConfig, arguments: Namespace) -> None:
 
 def write_configs(config: SimConfig, folder: Path) -> list[Path]:
     """Write `site.toml` and `<machine>.toml` for the agents: nominal values, nothing of the truth."""
-    from protocol.machine.machine_config import machine_toml, plain_lines
+    from protocol.machine.machine_config import machine_toml
     from sim.config import resolve
 
     scenario = resolve(config)
     machines = [rig.machine for rig in scenario.rigs()]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "site.toml").write_text("\n".join(plain_lines(scenario.site)) + "\n", encoding="utf-8")
+    (folder / "site.toml").write_text(site_toml(scenario.site), encoding="utf-8")
     paths = [folder / f"{machine.name}.toml" for machine in machines]
     for path, machine in zip(paths, machines, strict=True):
         path.write_text(machine_toml(machine), encoding="utf-8")

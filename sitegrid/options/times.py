@@ -1,4 +1,4 @@
-"""Times as people write and read them, on the command line."""
+"""Times on the command line, as people write and read them."""
 
 from __future__ import annotations
 

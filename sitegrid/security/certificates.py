@@ -1,7 +1,7 @@
-"""X.509 certificates of one site: its authority, and what that signs. Needs `cryptography`; touches no files.
+"""X.509 certificates of one site: the authority's, and those that it signs. Needs `cryptography`; touches no files.
 
-P-256 with SHA-256, PKCS #8 keys without a password. The router's certificates serve, all others only connect: so a
-stolen machine cannot pose as the router.
+P-256 with SHA-256, PKCS #8 keys without a password. The router's certificate is a server's (TLS server authentication),
+all others are clients': a stolen machine cannot act as the router.
 """
 
 from __future__ import annotations

@@ -24,9 +24,9 @@ def join(
             return SessionConfig(endpoint, wait_s=wait_s)
         credentials = load_credentials(keys)
         check_valid(credentials, datetime.now(UTC))
-        for what, wanted in (("role", role), ("name", name), ("site", site)):
-            if wanted and (found := getattr(credentials.identity, what)) != wanted:
-                raise ConfigError(keys, f"these keys are for {what} {found!r}, {wanted!r} is needed")
+        for what, required in (("role", role), ("name", name), ("site", site)):
+            if required and (actual := getattr(credentials.identity, what)) != required:
+                raise ConfigError(keys, f"these keys are for {what} {actual!r}, {required!r} is needed")
         return SessionConfig(with_keys(endpoint), wait_s=wait_s, credentials=credentials)
     except ValueError as error:
         raise ConfigError("network", str(error)) from None

@@ -6,13 +6,12 @@ a new common name, so that the old certificate stays refused.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from protocol.config import from_table, load_toml
+from protocol.config import from_table, load_toml, toml_lines
 from protocol.errors import ConfigError
 from protocol.files import write_whole
 from protocol.wire.keys import check_name
@@ -112,14 +111,12 @@ def write_private(path: Path, data: bytes) -> None:
 
 def register_toml(register: Register) -> str:
     """The register as TOML."""
-    lines = ["# Who is let in. Written by `sitegrid keys`.", *_plain(site=register.site, hosts=list(register.hosts))]
+    lines = [
+        "# Who is let in. Written by `sitegrid keys`.",
+        *toml_lines({"site": register.site, "hosts": list(register.hosts)}),
+    ]
     for name, entry in sorted(register.names.items()):
-        lines += ["", f"[names.{name}]", *_plain(role=entry.role, serial=entry.serial)]
+        lines += ["", f"[names.{name}]", *toml_lines({"role": entry.role, "serial": entry.serial})]
         lines += [f"expires = {entry.expires.astimezone(UTC):%Y-%m-%dT%H:%M:%SZ}"]
-        lines += _plain(issue=entry.issue, revoked=entry.revoked, signing=entry.signing)
+        lines += toml_lines({"issue": entry.issue, "revoked": entry.revoked, "signing": entry.signing})
     return "\n".join(lines) + "\n"
-
-
-def _plain(**values: object) -> list[str]:
-    """JSON's texts, numbers and lists are TOML's."""
-    return [f"{key} = {json.dumps(value)}" for key, value in values.items()]

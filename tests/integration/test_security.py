@@ -443,7 +443,7 @@ def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, chil
     with site.session("loader-1") as loader, site.session("loader-2") as other:
         assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == [True]
         site.make_keys("revoke", "loader-1")
-        assert site.router.expect("renewed", 10.0)["names"] == len(ROLES), f"router pid {site.router.pid}"
+        assert site.router.expect("reloaded", 10.0)["names"] == len(ROLES), f"router pid {site.router.pid}"
         wait_until(
             lambda: acknowledged(other, keys.ingest(SITE, "loader-2"), site.batch("loader-2")) == [True],
             20.0,
@@ -452,7 +452,7 @@ def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, chil
         wait_until(lambda: bool(loader.info.routers_zid()), 10.0, "the link is there again")
         assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == []
     site.make_keys("add", "loader-1")
-    site.router.expect("renewed", 10.0)
+    site.router.expect("reloaded", 10.0)
     with site.session("loader-1") as repaired:
         wait_until(
             lambda: acknowledged(repaired, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == [True],
@@ -472,7 +472,7 @@ def test_a_broken_register_changes_nothing(guarded: Guarded):
     wait_until(lambda: "the rules stay as they were" in log.read_text(), 10.0, "said so")
     assert guarded.still_works()
     register.write_bytes(whole)
-    assert guarded.router.expect("renewed", 10.0)["names"] == len(ROLES) + 1, "and the map server"
+    assert guarded.router.expect("reloaded", 10.0)["names"] == len(ROLES) + 1, "and the map server"
     wait_until(lambda: guarded.router.code is None and answers_again(guarded), 10.0, "as before")
 
 
