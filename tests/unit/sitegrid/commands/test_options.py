@@ -13,7 +13,7 @@ from protocol.site.geometry import Bounds
 from sim.scenario.file import FOLDER, load_scenario
 from sitegrid.cli import build_parser
 from sitegrid.commands import agent, plot, server
-from sitegrid.demo import run as demo
+from sitegrid.demo.plan import DEFAULT_MANIFEST
 from sitegrid.pictures import draw
 from tests.paths import ROOT
 
@@ -77,7 +77,7 @@ def test_plot_draws_once_what_it_is_told_to(drawn):
 
 
 def test_replay_takes_its_speed(husky_data: Path):
-    manifest = ROOT / demo.DEFAULT_MANIFEST
+    manifest = ROOT / DEFAULT_MANIFEST
     words = ["agent", "--spool", "x", "--driver", "replay", "--log", str(manifest), "--speed", "7"]
     log = open_log(manifest, husky_data)
     driver = agent._driver(build_parser().parse_args(words), log, None, log.site, log.machine)
