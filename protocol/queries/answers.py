@@ -102,8 +102,8 @@ class SampleCounts:
 class MapInfo:
     """State of the map and its server.
 
-    journalled, merged, snapshot: journal rows. bounds: of the cells that are known: first column and row, and those
-    behind the last; None without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    journalled, merged, snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks
+    with evidence; None without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
     """
 
     site: SiteInfo
