@@ -7,13 +7,13 @@ with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
 from protocol.queries.answers import (
     GroundChange,
+    HistorySpan,
     MachineState,
     MapInfo,
     PointAnswer,
     Region,
     SampleCounts,
     SiteInfo,
-    Span,
     TrustAnswer,
 )
 from protocol.site.geometry import Bounds
@@ -27,6 +27,7 @@ __all__ = [
     "Client",
     "ConfigError",
     "GroundChange",
+    "HistorySpan",
     "KnownGround",
     "LinkError",
     "Listener",
@@ -39,7 +40,6 @@ __all__ = [
     "SampleCounts",
     "SiteInfo",
     "SitegridError",
-    "Span",
     "TrustAnswer",
     "connect",
 ]

@@ -24,7 +24,7 @@ from protocol.queries.answer_codec import (
     decode_point,
     decode_region,
 )
-from protocol.queries.answers import GroundChange, MachineState, MapInfo, PointAnswer, Region, Span, TrustAnswer
+from protocol.queries.answers import GroundChange, HistorySpan, MachineState, MapInfo, PointAnswer, Region, TrustAnswer
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
 from protocol.queries.requests import (
@@ -114,7 +114,7 @@ class Client:
         span_s: float | None = None,
         after: int = 0,
         wait_s: float = 10.0,
-    ) -> tuple[Span, ...]:
+    ) -> tuple[HistorySpan, ...]:
         """Layers of the cell at a position in `map`, span by span, oldest first; spans without samples are skipped.
 
         from_ns, to_ns: both included; without them the newest 2000 spans until now. span_s: default one bucket.

@@ -36,7 +36,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Source:
+class SensorFile:
     """The CSV file of one sensor. fields: reading field -> Column; `stamp` is the time column."""
 
     sensor: SensorConfig
@@ -54,7 +54,7 @@ class LogFolder:
     start_ns: int
     site: SiteConfig
     machine: MachineConfig
-    sources: tuple[Source, ...]
+    sources: tuple[SensorFile, ...]
     refused: Counter[str] = field(default_factory=Counter)
 
     def readings(self) -> Iterator[Reading]:
@@ -63,7 +63,7 @@ class LogFolder:
         streams = [self._read(source) for source in self.sources if source.sensor.use]
         return heapq.merge(*streams, key=lambda r: r.stamp_ns)
 
-    def _read(self, source: Source) -> Iterator[Reading]:
+    def _read(self, source: SensorFile) -> Iterator[Reading]:
         path = self.data / source.file
         try:
             with _open_text(path) as text:
@@ -71,7 +71,7 @@ class LogFolder:
         except (OSError, EOFError, zlib.error, ValueError, csv.Error) as error:  # ValueError: no UTF-8, or no path
             raise LogFolderError(path, f"cannot be read: {error}") from None
 
-    def _parse(self, rows: csv.DictReader[str], source: Source, path: Path) -> Iterator[Reading]:
+    def _parse(self, rows: csv.DictReader[str], source: SensorFile, path: Path) -> Iterator[Reading]:
         names = columns(source.sensor.kind)
         picks = [_pick(name, source.fields[name], rows, path) for name in names]
         stamp_column, scale = _require(source.stamp.column, rows, path), stamp_scale(source.stamp.unit or "s")
@@ -127,7 +127,7 @@ class _Header:
     start_ns: int = 0
 
 
-def _parse_source(table: Any, where: str) -> Source:
+def _parse_source(table: Any, where: str) -> SensorFile:
     if not isinstance(table, dict):
         raise ConfigError(where, "a table is expected")
     table = dict(table)
@@ -145,7 +145,7 @@ def _parse_source(table: Any, where: str) -> Source:
         raise ConfigError(f"{where} columns.stamp", "a column is expected, not a constant")
     for name, column in parsed.items():
         _check_unit(name, column, f"{where} columns.{name}")
-    return Source(sensor, file, parsed.pop("stamp"), parsed)
+    return SensorFile(sensor, file, parsed.pop("stamp"), parsed)
 
 
 def _parse_column(value: Any, where: str) -> Column:

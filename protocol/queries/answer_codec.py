@@ -19,11 +19,11 @@ from protocol.errors import MessageError, QueryError, Refusal
 from protocol.queries.answers import (
     GroundChange,
     HistoryAnswer,
+    HistorySpan,
     MachineState,
     MapInfo,
     PointAnswer,
     Region,
-    Span,
     TrustAnswer,
 )
 from protocol.site.geometry import MAX_CELLS
@@ -116,7 +116,7 @@ def decode_history(data: bytes) -> HistoryAnswer:
     """Undo `encode_history`."""
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     spans = tuple(
-        Span(take(span, "first_ns", int), take(span, "last_ns", int), _take_values(span))
+        HistorySpan(take(span, "first_ns", int), take(span, "last_ns", int), _take_values(span))
         for span in _take_tables(table, "spans")
     )
     x, y = take(table, "x_m", float), take(table, "y_m", float)

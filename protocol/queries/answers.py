@@ -52,7 +52,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class Span:
+class HistorySpan:
     """Layer values of one cell from its samples with first_ns <= stamp <= last_ns alone; NaN is unknown."""
 
     first_ns: int
@@ -66,7 +66,7 @@ class HistoryAnswer:
 
     x_m: float
     y_m: float
-    spans: tuple[Span, ...]
+    spans: tuple[HistorySpan, ...]
     merged: int
     stamp_ns: int
 

@@ -18,8 +18,8 @@ from sitegrid.security.register import (
     REGISTER_FILE,
     ROLES,
     ROUTER,
-    Entry,
     Register,
+    RegisterEntry,
     common_name,
     load_register,
     save_register,
@@ -104,7 +104,7 @@ def _add(arguments: Namespace, now: datetime) -> None:
     _tell(arguments, line, name=name, role=role, folder=str(folder / name), expires=entry.expires.isoformat())
 
 
-def _role(arguments: Namespace, known: Entry | None) -> str:
+def _role(arguments: Namespace, known: RegisterEntry | None) -> str:
     """As asked for; a renewed certificate keeps its role."""
     if known is None or known.revoked:
         return str(arguments.role or "machine")
@@ -130,7 +130,7 @@ def _list(arguments: Namespace, now: datetime) -> None:
         print(f"{row['name']:24} {row['role']:8} {row['expires'][:10]}  {row['state']}")
 
 
-def _row(name: str, entry: Entry, now: datetime) -> dict[str, Any]:
+def _row(name: str, entry: RegisterEntry, now: datetime) -> dict[str, Any]:
     state = "revoked" if entry.revoked else "expired" if entry.expires < now else "valid"
     plain = {"name": name, "role": entry.role, "expires": entry.expires.isoformat(), "state": state}
     return {**plain, "revoked": entry.revoked, "serial": entry.serial, "common_name": common_name(name, entry.issue)}

@@ -39,7 +39,7 @@ OFFSET_S = 1.0  # of two clocks, beyond which the ages on the map are off
 
 
 @dataclass(frozen=True)
-class Link:
+class RouterLink:
     """The way to the router. took_s: to open a session, None if there is none. listens: somebody takes connections."""
 
     endpoint: str
@@ -48,17 +48,17 @@ class Link:
     has_keys: bool = False
 
 
-def open_link(config: SessionConfig) -> tuple[Link, zenoh.Session | None]:
+def open_link(config: SessionConfig) -> tuple[RouterLink, zenoh.Session | None]:
     """Open a session, and tell how that went."""
     has_keys = config.credentials is not None
     if not _listens(config.endpoint):  # else Zenoh tries until the time is up
-        return Link(config.endpoint, None, has_keys=has_keys), None
+        return RouterLink(config.endpoint, None, has_keys=has_keys), None
     start_s = time.perf_counter()
     try:
         session = open_session(config)
     except LinkError:
-        return Link(config.endpoint, None, listens=True, has_keys=has_keys), None
-    return Link(config.endpoint, time.perf_counter() - start_s, has_keys=has_keys), session
+        return RouterLink(config.endpoint, None, listens=True, has_keys=has_keys), None
+    return RouterLink(config.endpoint, time.perf_counter() - start_s, has_keys=has_keys), session
 
 
 def _listens(endpoint: str) -> bool:
@@ -71,7 +71,7 @@ def _listens(endpoint: str) -> bool:
     return True
 
 
-def check_link(link: Link) -> Finding:
+def check_link(link: RouterLink) -> Finding:
     """Whether a session with the router could be opened."""
     if link.took_s is not None:
         return Finding(Level.PASS, "router", f"{link.endpoint} answers in {link.took_s * 1e3:.0f} ms")

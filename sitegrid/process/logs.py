@@ -17,11 +17,11 @@ _VALUE = re.compile(r"(?:^| )(\w+)=%[^a-zA-Z%]*[a-zA-Z]")
 def start_logging(*, verbose: bool) -> None:
     """Log warnings to standard error; with `verbose` also what happens."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(Lines() if sys.stderr.isatty() else JsonLines())
+    handler.setFormatter(TextFormatter() if sys.stderr.isatty() else JsonFormatter())
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
 
 
-class Lines(logging.Formatter):
+class TextFormatter(logging.Formatter):
     """`2026-01-31T07:00:00.000Z level=WARNING logger=mapserver.ingest.writer refused machine=loader-1 reason=gap`."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -31,7 +31,7 @@ class Lines(logging.Formatter):
         return line + (f"\n{self.formatException(record.exc_info)}" if record.exc_info else "")
 
 
-class JsonLines(logging.Formatter):
+class JsonFormatter(logging.Formatter):
     """One JSON object in a line: t, level, logger, event, the values of the event, and the traceback of a bug."""
 
     def format(self, record: logging.LogRecord) -> str:

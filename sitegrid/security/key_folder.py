@@ -12,8 +12,8 @@ from pathlib import Path
 
 from protocol.errors import ConfigError
 from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, IDENTITY_FILE, KEY_FILE, SIGNING_FILE
-from sitegrid.security.certificates import Pair, expires_at, issue, make_authority
-from sitegrid.security.register import ROUTER, Entry, Register, common_name, save_register, write_private
+from sitegrid.security.certificates import KeyPair, expires_at, issue, make_authority
+from sitegrid.security.register import ROUTER, Register, RegisterEntry, common_name, save_register, write_private
 from sitegrid.security.signing import make_signing_key
 
 AUTHORITY = "authority"
@@ -37,7 +37,7 @@ def certify(folder: Path, register: Register, name: str, role: str, expires: dat
     hosts = register.hosts if role == ROUTER else ()
     pair = issue(authority, common_name(name, number), now, expires, hosts)
     signing_key, public = make_signing_key() if role == "machine" else (b"", "")
-    entry = Entry(role, pair.serial, expires_at(pair), number, signing=public)
+    entry = RegisterEntry(role, pair.serial, expires_at(pair), number, signing=public)
     identity = f'site = "{register.site}"\nname = "{name}"\nrole = "{role}"\nexpires = {entry.expires.isoformat()}\n'
     files = {AUTHORITY_FILE: authority.certificate, CERTIFICATE_FILE: pair.certificate, KEY_FILE: pair.key}
     if signing_key:
@@ -50,10 +50,10 @@ def certify(folder: Path, register: Register, name: str, role: str, expires: dat
     return register
 
 
-def _authority(folder: Path) -> Pair:
+def _authority(folder: Path) -> KeyPair:
     place = folder / AUTHORITY
     try:
-        return Pair((place / CERTIFICATE_FILE).read_bytes(), (place / KEY_FILE).read_bytes())
+        return KeyPair((place / CERTIFICATE_FILE).read_bytes(), (place / KEY_FILE).read_bytes())
     except OSError as error:
         raise ConfigError(place, f"cannot be read ({error.strerror}); it lies where `sitegrid keys init` ran") from None
 

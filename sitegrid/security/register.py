@@ -22,7 +22,7 @@ ROLES = ("machine", "visitor", "server", "admin", "sim")
 
 
 @dataclass(frozen=True)
-class Entry:
+class RegisterEntry:
     """One name.
 
     serial: of its newest certificate, hex. issue: 1, and one more each time it comes back from revoked. signing: the
@@ -51,9 +51,9 @@ class Register:
 
     site: str
     hosts: tuple[str, ...]
-    names: Mapping[str, Entry]
+    names: Mapping[str, RegisterEntry]
 
-    def admitted(self) -> dict[str, Entry]:
+    def admitted(self) -> dict[str, RegisterEntry]:
         """Those that are let in: neither revoked nor the router itself."""
         return {name: entry for name, entry in self.names.items() if not entry.revoked and entry.role != ROUTER}
 
@@ -66,7 +66,7 @@ class Register:
         known = self.names.get(name)
         return 1 if known is None else known.issue + known.revoked
 
-    def with_entry(self, name: str, entry: Entry) -> Register:
+    def with_entry(self, name: str, entry: RegisterEntry) -> Register:
         """With a name added or replaced."""
         return replace(self, names={**self.names, name: entry})
 

@@ -17,7 +17,15 @@ from protocol.errors import QueryError, Refusal
 from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu, Odometry, Torque
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
-from protocol.queries.answers import GroundChange, HistoryAnswer, MachineState, PointAnswer, Region, Span, TrustAnswer
+from protocol.queries.answers import (
+    GroundChange,
+    HistoryAnswer,
+    HistorySpan,
+    MachineState,
+    PointAnswer,
+    Region,
+    TrustAnswer,
+)
 from protocol.wire import codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -96,8 +104,8 @@ HISTORY = HistoryAnswer(
     0.5,
     1.5,
     (
-        Span(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
-        Span(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
+        HistorySpan(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
+        HistorySpan(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
     ),
     17,
     T0 + 700_000_000_000,

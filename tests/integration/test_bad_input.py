@@ -46,9 +46,9 @@ class Probe:
 
     def send(self, payload: bytes | None, key: str = "") -> Ack | Refused:
         key = key or keys.ingest(self.site.name, MACHINE)
-        found = [reply.ok for reply in self.session.get(key, payload=payload, timeout=READY_S)]
-        assert [ok is not None for ok in found] == [True], f"one answer is expected: {self.where}"
-        return decode_reply(found[0].payload.to_bytes())
+        answers = [reply.ok for reply in self.session.get(key, payload=payload, timeout=READY_S)]
+        assert [ok is not None for ok in answers] == [True], f"one answer is expected: {self.where}"
+        return decode_reply(answers[0].payload.to_bytes())
 
     def batch(self, n: int = 3, **over: Any) -> SampleBatch:
         columns = {name: over.pop(name) for name in list(over) if name in SAMPLE_DTYPE.names}
@@ -199,8 +199,8 @@ def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children:
     server = run.start_server()
     run.site_file.write_text(wide)
     session = open_session(SessionConfig(run.endpoint))
-    heard: list[bytes] = []
-    session.declare_subscriber(keys.health(run.site, "loader-1"), lambda s: heard.append(s.payload.to_bytes()))
+    reports: list[bytes] = []
+    session.declare_subscriber(keys.health(run.site, "loader-1"), lambda s: reports.append(s.payload.to_bytes()))
     agent = run.start_agent(run.configs[0])
     run.start_sim()
     where = f"router {router.pid}, server {server.pid}, agent {agent.pid}"
@@ -209,7 +209,9 @@ def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children:
     assert report["delivered"], where
     assert 0 < quarantined < report["samples"], where
     assert report["uplink"]["counters"]["refused_outside_site"] >= quarantined, where
-    wait_until(lambda: decode_health(heard[-1]).values["spool"]["put_aside"] == quarantined, READY_S, "health says so")
+    wait_until(
+        lambda: decode_health(reports[-1]).values["spool"]["put_aside"] == quarantined, READY_S, "health says so"
+    )
     session.close()
     with run.connect() as client:
         info = client.info()

@@ -78,11 +78,11 @@ def resistance(client: Client, **when: Any) -> float:
 
 def command(site_run: SiteRun, *words: str) -> Any:
     where = ("--endpoint", site_run.endpoint, "--site", site_run.site, "--json")
-    found = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "sitegrid.cli", words[0], *where, *words[1:]], capture_output=True, text=True, timeout=60
     )
-    assert found.returncode == 0, found.stderr
-    return json.loads(found.stdout.splitlines()[-1])
+    assert process.returncode == 0, process.stderr
+    return json.loads(process.stdout.splitlines()[-1])
 
 
 def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: SiteRun, server: Child):

@@ -31,13 +31,13 @@ from protocol.queries.answer_codec import (
 from protocol.queries.answers import (
     GroundChange,
     HistoryAnswer,
+    HistorySpan,
     MachineState,
     MapInfo,
     PointAnswer,
     Region,
     SampleCounts,
     SiteInfo,
-    Span,
     TrustAnswer,
 )
 from protocol.queries.commands import TrustCommand, encode_command, parse_command
@@ -290,7 +290,10 @@ def test_point_whose_values_are_no_numbers_is_refused():
 
 
 def test_history_round_trips_and_keeps_unknown_as_nan():
-    spans = (Span(10, 19, {"resistance": math.nan, "visits": 3}), Span(30, 39, {"resistance": 0.5, "visits": 1.0}))
+    spans = (
+        HistorySpan(10, 19, {"resistance": math.nan, "visits": 3}),
+        HistorySpan(30, 39, {"resistance": 0.5, "visits": 1.0}),
+    )
     got = decode_history(encode_history(HistoryAnswer(0.5, -0.5, spans, 7, 8)))
     assert (got.x_m, got.y_m, got.merged, got.stamp_ns) == (0.5, -0.5, 7, 8)
     assert [(span.first_ns, span.last_ns) for span in got.spans] == [(10, 19), (30, 39)]

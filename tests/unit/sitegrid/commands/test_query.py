@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries.answer_codec import encode_history, encode_info, encode_point, encode_region
-from protocol.queries.answers import HistoryAnswer, PointAnswer, Region, Span
+from protocol.queries.answers import HistoryAnswer, HistorySpan, PointAnswer, Region
 from protocol.queries.parameters import split_selector
 from protocol.queries.requests import (
     Freshness,
@@ -62,8 +62,8 @@ class Session:
         if isinstance(asked, InfoQuery):
             return encode_info(map_info(SITE, stamp_ns=self.now_ns))
         if isinstance(asked, HistoryQuery):
-            first = Span(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
-            spans = (first, Span(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
+            first = HistorySpan(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
+            spans = (first, HistorySpan(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
             return encode_history(HistoryAnswer(0.5, 1.5, () if asked.x_m < 0 else spans, 17, T0))
         assert isinstance(asked, PointQuery | RegionQuery)
         stamp_ns = asked.when.as_of_ns or self.now_ns

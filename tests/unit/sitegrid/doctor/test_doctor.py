@@ -39,7 +39,7 @@ from sitegrid.doctor import disk, network
 from sitegrid.doctor.disk import SpoolState, StoreState
 from sitegrid.doctor.findings import Finding, Level
 from sitegrid.doctor.keys import Certificate, check_certificate, read_certificate
-from sitegrid.doctor.network import Link
+from sitegrid.doctor.network import RouterLink
 from tests.unit.records import map_info
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
@@ -63,13 +63,13 @@ def samples(n: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("link", "level", "words"),
     [
-        (Link("tcp/a:1", 0.012), Level.PASS, "answers in 12 ms"),
-        (Link("tcp/a:1", None, listens=False), Level.FAIL, "nothing listens at tcp/a:1; start `sitegrid router`"),
-        (Link("tcp/a:1", None, listens=True), Level.FAIL, "pass --keys"),
-        (Link("tls/a:1", None, listens=True, has_keys=True), Level.FAIL, "these keys may be of another site"),
+        (RouterLink("tcp/a:1", 0.012), Level.PASS, "answers in 12 ms"),
+        (RouterLink("tcp/a:1", None, listens=False), Level.FAIL, "nothing listens at tcp/a:1; start `sitegrid router`"),
+        (RouterLink("tcp/a:1", None, listens=True), Level.FAIL, "pass --keys"),
+        (RouterLink("tls/a:1", None, listens=True, has_keys=True), Level.FAIL, "these keys may be of another site"),
     ],
 )
-def test_router(link: Link, level: Level, words: str):
+def test_router(link: RouterLink, level: Level, words: str):
     finding = network.check_link(link)
     assert (finding.level, words in str(finding)) == (level, True)
 
@@ -497,12 +497,12 @@ def test_a_running_agent_is_heard(site: Site, capsys):
     with closing(Spool(site.folder / "spool.db", SpoolConfig())):
         _, unnamed = site.doctor(capsys, *words)
         teller.start()
-        _, heard = site.doctor(capsys, *words, "--machine", "loader-1")
+        _, named = site.doctor(capsys, *words, "--machine", "loader-1")
         done.set()
         teller.join()
     assert "give --machine NAME" in unnamed["spool"].message
-    assert heard["spool"].message.startswith("loader-1 runs: 9 samples wait")
-    assert heard["spool"].advice == "no answer"
+    assert named["spool"].message.startswith("loader-1 runs: 9 samples wait")
+    assert named["spool"].advice == "no answer"
 
 
 def test_people_read_one_line_each(capsys):
