@@ -241,6 +241,7 @@ def reading_lists(draw):
     return readings
 
 
+@settings(max_examples=30)
 @given(names, st.integers(1, codec.MAX_SEQ), reading_lists(), st.booleans())
 def test_bundle_round_trip_in_the_order_of_stamps(machine, counter, readings, last):
     got = codec.decode_bundle(codec.encode_bundle(SensorBundle(machine, counter, tuple(readings), last)))
