@@ -7,22 +7,30 @@ from pathlib import Path
 
 from sitegrid.options.values import positive
 
-HELP = "router, map server, simulator and agents, each its own process; pictures"
+HELP = "run the whole system in simulation and draw the maps"
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("--seconds", type=positive, default=240.0, help="simulated time (default %(default)s)")
-    parser.add_argument("--speed", type=positive, default=4.0, help="times real time (default %(default)s)")
-    parser.add_argument("--scenario", default="paper_site", help="what is simulated (default %(default)s)")
-    parser.add_argument("--world", choices=("pybullet", "fast"), help="what moves the machines (over the scenario)")
-    parser.add_argument("--machines", type=int, help="machines of the scenario's first fleet (over the scenario)")
-    parser.add_argument("--seed", type=int, help="seed of the simulation (over the scenario)")
-    parser.add_argument("--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores")
-    parser.add_argument("--headless", action="store_true", help="no live display, plain lines only")
-    parser.add_argument("--log", type=Path, help="manifest of a real log that a further agent replays")
+    parser.add_argument(
+        "--seconds", type=positive, default=240.0, help="simulated time in seconds (default %(default)s)"
+    )
+    parser.add_argument("--speed", type=positive, default=4.0, help="speed relative to real time (default %(default)s)")
+    parser.add_argument("--scenario", default="paper_site", help="scenario to simulate (default %(default)s)")
+    parser.add_argument(
+        "--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)"
+    )
+    parser.add_argument(
+        "--machines", type=int, help="number of machines in the scenario's first fleet (overrides the scenario)"
+    )
+    parser.add_argument("--seed", type=int, help="random seed (overrides the scenario)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores (default %(default)s)"
+    )
+    parser.add_argument("--headless", action="store_true", help="no live display; print plain lines")
+    parser.add_argument("--log", type=Path, help="manifest of a real log, which another agent replays")
     parser.add_argument("--data", type=Path, help="folder with the CSV files of that log")
-    parser.add_argument("--no-log", action="store_true", help="replay no log, also where the default one exists")
+    parser.add_argument("--no-log", action="store_true", help="do not replay a log, even if the default log exists")
 
 
 def run(arguments: Namespace) -> int:

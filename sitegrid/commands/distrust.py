@@ -7,13 +7,13 @@ from argparse import ArgumentParser, Namespace
 from sitegrid.commands.trust import add_decision, decide
 from sitegrid.options.groups import add_network
 
-HELP = "leave a machine's samples out of the map, earlier ones too"
+HELP = "exclude all samples of a machine from the map"
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add_network(parser)
-    parser.add_argument("--reason", required=True, help="one line that is kept with the decision")
+    parser.add_argument("--reason", required=True, help="reason in one line, kept with the decision")
     add_decision(parser)
 
 

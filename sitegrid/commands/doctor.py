@@ -9,15 +9,15 @@ from pathlib import Path
 from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import say
 
-HELP = "what is wrong with this host's part of a site, and what to do"
+HELP = "check the set-up of this host and say how to repair it"
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add_network(parser)
     parser.add_argument("--site", help="name of the site (default: that of the site file or the keys, else paper)")
-    parser.add_argument("--site-file", type=Path, help="the site, to compare with that of the map server (site.toml)")
-    parser.add_argument("--machine", help="name to ask for its watermark under (default: that of the keys)")
+    parser.add_argument("--site-file", type=Path, help="site file, to compare with the map server's (site.toml)")
+    parser.add_argument("--machine", help="name of the machine (default: that of the keys)")
     parser.add_argument("--spool", type=Path, help="file of an agent's spool")
     parser.add_argument("--store", type=Path, help="folder of a map server's store")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from sitegrid.options.times import STAMP_HELP, parse_stamp
 from sitegrid.options.values import positive
 
-HELP = "fold archives again, with other parameters, into a new store"
+HELP = "build a new store from archives, with other parameters"
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -17,14 +17,16 @@ def add_options(parser: ArgumentParser) -> None:
         "archives", type=Path, nargs="+", metavar="ARCHIVE", help="a Parquet file, a folder of them, or a store"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="STORE", help="folder of the new store")
-    parser.add_argument("--site-file", type=Path, help="the site, where the archives do not say it (site.toml)")
-    parser.add_argument("--cell", type=positive, metavar="M", help="edge of a cell (default: that of the site)")
-    parser.add_argument("--config", type=Path, help="options to fold and read with (config/server.toml)")
+    parser.add_argument("--site-file", type=Path, help="site file, if the archives hold no site (site.toml)")
     parser.add_argument(
-        "--without", action="append", default=[], metavar="MACHINE", help="leave it out; again for more"
+        "--cell", type=positive, metavar="M", help="edge of a cell in metres (default: that of the site)"
     )
-    for name, what in (("from", "samples stamped then or later"), ("until", "samples stamped before then")):
-        summary = f"{what} only; {STAMP_HELP}"
+    parser.add_argument("--config", type=Path, help="file with options (config/server.toml)")
+    parser.add_argument(
+        "--without", action="append", default=[], metavar="MACHINE", help="exclude this machine; may be repeated"
+    )
+    for name, what in (("from", "at or after T"), ("until", "before T")):
+        summary = f"only samples with a stamp {what}; T: {STAMP_HELP}"
         parser.add_argument(f"--{name}", type=parse_stamp, dest=f"{name}_ns", metavar="T", help=summary)
 
 

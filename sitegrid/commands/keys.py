@@ -25,7 +25,7 @@ from sitegrid.security.register import (
     save_register,
 )
 
-HELP = "the certificates of a site: who is let in, as what"
+HELP = "make, list and revoke the certificates of a site"
 THIS_HOST = ("localhost", "127.0.0.1")
 HOST_LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
 
@@ -33,23 +33,25 @@ HOST_LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command: those of each action."""
     actions = parser.add_subparsers(metavar="ACTION", required=True, dest="action")
-    init = add_action(actions, "init", "the site's authority, its router and its map server")
+    init = add_action(actions, "init", "make the site's authority, and the keys of its router and map server")
     init.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
-    init.add_argument(
-        "--host", nargs="+", action="extend", default=[], help="names and addresses that the router is reached at"
-    )
-    add = add_action(actions, "add", "keys for a machine, or another that is to be let in")
-    add.add_argument("--role", choices=ROLES, help="what it may do (default machine)")
+    init.add_argument("--host", nargs="+", action="extend", default=[], help="names and addresses of the router")
+    add = add_action(actions, "add", "make keys for a machine or another participant")
+    add.add_argument("--role", choices=ROLES, help="role, which says what it may do (default machine)")
     add.add_argument(
-        "--renew", action="store_true", help="a new certificate for one that has it; the old one stays valid"
+        "--renew", action="store_true", help="make a new certificate for a name that has one; the old one stays valid"
     )
-    revoke = add_action(actions, "revoke", "let it in no more")
+    revoke = add_action(actions, "revoke", "revoke the access of a name")
     for action in (add, revoke):
         action.add_argument("name", metavar="MACHINE")
     for action in (init, add):
-        action.add_argument("--days", type=days, default=365, help="how long it is valid (default %(default)s)")
-    for action in (init, add, revoke, add_action(actions, "list", "who is let in, until when")):
-        action.add_argument("--dir", type=Path, default=Path("keys"), help="folder of the keys (default %(default)s)")
+        action.add_argument(
+            "--days", type=days, default=365, help="days that the certificate is valid (default %(default)s)"
+        )
+    for action in (init, add, revoke, add_action(actions, "list", "list who has access, and until when")):
+        action.add_argument(
+            "--dir", type=Path, default=Path("keys"), help="folder with all keys of the site (default %(default)s)"
+        )
 
 
 def run(arguments: Namespace) -> int:

@@ -30,7 +30,10 @@ def add_options(parser: ArgumentParser) -> None:
     add_network(parser)
     add_site(parser)
     parser.add_argument(
-        "--after", type=int, default=0, help="wait until this journal row is merged; changes: those beyond this number"
+        "--after",
+        type=int,
+        default=0,
+        help="wait until this journal row is in the map; for changes: list those after this number",
     )
     parser.add_argument("--layers", default="", help="layers, comma-separated; default all")
     queries = parser.add_subparsers(metavar="QUERY", required=True, dest="ask")
@@ -40,17 +43,15 @@ def add_options(parser: ArgumentParser) -> None:
     region = _add_query(queries, "region", "a rectangle of cells, in metres")
     for side in ("west_m", "south_m", "east_m", "north_m"):
         region.add_argument(side, type=float)
-    region.add_argument("--out", type=Path, help="write coordinates and layers as .npz")
+    region.add_argument("--out", type=Path, help="write coordinates and layers into this .npz file")
     _add_when(region)
     history = _add_query(queries, "history", "the cell at a position over time")
     _add_place(history)
-    _add_times(
-        history, ("from", "samples from this time on"), ("to", "samples up to this time; default the site's now")
-    )
-    history.add_argument("--span", type=positive, metavar="SECONDS", help="length of a span; default 5 minutes")
-    _add_query(queries, "machines", "what the map server knows of each machine")
-    changes = _add_query(queries, "changes", "where the ground changed, and when")
-    changes.add_argument("--follow", action="store_true", help="go on with each change that is found, until stopped")
+    _add_times(history, ("from", "samples from this time on"), ("to", "samples up to this time; default the newest"))
+    history.add_argument("--span", type=positive, metavar="SECONDS", help="length of one span; default 5 minutes")
+    _add_query(queries, "machines", "state of each machine: samples, trust, reasons")
+    changes = _add_query(queries, "changes", "list of ground changes: place and time")
+    changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
     _add_query(queries, "info", "state of the map and its server")
 
 
@@ -64,7 +65,7 @@ def _add_place(query: ArgumentParser) -> None:
 
 
 def _add_when(query: ArgumentParser) -> None:
-    _add_times(query, ("as-of", "the map as of this time"), ("minus", "less the map as of this time"))
+    _add_times(query, ("as-of", "the map as of this time"), ("minus", "subtract the map as of this time"))
 
 
 def _add_times(query: ArgumentParser, *options: tuple[str, str]) -> None:

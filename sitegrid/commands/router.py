@@ -16,18 +16,18 @@ from sitegrid.security.access import router_settings
 from sitegrid.security.join import is_loopback, with_keys
 from sitegrid.security.register import REGISTER_FILE, ROUTER, Register, load_register
 
-HELP = "the site's Zenoh router"
+HELP = "run the site's Zenoh router"
 log = logging.getLogger("sitegrid.router")
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("--listen", default=DEFAULT_ENDPOINT, help="where to listen (default %(default)s)")
+    parser.add_argument("--listen", default=DEFAULT_ENDPOINT, help="endpoint to listen on (default %(default)s)")
     safety = parser.add_mutually_exclusive_group()
     safety.add_argument(
-        "--keys", type=Path, metavar="KEYS", help="folder of the site's keys; it listens on tls/... then"
+        "--keys", type=Path, metavar="KEYS", help="folder with the site's keys; the default endpoint is tls/... then"
     )
-    safety.add_argument("--insecure", action="store_true", help="listen beyond this host, although there are no keys")
+    safety.add_argument("--insecure", action="store_true", help="accept connections from other hosts without keys")
 
 
 def run(arguments: Namespace) -> int:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mapserver.ingest.store import Verify
     from mapserver.server import Server
 
-HELP = "the map server of a site"
+HELP = "run the map server of a site"
 METRICS_PORT = 9464
 
 
@@ -32,12 +32,12 @@ def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add_network(parser)
     parser.add_argument(
-        "--site-file", type=Path, required=True, help="the site: name, origin, cells (config/site.toml)"
+        "--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)"
     )
-    parser.add_argument("--store", type=Path, required=True, help="folder of the journal and its snapshots")
-    parser.add_argument("--config", type=Path, help="options (config/server.toml)")
+    parser.add_argument("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
+    parser.add_argument("--config", type=Path, help="file with options (config/server.toml)")
     parser.add_argument(
-        "--signed", type=Path, metavar="KEYS", help="take only batches that are signed, by the register in this folder"
+        "--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register"
     )
     parser.add_argument(
         "--metrics",
@@ -45,7 +45,7 @@ def add_options(parser: ArgumentParser) -> None:
         nargs="?",
         const=("127.0.0.1", METRICS_PORT),
         metavar="[HOST:]PORT",
-        help=f"show metrics for Prometheus over HTTP, to this host unless HOST is given (port {METRICS_PORT})",
+        help=f"serve Prometheus metrics over HTTP; without a value at 127.0.0.1:{METRICS_PORT}",
     )
 
 

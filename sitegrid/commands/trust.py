@@ -1,4 +1,4 @@
-"""`sitegrid trust`: use a machine's samples, whatever the map server finds."""
+"""`sitegrid trust`: use a machine's samples, even if they contradict other machines."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sitegrid.options.groups import add_network, add_site
 from sitegrid.options.values import not_negative
 from sitegrid.process.lifetime import plain, say
 
-HELP = "use a machine's samples, whatever the map server finds"
+HELP = "use a machine's samples, even if they contradict other machines"
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add_network(parser)
-    parser.add_argument("--auto", action="store_true", help="leave it to the map server again")
+    parser.add_argument("--auto", action="store_true", help="let the map server decide again")
     add_decision(parser)
 
 
@@ -29,7 +29,7 @@ def add_decision(parser: ArgumentParser) -> None:
         "--wait",
         type=not_negative,
         default=30.0,
-        help="seconds for the map to be folded again (default %(default)g)",
+        help="seconds to wait until the map is folded again (default %(default)g)",
     )
 
 

@@ -15,7 +15,7 @@ def add_command(commands: Subparsers, name: str, summary: str) -> ArgumentParser
     """Add `sitegrid NAME`, with the options of every command."""
     parser: ArgumentParser = commands.add_parser(name, help=summary, description=_sentence(summary))
     parser.add_argument("--json", action="store_true", help="print JSON for machines")
-    parser.add_argument("--verbose", action="store_true", help="log what happens, not only what goes wrong")
+    parser.add_argument("--verbose", action="store_true", help="log normal events too, not only warnings and errors")
     return parser
 
 
@@ -34,7 +34,7 @@ def add_network(parser: ArgumentParser) -> None:
         "--keys",
         type=Path,
         metavar="FOLDER",
-        help="keys of this process (`sitegrid keys`); the endpoint is tls/... then",
+        help="folder with the keys of this process (see `sitegrid keys`); the default endpoint is tls/... then",
     )
 
 

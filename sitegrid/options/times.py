@@ -12,7 +12,7 @@ from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
 
 STAMP_HELP = "ISO 8601 (UTC unless it names a zone) or a stamp in ns"
-HELP = f"{STAMP_HELP}, or before the site's now: -2h, -30m, -90s"
+HELP = f"{STAMP_HELP}, or a duration before the newest sample of the site: -2h, -30m, -90s"
 _UNIT_S = {"d": 86_400, "h": 3600, "m": 60, "s": 1}
 _AGO = re.compile(r"-(\d+(?:\.\d+)?)([dhms])")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
