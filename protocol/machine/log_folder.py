@@ -1,4 +1,4 @@
-"""Log folders: CSV files and a manifest `log.toml` that says what they mean (docs/log-folders.md).
+"""Log folders: CSV files and a manifest `log.toml` that describes them (docs/log-folders.md).
 
 The manifest may lie apart from the data, so that logs of others are described without touching them.
 """
@@ -186,7 +186,7 @@ def _open_text(path: Path) -> IO[str]:
 
 
 def _lines(text: IO[str], path: Path) -> Iterator[str]:
-    """Lines, refused where one is so long that it is none: a small packed file can hold one of many gigabytes."""
+    """Lines, refused where one is too long: a small compressed file can hold a line of many gigabytes."""
     while line := text.readline(MAX_LINE):
         if len(line) == MAX_LINE:
             raise LogFolderError(path, f"cannot be read: a line is longer than {MAX_LINE} characters")

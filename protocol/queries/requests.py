@@ -1,6 +1,6 @@
 """Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers: `answers.py`.
 
-A query is parsed once, at the server's door, into a frozen type; an unknown parameter is refused by name.
+The server parses a query once, into a frozen type; an unknown parameter is refused by name.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class ChangesQuery:
     """Changes of the ground with a number beyond `after`."""
 
     after: int = 0
-    fresh = Freshness()  # `after` is another one here
+    fresh = Freshness()  # the `after` of this query is not a journal row
 
     name = "changes"
 
@@ -112,7 +112,7 @@ MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | MachinesQuery |
 
 
 def check_size(columns: int, rows: int) -> None:
-    """Refuse a region that no reply could carry."""
+    """Refuse a region with more cells than one reply may hold."""
     if columns * rows > MAX_CELLS:
         raise QueryError(Refusal.TOO_LARGE, f"region of {columns} x {rows} cells; at most {MAX_CELLS} are answered")
 

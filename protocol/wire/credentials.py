@@ -20,7 +20,7 @@ SIGNING_FILE = "sign.pem"  # machines only
 
 @dataclass(frozen=True)
 class Identity:
-    """Whom a certificate names. role: see docs/security.md. expires: the last moment at which it is taken."""
+    """The holder of a certificate. role: see docs/security.md. expires: the end of its validity."""
 
     site: str
     name: str
@@ -36,7 +36,7 @@ class Credentials:
     identity: Identity
 
     def tls(self, *, listens: bool) -> Mapping[str, object]:
-        """The settings of Zenoh that make both ends of a link prove themselves; it ends when a certificate does."""
+        """Settings of Zenoh for mutual TLS; a link ends when one of its certificates expires."""
         end = "listen" if listens else "connect"
         return {
             "root_ca_certificate": str(self.folder / AUTHORITY_FILE),

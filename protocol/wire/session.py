@@ -21,8 +21,8 @@ class SessionConfig:
     """How a process joins the network.
 
     mode: "client" connects to a router; "router" is the site's router and listens. wait_s: how long to wait for the
-    router; negative opens at once and goes on looking for it in the background, as an agent does. credentials: with
-    them both ends of every link prove their names, without them nobody does. guard: the router's rules, as Zenoh's
+    router; negative opens at once and goes on looking for it in the background, as an agent does. credentials: for
+    mutual TLS; None for links without encryption. guard: the router's rules, as Zenoh's
     settings.
     """
 

@@ -38,7 +38,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _draw_if_possible(client: Client, arguments: Namespace, tracks: list[Track]) -> int:
-    """Draw one picture; while following, a server that is away is waited for."""
+    """Draw one picture; with --follow, wait for a server that does not answer."""
     try:
         draw(client, arguments.out, arguments.bounds, tracks, arguments.truth)
     except (LinkError, QueryError) as error:
@@ -69,7 +69,7 @@ def draw(
 
 
 def draw_both(region: Region, tracks: list[Track]) -> list[Image]:
-    """Resistance and grade; a map without any resistance says why."""
+    """Resistance and grade; the title of a map without any resistance says why."""
     has_torque = np.isfinite(region["resistance"]).any() or not np.isfinite(region["grade_east"]).any()
     title = "Rolling resistance" if has_torque else "Rolling resistance: unknown, no machine measures drive torque"
     return [draw_resistance(region, tracks, title), draw_grade(region, tracks)]

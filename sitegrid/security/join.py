@@ -1,4 +1,4 @@
-"""How a command joins the network: with the keys that it was given, or without any and then on this host alone."""
+"""Settings with which a command joins the network: with its keys, or without keys and then on this host only."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def with_keys(endpoint: str) -> str:
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether only processes of this host reach a TCP endpoint; False where that is not plain to see."""
+    """Whether only processes of this host reach a TCP endpoint; False where that is not certain."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if protocol != "tcp" or not port.isdecimal():

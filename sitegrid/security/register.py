@@ -1,4 +1,4 @@
-"""The register of a site's names: who has which role, until when, and who is let in no more. Readable TOML.
+"""The register of a site's names, as TOML: role, end of validity, and who is revoked.
 
 The router makes its rules from it, by the common names of certificates. A name that was revoked and is added again gets
 a new common name, so that the old certificate stays refused.
@@ -47,18 +47,18 @@ class RegisterEntry:
 
 @dataclass(frozen=True)
 class Register:
-    """All names of one site. hosts: names and addresses that the router is reached at."""
+    """All names of one site. hosts: names and addresses of the router."""
 
     site: str
     hosts: tuple[str, ...]
     names: Mapping[str, RegisterEntry]
 
     def admitted(self) -> dict[str, RegisterEntry]:
-        """Those that are let in: neither revoked nor the router itself."""
+        """Names that may connect: all but the revoked ones and the router."""
         return {name: entry for name, entry in self.names.items() if not entry.revoked and entry.role != ROUTER}
 
     def signing_keys(self) -> dict[str, str]:
-        """Public keys of the machines whose batches are taken."""
+        """Public keys of the machines whose batches are accepted."""
         return {name: entry.signing for name, entry in self.admitted().items() if entry.signing}
 
     def next_issue(self, name: str) -> int:
@@ -81,7 +81,7 @@ class Register:
 
 
 def common_name(name: str, issue: int) -> str:
-    """What the certificate of a name says; names hold no dot, so these never meet."""
+    """The common name of a certificate; names hold no dot, so two names never give the same one."""
     return name if issue == 1 else f"{name}.{issue}"
 
 
