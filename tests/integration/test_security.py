@@ -199,7 +199,7 @@ def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
 
 def test_only_an_admin_commands(guarded: Guarded):
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "boss") as client:
-        assert client.trust("loader-1", "seen to")["trusted"]
+        assert client.trust("loader-1", "seen to").trusted
 
 
 # --- who has no name that counts -------------------------------------------------------------------------------------
