@@ -19,8 +19,8 @@ from mapserver.ingest.store import JOURNAL_FILE, Incoming, Verify
 from mapserver.ingest.writer import Writer
 from mapserver.query.answers import Answers, reads_past
 from protocol.errors import ConfigError, QueryError
+from protocol.queries.answer_codec import encode_change, encode_error
 from protocol.queries.parameters import split_selector
-from protocol.queries.requests import encode_change, encode_error
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import encode_reply

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import tomllib
 import types
@@ -49,6 +50,11 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
         raise ConfigError(where, str(error)) from None
 
 
+def toml_lines(values: Mapping[str, object]) -> list[str]:
+    """Texts, numbers and lists as lines of TOML, which writes them as JSON does."""
+    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()]
+
+
 def section(table: dict[str, Any], name: str, where: str) -> dict[str, Any]:
     """Take the sub-table `name` out of `table`, empty where it is absent."""
     return _table(table.pop(name, {}), f"{where} {name}")
@@ -67,8 +73,8 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if origin is tuple:
         return _convert_tuple(value, typing.get_args(hint), where)
     if origin is Mapping:
-        _, of = typing.get_args(hint)
-        return {name: _convert(v, of, f"{where}.{name}") for name, v in _table(value, where).items()}
+        _, kind = typing.get_args(hint)
+        return {name: _convert(v, kind, f"{where}.{name}") for name, v in _table(value, where).items()}
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_table(hint, _table(value, where), where)
     if type(value) is int and value.bit_length() > 63:

@@ -1,4 +1,4 @@
-"""Units that logs come in, their factor to the unit that a field's suffix names, and the one constant of nature."""
+"""Units that logs come in, their factor to the unit that a field's suffix names, and standard gravity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The version of this package, which both sides tell."""
+"""The version of this package."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ UNKNOWN = "unknown"  # run from its sources, without being installed
 
 
 def package_version() -> str:
-    """As it is installed."""
+    """The installed version, or UNKNOWN."""
     try:
         return version("sitegrid")
     except PackageNotFoundError:

@@ -1,5 +1,46 @@
-"""sitegrid: many machines on a construction site draw one map of the ground together."""
+"""sitegrid: many machines on a construction site draw one map of the ground together.
 
+with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
+    ground = site.region((0, 0, 200, 150), ["resistance"])
+"""
+
+from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
+from protocol.queries.answers import (
+    GroundChange,
+    HistorySpan,
+    MachineState,
+    MapInfo,
+    PointAnswer,
+    Region,
+    SampleCounts,
+    SiteInfo,
+    TrustAnswer,
+)
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import KnownGround
+from protocol.version import package_version
 from sitegrid.client import Client, connect
+from sitegrid.listener import Listener
 
-__all__ = ["Client", "connect"]
+__all__ = [
+    "Bounds",
+    "Client",
+    "ConfigError",
+    "GroundChange",
+    "HistorySpan",
+    "KnownGround",
+    "LinkError",
+    "Listener",
+    "MachineState",
+    "MapInfo",
+    "MessageError",
+    "PointAnswer",
+    "QueryError",
+    "Region",
+    "SampleCounts",
+    "SiteInfo",
+    "SitegridError",
+    "TrustAnswer",
+    "connect",
+]
+__version__ = package_version()

@@ -9,11 +9,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import zenoh
 
 from protocol.errors import LinkError
+from protocol.queries.answer_codec import (
+    decode_change,
+    decode_changes,
+    decode_error,
+    decode_history,
+    decode_info,
+    decode_machine,
+    decode_machines,
+    decode_point,
+    decode_region,
+)
+from protocol.queries.answers import GroundChange, HistorySpan, MachineState, MapInfo, PointAnswer, Region, TrustAnswer
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
 from protocol.queries.requests import (
@@ -24,21 +35,9 @@ from protocol.queries.requests import (
     InfoQuery,
     MachinesQuery,
     MapQuery,
-    PointAnswer,
     PointQuery,
-    Region,
     RegionQuery,
-    Span,
     When,
-    decode_change,
-    decode_changes,
-    decode_error,
-    decode_history,
-    decode_info,
-    decode_machine,
-    decode_machines,
-    decode_point,
-    decode_region,
     encode_query,
 )
 from protocol.site.geometry import Bounds
@@ -48,16 +47,15 @@ from sitegrid.listener import Listener
 from sitegrid.security.join import join
 
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
-
-
-TIMED_OUT = b"Timeout"  # what Zenoh says itself where nobody answered in time
+TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 
 
 class Client:
-    """Asks the map server of one site. Every call may raise QueryError (refused) or LinkError (no answer).
+    """Asks the map server of one site.
 
-    Wherever they stand: layers: names, none for all. after: answer once this journal row is merged, waiting for it at
-    most wait_s. Times are stamps: UTC in nanoseconds, as samples carry them.
+    Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read).
+    Arguments of several methods: layers: names, none for all. after: answer once this journal row is merged, and wait
+    for it at most wait_s [s]. Times are stamps, UTC in nanoseconds.
     """
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float = 10.0) -> None:
@@ -65,7 +63,7 @@ class Client:
         self.site = site
         self._endpoint = endpoint
         self._timeout_s = timeout_s
-        self._listeners: list[Listener[dict[str, Any]]] = []
+        self._listeners: list[Listener[GroundChange]] = []
 
     # --- the map -----------------------------------------------------------------------------------------------------
 
@@ -116,29 +114,29 @@ class Client:
         span_s: float | None = None,
         after: int = 0,
         wait_s: float = 10.0,
-    ) -> tuple[Span, ...]:
-        """Layers of the cell at a position in `map`, span by span, oldest first; spans without samples are left out.
+    ) -> tuple[HistorySpan, ...]:
+        """Layers of the cell at a position in `map`, span by span, oldest first; spans without samples are skipped.
 
         from_ns, to_ns: both included; without them the newest 2000 spans until now. span_s: default one bucket.
         """
         query = HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, Freshness(after, wait_s))
         return decode_history(self._ask(query)).spans
 
-    def info(self, *, after: int = 0, wait_s: float = 10.0) -> dict[str, Any]:
+    def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
         return decode_info(self._ask(InfoQuery(Freshness(after, wait_s))))
 
     # --- machines and changes ----------------------------------------------------------------------------------------
 
-    def machines(self, *, after: int = 0, wait_s: float = 10.0) -> list[dict[str, Any]]:
-        """What the server knows of each machine: name, trusted, by whom, reasons, evidence, samples, ..."""
+    def machines(self, *, after: int = 0, wait_s: float = 10.0) -> list[MachineState]:
+        """What the server knows of each machine: whether it is trusted, why, and what it sent."""
         return decode_machines(self._ask(MachinesQuery(Freshness(after, wait_s))))
 
-    def changes(self, after: int = 0) -> list[dict[str, Any]]:
+    def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with an id beyond `after`: when, where, how many cells, from what to what."""
         return decode_changes(self._ask(ChangesQuery(after)))
 
-    def on_change(self, callback: Callable[[dict[str, Any]], object]) -> Listener[dict[str, Any]]:
+    def on_change(self, callback: Callable[[GroundChange], object]) -> Listener[GroundChange]:
         """Call `callback`, on a thread of its own, with each change that is found or grows, until the handle is closed.
 
         Events are not repeated: ask `changes` for what was before, or was missed.
@@ -147,23 +145,23 @@ class Client:
         self._listeners.append(listener)
         return listener
 
-    def trust(self, machine: str, reason: str = "", *, wait_s: float = 30.0) -> dict[str, Any]:
-        """Use a machine's samples whatever the server finds; returns its row of `machines`, and `merged`.
+    def trust(self, machine: str, reason: str = "", *, wait_s: float = 30.0) -> TrustAnswer:
+        """Use a machine's samples whatever the server finds; returns its state then.
 
         wait_s: how long to wait for the map to be folded again, here as below.
         """
         return self._command(TrustCommand(machine, True, reason, wait_s))
 
-    def distrust(self, machine: str, reason: str, *, wait_s: float = 30.0) -> dict[str, Any]:
+    def distrust(self, machine: str, reason: str, *, wait_s: float = 30.0) -> TrustAnswer:
         """Leave a machine's samples out of the map, earlier ones too."""
         return self._command(TrustCommand(machine, False, reason, wait_s))
 
-    def judge_automatically(self, machine: str, *, wait_s: float = 30.0) -> dict[str, Any]:
+    def judge_automatically(self, machine: str, *, wait_s: float = 30.0) -> TrustAnswer:
         """Leave it to the server again whether a machine's samples are used."""
         return self._command(TrustCommand(machine, None, "", wait_s))
 
     def close(self) -> None:
-        """Close the session, and whatever listens to it."""
+        """Close the session and its listeners."""
         for listener in self._listeners:
             listener.close()
         self.session.close()  # type: ignore[no-untyped-call]
@@ -182,7 +180,7 @@ class Client:
             wait_s += PAST_S
         return self._get(keys.map_query(self.site, query.name), encode_query(query), wait_s)
 
-    def _command(self, command: TrustCommand) -> dict[str, Any]:
+    def _command(self, command: TrustCommand) -> TrustAnswer:
         key = keys.admin(self.site, command.name)
         return decode_machine(self._get(key, encode_command(command), command.wait_s))
 

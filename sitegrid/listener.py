@@ -1,4 +1,4 @@
-"""Events for a callback that may take its time: Zenoh's own callbacks must not (EVIDENCE: they stall the session)."""
+"""Events for a callback that may be slow: a slow callback of Zenoh itself stalls the session."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import zenoh
 
 from protocol.errors import MessageError
 
-MOST_WAITING = 1000  # events; more are left out
+MOST_WAITING = 1000  # events; more are dropped
 T = TypeVar("T")
 log = logging.getLogger("sitegrid.listener")
 
@@ -20,7 +20,7 @@ log = logging.getLogger("sitegrid.listener")
 class Listener(Generic[T]):
     """Calls `callback` with every event put on a key, one after the other, on a thread of its own, until closed.
 
-    Events that cannot be read, or come faster than they are taken, are left out; an error in the callback is logged.
+    Events that cannot be read, or come faster than the callback returns, are dropped; its errors are logged.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Listener(Generic[T]):
         try:
             self._waiting.put_nowait(sample.payload.to_bytes())
         except queue.Full:
-            log.warning("event left out key=%s waiting=%d", sample.key_expr, MOST_WAITING)
+            log.warning("event dropped key=%s waiting=%d", sample.key_expr, MOST_WAITING)
 
     def _drop_waiting(self) -> None:
         try:
@@ -62,6 +62,6 @@ class Listener(Generic[T]):
             try:
                 self._callback(self._decode(data))
             except MessageError as error:
-                log.warning("event left out error=%r", str(error))
+                log.warning("event dropped error=%r", str(error))
             except Exception:  # the callback's bug is not the end of the events
                 log.exception("callback failed")

@@ -195,7 +195,7 @@ def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
 
 def _look(client: Client, watched: tuple[Child, Child], minute: float) -> Look:
     server_mib, router_mib = (_resident_mib(child.pid) for child in watched)
-    return Look(minute, client.info()["samples_merged"], server_mib, router_mib)
+    return Look(minute, client.info().samples_merged, server_mib, router_mib)
 
 
 def _resident_mib(pid: int) -> float:

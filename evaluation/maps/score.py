@@ -11,7 +11,7 @@ import numpy as np
 from evaluation.ground.truth import border_distance
 from mapserver.pictures.plotter import Layers
 from protocol.arrays import Bools, Floats, Ints
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from protocol.site.ground_classes import UNKNOWN, resistance_class, slope_class, wrong_percent
 
 BORDER_EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # of the bins by distance to the nearest border; the last is open

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -153,9 +153,8 @@ class Store:
 
     def info(self) -> dict[str, Any]:
         """State of the store in plain values."""
-        site = {name: getattr(self.site, name) for name in SiteConfig.__dataclass_fields__}
         return {
-            "site": {**site, "frame": self.site.frame, "crs": self.site.crs},
+            "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
             "journalled": self.journalled,
             "merged": self.merged,
             "snapshot": self.snapshot_row,

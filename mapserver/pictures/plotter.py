@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mapserver.pictures.frame import EDGE, MAX_NAME, PAPER, Axes, Colour, Entry, Image, compose, text, text_size
 from protocol.arrays import AnyArray, Floats, Ints
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from protocol.site.ground_classes import SLOPE, UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom [px]

@@ -17,21 +17,7 @@ from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.views import Past, View, cropped, read_cells, view_now, widened
 from protocol.errors import QueryError, Refusal
-from protocol.queries.commands import TrustCommand, parse_command
-from protocol.queries.requests import (
-    MAX_SPANS,
-    ChangesQuery,
-    HistoryAnswer,
-    HistoryQuery,
-    MachinesQuery,
-    MapQuery,
-    PointAnswer,
-    PointQuery,
-    Region,
-    RegionQuery,
-    Span,
-    When,
-    check_size,
+from protocol.queries.answer_codec import (
     encode_changes,
     encode_history,
     encode_info,
@@ -39,6 +25,19 @@ from protocol.queries.requests import (
     encode_machines,
     encode_point,
     encode_region,
+)
+from protocol.queries.answers import HistoryAnswer, HistorySpan, PointAnswer, Region
+from protocol.queries.commands import TrustCommand, parse_command
+from protocol.queries.requests import (
+    MAX_SPANS,
+    ChangesQuery,
+    HistoryQuery,
+    MachinesQuery,
+    MapQuery,
+    PointQuery,
+    RegionQuery,
+    When,
+    check_size,
     parse_query,
 )
 from protocol.site.geometry import Bounds, CellWindow
@@ -194,9 +193,9 @@ class Answers:
             return self._writer.read(lambda store: view_now(store, window))
         return self._known_past().view(window, as_of_ns, self._keeper.distrusted())
 
-    def _span(self, moment: Moment, names: tuple[str, ...]) -> Span:
+    def _span(self, moment: Moment, names: tuple[str, ...]) -> HistorySpan:
         values = cell_layers.read(moment.evidence, names, self._config.read, moment.last_ns)
-        return Span(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
+        return HistorySpan(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
 
     def _known_past(self) -> Past:
         if self._past is None:

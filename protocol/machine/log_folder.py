@@ -1,4 +1,4 @@
-"""Log folders: CSV files and a manifest `log.toml` that says what they mean (docs/log-folders.md).
+"""Log folders: CSV files and a manifest `log.toml` that describes them (docs/log-folders.md).
 
 The manifest may lie apart from the data, so that logs of others are described without touching them.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import gzip
 import heapq
-import json
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -16,11 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from protocol.config import from_table, load_toml, section
+from protocol.config import from_table, load_toml, section, toml_lines
 from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal
 from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
 from protocol.machine.readings import Reading, columns, parse_reading
-from protocol.site.site_config import SiteConfig
+from protocol.site.site_config import SiteConfig, site_toml
 from protocol.units import factor, stamp_ns, stamp_scale
 
 MANIFEST = "log.toml"
@@ -37,7 +36,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Source:
+class SensorFile:
     """The CSV file of one sensor. fields: reading field -> Column; `stamp` is the time column."""
 
     sensor: SensorConfig
@@ -48,14 +47,14 @@ class Source:
 
 @dataclass
 class LogFolder:
-    """A described recording. `refused` counts, while it is read, the rows that were left out, by reason."""
+    """A described recording. `refused` counts the rows that were skipped while it is read, by reason."""
 
     name: str
     data: Path
     start_ns: int
     site: SiteConfig
     machine: MachineConfig
-    sources: tuple[Source, ...]
+    sources: tuple[SensorFile, ...]
     refused: Counter[str] = field(default_factory=Counter)
 
     def readings(self) -> Iterator[Reading]:
@@ -64,7 +63,7 @@ class LogFolder:
         streams = [self._read(source) for source in self.sources if source.sensor.use]
         return heapq.merge(*streams, key=lambda r: r.stamp_ns)
 
-    def _read(self, source: Source) -> Iterator[Reading]:
+    def _read(self, source: SensorFile) -> Iterator[Reading]:
         path = self.data / source.file
         try:
             with _open_text(path) as text:
@@ -72,7 +71,7 @@ class LogFolder:
         except (OSError, EOFError, zlib.error, ValueError, csv.Error) as error:  # ValueError: no UTF-8, or no path
             raise LogFolderError(path, f"cannot be read: {error}") from None
 
-    def _parse(self, rows: csv.DictReader[str], source: Source, path: Path) -> Iterator[Reading]:
+    def _parse(self, rows: csv.DictReader[str], source: SensorFile, path: Path) -> Iterator[Reading]:
         names = columns(source.sensor.kind)
         picks = [_pick(name, source.fields[name], rows, path) for name in names]
         stamp_column, scale = _require(source.stamp.column, rows, path), stamp_scale(source.stamp.unit or "s")
@@ -128,7 +127,7 @@ class _Header:
     start_ns: int = 0
 
 
-def _parse_source(table: Any, where: str) -> Source:
+def _parse_source(table: Any, where: str) -> SensorFile:
     if not isinstance(table, dict):
         raise ConfigError(where, "a table is expected")
     table = dict(table)
@@ -146,7 +145,7 @@ def _parse_source(table: Any, where: str) -> Source:
         raise ConfigError(f"{where} columns.stamp", "a column is expected, not a constant")
     for name, column in parsed.items():
         _check_unit(name, column, f"{where} columns.{name}")
-    return Source(sensor, file, parsed.pop("stamp"), parsed)
+    return SensorFile(sensor, file, parsed.pop("stamp"), parsed)
 
 
 def _parse_column(value: Any, where: str) -> Column:
@@ -187,7 +186,7 @@ def _open_text(path: Path) -> IO[str]:
 
 
 def _lines(text: IO[str], path: Path) -> Iterator[str]:
-    """Lines, refused where one is so long that it is none: a small packed file can hold one of many gigabytes."""
+    """Lines, refused where one is too long: a small compressed file can hold a line of many gigabytes."""
     while line := text.readline(MAX_LINE):
         if len(line) == MAX_LINE:
             raise LogFolderError(path, f"cannot be read: a line is longer than {MAX_LINE} characters")
@@ -212,30 +211,9 @@ def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig,
 
 
 def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
-    lines = [
-        "[log]",
-        f"name = {json.dumps(name, ensure_ascii=False)}",
-        "",
-        "[site]",
-        *plain_lines(site),
-        *_known_ground(site),
-        "",
-        "[machine]",
-        *plain_lines(machine),
-    ]
+    head = "\n".join(["[log]", *toml_lines({"name": name}), "", "[site]"])
+    lines = [head, site_toml(site), "[machine]", *plain_lines(machine)]
     for sensor in machine.sensors:
         lines += ["", "[[sensor]]", *sensor_lines(sensor), f'file = "{sensor.name}.csv"', "[sensor.columns]"]
         lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(sensor.kind))]
     return "\n".join(lines) + "\n"
-
-
-def _known_ground(site: SiteConfig) -> list[str]:
-    areas = [
-        f"{{ name = {json.dumps(area.name)}, c_rr = {float(area.c_rr)!r}, outline = {_floats(area.outline)} }}"
-        for area in site.known_ground
-    ]
-    return [f"known_ground = [{', '.join(areas)}]"] if areas else []
-
-
-def _floats(points: Iterable[Iterable[float]]) -> list[list[float]]:
-    return [[float(value) for value in point] for point in points]

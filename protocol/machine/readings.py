@@ -1,4 +1,4 @@
-"""Readings: what sensors say, the one door by which simulation, replayed logs and real drivers enter an agent.
+"""Readings of sensors: the only input of an agent, from the simulation, from replayed logs and from real drivers.
 
 Each kind is a flat frozen dataclass whose fields are also the columns of log folders and of sensor bundles; the
 suffix of a field is its unit. Values are raw: in the sensor's own frame, before any correction.

@@ -81,7 +81,7 @@ def check_samples(rows: Table, extent_m: float) -> None:
     for name, limit in LIMITS.items():
         bad: Bools = np.asarray(
             (rows[name] < limit.low) | (rows[name] > limit.high)
-        )  # NaN passes here: it was judged above
+        )  # NaN passes here: it was checked above
         reason = Refusal.COVARIANCE if name.startswith("cov_") else Refusal.OUT_OF_RANGE
         _refuse(bad, rows, name, reason, f"not between {limit.low:g} and {limit.high:g}")
     _refuse(~_is_semidefinite(rows), rows, "cov_xy_m2", Refusal.COVARIANCE, "covariance is not positive semidefinite")

@@ -1,27 +1,23 @@
-"""Answers to map queries, as MessagePack (docs/protocol.md, "Map queries")."""
+"""Answers to map queries as values (docs/protocol.md, "Map queries"); their bytes: `answer_codec.py`.
+
+Stamps are UTC in nanoseconds. `merged` is the journal row that an answer is true for; `stamp_ns` is the site's now, or
+the time that the map is as of.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from protocol.arrays import Floats, Floats32
-from protocol.errors import MessageError, QueryError, Refusal
-from protocol.site.geometry import MAX_CELLS, Bounds
-from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_plain, unpack
-
-MAX_REPLY_BYTES = 2**30
-MAX_CELL_M = 1e4
-MAX_PLACE_M = 1e7  # from the origin
-MAX_ITEMS = 100_000  # of one list
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import KnownGround
 
 
 @dataclass(frozen=True)
 class PointAnswer:
-    """Layer values of the cell with centre (x_m, y_m); NaN is unknown. merged: the journal row it is true for."""
+    """Layer values of the cell with centre (x_m, y_m); NaN is unknown."""
 
     x_m: float
     y_m: float
@@ -35,8 +31,7 @@ class Region:
     """A rectangle of cells.
 
     x_m (columns,), y_m (rows,): cell centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
-    NaN where unknown; row 0 is the southernmost. merged: the journal row it is true for; stamp_ns: the site's now, or
-    the time that the map is as of.
+    NaN where unknown; row 0 is the southernmost.
     """
 
     x_m: Floats
@@ -57,7 +52,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class Span:
+class HistorySpan:
     """Layer values of one cell from its samples with first_ns <= stamp <= last_ns alone; NaN is unknown."""
 
     first_ns: int
@@ -67,187 +62,111 @@ class Span:
 
 @dataclass(frozen=True)
 class HistoryAnswer:
-    """The cell with centre (x_m, y_m) over time, oldest first; spans in which nobody was there are left out."""
+    """The cell with centre (x_m, y_m) over time, oldest first; a span without samples is not there."""
 
     x_m: float
     y_m: float
-    spans: tuple[Span, ...]
+    spans: tuple[HistorySpan, ...]
     merged: int
     stamp_ns: int
 
 
-# --- the map ---------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class SiteInfo:
+    """The site as its map server has it: `SiteConfig`, with the digits and the PROJ string of its frame."""
+
+    name: str
+    origin_lat_deg: float
+    origin_lon_deg: float
+    origin_height_m: float
+    cell_m: float
+    extent_m: float
+    clock: str
+    clock_tolerance_s: float
+    known_ground: tuple[KnownGround, ...]
+    frame: str
+    crs: str
 
 
-def encode_point(answer: PointAnswer) -> bytes:
-    """Answer of `point`."""
-    place = {"x_m": answer.x_m, "y_m": answer.y_m}
-    return pack({**place, "values": _plain(answer.values), "merged": answer.merged, "stamp_ns": answer.stamp_ns})
+@dataclass(frozen=True)
+class SampleCounts:
+    """What one machine sent: spools, samples accepted, samples declared lost, and its newest stamp."""
+
+    spools: int
+    samples: int
+    lost: int
+    newest_ns: int
 
 
-def decode_point(data: bytes) -> PointAnswer:
-    """Undo `encode_point`."""
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
-    x, y, values = take(table, "x_m", float), take(table, "y_m", float), _take_values(table)
-    return PointAnswer(x, y, values, take(table, "merged", int), take(table, "stamp_ns", int))
+@dataclass(frozen=True)
+class MapInfo:
+    """State of the map and its server.
+
+    journalled, merged, snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks
+    with evidence; None without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    """
+
+    site: SiteInfo
+    journalled: int
+    merged: int
+    snapshot: int
+    samples_merged: int
+    samples_too_unsure: int
+    cells: int
+    bounds: tuple[int, int, int, int] | None
+    stamp_ns: int
+    wall_ns: int
+    version: str
+    machines: Mapping[str, SampleCounts]
+    distrusted: tuple[str, ...]
+    counters: Mapping[str, int]
+    layers: tuple[str, ...]
 
 
-def encode_region(region: Region) -> bytes:
-    """Answer of `region`: layers as float32 little-endian, row by row from the south."""
-    layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in region.layers.items()}
-    return pack(
-        {
-            "west_m": float(region.x_m[0] - region.cell_m / 2),
-            "south_m": float(region.y_m[0] - region.cell_m / 2),
-            "cell_m": region.cell_m,
-            "columns": len(region.x_m),
-            "rows": len(region.y_m),
-            "layers": layers,
-            "merged": region.merged,
-            "stamp_ns": region.stamp_ns,
-        }
-    )
+@dataclass(frozen=True)
+class MachineState:
+    """What the map server knows of one machine.
+
+    trusted: whether its samples are in the map. by: who decided that last: `audit` (the server), `person`, or empty.
+    reason: one line. since_ns: the site's now at the decision, 0 for never. contradicts: whether it contradicts all
+    others now. reasons, evidence: in what, and by which figures. The counts: see SampleCounts.
+    """
+
+    name: str
+    trusted: bool
+    by: str
+    reason: str
+    since_ns: int
+    contradicts: bool
+    reasons: tuple[str, ...]
+    evidence: Mapping[str, Any]
+    spools: int
+    samples: int
+    lost: int
+    newest_ns: int
 
 
-def decode_region(data: bytes) -> Region:
-    """Undo `encode_region`."""
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
-    cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
-    if not (0 < cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
-        raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
-    if not (tables := take(table, "layers", dict)):  # what is in them proves the number of cells
-        raise MessageError(Refusal.MISSING_FIELD, "empty", field="layers")
-    layers = {name: _decode_layer(tables, name, rows, columns) for name in tables}
-    west_m, south_m = (_take_place(table, name) for name in ("west_m", "south_m"))
-    return Region(
-        x_m=west_m + (np.arange(columns) + 0.5) * cell_m,
-        y_m=south_m + (np.arange(rows) + 0.5) * cell_m,
-        cell_m=cell_m,
-        layers=layers,
-        merged=take(table, "merged", int),
-        stamp_ns=take(table, "stamp_ns", int),
-    )
+@dataclass(frozen=True)
+class TrustAnswer(MachineState):
+    """The machine after a command, and the journal row of the map that the command counts in."""
+
+    merged: int
 
 
-def _take_place(table: dict[str, Any], name: str) -> float:
-    value: float = take(table, name, float)
-    if abs(value) > MAX_PLACE_M:
-        raise MessageError(Refusal.OUT_OF_RANGE, f"{value} is beyond {MAX_PLACE_M:g} m", field=name)
-    return value
+@dataclass(frozen=True)
+class GroundChange:
+    """One change of the ground.
 
+    id: 1, 2, 3... first_ns, last_ns: between them it took place, cell by cell. bounds: west, south, east, north [m].
+    cells: how many are known to have changed. resistance [-], grade [m/m]: medians over them; None is unknown.
+    """
 
-def _decode_layer(layers: dict[str, Any], name: str, rows: int, columns: int) -> Floats32:
-    data: bytes = take(layers, name, bytes)
-    if type(name) is not str or len(data) != 4 * rows * columns:
-        problem = f"{len(data)} bytes, {columns} x {rows} cells take {4 * rows * columns}"
-        raise MessageError(Refusal.COLUMN_LENGTH, problem, field=f"layers.{name!s:.40}")
-    return np.frombuffer(data, "<f4").reshape(rows, columns)
-
-
-def encode_history(answer: HistoryAnswer) -> bytes:
-    """Answer of `history`."""
-    spans = [{"first_ns": s.first_ns, "last_ns": s.last_ns, "values": _plain(s.values)} for s in answer.spans]
-    place = {"x_m": answer.x_m, "y_m": answer.y_m}
-    return pack({**place, "spans": spans, "merged": answer.merged, "stamp_ns": answer.stamp_ns})
-
-
-def decode_history(data: bytes) -> HistoryAnswer:
-    """Undo `encode_history`."""
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
-    spans = tuple(
-        Span(take(span, "first_ns", int), take(span, "last_ns", int), _take_values(span))
-        for span in _take_rows(table, "spans")
-    )
-    x, y = take(table, "x_m", float), take(table, "y_m", float)
-    return HistoryAnswer(x, y, spans, take(table, "merged", int), take(table, "stamp_ns", int))
-
-
-def _plain(values: Mapping[str, float]) -> dict[str, float]:
-    return {name: float(value) for name, value in values.items()}
-
-
-def _take_values(table: dict[str, Any]) -> dict[str, float]:
-    values: dict[str, float] = take(table, "values", dict)
-    for name, value in values.items():
-        if type(name) is not str or type(value) is not float:  # NaN is unknown, so `take` would be too strict
-            raise MessageError(Refusal.WRONG_TYPE, "a number is expected", field=f"values.{name!s:.40}")
-    return values
-
-
-# --- plain tables ----------------------------------------------------------------------------------------------------
-
-
-def encode_info(info: Mapping[str, Any]) -> bytes:
-    """Answer of `info`: nested tables of plain values."""
-    return pack({"info": dict(info)})
-
-
-def decode_info(data: bytes) -> dict[str, Any]:
-    """Undo `encode_info`."""
-    info: dict[str, Any] = take_plain(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
-    return info
-
-
-def encode_machines(machines: Sequence[Mapping[str, Any]]) -> bytes:
-    """Answer of `machines`: a table of plain values for each."""
-    return pack({"machines": [dict(machine) for machine in machines]})
-
-
-def decode_machines(data: bytes) -> list[dict[str, Any]]:
-    """Undo `encode_machines`."""
-    return _take_rows(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machines")
-
-
-def encode_machine(machine: Mapping[str, Any]) -> bytes:
-    """Answer to a command about one machine: what `machines` says of it, and more."""
-    return pack({"machine": dict(machine)})
-
-
-def decode_machine(data: bytes) -> dict[str, Any]:
-    """Undo `encode_machine`."""
-    machine: dict[str, Any] = take_plain(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
-    return machine
-
-
-def encode_changes(changes: Sequence[Mapping[str, Any]]) -> bytes:
-    """Answer of `changes`: a table of plain values for each."""
-    return pack({"changes": [dict(change) for change in changes]})
-
-
-def decode_changes(data: bytes) -> list[dict[str, Any]]:
-    """Undo `encode_changes`."""
-    return _take_rows(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "changes")
-
-
-def encode_change(change: Mapping[str, Any]) -> bytes:
-    """The event that an area changed, put on `map/changed`."""
-    return pack({"change": dict(change)})
-
-
-def decode_change(data: bytes) -> dict[str, Any]:
-    """Undo `encode_change`."""
-    change: dict[str, Any] = take_plain(unpack(data, MAX_SMALL_BYTES), "change")
-    return change
-
-
-def _take_rows(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = take(table, name, list)
-    for index, row in enumerate(rows):
-        if type(row) is not dict:
-            raise MessageError(Refusal.WRONG_TYPE, f"map expected, not {type(row).__name__}", field=name, row=index)
-        check_plain(row, f"{name}[{index}]")
-    return rows
-
-
-# --- refused ---------------------------------------------------------------------------------------------------------
-
-
-def encode_error(error: QueryError) -> bytes:
-    """Answer to a query or a command that is refused."""
-    return pack({"reason": error.reason, "problem": str(error)})
-
-
-def decode_error(data: bytes) -> QueryError:
-    """Undo `encode_error`."""
-    table = unpack(data, MAX_SMALL_BYTES)
-    return QueryError(take(table, "reason", str), take(table, "problem", str))
+    id: int
+    first_ns: int
+    last_ns: int
+    bounds: tuple[float, float, float, float]
+    cells: int
+    resistance_before: float | None
+    resistance_after: float | None
+    grade_before: float | None
+    grade_after: float | None

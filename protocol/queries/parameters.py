@@ -1,4 +1,4 @@
-"""Selector parameters of queries: text one way, checked values the other; QueryError names what is wrong."""
+"""Selector parameters of queries: values to text, and text to checked values; QueryError names what is wrong."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def number(parameters: Parameters, name: str) -> float:
 
 
 def count(parameters: Parameters, name: str) -> int:
-    """A whole number that is not negative; 0 where it is missing."""
+    """A whole number from 0 on; 0 where it is missing."""
     value = number({name: "0", **parameters}, name)
     if value < 0 or value != int(value):
         raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {value:g} is no whole number from 0 on")

@@ -1,6 +1,6 @@
 """Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers: `answers.py`.
 
-A query is parsed once, at the server's door, into a frozen type; an unknown parameter is refused by name.
+The server parses a query once, into a frozen type; an unknown parameter is refused by name.
 """
 
 from __future__ import annotations
@@ -10,42 +10,8 @@ from dataclasses import dataclass
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries import parameters as ps
-from protocol.queries.answers import (
-    HistoryAnswer,
-    PointAnswer,
-    Region,
-    Span,
-    decode_change,
-    decode_changes,
-    decode_error,
-    decode_history,
-    decode_info,
-    decode_machine,
-    decode_machines,
-    decode_point,
-    decode_region,
-    encode_change,
-    encode_changes,
-    encode_error,
-    encode_history,
-    encode_info,
-    encode_machine,
-    encode_machines,
-    encode_point,
-    encode_region,
-)
 from protocol.site.geometry import MAX_CELLS, Bounds
 
-# fmt: off
-__all__ = [  # queries, and the answers to them
-    "MAX_SPANS", "MAX_SPAN_S", "MAX_WAIT_S", "NOW", "ChangesQuery", "Freshness", "HistoryAnswer",
-    "HistoryQuery", "InfoQuery", "MachinesQuery", "MapQuery", "PointAnswer", "PointQuery", "Region", "RegionQuery",
-    "Span", "When", "check_size", "decode_change", "decode_changes", "decode_error", "decode_history", "decode_info",
-    "decode_machine", "decode_machines", "decode_point", "decode_region", "encode_change", "encode_changes",
-    "encode_error", "encode_history", "encode_info", "encode_machine", "encode_machines", "encode_point",
-    "encode_query", "encode_region", "parse_query",
-]
-# fmt: on
 MAX_WAIT_S = 60.0
 MAX_SPANS = 2000  # of one history
 MAX_SPAN_S = 1e9
@@ -137,7 +103,7 @@ class ChangesQuery:
     """Changes of the ground with a number beyond `after`."""
 
     after: int = 0
-    fresh = Freshness()  # `after` is another one here
+    fresh = Freshness()  # the `after` of this query is not a journal row
 
     name = "changes"
 
@@ -146,7 +112,7 @@ MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | MachinesQuery |
 
 
 def check_size(columns: int, rows: int) -> None:
-    """Refuse a region that no reply could carry."""
+    """Refuse a region with more cells than one reply may hold."""
     if columns * rows > MAX_CELLS:
         raise QueryError(Refusal.TOO_LARGE, f"region of {columns} x {rows} cells; at most {MAX_CELLS} are answered")
 

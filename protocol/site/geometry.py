@@ -1,7 +1,7 @@
-"""Grid geometry, in pure functions: cells, blocks, tiles, bounds.
+"""Grid geometry, in pure functions: cells, blocks, bounds.
 
 Cell (0, 0) has its south-west corner at the origin of `map`; columns grow to the east, rows to the north. Blocks of
-16 x 16 cells are the unit of memory; tiles are the unit on the wire.
+16 x 16 cells are the unit of memory.
 """
 
 from __future__ import annotations
@@ -50,7 +50,6 @@ class GridGeometry:
     """How positions map to cells."""
 
     cell_m: float = 1.0
-    tile_cells: int = 64
 
     def cell_of(self, position_m: Floats) -> Ints:
         """Column or row of positions along one axis."""
@@ -74,7 +73,3 @@ class GridGeometry:
     def centres(self, first: int, count: int) -> Floats:
         """Centres [m] of `count` cells along one axis."""
         return (np.arange(first, first + count, dtype=np.float64) + 0.5) * self.cell_m
-
-    def tile_of(self, cell: int) -> int:
-        """Tile index of a column or row."""
-        return cell // self.tile_cells

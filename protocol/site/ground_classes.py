@@ -1,4 +1,4 @@
-"""Kinds of ground as the paper tells them apart: names, coefficients, colours, and the classes of a map's cells."""
+"""Kinds of ground as the paper distinguishes them: names, coefficients, colours, and the classes of a map's cells."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Ints
 
-UNKNOWN = -1  # class of a cell where nobody has been
+UNKNOWN = -1  # class of a cell without samples
 
 
 @dataclass(frozen=True)

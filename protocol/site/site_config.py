@@ -1,14 +1,14 @@
-"""The site: its name, its frame `map` (metres east and north of the origin), and the way from latitude and longitude.
+"""The site: its name, its frame `map` (metres east and north of the origin), and the projection to and from WGS 84.
 
-The frame is a transverse Mercator projection at the origin with scale 1 (DESIGN, "Frames, units, time"): x, y are
-metres, every export has a true coordinate reference system, and all machines share it.
+The frame is a transverse Mercator projection at the origin with scale 1 (docs/design.md): x, y are metres, every export
+has a true coordinate reference system, and all machines share it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Floats
-from protocol.config import from_table, load_toml
+from protocol.config import from_table, load_toml, toml_lines
 from protocol.site.geometry import GridGeometry
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
@@ -39,12 +39,12 @@ class KnownGround:
     def inside_m(self, x_m: float, y_m: float) -> float:
         """How far inside of the outline a place lies [m]; negative outside."""
         corners = np.array(self.outline)
-        ways = np.roll(corners, -1, axis=0) - corners
+        sides = np.roll(corners, -1, axis=0) - corners
         off = np.array([x_m, y_m]) - corners
-        share = np.clip((off * ways).sum(axis=1) / np.maximum((ways**2).sum(axis=1), 1e-12), 0, 1)
-        edge_m = float(np.hypot(*(off - share[:, None] * ways).T).min())
+        share = np.clip((off * sides).sum(axis=1) / np.maximum((sides**2).sum(axis=1), 1e-12), 0, 1)
+        edge_m = float(np.hypot(*(off - share[:, None] * sides).T).min())
         above, next_above = off[:, 1] < 0, np.roll(off[:, 1], -1) < 0
-        left = ways[:, 0] * off[:, 1] - ways[:, 1] * off[:, 0]
+        left = sides[:, 0] * off[:, 1] - sides[:, 1] * off[:, 0]
         crossings = (above != next_above) & ((left < 0) == next_above)
         return edge_m if crossings.sum() % 2 else -edge_m
 
@@ -63,7 +63,6 @@ class SiteConfig:
     origin_lon_deg: float
     origin_height_m: float = 0.0
     cell_m: float = 1.0
-    tile_cells: int = 64
     extent_m: float = 20_000.0
     clock: str = "data"
     clock_tolerance_s: float = 5.0
@@ -76,8 +75,6 @@ class SiteConfig:
             raise ValueError("origin_lat_deg, origin_lon_deg: not a place on Earth between 80 S and 84 N")
         if not 0.05 <= self.cell_m <= 100:
             raise ValueError(f"cell_m: {self.cell_m} is not between 0.05 and 100")
-        if self.tile_cells not in (16, 32, 64, 128, 256):
-            raise ValueError(f"tile_cells: {self.tile_cells} is not one of 16, 32, 64, 128, 256")
         if not 10 <= self.extent_m <= 100_000:
             raise ValueError(f"extent_m: {self.extent_m} is not between 10 and 100000")
         if self.clock not in ("data", "wall"):
@@ -101,7 +98,17 @@ class SiteConfig:
     @cached_property
     def geometry(self) -> GridGeometry:
         """The grid of this site."""
-        return GridGeometry(self.cell_m, self.tile_cells)
+        return GridGeometry(self.cell_m)
+
+
+def site_toml(site: SiteConfig) -> str:
+    """The site as TOML."""
+    values = {item.name: getattr(site, item.name) for item in fields(site) if item.name != "known_ground"}
+    areas = [
+        f"{{ {', '.join(toml_lines({'name': area.name, 'c_rr': area.c_rr, 'outline': area.outline}))} }}"
+        for area in site.known_ground
+    ]
+    return "\n".join([*toml_lines(values), f"known_ground = [{', '.join(areas)}]"]) + "\n"
 
 
 class Projection:

@@ -20,7 +20,7 @@ MAX_BATCH_BYTES = 4 * 2**20
 MAX_BATCH_SAMPLES = 20_000
 MAX_BUNDLE_BYTES = 2**20
 MAX_SMALL_BYTES = 64 * 2**10
-MAX_ITEMS = 1000  # of one list, answers aside: the decoder reserves what a header claims, at each depth anew
+MAX_ITEMS = 1000  # of one list, except in answers: the decoder reserves memory for what a header claims
 MAX_DEPTH = 16  # of plain values
 MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
@@ -66,13 +66,13 @@ def check_plain(value: Any, field: str, depth: int = MAX_DEPTH) -> None:
     if depth < 0:
         raise MessageError(Refusal.WRONG_TYPE, f"nested more than {MAX_DEPTH} deep", field=field)
     if isinstance(value, dict):
-        for name, of in value.items():
+        for name, part in value.items():
             if type(name) is not str:
                 raise MessageError(Refusal.WRONG_TYPE, f"the name {name!r:.40} is no text", field=field)
-            check_plain(of, field, depth - 1)
+            check_plain(part, field, depth - 1)
     elif isinstance(value, list):
-        for of in value:
-            check_plain(of, field, depth - 1)
+        for part in value:
+            check_plain(part, field, depth - 1)
     elif not isinstance(value, str | int | float | None):
         raise MessageError(Refusal.WRONG_TYPE, f"{type(value).__name__} is no plain value", field=field)
 
@@ -121,7 +121,7 @@ def encode_batch(batch: SampleBatch) -> bytes:
 
 
 def decode_batch(data: bytes, extent_m: float) -> SampleBatch:
-    """Decode and judge a batch, wholly: one bad sample refuses it, with field and row named.
+    """Decode and check a batch: one bad sample refuses the whole batch, with field and row named.
 
     extent_m: how far from the origin a position may lie. Unknown columns and fields are ignored.
     """
@@ -190,7 +190,7 @@ def _encode_group(sensor: str, kind: str, readings: list[Reading]) -> dict[str, 
 def decode_bundle(data: bytes) -> SensorBundle:
     """Decode a bundle; readings in the order of their stamps.
 
-    A malformed bundle is refused whole; a single implausible reading is left out and counted in `refused`.
+    A malformed bundle is refused as a whole; a single implausible reading is skipped and counted in `refused`.
     """
     table = unpack(data, MAX_BUNDLE_BYTES)
     refused: Counter[str] = Counter()

@@ -1,7 +1,7 @@
-"""What a process proves its name with: one folder of files that `sitegrid keys` makes. The base install is enough.
+"""Credentials of a process: one folder of files that `sitegrid keys` makes. The base install can read it.
 
-identity.toml says in plain words what the certificate says, so that a wrong or outdated folder is named at once: a
-router that refuses only lets the time run out (EVIDENCE: denials are silent).
+identity.toml repeats the certificate's role, name and end as text, so that a wrong or outdated folder is reported at
+once: a router that refuses a certificate does not answer at all.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SIGNING_FILE = "sign.pem"  # machines only
 
 @dataclass(frozen=True)
 class Identity:
-    """Whom a certificate names. role: see docs/security.md. expires: the last moment at which it is taken."""
+    """The holder of a certificate. role: see docs/security.md. expires: the end of its validity."""
 
     site: str
     name: str
@@ -36,13 +36,13 @@ class Credentials:
     identity: Identity
 
     def tls(self, *, listens: bool) -> Mapping[str, object]:
-        """The settings of Zenoh that make both ends of a link prove themselves; it ends when a certificate does."""
+        """Settings of Zenoh for mutual TLS; a link ends when one of its certificates expires."""
         end = "listen" if listens else "connect"
         return {
             "root_ca_certificate": str(self.folder / AUTHORITY_FILE),
             f"{end}_certificate": str(self.folder / CERTIFICATE_FILE),
             f"{end}_private_key": str(self.folder / KEY_FILE),
-            "enable_mtls": True,  # on both ends (EVIDENCE: a client without it shows no certificate)
+            "enable_mtls": True,  # on both ends: a client without it shows no certificate
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
         }

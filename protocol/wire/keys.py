@@ -1,4 +1,4 @@
-"""All key expressions, built and parsed here and nowhere else (DESIGN, "Keys")."""
+"""All key expressions, built and parsed here and nowhere else (docs/protocol.md, "Keys")."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def ingest(site: str, machine: str) -> str:
 
 
 def ingest_all(site: str) -> str:
-    """What the map server of a site answers."""
+    """Samples of all machines of a site, which the map server answers."""
     return f"{ROOT}/{check_name(site, 'site')}/ingest/*"
 
 
@@ -71,7 +71,7 @@ def map_queries_all(site: str) -> str:
 
 
 def changed(site: str) -> str:
-    """Events: an area of the map changed. Subscribers hear it; as a query it is one that is not known."""
+    """Events: an area of the map changed. It is for subscribers; as a query it is refused."""
     return map_query(site, "changed")
 
 

@@ -47,7 +47,7 @@ class Ack:
 class Refused:
     """The server did not take a batch. expected: the next sequence number it would take, 0 where that is not known.
 
-    reason, problem: one line each; what would not print is escaped, here as on the side that reads it.
+    reason, problem: one line each; characters that cannot be printed are escaped.
     """
 
     reason: str
@@ -67,7 +67,7 @@ class SensorBundle:
     counter: int
     readings: tuple[Reading, ...]
     last: bool = False
-    refused: Mapping[str, int] = field(default_factory=dict)  # readings left out when decoding, by reason
+    refused: Mapping[str, int] = field(default_factory=dict)  # readings skipped when decoding, by reason
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Health:
-    """What an agent says of itself. values: nested tables of plain values, shown as they are."""
+    """The health report of one agent. values: nested tables of plain values."""
 
     machine: str
     stamp_ns: int

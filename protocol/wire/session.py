@@ -1,4 +1,4 @@
-"""Zenoh sessions as this project uses them (EVIDENCE: shared memory bypasses namespaces and can drop queries)."""
+"""Zenoh sessions as this project uses them: no scouting, and no shared memory, which can drop queries."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class SessionConfig:
     """How a process joins the network.
 
     mode: "client" connects to a router; "router" is the site's router and listens. wait_s: how long to wait for the
-    router; negative opens at once and goes on looking for it in the background, as an agent does. credentials: with
-    them both ends of every link prove their names, without them nobody does. guard: the router's rules, as Zenoh's
+    router; negative opens at once and goes on looking for it in the background, as an agent does. credentials: for
+    mutual TLS; None for links without encryption. guard: the router's rules, as Zenoh's
     settings.
     """
 
@@ -57,7 +57,7 @@ def open_session(config: SessionConfig) -> zenoh.Session:
 
 
 def _aim(config: SessionConfig) -> str:
-    """What could not be done, and what may be the reason: a link that is refused looks like one that is not there."""
+    """What failed, and the likely reasons: a link that is refused looks like one that is not there."""
     if config.mode == "router":
         return "listen here"
     if config.credentials:

@@ -1,1 +1,5 @@
-"""One module per sub-command; each has `run(arguments) -> exit code`."""
+"""The commands of `sitegrid`, one module each: `HELP`, `add_options(parser)` and `run(arguments)`, the exit code.
+
+A command module imports at its top only what the base install has. What needs an extra is imported inside a function,
+so that every command describes itself in any install, and `sitegrid --help` is quick.
+"""

@@ -4,33 +4,64 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import zenoh
 
-from agents.agent import Agent, Places
-from agents.config import AgentConfig, load_agent
-from agents.delivery.uplink import Sign
-from agents.drivers import Driver
-from agents.drivers.replay import Replay
-from agents.drivers.zenoh import ZenohDriver
-from agents.presence import Owner, find_namesake, this_process
 from protocol.errors import ConfigError, LinkError
-from protocol.machine.log_folder import LogFolder, open_log
-from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig, load_site
 from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.session import SessionConfig, open_session
+from sitegrid.options.groups import add_network
+from sitegrid.options.values import not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
 from sitegrid.security.join import join
 
+if TYPE_CHECKING:
+    from agents.agent import Places
+    from agents.config import AgentConfig
+    from agents.delivery.uplink import Sign
+    from agents.drivers import Driver
+    from agents.presence import Owner
+    from protocol.machine.log_folder import LogFolder
+    from protocol.machine.machine_config import MachineConfig
+
+HELP = "run the localisation agent of one machine"
 LINK_S = 1.0  # how long to wait for the router before starting without it
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add_network(parser)
+    parser.add_argument("--config", type=Path, help="file with machine, sensors and options (config/agent.toml)")
+    parser.add_argument("--site-file", type=Path, help="site file (config/site.toml); not needed with --log")
+    parser.add_argument("--name", help="name of the machine (overrides the config file)")
+    parser.add_argument("--spool", type=Path, required=True, help="file of the spool")
+    parser.add_argument("--audit", type=Path, help="file that lists every recorded sample, to prove that none is lost")
+    parser.add_argument("--calibration", type=Path, help="calibration file (default: beside the spool)")
+    parser.add_argument(
+        "--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)"
+    )
+    parser.add_argument("--log", type=Path, help="replay: manifest of the log")
+    parser.add_argument("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
+    parser.add_argument(
+        "--speed", type=not_negative, default=1.0, help="replay: speed relative to real time; 0 as fast as possible"
+    )
+    parser.add_argument(
+        "--withhold",
+        action="store_true",
+        help="withhold part of the GPS fixes ([holdout]) and report the error against them",
+    )
 
 
 def run(arguments: Namespace) -> int:
     """Run until the stream ends or the process is stopped; the router may come and go."""
+    from agents.agent import Agent
+    from protocol.machine.log_folder import open_log
+
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
     site, machine, config = _configure(arguments, log)
@@ -64,7 +95,9 @@ def _open(settings: SessionConfig) -> zenoh.Session:
 
 
 def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) -> Owner:
-    """Refuse to start beside a live agent of the same name."""
+    """Refuse to start while another agent of the same name runs."""
+    from agents.presence import find_namesake, this_process
+
     owner = this_process()
     if other := find_namesake(session, site, machine):
         problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"
@@ -84,11 +117,15 @@ def _signer(keys: Path | None) -> Sign | None:
 
 def _places(arguments: Namespace) -> Places:
     """Files of the agent; the calibration lies beside the spool, if nothing else is asked for."""
+    from agents.agent import Places
+
     calibration = arguments.calibration or arguments.spool.with_suffix(".calibration.json")
     return Places(arguments.spool, arguments.audit, calibration)
 
 
 def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig, MachineConfig, AgentConfig]:
+    from agents.config import AgentConfig, load_agent
+
     machine, config = load_agent(arguments.config) if arguments.config else (None, AgentConfig())
     if arguments.driver == "replay" and log is None:
         raise ConfigError("sitegrid agent", "--driver replay needs --log MANIFEST")
@@ -107,6 +144,9 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
 def _driver(
     arguments: Namespace, log: LogFolder | None, session: zenoh.Session, site: SiteConfig, machine: MachineConfig
 ) -> Driver:
+    from agents.drivers.replay import Replay
+    from agents.drivers.zenoh import ZenohDriver
+
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)
     return ZenohDriver(session, site.name, machine.name)

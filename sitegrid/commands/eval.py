@@ -2,17 +2,87 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from benchmarks.measure import table
+from sitegrid.options.groups import Subparsers, add_action
+from sitegrid.options.values import count, positive, seed, withhold
 from sitegrid.process.lifetime import note, plain, say
 from sitegrid.process.progress import Display
 
+HELP = "run the accuracy experiments"
 Tables = dict[str, Any]
 MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side
 SHOWN = (list, dict)  # values of a row that a table for people has no room for
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command: those of each experiment."""
+    experiments = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
+    physics = add_action(
+        experiments, "physics", "compare the simulator with mechanics, and its two worlds with each other"
+    )
+    _add_seeds(physics, 3)
+    parity = add_action(experiments, "parity", "compare final poses with those that robot_localization's tests expect")
+    parity.add_argument(
+        "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
+    )
+    table = add_action(experiments, "localisation", "repeat the paper's table on simulated recordings")
+    _add_recorded(table, 1200.0)
+    table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
+    table.add_argument("--plots", type=Path, help="folder to draw errors over time, tracks and the table into")
+    ground = add_action(
+        experiments, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work"
+    )
+    _add_recorded(ground, 600.0)
+    ground.add_argument("--plots", type=Path, help="folder to draw estimates along the way, errors by place into")
+    merge = add_action(experiments, "merge", "compare this map merge with other methods")
+    _add_kept(merge)
+    merge.add_argument("--cases", default="", help="names, comma-separated; default all")
+    merge.add_argument("--plots", type=Path, help="folder to draw the maps of the first seed and the table into")
+    _add_log(experiments)
+
+
+def _add_log(experiments: Subparsers) -> None:
+    log = add_action(experiments, "log", "replay a real log and compare with withheld fixes or with its ground truth")
+    log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
+    log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
+    log.add_argument(
+        "--withhold",
+        action="append",
+        type=withhold,
+        metavar="OFF/PERIOD",
+        help="OFF seconds without GPS in every PERIOD seconds; may be repeated (default none, 1/10, 10/30, 30/60)",
+    )
+    log.add_argument("--gps", type=count, help="number of GPS receivers to use")
+    log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="filter (default %(default)s)")
+    log.add_argument(
+        "--profile", choices=("default", "paper"), default="default", help="filter profile (default %(default)s)"
+    )
+
+
+def _add_recorded(parser: ArgumentParser, seconds: float) -> None:
+    """Options of what runs on recordings that are kept."""
+    _add_kept(parser)
+    parser.add_argument(
+        "--seconds", type=positive, default=seconds, help="length of each recording in seconds (default %(default)g)"
+    )
+
+
+def _add_kept(parser: ArgumentParser) -> None:
+    """Options of what keeps its results by seed."""
+    _add_seeds(parser, 12)
+    parser.add_argument(
+        "--out", type=Path, default=Path("eval-output"), help="folder for recordings and results (default %(default)s)"
+    )
+    parser.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
+
+
+def _add_seeds(parser: ArgumentParser, usual: int) -> None:
+    parser.add_argument("--seeds", type=count, default=usual, help="number of seeds (default %(default)s)")
+    parser.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
 
 
 def run(arguments: Namespace) -> int:
@@ -121,6 +191,8 @@ def _seeds(arguments: Namespace) -> range:
 
 def _lines(result: Tables) -> list[str]:
     """For people: values on a line of their own, rows as tables."""
+    from benchmarks.measure import table
+
     lines = []
     for name, value in result.items():
         if isinstance(value, list) and value and isinstance(value[0], dict):

@@ -2,232 +2,36 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import sys
-import time
-from argparse import Namespace
-from collections import Counter
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
 
-from mapserver.config import ServerConfig
-from mapserver.ingest.store import JOURNAL_FILE, Store
-from mapserver.journal.archive import FOLDER, Archive, ArchiveFile
-from mapserver.journal.history import Copier, History, Spool, history_rows, merged
-from mapserver.journal.journal import Journal, JournalReader
-from mapserver.journal.rows import JournalRow, Mark, Wanted
-from protocol.config import from_table, load_toml
-from protocol.errors import ConfigError
-from protocol.machine.machine_config import plain_lines
-from protocol.machine.readings import MAX_STAMP_NS
-from protocol.site.site_config import SiteConfig, load_site
-from sitegrid.process.lifetime import say
-from sitegrid.process.progress import Display
+from sitegrid.options.times import STAMP_HELP, parse_stamp
+from sitegrid.options.values import positive
 
-SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
-COMMIT_ROWS = 500
+HELP = "build a new store from archives, with other parameters"
 
 
-@dataclass(frozen=True)
-class Source:
-    """Rows of a file or a store. site: where it says so; first_ns: when its first row was received."""
-
-    path: Path
-    name: str
-    frame: str
-    site: SiteConfig | None
-    machines: frozenset[str]
-    samples: int
-    first_ns: int
-    rows: Iterator[JournalRow]
-    marks: Mapping[Spool, Mark] = field(default_factory=dict)
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument(
+        "archives", type=Path, nargs="+", metavar="ARCHIVE", help="a Parquet file, a folder of them, or a store"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="STORE", help="folder of the new store")
+    parser.add_argument("--site-file", type=Path, help="site file, if the archives hold no site (site.toml)")
+    parser.add_argument(
+        "--cell", type=positive, metavar="M", help="edge of a cell in metres (default: that of the site)"
+    )
+    parser.add_argument("--config", type=Path, help="file with options (config/server.toml)")
+    parser.add_argument(
+        "--without", action="append", default=[], metavar="MACHINE", help="exclude this machine; may be repeated"
+    )
+    for name, what in (("from", "at or after T"), ("until", "before T")):
+        summary = f"only samples with a stamp {what}; T: {STAMP_HELP}"
+        parser.add_argument(f"--{name}", type=parse_stamp, dest=f"{name}_ns", metavar="T", help=summary)
 
 
 def run(arguments: Namespace) -> int:
     """Fold once and print what became of the samples."""
-    wanted = Wanted(
-        from_ns=arguments.from_ns or 0,
-        to_ns=MAX_STAMP_NS if arguments.until_ns is None else arguments.until_ns - 1,
-        without=frozenset(arguments.without),
-    )
-    if wanted.to_ns < wanted.from_ns:
-        raise ConfigError("--until", "is not after --from, so no time is left between them")
-    if arguments.out.exists() and (not arguments.out.is_dir() or any(arguments.out.iterdir())):
-        raise ConfigError(arguments.out, "exists and is not empty; choose another --out")
-    with ExitStack() as opened:
-        sources = [source for path in arguments.archives for source in _sources(path, wanted, opened)]
-        site = _site(sources, arguments)
-        config, config_text = _config(arguments)
-        if unknown := sorted(wanted.without - {name for source in sources for name in source.machines}):
-            known = ", ".join(sorted({name for source in sources for name in source.machines}))
-            raise ConfigError("--without", f"{unknown[0]!r} is no machine of these archives; they are: {known}")
-        summary = _build(arguments, sources, site, config, config_text, wanted)
-    say(summary) if arguments.json else print("\n".join(_lines(summary)))
-    return 0
+    from sitegrid.refold import run as refold
 
-
-def _build(
-    arguments: Namespace, sources: list[Source], site: SiteConfig, config: ServerConfig, text: str, wanted: Wanted
-) -> dict[str, Any]:
-    """Make the store beside its place, and put it there when it is complete."""
-    part = arguments.out.with_name(f"{arguments.out.name}.part")
-    try:
-        part.mkdir(parents=True)
-    except FileExistsError:
-        raise ConfigError(part, "is left from a fold that was killed; remove it") from None
-    try:
-        copier = _copy(part, sources, site, wanted, headless=arguments.json)
-        (part / SITE_FILE).write_text("\n".join(_site_lines(site)) + "\n", encoding="utf-8")
-        (part / CONFIG_FILE).write_text(text, encoding="utf-8")
-        info = _fold(part, site, config)
-        part.replace(arguments.out)
-    except BaseException:
-        shutil.rmtree(part)
-        raise
-    return {
-        "store": str(arguments.out),
-        "archives": len(sources),
-        "rows": info["journalled"],
-        "samples": copier.kept.total(),
-        "left_out": dict(copier.left_out),
-        "too_unsure": info["samples_too_unsure"],
-        "machines": _by_machine(copier.kept),
-        "cells": info["cells"],
-        "cell_m": site.cell_m,
-    }
-
-
-def _sources(path: Path, wanted: Wanted, opened: ExitStack) -> Iterator[Source]:
-    """What a Parquet file, a folder of them or a store holds; by time only what is wanted is read."""
-    in_time = Wanted(from_ns=wanted.from_ns, to_ns=wanted.to_ns)
-    if (path / JOURNAL_FILE).exists():
-        yield _store(path, in_time, opened)
-        return
-    if not path.exists():
-        raise ConfigError(path, "no such file or folder")
-    files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
-    if not files:
-        raise ConfigError(path, f"holds neither Parquet files nor a {JOURNAL_FILE}")
-    for file in map(ArchiveFile, files):
-        said, rows = file.header, file.read(wanted=in_time)
-        machines = frozenset(said.machines)
-        yield Source(
-            file.path, said.site.name, said.frame, said.site, machines, file.samples, file.first_received_ns, rows
-        )
-
-
-def _store(path: Path, wanted: Wanted, opened: ExitStack) -> Source:
-    journal = opened.enter_context(JournalReader(path / JOURNAL_FILE))
-    history, marks = History.of(journal), journal.marks()
-    first = next(history_rows(history), None)
-    samples = sum(mark.seq - mark.lost for mark in marks.values())
-    machines = frozenset(machine for machine, _ in marks)
-    first_ns = first.received_ns if first else 0
-    rows = history_rows(history, wanted=wanted)
-    return Source(path, journal.site, journal.frame, _site_of(path), machines, samples, first_ns, rows, marks)
-
-
-def _site_of(store: Path) -> SiteConfig | None:
-    """The site as a store knows it: a file of its own, or the header of its newest archive."""
-    if (store / SITE_FILE).exists():
-        return load_site(store / SITE_FILE)
-    paths = Archive(store / FOLDER).paths()
-    return ArchiveFile(paths[-1]).header.site if paths else None
-
-
-def _site(sources: list[Source], arguments: Namespace) -> SiteConfig:
-    """The one site of all sources, with what the options change."""
-    for source in sources[1:]:
-        if (source.name, source.frame) != (sources[0].name, sources[0].frame):
-            problem = f"is of site {source.name!r}, frame {source.frame}"
-            problem += f", but {sources[0].path} of {sources[0].name!r}, {sources[0].frame}; fold them apart"
-            raise ConfigError(source.path, problem)
-    said = load_site(arguments.site_file) if arguments.site_file else None
-    site = said or next((source.site for source in sources if source.site), None)
-    if not site:
-        raise ConfigError(sources[0].path, "does not say where its site is; give --site-file")
-    if (site.name, site.frame) != (sources[0].name, sources[0].frame):
-        problem = f"is site {site.name!r}, frame {site.frame}, the archives are of {sources[0].name!r}"
-        raise ConfigError(arguments.site_file or SITE_FILE, f"{problem}, frame {sources[0].frame}")
-    try:
-        return replace(site, cell_m=arguments.cell or site.cell_m)
-    except ValueError as error:
-        raise ConfigError("--cell", str(error)) from None
-
-
-def _config(arguments: Namespace) -> tuple[ServerConfig, str]:
-    """The server's options and their text: from --config, else from the first store that has its own."""
-    kept = (path / CONFIG_FILE for path in arguments.archives if (path / JOURNAL_FILE).exists())
-    path = arguments.config or next((file for file in kept if file.exists()), None)
-    if not path:
-        return ServerConfig(), "# Every option has its default.\n"
-    return from_table(ServerConfig, load_toml(path), str(path)), path.read_text(encoding="utf-8")
-
-
-def _copy(part: Path, sources: list[Source], site: SiteConfig, wanted: Wanted, *, headless: bool) -> Copier:
-    """Write the journal of the new store."""
-    journal = Journal(part / JOURNAL_FILE, site.name, site.frame)
-    copier = Copier(journal, site.frame, wanted)
-    total, done = sum(source.samples for source in sources), 0
-    sources = sorted(sources, key=lambda source: (source.first_ns, sorted(source.machines), source.path))
-    origins = [(str(source.path), source.first_ns, source.rows) for source in sources]
-    hidden = headless or not sys.stderr.isatty() or not find_spec("rich")
-    with closing(journal), ExitStack() as ending:
-        ending.callback(journal.rollback)  # after an error; a journal is not closed inside of a transaction
-        display = None if hidden else ending.enter_context(Display("samples are copied", headless=False))
-        journal.begin()
-        for number, (origin, row) in enumerate(merged(origins)):
-            copier.add(origin, row)
-            done += len(row.rows)
-            if number % COMMIT_ROWS == COMMIT_ROWS - 1:
-                journal.commit()
-                journal.begin()
-                if display:
-                    display.show(done, total, f"{done / 1e6:.2f} of {total / 1e6:.2f} M samples")
-        copier.left_out["time"] += max(0, total - done)  # whole batches and files that were passed over
-        copier.finish({spool: mark.seq for source in sources for spool, mark in source.marks.items()})
-        journal.commit()
-    if not copier.kept.total():
-        raise ConfigError("sitegrid fold", f"no sample is left: {json.dumps(copier.left_out)} are left out")
-    return copier
-
-
-def _fold(part: Path, site: SiteConfig, config: ServerConfig) -> dict[str, Any]:
-    """Fold the new journal as a server would, and leave a snapshot to start from."""
-    with closing(Store(part, site, config, time.time_ns)) as store:
-        store.save_snapshot()
-        return store.info()
-
-
-def _site_lines(site: SiteConfig) -> list[str]:
-    """A site as TOML."""
-    grounds = [
-        f"{{ name = {json.dumps(g.name)}, c_rr = {g.c_rr}, outline = {json.dumps(g.outline)} }}"
-        for g in site.known_ground
-    ]
-    return [*plain_lines(site), f"known_ground = [{', '.join(grounds)}]"]
-
-
-def _by_machine(kept: Mapping[Spool, int]) -> dict[str, int]:
-    machines: Counter[str] = Counter()
-    for (machine, _), samples in kept.items():
-        machines[machine] += samples
-    return dict(sorted(machines.items()))
-
-
-def _lines(summary: Mapping[str, Any]) -> list[str]:
-    """The summary for people."""
-    left, store = summary["left_out"], summary["store"]
-    size = f"{summary['rows']} journal rows, {summary['cells']} cells of {summary['cell_m']:g} m"
-    return [
-        f"{store}: {summary['samples']} samples in {size}",
-        *(f"  {machine}: {samples} samples" for machine, samples in summary["machines"].items()),
-        f"  left out: {left['machine']} of machines, {left['time']} by time, {left['twice']} that came twice",
-        f"  too unsure of their place to vote: {summary['too_unsure']}",
-        f"sitegrid server --store {store} --site-file {store}/{SITE_FILE} --config {store}/{CONFIG_FILE}",
-    ]
+    return refold(arguments)

@@ -3,20 +3,78 @@
 from __future__ import annotations
 
 import math
-from argparse import Namespace
+import re
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
-from protocol.queries.requests import Region
+from protocol.queries.answers import GroundChange, MachineState, Region
 from sitegrid.client import Client, connect
-from sitegrid.commands.times import SiteTime, told
+from sitegrid.options.groups import Subparsers, add_action, add_network, add_site
+from sitegrid.options.times import HELP as TIME_HELP
+from sitegrid.options.times import SiteTime, parse_time, utc_text
+from sitegrid.options.values import positive
 from sitegrid.process.lifetime import plain, say, stop_flag, wait
 
+HELP = "ask the map"
 HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of a table for people, unless named
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add_network(parser)
+    add_site(parser)
+    parser.add_argument(
+        "--after",
+        type=int,
+        default=0,
+        help="wait until this journal row is in the map; for changes: list those after this number",
+    )
+    parser.add_argument("--layers", default="", help="layers, comma-separated; default all")
+    queries = parser.add_subparsers(metavar="QUERY", required=True, dest="ask")
+    point = _add_query(queries, "point", "the cell at a position, in metres")
+    _add_place(point)
+    _add_when(point)
+    region = _add_query(queries, "region", "a rectangle of cells, in metres")
+    for side in ("west_m", "south_m", "east_m", "north_m"):
+        region.add_argument(side, type=float)
+    region.add_argument("--out", type=Path, help="write coordinates and layers into this .npz file")
+    _add_when(region)
+    history = _add_query(queries, "history", "the cell at a position over time")
+    _add_place(history)
+    _add_times(history, ("from", "samples from this time on"), ("to", "samples up to this time; default the newest"))
+    history.add_argument("--span", type=positive, metavar="SECONDS", help="length of one span; default 5 minutes")
+    _add_query(queries, "machines", "state of each machine: samples, trust, reasons")
+    changes = _add_query(queries, "changes", "list of ground changes: place and time")
+    changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
+    _add_query(queries, "info", "state of the map and its server")
+
+
+def _add_query(queries: Subparsers, name: str, summary: str) -> ArgumentParser:
+    return add_action(queries, name, summary, summary[0].upper() + summary[1:] + ".")
+
+
+def _add_place(query: ArgumentParser) -> None:
+    query.add_argument("x_m", type=float)
+    query.add_argument("y_m", type=float)
+
+
+def _add_when(query: ArgumentParser) -> None:
+    _add_times(query, ("as-of", "the map as of this time"), ("minus", "subtract the map as of this time"))
+
+
+def _add_times(query: ArgumentParser, *options: tuple[str, str]) -> None:
+    for name, summary in options:
+        dest = f"{name.replace('-', '_')}_time"
+        query.add_argument(f"--{name}", dest=dest, type=parse_time, metavar="TIME", help=summary)
+    query.epilog = f"TIME: {TIME_HELP}."
+    # argparse knows no public way to say that -2h is a value as -2 is one, not an option
+    query._negative_number_matcher = re.compile(r"-\.?\d.*")  # noqa: SLF001
 
 
 def run(arguments: Namespace) -> int:
@@ -72,7 +130,7 @@ def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> N
         print("nobody was there")
         return
     names = list(spans[0].values)
-    _table(["from (UTC)", *names], ([told(s.first_ns), *(_value(s.values[name]) for name in names)] for s in spans))
+    _table(["from (UTC)", *names], ([utc_text(s.first_ns), *(_value(s.values[name]) for name in names)] for s in spans))
 
 
 def _machines(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
@@ -83,12 +141,12 @@ def _machines(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
     _table(["machine", "trusted", "since", "samples", "lost", "newest", "why"], map(_machine_row, machines))
 
 
-def _machine_row(machine: Mapping[str, Any]) -> list[str]:
-    reasons = ", ".join([*machine.get("reasons", ()), *filter(None, [machine.get("reason")])])
-    trusted = ("yes" if machine["trusted"] else "NO") + (f", by {machine['by']}" if machine.get("by") else "")
-    since = told(machine["since_ns"]) if machine.get("since_ns") else "-"
-    numbers = [str(machine.get(name, "-")) for name in ("samples", "lost")]
-    return [machine["name"], trusted, since, *numbers, told(machine.get("newest_ns", 0)), reasons or "-"]
+def _machine_row(machine: MachineState) -> list[str]:
+    reasons = ", ".join([*machine.reasons, *filter(None, [machine.reason])])
+    trusted = ("yes" if machine.trusted else "NO") + (f", by {machine.by}" if machine.by else "")
+    since = utc_text(machine.since_ns) if machine.since_ns else "-"
+    counts = [str(machine.samples), str(machine.lost)]
+    return [machine.name, trusted, since, *counts, utc_text(machine.newest_ns), reasons or "-"]
 
 
 def _changes(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
@@ -100,7 +158,7 @@ def _changes(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
         say(plain({"changes": changes}))
         return
     for change in changes:
-        print(_told_change(change))
+        print(_change_line(change))
     if not changes:
         print("no change of the ground was found")
 
@@ -109,8 +167,8 @@ def _follow_changes(client: Client, arguments: Namespace) -> None:
     """First what is known, then what is found; listens before it asks, so that none is missed in between."""
     stop = stop_flag()
 
-    def show(change: Mapping[str, Any]) -> None:
-        say(plain(change)) if arguments.json else print(_told_change(change), flush=True)
+    def show(change: GroundChange) -> None:
+        say(plain(change)) if arguments.json else print(_change_line(change), flush=True)
 
     listener = client.on_change(show)
     for change in client.changes(arguments.after):
@@ -119,12 +177,15 @@ def _follow_changes(client: Client, arguments: Namespace) -> None:
     listener.close()
 
 
-def _told_change(change: Mapping[str, Any]) -> str:
-    west, south, east, north = change["bounds"]
-    parts = [f"{change['id']}: {told(change['first_ns'])} to {told(change['last_ns'])}"]
-    parts += [f"{west:g}..{east:g} x {south:g}..{north:g} m", f"{change['cells']} cells"]
-    for name in ("resistance", "grade"):
-        before, after = (change.get(f"{name}_{side}") for side in ("before", "after"))
+def _change_line(change: GroundChange) -> str:
+    west, south, east, north = change.bounds
+    parts = [f"{change.id}: {utc_text(change.first_ns)} to {utc_text(change.last_ns)}"]
+    parts += [f"{west:g}..{east:g} x {south:g}..{north:g} m", f"{change.cells} cells"]
+    values = {
+        "resistance": (change.resistance_before, change.resistance_after),
+        "grade": (change.grade_before, change.grade_after),
+    }
+    for name, (before, after) in values.items():
         if before is not None or after is not None:
             parts.append(f"{name} {_value(before)} -> {_value(after)}")
     return "  ".join(parts)
@@ -135,12 +196,12 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
     if arguments.json:
         say(plain(info))
         return
-    print(f"site {info['site']['name']}: {info['cells']} cells known, bounds {info['bounds']}")
-    print(f"  journal row {info['journalled']}, merged {info['merged']}, snapshot {info['snapshot']}")
-    print(f"  samples merged {info['samples_merged']}, too unsure of their place {info['samples_too_unsure']}")
-    for name, machine in sorted(info["machines"].items()):
-        print(f"  {name}: {machine['samples']} samples, {machine['lost']} lost, {machine['spools']} spools")
-    for name, count in sorted(info["counters"].items()):
+    print(f"site {info.site.name}: {info.cells} cells known, bounds {info.bounds and list(info.bounds)}")
+    print(f"  journal row {info.journalled}, merged {info.merged}, snapshot {info.snapshot}")
+    print(f"  samples merged {info.samples_merged}, too unsure of their place {info.samples_too_unsure}")
+    for name, sent in sorted(info.machines.items()):
+        print(f"  {name}: {sent.samples} samples, {sent.lost} lost, {sent.spools} spools")
+    for name, count in sorted(info.counters.items()):
         print(f"  {name}: {count}")
 
 
@@ -158,7 +219,7 @@ def _stamps(client: Client, **times: SiteTime | None) -> dict[str, Any]:
     """Times of options as the client's arguments: `as_of` becomes `as_of_ns`."""
 
     def now_ns() -> int:
-        return int(client.info()["stamp_ns"])
+        return client.info().stamp_ns
 
     given = {name: time for name, time in times.items() if time}
     return {f"{name}_ns": time.stamp(f"--{name.replace('_', '-')}", now_ns) for name, time in given.items()}
@@ -166,8 +227,8 @@ def _stamps(client: Client, **times: SiteTime | None) -> dict[str, Any]:
 
 def _as_of(when: Mapping[str, int], stamp_ns: int) -> str:
     """What to say of the time of an answer, nothing where it is the map as it is."""
-    as_of = f", as of {told(stamp_ns)}" if "as_of_ns" in when else ""
-    return as_of + (f", minus that of {told(when['minus_ns'])}" if "minus_ns" in when else "")
+    as_of = f", as of {utc_text(stamp_ns)}" if "as_of_ns" in when else ""
+    return as_of + (f", minus that of {utc_text(when['minus_ns'])}" if "minus_ns" in when else "")
 
 
 def _value(value: float | None) -> str:

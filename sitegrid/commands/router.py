@@ -1,22 +1,33 @@
-"""`sitegrid router`: a Zenoh session in router mode is a full site router (EVIDENCE, Zenoh)."""
+"""`sitegrid router`: the site's router, which is a Zenoh session in router mode."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from datetime import UTC, datetime
 from pathlib import Path
 
 from protocol.errors import ConfigError
 from protocol.wire.credentials import check_valid, load_credentials
-from protocol.wire.session import SessionConfig, open_session
+from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, open_session
 from sitegrid.process.lifetime import say, stop_flag, wait
 from sitegrid.security.access import router_settings
 from sitegrid.security.join import is_loopback, with_keys
 from sitegrid.security.register import REGISTER_FILE, ROUTER, Register, load_register
 
+HELP = "run the site's Zenoh router"
 log = logging.getLogger("sitegrid.router")
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("--listen", default=DEFAULT_ENDPOINT, help="endpoint to listen on (default %(default)s)")
+    safety = parser.add_mutually_exclusive_group()
+    safety.add_argument(
+        "--keys", type=Path, metavar="KEYS", help="folder with the site's keys; the default endpoint is tls/... then"
+    )
+    safety.add_argument("--insecure", action="store_true", help="accept connections from other hosts without keys")
 
 
 def run(arguments: Namespace) -> int:
@@ -30,7 +41,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None:
-    """Without keys whoever gets here may do everything: so nobody from elsewhere does, unless that is asked for."""
+    """Route without keys: whoever connects may do everything, so only this host may, unless --insecure is given."""
     on_this_host = is_loopback(endpoint)
     if not (on_this_host or insecure):
         advice = "pass --keys (`sitegrid keys init`), listen on tcp/127.0.0.1:7447, or say --insecure"
@@ -43,10 +54,10 @@ def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None
 
 
 def _route_guarded(folder: Path, endpoint: str, stop: threading.Event) -> None:
-    """With keys. Zenoh reads rules when a session opens, so a changed register means a new session.
+    """Route with keys. Zenoh reads its rules when a session opens, so a changed register needs a new session.
 
-    Links are cut for half a second then; whoever may, is back by itself. A register that cannot be read changes
-    nothing.
+    All links are cut for half a second then; those that are allowed connect again by themselves. A register that cannot
+    be read changes nothing.
     """
     text, register = _text(folder), load_register(folder)
     session = open_session(_guarded(folder, endpoint, register))
@@ -63,7 +74,7 @@ def _route_guarded(folder: Path, endpoint: str, stop: threading.Event) -> None:
             continue
         session.close()  # type: ignore[no-untyped-call]
         session = open_session(config)
-        say({"renewed": "rules", "names": len(register.admitted())})
+        say({"reloaded": "rules", "names": len(register.admitted())})
     session.close()  # type: ignore[no-untyped-call]
 
 

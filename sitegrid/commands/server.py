@@ -3,28 +3,58 @@
 from __future__ import annotations
 
 import time
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import zenoh
 
-from mapserver.config import ServerConfig
-from mapserver.evidence.grid import warm_up
-from mapserver.ingest.store import Verify
-from mapserver.monitoring.exporter import Exporter, HealthEar, text_of
-from mapserver.server import Server
 from protocol.config import from_table, load_toml
 from protocol.site.site_config import load_site
 from protocol.version import package_version
 from protocol.wire.session import open_session
+from sitegrid.options.groups import add_network
+from sitegrid.options.values import address
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
 from sitegrid.security.join import join
 from sitegrid.security.register import load_register
 
+if TYPE_CHECKING:
+    from mapserver.ingest.store import Verify
+    from mapserver.server import Server
+
+HELP = "run the map server of a site"
+METRICS_PORT = 9464
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add_network(parser)
+    parser.add_argument(
+        "--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)"
+    )
+    parser.add_argument("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
+    parser.add_argument("--config", type=Path, help="file with options (config/server.toml)")
+    parser.add_argument(
+        "--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register"
+    )
+    parser.add_argument(
+        "--metrics",
+        type=address,
+        nargs="?",
+        const=("127.0.0.1", METRICS_PORT),
+        metavar="[HOST:]PORT",
+        help=f"serve Prometheus metrics over HTTP; without a value at 127.0.0.1:{METRICS_PORT}",
+    )
+
 
 def run(arguments: Namespace) -> int:
     """Serve until stopped; then finish what has come in, commit, snapshot."""
+    from mapserver.config import ServerConfig
+    from mapserver.evidence.grid import warm_up
+    from mapserver.server import Server
+
     stop = stop_flag()
     return_large_blocks()
     site = load_site(arguments.site_file)
@@ -51,15 +81,15 @@ def _verifier(keys: Path | None) -> Verify | None:
     """What checks signatures by the register in a folder of keys, as it is now."""
     if keys is None:
         return None
-    from sitegrid.security.signing import (
-        Verifier,  # imported here: only a server that asks for signatures needs `cryptography`
-    )
+    from sitegrid.security.signing import Verifier  # only a server that asks for signatures needs `cryptography`
 
     return Verifier(load_register(keys).signing_keys()).check
 
 
 def _export(opened: ExitStack, session: zenoh.Session, server: Server, site: str, arguments: Namespace) -> str:
     """Show metrics for as long as the server runs; returns where."""
+    from mapserver.monitoring.exporter import Exporter, HealthEar, text_of
+
     store: Path = arguments.store
     ear = opened.enter_context(closing(HealthEar(session, site)))
 

@@ -1,27 +1,65 @@
-"""`sitegrid sim`: simulated machines publish what their sensors say."""
+"""`sitegrid sim`: simulated machines publish the readings of their sensors."""
 
 from __future__ import annotations
 
 import dataclasses
 import threading
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from protocol.errors import ConfigError
-from protocol.machine.machine_config import machine_toml, plain_lines
-from sim.config import SimConfig, load_sim, resolve
-from sim.publisher import run as publish
-from sim.recorder import record
+from protocol.site.site_config import site_toml
+from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import END_S, note, say, stop_flag
 from sitegrid.process.progress import Display
 from sitegrid.security.join import join
 
+if TYPE_CHECKING:
+    from sim.config import SimConfig
+
+HELP = "run the simulator: machines drive and publish sensor readings"
 OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site")
 ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
 
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add_network(parser)
+    parser.add_argument("--config", type=Path, help="file with options (config/sim.toml)")
+    parser.add_argument(
+        "--scenario", help="name of a scenario, or the path of its .toml file (overrides the config file)"
+    )
+    parser.add_argument(
+        "--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)"
+    )
+    parser.add_argument(
+        "--preset", help="sensor error preset: paper, dgps, standalone, rtk or harsh (overrides the scenario)"
+    )
+    for name, kind, what in (
+        ("seconds", float, "simulated time in seconds; 0 runs until stopped"),
+        ("speed", float, "speed relative to real time; 0 as fast as possible"),
+        ("machines", int, "number of machines in the scenario's first fleet"),
+        ("seed", int, "random seed"),
+    ):
+        parser.add_argument(f"--{name}", type=kind, help=f"{what} (overrides the config file)")
+    parser.add_argument("--site", help="name of the site in keys (overrides the config file)")
+    parser.add_argument("--truth", type=Path, help="folder for the true map and the true tracks")
+    parser.add_argument(
+        "--record", type=Path, help="folder for log folders, one per machine; nothing is published then"
+    )
+    parser.add_argument("--all-sensors", action="store_true", help="use every GPS receiver and IMU of the machines")
+    parser.add_argument("--picture", type=Path, help="draw the site into this file (plan and perspective), then exit")
+    parser.add_argument(
+        "--write-configs", type=Path, help="write site.toml and one agent file per machine into this folder, then exit"
+    )
+
+
 def run(arguments: Namespace) -> int:
     """Publish, record, draw, or write the configurations that go with the simulation."""
+    from sim.config import resolve
+    from sim.publisher import run as publish
+
     stop = stop_flag(None if arguments.record else END_S)  # a recording is written at its end, whole
     config = _config(arguments)
     if arguments.write_configs:
@@ -47,6 +85,9 @@ def run(arguments: Namespace) -> int:
 
 
 def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> int:
+    from sim.config import resolve
+    from sim.recorder import record
+
     display = Display("machines drive", headless=arguments.json)
     seconds = resolve(config).seconds
     with display:
@@ -70,10 +111,13 @@ def _draw(config: SimConfig, arguments: Namespace) -> None:
 
 def write_configs(config: SimConfig, folder: Path) -> list[Path]:
     """Write `site.toml` and `<machine>.toml` for the agents: nominal values, nothing of the truth."""
+    from protocol.machine.machine_config import machine_toml
+    from sim.config import resolve
+
     scenario = resolve(config)
     machines = [rig.machine for rig in scenario.rigs()]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "site.toml").write_text("\n".join(plain_lines(scenario.site)) + "\n", encoding="utf-8")
+    (folder / "site.toml").write_text(site_toml(scenario.site), encoding="utf-8")
     paths = [folder / f"{machine.name}.toml" for machine in machines]
     for path, machine in zip(paths, machines, strict=True):
         path.write_text(machine_toml(machine), encoding="utf-8")
@@ -81,6 +125,8 @@ def write_configs(config: SimConfig, folder: Path) -> list[Path]:
 
 
 def _config(arguments: Namespace) -> SimConfig:
+    from sim.config import SimConfig, load_sim
+
     config = load_sim(arguments.config) if arguments.config else SimConfig()
     over = {name: getattr(arguments, name) for name in OVER if getattr(arguments, name) is not None}
     if "machines" in over and over["machines"] != config.machines:

@@ -1,29 +1,53 @@
-"""`sitegrid trust` and `sitegrid distrust`: say whether a machine's samples are used."""
+"""`sitegrid trust`: use a machine's samples, even if they contradict other machines."""
 
 from __future__ import annotations
 
-from argparse import Namespace
-from typing import Any
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
 
+from protocol.queries.answers import TrustAnswer
 from sitegrid.client import Client, connect
+from sitegrid.options.groups import add_network, add_site
+from sitegrid.options.values import not_negative
 from sitegrid.process.lifetime import plain, say
+
+HELP = "use a machine's samples, even if they contradict other machines"
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add_network(parser)
+    parser.add_argument("--auto", action="store_true", help="let the map server decide again")
+    add_decision(parser)
+
+
+def add_decision(parser: ArgumentParser) -> None:
+    """Options of every decision about a machine."""
+    parser.add_argument("machine", metavar="MACHINE")
+    add_site(parser)
+    parser.add_argument(
+        "--wait",
+        type=not_negative,
+        default=30.0,
+        help="seconds to wait until the map is folded again (default %(default)g)",
+    )
 
 
 def run(arguments: Namespace) -> int:
+    """Trust the machine, or leave it to the map server."""
+    machine, wait_s = arguments.machine, arguments.wait
+    if arguments.auto:
+        return decide(arguments, lambda client: client.judge_automatically(machine, wait_s=wait_s))
+    return decide(arguments, lambda client: client.trust(machine, wait_s=wait_s))
+
+
+def decide(arguments: Namespace, command: Callable[[Client], TrustAnswer]) -> int:
     """Give the command, wait until the map follows, print what is known of the machine then."""
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
-        row = _decide(client, arguments)
+        machine = command(client)
     if arguments.json:
-        say(plain(row))
+        say(plain(machine))
         return 0
-    state = "is trusted" if row["trusted"] else "is left out of the map"
-    print(f"{row['name']} {state}, as of journal row {row['merged']}")
+    state = "is trusted" if machine.trusted else "is left out of the map"
+    print(f"{machine.name} {state}, as of journal row {machine.merged}")
     return 0
-
-
-def _decide(client: Client, arguments: Namespace) -> dict[str, Any]:
-    if not arguments.trusted:
-        return client.distrust(arguments.machine, arguments.reason, wait_s=arguments.wait)
-    if arguments.auto:
-        return client.judge_automatically(arguments.machine, wait_s=arguments.wait)
-    return client.trust(arguments.machine, wait_s=arguments.wait)

@@ -1,4 +1,4 @@
-"""Children of this process: started, listened to, and ended, whatever happens."""
+"""Child processes: started, their JSON lines read, and always ended."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ class Child:
 
     def lines(self) -> list[dict[str, Any]]:
         """JSON lines that have come in since the last call."""
-        found = []
+        lines = []
         while True:
             try:
-                found.append(self._lines.get_nowait())
+                lines.append(self._lines.get_nowait())
             except queue.Empty:
-                return found
+                return lines
 
     def expect(self, key: str, timeout_s: float) -> dict[str, Any]:
         """Wait for a line that has `key`; ProcessError if the process ends or the time is up first."""

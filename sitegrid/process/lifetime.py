@@ -1,4 +1,4 @@
-"""What every long-running sub-command needs: a stop flag that signals set, a ready line, and an end that is clean."""
+"""The life of a command's process: a stop flag that signals set, an end in time, and lines for people and programs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, is_dataclass
 from typing import Any
 
 END_S = 2.5  # from the signal to the end of the process
@@ -21,10 +22,10 @@ log = logging.getLogger("sitegrid.process.lifetime")
 
 
 def stop_flag(end_s: float | None = END_S) -> threading.Event:
-    """Return an event that SIGINT and SIGTERM set. Wait on it with a time-out only (EVIDENCE: else SIGTERM is lost).
+    """Return an event that SIGINT and SIGTERM set. Wait on it with a time-out only: Python may lose SIGTERM otherwise.
 
-    The process ends end_s after the signal, whatever it is doing then; None lets it take its time. What counts is safe
-    at any moment: samples are acknowledged after their commit, and deleted after their acknowledgement.
+    The process ends end_s after the signal, whatever it is doing then; None lets it take its time. No sample is lost at
+    any moment: samples are acknowledged after their commit, and deleted after their acknowledgement.
     """
     stop = threading.Event()
 
@@ -39,18 +40,18 @@ def stop_flag(end_s: float | None = END_S) -> threading.Event:
 
 
 def _end_in_time(stop: threading.Event, handler: Callable[..., None], end_s: float) -> None:
-    """See to it that the process ends, on a thread that hears of signals by itself.
+    """End the process in time, from a thread that receives signals by itself.
 
-    Python runs handlers between two steps of the main thread: not while that waits inside Zenoh, for a router, for a
-    reply or for a slow subscriber, up to 30 s. The wake-up descriptor is written to at once (signal.set_wakeup_fd).
+    Python runs signal handlers on the main thread, and not while that waits inside Zenoh: for a router, for a reply or
+    for a slow subscriber, up to 30 s. The wake-up descriptor is written to at once (signal.set_wakeup_fd).
     """
-    heard, woken = socket.socketpair()
+    signals, woken = socket.socketpair()
     woken.setblocking(False)
     signal.set_wakeup_fd(woken.fileno(), warn_on_full_buffer=False)
 
     def watch(_: socket.socket) -> None:  # holds the other end open for as long as the process runs
         while True:
-            if heard.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
+            if signals.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
                 continue
             stop.set()
             time.sleep(end_s)
@@ -61,18 +62,18 @@ def _end_in_time(stop: threading.Event, handler: Callable[..., None], end_s: flo
 
 
 def _end_now(after_s: float) -> None:
-    """End, and say so beside it: standard error may be a pipe that nobody empties."""
-    told = threading.Thread(target=log.warning, args=("ended in mid-work seconds=%g", after_s), daemon=True)
-    told.start()
-    told.join(0.2)
+    """End the process; a thread logs it, since standard error may be a pipe that nobody empties."""
+    warning = threading.Thread(target=log.warning, args=("ended in mid-work seconds=%g", after_s), daemon=True)
+    warning.start()
+    warning.join(0.2)
     os._exit(0)
 
 
 def return_large_blocks() -> bool:
-    """Have the C library give large blocks back to the system when they are freed; False where it cannot be told to.
+    """Make the C library return large blocks to the system when they are freed; False where it cannot.
 
-    glibc puts up its threshold for that, to 32 MB, when blocks of that size are freed, and keeps what lies below it:
-    arrays that live for one query would stay in resident memory, a few more of them every hour.
+    glibc raises its threshold for that up to 32 MB when large blocks are freed, and keeps smaller ones: the arrays of
+    each query would stay in resident memory, a few more of them every hour.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     return bool(mallopt and mallopt(_MMAP_THRESHOLD, LARGE_BYTES))
@@ -95,7 +96,9 @@ def note(line: str) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Replace NaN, which JSON does not know, by None."""
+    """Records as tables, and NaN, which JSON does not know, as None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, Mapping):
         return {key: plain(v) for key, v in value.items()}
     if isinstance(value, list | tuple):

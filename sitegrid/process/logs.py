@@ -15,13 +15,13 @@ _VALUE = re.compile(r"(?:^| )(\w+)=%[^a-zA-Z%]*[a-zA-Z]")
 
 
 def start_logging(*, verbose: bool) -> None:
-    """Log warnings, and with `verbose` what happens; in lines for whoever reads standard error."""
+    """Log warnings to standard error; with `verbose` also what happens."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(Lines() if sys.stderr.isatty() else JsonLines())
+    handler.setFormatter(TextFormatter() if sys.stderr.isatty() else JsonFormatter())
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
 
 
-class Lines(logging.Formatter):
+class TextFormatter(logging.Formatter):
     """`2026-01-31T07:00:00.000Z level=WARNING logger=mapserver.ingest.writer refused machine=loader-1 reason=gap`."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -31,7 +31,7 @@ class Lines(logging.Formatter):
         return line + (f"\n{self.formatException(record.exc_info)}" if record.exc_info else "")
 
 
-class JsonLines(logging.Formatter):
+class JsonFormatter(logging.Formatter):
     """One JSON object in a line: t, level, logger, event, the values of the event, and the traceback of a bug."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -47,11 +47,11 @@ class JsonLines(logging.Formatter):
 def _parts(record: logging.LogRecord) -> tuple[str, dict[str, Any]]:
     """The event and its values; where a message is not of that form, it is the event as a whole."""
     template, given = str(record.msg), record.args
-    found = list(_VALUE.finditer(template))
-    if not found or not isinstance(given, tuple) or not len(found) == len(given) == template.count("%"):
+    matches = list(_VALUE.finditer(template))
+    if not matches or not isinstance(given, tuple) or not len(matches) == len(given) == template.count("%"):
         return record.getMessage(), {}
-    names = [match[1] for match in found]
-    return template[: found[0].start()].strip(), {name: _plain(v) for name, v in zip(names, given, strict=True)}
+    names = [match[1] for match in matches]
+    return template[: matches[0].start()].strip(), {name: _plain(v) for name, v in zip(names, given, strict=True)}
 
 
 def _plain(value: Any) -> Any:

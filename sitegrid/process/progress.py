@@ -1,4 +1,4 @@
-"""What a long run shows: a bar on a terminal, a plain line now and then elsewhere."""
+"""Progress of a long run: a bar on a terminal, elsewhere a plain line now and then."""
 
 from __future__ import annotations
 

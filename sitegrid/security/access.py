@@ -1,7 +1,7 @@
-"""What the router lets each name do: Zenoh's access control, size and rate limits, made from the register.
+"""Access control of the router: Zenoh's rules, size limits and rate limits, made from the register.
 
-Everything is denied that is not granted. Zenoh compares by inclusion: a granted `machine/a/**` never lets a
-`machine/*/pose` pass. Exact keys are those of `protocol.wire.keys`; the patterns here are only ever used for granting.
+Whatever is not granted is denied. Zenoh compares by inclusion: a granted `machine/a/**` does not let `machine/*/pose`
+pass. Exact keys are those of `protocol.wire.keys`; the patterns here serve for granting only.
 """
 
 from __future__ import annotations
@@ -14,25 +14,24 @@ from protocol.wire.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_SMALL_BYT
 from sitegrid.security.register import Register, common_name
 
 POSE_HZ, HEALTH_HZ = 50.0, 10.0  # of one link; poses come with 5 Hz, at ten times real time with 50
-SPARE_BYTES = 4096  # for what goes along with a payload, as a signature
+SPARE_BYTES = 4096  # for attachments of a payload, as a signature
 
 Keys = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Grant:
-    """Key expressions of what one name may do.
+    """Key expressions that one name may publish, subscribe to, query and answer as a queryable.
 
-    puts, hears: publish and subscribe. asks, answers: query, and be a queryable. alive: show a liveliness token.
-    watches: see the tokens of others.
+    alive: it may show a liveliness token. watch: it may see the tokens of others.
     """
 
-    puts: Keys = ()
-    hears: Keys = ()
-    asks: Keys = ()
-    answers: Keys = ()
+    publish: Keys = ()
+    subscribe: Keys = ()
+    query: Keys = ()
+    answer: Keys = ()
     alive: Keys = ()
-    watches: Keys = ()
+    watch: Keys = ()
 
 
 def grant(role: str, site: str, name: str) -> Grant:
@@ -67,9 +66,9 @@ def access_control(register: Register) -> dict[str, Any]:
 
 
 def size_limits(site: str) -> list[dict[str, Any]]:
-    """Largest payloads that the router takes in; larger ones vanish there (EVIDENCE: rx/max_message_size does nothing).
+    """Largest payloads that the router takes in; it drops larger ones without a word.
 
-    Answers of the map server are not limited.
+    Zenoh's own setting `rx/max_message_size` has no effect. Answers of the map server are not limited.
     """
     limits = (
         ("batches", ["query"], keys.ingest_all(site), MAX_BATCH_BYTES + SPARE_BYTES),
@@ -86,25 +85,25 @@ def size_limits(site: str) -> list[dict[str, Any]]:
 
 
 def _rate_limits(site: str) -> dict[str, Any]:
-    """Only for what may get lost: never for what is acknowledged (EVIDENCE)."""
+    """Limits for messages that may get lost; a limit on acknowledged ones would lose samples."""
     rates = ((keys.poses_all(site), POSE_HZ), (keys.health_all(site), HEALTH_HZ))
     rules = [{"key_expr": key, "freq": rate} for key, rate in rates]
     return {"id": "rates", "messages": ["put"], "flows": ["ingress"], "rules": rules}
 
 
 def _rules(name: str, site: str, granted: Grant) -> list[dict[str, Any]]:
-    ways = (
-        ("ingress", ("put",), granted.puts),
-        ("ingress", ("declare_subscriber",), granted.hears),
-        ("egress", ("put",), granted.hears),
-        ("ingress", ("query",), granted.asks),
-        ("egress", ("reply",), granted.asks),
-        ("ingress", ("declare_queryable", "reply"), granted.answers),
-        ("egress", ("query",), granted.answers),
+    flows = (
+        ("ingress", ("put",), granted.publish),
+        ("ingress", ("declare_subscriber",), granted.subscribe),
+        ("egress", ("put",), granted.subscribe),
+        ("ingress", ("query",), granted.query),
+        ("egress", ("reply",), granted.query),
+        ("ingress", ("declare_queryable", "reply"), granted.answer),
+        ("egress", ("query",), granted.answer),
         ("ingress", ("liveliness_token",), granted.alive),
-        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), granted.watches),
-        ("egress", ("liveliness_token", "reply"), granted.watches),
-        # who listens and answers, without which nobody sends; it tells nothing but key expressions
+        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), granted.watch),
+        ("egress", ("liveliness_token", "reply"), granted.watch),
+        # who subscribes and answers: without these declarations nobody sends, and they hold key expressions only
         ("egress", ("declare_subscriber", "declare_queryable"), (_whole(site),)),
     )
     return [
@@ -115,7 +114,7 @@ def _rules(name: str, site: str, granted: Grant) -> list[dict[str, Any]]:
             "messages": list(messages),
             "key_exprs": list(expressions),
         }
-        for number, (flow, messages, expressions) in enumerate(ways)
+        for number, (flow, messages, expressions) in enumerate(flows)
         if expressions
     ]
 
@@ -125,39 +124,39 @@ def _rules(name: str, site: str, granted: Grant) -> list[dict[str, Any]]:
 
 def _machine(site: str, name: str) -> Grant:
     return Grant(
-        puts=(_whole(site, "machine", name),),
-        hears=(keys.sensors(site, name), _whole(site, "map"), _whole(site, "base")),
-        asks=(keys.ingest(site, name), keys.map_queries_all(site), keys.alive(site, name)),
-        answers=(keys.alive(site, name),),  # who holds the name, if a second one comes
+        publish=(_whole(site, "machine", name),),
+        subscribe=(keys.sensors(site, name), _whole(site, "map"), _whole(site, "base")),
+        query=(keys.ingest(site, name), keys.map_queries_all(site), keys.alive(site, name)),
+        answer=(keys.alive(site, name),),  # who holds the name, if a second one comes
         alive=(keys.alive(site, name),),
-        watches=(keys.alive(site, name),),
+        watch=(keys.alive(site, name),),
     )
 
 
 def _visitor(site: str, _: str) -> Grant:
     return Grant(
-        hears=(_whole(site, "map"), keys.poses_all(site), keys.health_all(site)),
-        asks=(keys.map_queries_all(site),),
-        watches=(keys.alive_all(site),),
+        subscribe=(_whole(site, "map"), keys.poses_all(site), keys.health_all(site)),
+        query=(keys.map_queries_all(site),),
+        watch=(keys.alive_all(site),),
     )
 
 
 def _admin(site: str, name: str) -> Grant:
     visitor = _visitor(site, name)
-    return replace(visitor, asks=(*visitor.asks, keys.admin_all(site)))
+    return replace(visitor, query=(*visitor.query, keys.admin_all(site)))
 
 
 def _server(site: str, _: str) -> Grant:
     return Grant(
-        puts=(_whole(site, "map"),),
-        hears=(keys.poses_all(site), keys.health_all(site)),
-        answers=(keys.ingest_all(site), keys.map_queries_all(site), keys.admin_all(site)),
-        watches=(keys.alive_all(site),),
+        publish=(_whole(site, "map"),),
+        subscribe=(keys.poses_all(site), keys.health_all(site)),
+        answer=(keys.ingest_all(site), keys.map_queries_all(site), keys.admin_all(site)),
+        watch=(keys.alive_all(site),),
     )
 
 
 def _sim(site: str, _: str) -> Grant:
-    return Grant(puts=(_sensors_all(site),))
+    return Grant(publish=(_sensors_all(site),))
 
 
 _GRANTS = {"machine": _machine, "visitor": _visitor, "admin": _admin, "server": _server, "sim": _sim}

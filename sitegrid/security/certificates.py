@@ -1,7 +1,7 @@
-"""X.509 certificates of one site: its authority, and what that signs. Needs `cryptography`; touches no files.
+"""X.509 certificates of one site: the authority's, and those that it signs. Needs `cryptography`; touches no files.
 
-P-256 with SHA-256, PKCS #8 keys without a password. The router's certificates serve, all others only connect: so a
-stolen machine cannot pose as the router.
+P-256 with SHA-256, PKCS #8 keys without a password. The router's certificate is a server's (TLS server authentication),
+all others are clients': a stolen machine cannot act as the router.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ EARLY = timedelta(minutes=10)  # valid from before now: the clocks of machines d
 
 
 @dataclass(frozen=True)
-class Pair:
+class KeyPair:
     """A certificate and its private key, both PEM."""
 
     certificate: bytes
@@ -32,7 +32,7 @@ class Pair:
         return f"{_certificate(self).serial_number:x}"
 
 
-def make_authority(site: str, begins: datetime, expires: datetime) -> Pair:
+def make_authority(site: str, begins: datetime, expires: datetime) -> KeyPair:
     """Make the authority of a site: it signs certificates, and no further authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"sitegrid {site} authority")
@@ -42,7 +42,9 @@ def make_authority(site: str, begins: datetime, expires: datetime) -> Pair:
     return _pair(builder.sign(key, hashes.SHA256()), key)
 
 
-def issue(authority: Pair, common_name: str, begins: datetime, expires: datetime, hosts: Sequence[str] = ()) -> Pair:
+def issue(
+    authority: KeyPair, common_name: str, begins: datetime, expires: datetime, hosts: Sequence[str] = ()
+) -> KeyPair:
     """Make a key and have the authority sign it.
 
     hosts: names and addresses that it serves at; none: it only connects.
@@ -63,12 +65,12 @@ def issue(authority: Pair, common_name: str, begins: datetime, expires: datetime
     return _pair(builder.sign(signer, hashes.SHA256()), key)
 
 
-def expires_at(pair: Pair) -> datetime:
+def expires_at(pair: KeyPair) -> datetime:
     """The end of a certificate's validity, UTC."""
     return _certificate(pair).not_valid_after_utc
 
 
-def _certificate(pair: Pair) -> x509.Certificate:
+def _certificate(pair: KeyPair) -> x509.Certificate:
     return x509.load_pem_x509_certificate(pair.certificate)
 
 
@@ -106,7 +108,7 @@ def _host(host: str) -> x509.GeneralName:
         return x509.DNSName(host)
 
 
-def _pair(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> Pair:
+def _pair(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> KeyPair:
     pem = serialization.Encoding.PEM
     form, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    return Pair(certificate.public_bytes(pem), key.private_bytes(pem, form, plain))
+    return KeyPair(certificate.public_bytes(pem), key.private_bytes(pem, form, plain))

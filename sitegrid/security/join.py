@@ -1,4 +1,4 @@
-"""How a command joins the network: with the keys that it was given, or without any and then on this host alone."""
+"""Settings with which a command joins the network: with its keys, or without keys and then on this host only."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def join(
             return SessionConfig(endpoint, wait_s=wait_s)
         credentials = load_credentials(keys)
         check_valid(credentials, datetime.now(UTC))
-        for what, wanted in (("role", role), ("name", name), ("site", site)):
-            if wanted and (found := getattr(credentials.identity, what)) != wanted:
-                raise ConfigError(keys, f"these keys are for {what} {found!r}, {wanted!r} is needed")
+        for what, required in (("role", role), ("name", name), ("site", site)):
+            if required and (actual := getattr(credentials.identity, what)) != required:
+                raise ConfigError(keys, f"these keys are for {what} {actual!r}, {required!r} is needed")
         return SessionConfig(with_keys(endpoint), wait_s=wait_s, credentials=credentials)
     except ValueError as error:
         raise ConfigError("network", str(error)) from None
@@ -38,7 +38,7 @@ def with_keys(endpoint: str) -> str:
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether only processes of this host reach a TCP endpoint; False where that is not plain to see."""
+    """Whether only processes of this host reach a TCP endpoint; False where that is not certain."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if protocol != "tcp" or not port.isdecimal():

@@ -1,4 +1,4 @@
-"""The register of a site's names: who has which role, until when, and who is let in no more. Readable TOML.
+"""The register of a site's names, as TOML: role, end of validity, and who is revoked.
 
 The router makes its rules from it, by the common names of certificates. A name that was revoked and is added again gets
 a new common name, so that the old certificate stays refused.
@@ -6,14 +6,14 @@ a new common name, so that the old certificate stays refused.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from protocol.config import from_table, load_toml
+from protocol.config import from_table, load_toml, toml_lines
 from protocol.errors import ConfigError
+from protocol.files import write_whole
 from protocol.wire.keys import check_name
 
 REGISTER_FILE = "register.toml"
@@ -22,7 +22,7 @@ ROLES = ("machine", "visitor", "server", "admin", "sim")
 
 
 @dataclass(frozen=True)
-class Entry:
+class RegisterEntry:
     """One name.
 
     serial: of its newest certificate, hex. issue: 1, and one more each time it comes back from revoked. signing: the
@@ -47,18 +47,18 @@ class Entry:
 
 @dataclass(frozen=True)
 class Register:
-    """All names of one site. hosts: names and addresses that the router is reached at."""
+    """All names of one site. hosts: names and addresses of the router."""
 
     site: str
     hosts: tuple[str, ...]
-    names: Mapping[str, Entry]
+    names: Mapping[str, RegisterEntry]
 
-    def admitted(self) -> dict[str, Entry]:
-        """Those that are let in: neither revoked nor the router itself."""
+    def admitted(self) -> dict[str, RegisterEntry]:
+        """Names that may connect: all but the revoked ones and the router."""
         return {name: entry for name, entry in self.names.items() if not entry.revoked and entry.role != ROUTER}
 
     def signing_keys(self) -> dict[str, str]:
-        """Public keys of the machines whose batches are taken."""
+        """Public keys of the machines whose batches are accepted."""
         return {name: entry.signing for name, entry in self.admitted().items() if entry.signing}
 
     def next_issue(self, name: str) -> int:
@@ -66,7 +66,7 @@ class Register:
         known = self.names.get(name)
         return 1 if known is None else known.issue + known.revoked
 
-    def with_entry(self, name: str, entry: Entry) -> Register:
+    def with_entry(self, name: str, entry: RegisterEntry) -> Register:
         """With a name added or replaced."""
         return replace(self, names={**self.names, name: entry})
 
@@ -81,7 +81,7 @@ class Register:
 
 
 def common_name(name: str, issue: int) -> str:
-    """What the certificate of a name says; names hold no dot, so these never meet."""
+    """The common name of a certificate; names hold no dot, so two names never give the same one."""
     return name if issue == 1 else f"{name}.{issue}"
 
 
@@ -96,16 +96,27 @@ def load_register(folder: Path) -> Register:
     return register
 
 
+def save_register(folder: Path, register: Register) -> None:
+    """Write the register into a folder of keys, whole or not at all."""
+    write_private(folder / REGISTER_FILE, register_toml(register).encode())
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that only its owner reads, whole or not at all; ConfigError where that is not possible."""
+    try:
+        write_whole(path, data, 0o600)
+    except OSError as error:
+        raise ConfigError(path, f"cannot be written: {error.strerror}") from None
+
+
 def register_toml(register: Register) -> str:
     """The register as TOML."""
-    lines = ["# Who is let in. Written by `sitegrid keys`.", *_plain(site=register.site, hosts=list(register.hosts))]
+    lines = [
+        "# Who is let in. Written by `sitegrid keys`.",
+        *toml_lines({"site": register.site, "hosts": list(register.hosts)}),
+    ]
     for name, entry in sorted(register.names.items()):
-        lines += ["", f"[names.{name}]", *_plain(role=entry.role, serial=entry.serial)]
+        lines += ["", f"[names.{name}]", *toml_lines({"role": entry.role, "serial": entry.serial})]
         lines += [f"expires = {entry.expires.astimezone(UTC):%Y-%m-%dT%H:%M:%SZ}"]
-        lines += _plain(issue=entry.issue, revoked=entry.revoked, signing=entry.signing)
+        lines += toml_lines({"issue": entry.issue, "revoked": entry.revoked, "signing": entry.signing})
     return "\n".join(lines) + "\n"
-
-
-def _plain(**values: object) -> list[str]:
-    """JSON's texts, numbers and lists are TOML's."""
-    return [f"{key} = {json.dumps(value)}" for key, value in values.items()]

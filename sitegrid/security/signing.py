@@ -1,8 +1,8 @@
-"""Signed batches (Ed25519): who carries a batch, be it the router, can neither make one up nor alter it.
+"""Ed25519 signatures over batches: nobody on the way, not even the router, can forge or alter one.
 
-The signature goes beside the batch, as the attachment of the query: the batch's own bytes stay what they are, and a
-server that asks for no signatures reads past it. Signed are the key expression and the payload, so that a batch holds
-for one machine of one site. Sending it once more does no harm: identity is the sample's. Needs `cryptography`.
+The signature is the attachment of the query; the bytes of the batch stay the same, and a server without signatures
+ignores it. Key expression and payload are signed, so that a batch is valid for one machine of one site. A replay
+does no harm: the map server knows each sample by its number. Needs `cryptography`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from protocol.errors import ConfigError, MessageError, Refusal
 
-_CONTEXT = b"sitegrid batch 1\0"  # a signature of anything else is none of a batch
+_CONTEXT = b"sitegrid batch 1\0"  # a signature of something else is not valid for a batch
 
 
 class Signer:
-    """Signs in the name of one machine. private_key: PEM; ConfigError where it is none of Ed25519."""
+    """Signs the batches of one machine. private_key: PEM; ConfigError where it is no Ed25519 key."""
 
     def __init__(self, private_key: bytes) -> None:
         try:
@@ -38,20 +38,20 @@ class Signer:
 
 
 class Verifier:
-    """Knows the machines' public keys: base64 of 32 bytes each, as the register has them."""
+    """Checks signatures. public_keys: by machine, base64 of 32 bytes each, as the register has them."""
 
     def __init__(self, public_keys: Mapping[str, str]) -> None:
         self._keys = {machine: _public_key(machine, text) for machine, text in public_keys.items()}
 
     def check(self, machine: str, key_expression: str, payload: bytes, signature: bytes) -> None:
         """MessageError unless the machine has signed this payload for this key."""
-        known = self._keys.get(machine)
-        if known is None:
+        key = self._keys.get(machine)
+        if key is None:
             raise MessageError(Refusal.WRONG_MACHINE, f"no signing key of {machine!r} is in the register")
         if not signature:
             raise MessageError(Refusal.WRONG_MACHINE, "the batch is not signed, and this server asks for it")
         try:
-            known.verify(signature, _signed(key_expression, payload))
+            key.verify(signature, _signed(key_expression, payload))
         except InvalidSignature:
             problem = f"the signature is not that of {machine!r}; compare its keys with the register"
             raise MessageError(Refusal.WRONG_MACHINE, problem) from None

@@ -17,8 +17,7 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from protocol.errors import StoreError
 from protocol.machine.log_folder import open_log
-from protocol.machine.machine_config import plain_lines
-from protocol.site.site_config import load_site
+from protocol.site.site_config import load_site, site_toml
 from protocol.wire.session import free_endpoint
 from tests.chaos.leashed import Process
 from tests.chaos.outcome import Outcome, Span, Told, longest_pause
@@ -68,7 +67,7 @@ class Site:
         self._running: dict[str, Process] = {}
         self._starts = 0
         site = replace(open_log(recordings.data(self.machines[0])).site, clock=clock)
-        (folder / "site.toml").write_text("\n".join(plain_lines(site)) + "\n", encoding="utf-8")
+        (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
         (folder / "server.toml").write_text(server_toml, encoding="utf-8")
 
     def __enter__(self) -> Site:

@@ -30,7 +30,7 @@ from protocol.site.geometry import Bounds
 from protocol.site.site_config import load_site
 from protocol.wire.credentials import check_valid, load_credentials
 from sim.config import load_sim
-from sitegrid.security.register import Entry, Register, load_register, register_toml
+from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml
 from tests.fuzz.messages import messages
 from tests.fuzz.mutations import files
 from tests.fuzz.stores import archive_decoder, journal_decoder
@@ -145,7 +145,7 @@ def _configs() -> Iterator[Decoder]:
     yield _config("server", (shipped["server"],), lambda path: from_table(ServerConfig, load_toml(path), str(path)))
     yield _config("agent", (shipped["agent"],), load_agent)
     yield _config("sim", (shipped["sim"],), load_sim)
-    entry = Entry("machine", "1f", NOW, signing="A" * 43 + "=")
+    entry = RegisterEntry("machine", "1f", NOW, signing="A" * 43 + "=")
     register = register_toml(Register("paper", ("localhost",), {"loader-1": entry, "router": entry}))
     yield _config("register", (register.encode(),), _register, "register.toml")
     identity = b'site = "paper"\nname = "loader-1"\nrole = "machine"\nexpires = 2030-01-01T00:00:00Z\n'

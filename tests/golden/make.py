@@ -16,7 +16,16 @@ import numpy as np
 from protocol.errors import QueryError, Refusal
 from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu, Odometry, Torque
 from protocol.machine.samples import SAMPLE_DTYPE
-from protocol.queries import requests
+from protocol.queries import answer_codec as answers
+from protocol.queries.answers import (
+    GroundChange,
+    HistoryAnswer,
+    HistorySpan,
+    MachineState,
+    PointAnswer,
+    Region,
+    TrustAnswer,
+)
 from protocol.wire import codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -61,10 +70,10 @@ def readings() -> tuple[Any, ...]:
     )
 
 
-def region() -> requests.Region:
+def region() -> Region:
     """3 x 2 cells of half a metre, south-west corner (-1, 2)."""
     resistance = np.array([[0.02, NAN, 0.25], [NAN, 0.008, 0.04]], np.float32)
-    return requests.Region(
+    return Region(
         x_m=np.array([-0.75, -0.25, 0.25]),
         y_m=np.array([2.25, 2.75]),
         cell_m=0.5,
@@ -79,47 +88,53 @@ def decode_batch(data: bytes) -> SampleBatch:
     return codec.decode_batch(data, EXTENT_M)
 
 
+def decode_info_table(data: bytes) -> dict[str, Any]:
+    """Decode any table of plain values; `decode_info` asks for every field of `MapInfo`."""
+    table: dict[str, Any] = codec.take_plain(codec.unpack(data, codec.MAX_SMALL_BYTES), "info")
+    return table
+
+
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
 LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
-POINT = requests.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
-HISTORY = requests.HistoryAnswer(
+POINT = PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
+HISTORY = HistoryAnswer(
     0.5,
     1.5,
     (
-        requests.Span(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
-        requests.Span(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
+        HistorySpan(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
+        HistorySpan(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
     ),
     17,
     T0 + 700_000_000_000,
 )
-MACHINE = {
-    "name": "loader-2",
-    "trusted": False,
-    "by": "audit",
-    "reason": "contradicts all others",
-    "since_ns": T0,
-    "contradicts": True,
-    "reasons": ["offset"],
-    "evidence": {"offset_m": 2.75, "machines": 3},
-    "spools": 1,
-    "samples": 1200,
-    "lost": 3,
-    "newest_ns": T0 + 1,
-}
-CHANGE = {
-    "id": 4,
-    "first_ns": T0,
-    "last_ns": T0 + 60_000_000_000,
-    "bounds": [10.0, -20.0, 40.0, 12.5],
-    "cells": 615,
-    "resistance_before": 0.25,
-    "resistance_after": 0.0078125,
-    "grade_before": 0.0,
-    "grade_after": None,
-}
+MACHINE = MachineState(
+    name="loader-2",
+    trusted=False,
+    by="audit",
+    reason="contradicts all others",
+    since_ns=T0,
+    contradicts=True,
+    reasons=("offset",),
+    evidence={"offset_m": 2.75, "machines": 3},
+    spools=1,
+    samples=1200,
+    lost=3,
+    newest_ns=T0 + 1,
+)
+CHANGE = GroundChange(
+    id=4,
+    first_ns=T0,
+    last_ns=T0 + 60_000_000_000,
+    bounds=(10.0, -20.0, 40.0, 12.5),
+    cells=615,
+    resistance_before=0.25,
+    resistance_after=0.0078125,
+    grade_before=0.0,
+    grade_after=None,
+)
 
 GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
@@ -130,18 +145,18 @@ GOLDEN: dict[str, Golden] = {
     "bundle.bin": Golden(SensorBundle("loader-1", 5, readings(), last=True), codec.encode_bundle, codec.decode_bundle),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
-    "point.bin": Golden(POINT, requests.encode_point, requests.decode_point),
-    "region.bin": Golden(region(), requests.encode_region, requests.decode_region),
-    "history.bin": Golden(HISTORY, requests.encode_history, requests.decode_history),
-    "machines.bin": Golden([MACHINE], requests.encode_machines, requests.decode_machines),
-    "machine.bin": Golden({**MACHINE, "merged": 17}, requests.encode_machine, requests.decode_machine),
-    "changes.bin": Golden([CHANGE], requests.encode_changes, requests.decode_changes),
-    "change.bin": Golden(CHANGE, requests.encode_change, requests.decode_change),
-    "info.bin": Golden(
-        {"site": "paper", "merged": 17, "refused": {"gap": 1}}, requests.encode_info, requests.decode_info
-    ),
+    "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
+    "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
+    "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
+    "machines.bin": Golden([MACHINE], answers.encode_machines, answers.decode_machines),
+    "machine.bin": Golden(TrustAnswer(**vars(MACHINE), merged=17), answers.encode_machine, answers.decode_machine),
+    "changes.bin": Golden([CHANGE], answers.encode_changes, answers.decode_changes),
+    "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
+    "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, answers.encode_info, decode_info_table),
     "error.bin": Golden(
-        QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known"), requests.encode_error, requests.decode_error
+        QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known"),
+        answers.encode_error,
+        answers.decode_error,
     ),
 }
 NEWER = "batch_newer.bin"  # of a later version of the software: an unknown field and an unknown column

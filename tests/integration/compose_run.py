@@ -85,12 +85,12 @@ class ComposeRun:
         if name in self.started:
             return
         service = self.services[name]
-        for other, wanted in service.get("depends_on", {}).items():
+        for other, rule in service.get("depends_on", {}).items():
             self._start(other)
-            if wanted["condition"] == "service_healthy":
+            if rule["condition"] == "service_healthy":
                 self._wait_healthy(other)
             else:
-                assert wanted["condition"] == "service_started"
+                assert rule["condition"] == "service_started"
         assert "environment" not in service, "it would have to be set here"
         self.started[name] = self.children.start(name, *self.words(name, service["command"]))
 

@@ -15,8 +15,8 @@ from tests.integration.site_run import SiteRun  # beside this file
 
 @pytest.fixture
 def children(tmp_path: Path) -> Iterator[Children]:
-    with Children(tmp_path) as found:
-        yield found
+    with Children(tmp_path) as started:
+        yield started
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ class SiteRun:
         return connect(self.endpoint, self.site)
 
     def wait_merged(self, client: Client, samples: int) -> None:
-        wait_until(lambda: client.info()["samples_merged"] >= samples, READY_S, f"{samples} samples merged")
+        wait_until(lambda: client.info().samples_merged >= samples, READY_S, f"{samples} samples merged")
 
     def end_of_agents(self) -> dict[str, dict]:
         return {name: agent.expect("ended", 90.0)["ended"] for name, agent in self.agents.items()}

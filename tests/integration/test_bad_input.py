@@ -12,7 +12,7 @@ import zenoh
 
 from protocol.errors import Refusal
 from protocol.machine.samples import SAMPLE_DTYPE
-from protocol.queries.requests import decode_error
+from protocol.queries.answer_codec import decode_error
 from protocol.site.site_config import load_site
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, decode_health, decode_reply, encode_batch
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.processes
 
 NOW_NS = 1_767_225_600_000_000_000
 MACHINE = "probe"
-LEFT_ALONE = ("journalled", "merged", "samples_merged", "cells", "stamp_ns", "machines")  # by what is refused
+UNCHANGED = ("journalled", "merged", "samples_merged", "cells", "stamp_ns", "machines")  # by what is refused
 
 
 class Probe:
@@ -46,9 +46,9 @@ class Probe:
 
     def send(self, payload: bytes | None, key: str = "") -> Ack | Refused:
         key = key or keys.ingest(self.site.name, MACHINE)
-        found = [reply.ok for reply in self.session.get(key, payload=payload, timeout=READY_S)]
-        assert [ok is not None for ok in found] == [True], f"one answer is expected: {self.where}"
-        return decode_reply(found[0].payload.to_bytes())
+        answers = [reply.ok for reply in self.session.get(key, payload=payload, timeout=READY_S)]
+        assert [ok is not None for ok in answers] == [True], f"one answer is expected: {self.where}"
+        return decode_reply(answers[0].payload.to_bytes())
 
     def batch(self, n: int = 3, **over: Any) -> SampleBatch:
         columns = {name: over.pop(name) for name in list(over) if name in SAMPLE_DTYPE.names}
@@ -126,11 +126,11 @@ def test_a_bad_batch_is_refused_counted_and_leaves_no_trace(probe: Probe, name: 
     assert (reply.reason, reply.problem[: len(problem)]) == (reason, problem), probe.where
     assert reply.problem.isprintable()
     after = probe.client.info()
-    changed = {k: n - before["counters"].get(k, 0) for k, n in after["counters"].items()}
+    changed = {k: n - before.counters.get(k, 0) for k, n in after.counters.items()}
     assert {k: n for k, n in changed.items() if n} == {f"refused_{reason}": 1}, probe.where
-    assert [after[name] for name in LEFT_ALONE] == [before[name] for name in LEFT_ALONE], probe.where
+    assert [getattr(after, name) for name in UNCHANGED] == [getattr(before, name) for name in UNCHANGED], probe.where
     probe.takes_a_good_one()
-    assert probe.client.info()["journalled"] == before["journalled"] + 1
+    assert probe.client.info().journalled == before.journalled + 1
 
 
 def test_a_key_with_a_wildcard_names_no_machine(probe: Probe):
@@ -138,15 +138,15 @@ def test_a_key_with_a_wildcard_names_no_machine(probe: Probe):
     reply = probe.send(encode_batch(probe.batch()), f"sitegrid/{probe.site.name}/ingest/*")
     assert isinstance(reply, Refused)
     assert reply.reason == Refusal.WRONG_MACHINE, probe.where
-    assert probe.client.info()["journalled"] == before["journalled"]
+    assert probe.client.info().journalled == before.journalled
 
 
 def test_a_sequence_that_goes_back_is_acknowledged_and_changes_nothing(probe: Probe):
     before = probe.client.info()
     reply = probe.send(encode_batch(probe.batch(first_seq=1)))
-    assert reply == Ack(probe.seq, before["journalled"], 3), probe.where
+    assert reply == Ack(probe.seq, before.journalled, 3), probe.where
     after = probe.client.info()
-    assert (after["journalled"], after["samples_merged"]) == (before["journalled"], before["samples_merged"])
+    assert (after.journalled, after.samples_merged) == (before.journalled, before.samples_merged)
 
 
 BAD_QUERIES = {
@@ -180,8 +180,8 @@ def test_a_bad_query_is_refused_counted_and_named(probe: Probe, selector: str):
     assert str(error).isprintable()
     after = probe.client.info()
     name = f"refused_query_{error.reason}"
-    assert after["counters"][name] - before["counters"].get(name, 0) == 1, probe.where
-    assert after["journalled"] == before["journalled"]
+    assert after.counters[name] - before.counters.get(name, 0) == 1, probe.where
+    assert after.journalled == before.journalled
     assert probe.server.code is None, probe.where
 
 
@@ -199,23 +199,25 @@ def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children:
     server = run.start_server()
     run.site_file.write_text(wide)
     session = open_session(SessionConfig(run.endpoint))
-    heard: list[bytes] = []
-    session.declare_subscriber(keys.health(run.site, "loader-1"), lambda s: heard.append(s.payload.to_bytes()))
+    reports: list[bytes] = []
+    session.declare_subscriber(keys.health(run.site, "loader-1"), lambda s: reports.append(s.payload.to_bytes()))
     agent = run.start_agent(run.configs[0])
     run.start_sim()
     where = f"router {router.pid}, server {server.pid}, agent {agent.pid}"
     report = agent.expect("ended", 90.0)["ended"]
-    aside = report["spool"]["put_aside"]
+    quarantined = report["spool"]["put_aside"]
     assert report["delivered"], where
-    assert 0 < aside < report["samples"], where
-    assert report["uplink"]["counters"]["refused_outside_site"] >= aside, where
-    wait_until(lambda: decode_health(heard[-1]).values["spool"]["put_aside"] == aside, READY_S, "health says so")
+    assert 0 < quarantined < report["samples"], where
+    assert report["uplink"]["counters"]["refused_outside_site"] >= quarantined, where
+    wait_until(
+        lambda: decode_health(reports[-1]).values["spool"]["put_aside"] == quarantined, READY_S, "health says so"
+    )
     session.close()
     with run.connect() as client:
         info = client.info()
-    sent = info["machines"]["loader-1"]
-    assert (sent["samples"], sent["samples"] + aside) == (info["samples_merged"], report["samples"]), where
-    assert 0 < sent["lost"] <= aside, f"declared lost, those before the last that was taken: {where}"
+    sent = info.machines["loader-1"]
+    assert (sent.samples, sent.samples + quarantined) == (info.samples_merged, report["samples"]), where
+    assert 0 < sent.lost <= quarantined, f"declared lost, those before the last that was taken: {where}"
 
 
 def words(sim: SimConfig) -> list[str]:

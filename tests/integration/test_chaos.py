@@ -30,9 +30,9 @@ from tests.chaos.tcp_proxy import FAIR, Proxy, Weather
 
 @pytest.fixture
 def library(tmp_path: Path) -> Path:
-    if not (found := build(tmp_path)):
+    if not (library := build(tmp_path)):
         pytest.skip("no C compiler for the shim")
-    return found
+    return library
 
 
 def scenario(folder: Path, **options) -> Scenario:
@@ -92,15 +92,15 @@ def test_a_power_cut_keeps_what_was_synced_and_may_drop_the_rest(tmp_path):
 
 
 def test_names_come_in_order_and_any_sync_makes_them_durable(tmp_path):
-    disk, found = Disk(), set()
+    disk, listings = Disk(), set()
     disk.do(Operation(Kind.CREATE, "new", 0, b""))
     disk.do(Operation(Kind.RENAME, "new", 0, b"named"))
     for seed in range(30):
         folder = tmp_path / str(seed)
         folder.mkdir()
         disk.cut(random.Random(seed), folder)
-        found.add(tuple(path.name for path in folder.iterdir()))
-    assert found == {(), ("new",), ("named",)}
+        listings.add(tuple(path.name for path in folder.iterdir()))
+    assert listings == {(), ("new",), ("named",)}
     disk.do(Operation(Kind.SYNC, "named", 0, b""))
     disk.cut(random.Random(1), tmp_path)
     assert (tmp_path / "named").exists()

@@ -161,10 +161,10 @@ def is_alive(pid: int) -> bool:
 )
 def test_errors_are_one_line_that_says_what_to_do(words: tuple[str, ...], problem: str, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    found = sitegrid(*words)
-    assert found.returncode == 1
-    assert problem in found.stderr
-    assert len(found.stderr.strip().splitlines()) == 1
+    process = sitegrid(*words)
+    assert process.returncode == 1
+    assert problem in process.stderr
+    assert len(process.stderr.strip().splitlines()) == 1
 
 
 def test_wrong_usage_exits_with_2():

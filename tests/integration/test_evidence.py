@@ -78,17 +78,17 @@ def resistance(client: Client, **when: Any) -> float:
 
 def command(site_run: SiteRun, *words: str) -> Any:
     where = ("--endpoint", site_run.endpoint, "--site", site_run.site, "--json")
-    found = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "sitegrid.cli", words[0], *where, *words[1:]], capture_output=True, text=True, timeout=60
     )
-    assert found.returncode == 0, found.stderr
-    return json.loads(found.stdout.splitlines()[-1])
+    assert process.returncode == 0, process.stderr
+    return json.loads(process.stdout.splitlines()[-1])
 
 
-def test_a_repaved_zone_is_told_dated_and_can_be_undone_in_time(site_run: SiteRun, server: Child):
+def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: SiteRun, server: Child):
     with site_run.connect() as client:
-        told: list[Any] = []
-        ear = client.on_change(told.append)
+        events: list[Any] = []
+        listener = client.on_change(events.append)
         senders = Senders(site_run, client)
         senders.send({"a": np.concatenate([sweep(1, 0), sweep(2, 1)])})
         before_ns = START_NS + 2 * HOUR_NS
@@ -98,12 +98,12 @@ def test_a_repaved_zone_is_told_dated_and_can_be_undone_in_time(site_run: SiteRu
         assert resistance(client, minus_ns=before_ns) == pytest.approx(NEW - OLD, rel=0.1)
         spans = client.history(SIZE - 8.5, 20.5, ["resistance"], span_s=3600.0)
         assert [round(span.values["resistance"], 2) for span in spans] == [OLD, OLD, NEW]
-        wait_until(lambda: told and client.changes()[0]["cells"] > 400, READY_S, f"a change of server pid {server.pid}")
+        wait_until(lambda: events and client.changes()[0].cells > 400, READY_S, f"a change of server pid {server.pid}")
         (change,) = client.changes()
-        assert change["resistance_before"] == pytest.approx(OLD, rel=0.1)
-        assert before_ns - HOUR_NS < change["first_ns"] < START_NS + 4 * HOUR_NS
-        ear.close()
-    assert command(site_run, "query", "changes")["changes"][0]["id"] == change["id"]
+        assert change.resistance_before == pytest.approx(OLD, rel=0.1)
+        assert before_ns - HOUR_NS < change.first_ns < START_NS + 4 * HOUR_NS
+        listener.close()
+    assert command(site_run, "query", "changes")["changes"][0]["id"] == change.id
 
 
 def test_a_bad_machine_is_found_left_out_and_stays_so_after_a_kill(site_run: SiteRun, server: Child, tmp_path: Path):
@@ -112,18 +112,18 @@ def test_a_bad_machine_is_found_left_out_and_stays_so_after_a_kill(site_run: Sit
         good = {name: sweep(i, 0) for i, name in enumerate("abd")}
         senders.send({**good, "c": sweep(9, 0, BAD)})
         senders.send({**{n: sweep(i + 20, 3) for i, n in enumerate("abd")}, "c": sweep(29, 3, BAD)})
-        wait_until(lambda: client.info()["distrusted"] == ["c"], READY_S, f"server pid {server.pid} leaves out c")
-        (row,) = [row for row in client.machines() if row["name"] == "c"]
-        assert (row["trusted"], row["by"]) == (False, "audit")
-        assert "gain" in row["reason"]
-        assert row["evidence"]["gain"] == pytest.approx(BAD, rel=0.15)
+        wait_until(lambda: client.info().distrusted == ("c",), READY_S, f"server pid {server.pid} leaves out c")
+        (machine,) = [machine for machine in client.machines() if machine.name == "c"]
+        assert (machine.trusted, machine.by) == (False, "audit")
+        assert "gain" in machine.reason
+        assert machine.evidence["gain"] == pytest.approx(BAD, rel=0.15)
         assert resistance(client) == pytest.approx(OLD, rel=0.05)
         kill(server)
     site_run.start_server("--config", str(tmp_path / "server.toml"))
     with site_run.connect() as client:
-        assert client.info()["distrusted"] == ["c"]
-        folded = client.info()["samples_merged"]
+        assert client.info().distrusted == ("c",)
+        folded = client.info().samples_merged
         assert command(site_run, "trust", "c")["trusted"] is True
-        assert client.info()["samples_merged"] == folded * 4 // 3
+        assert client.info().samples_merged == folded * 4 // 3
         assert command(site_run, "distrust", "c", "--reason", "its scale is broken")["by"] == "person"
-        assert client.info()["samples_merged"] == folded
+        assert client.info().samples_merged == folded

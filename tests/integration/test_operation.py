@@ -292,10 +292,10 @@ def test_the_server_tells_prometheus_of_itself_and_of_the_agents(site: SiteRun):
     machine = f'{{machine="{site.configs[0].stem}"}}'
     wait_until(lambda: scrape(url).get(f"sitegrid_machine_samples_total{machine}") == 500, READY_S, "samples counted")
     wait_until(lambda: scrape(url).get(f"sitegrid_agent_spool_samples{machine}") == 0, READY_S, "health heard")
-    found = scrape(url)
-    assert found["sitegrid_map_samples"] == 500
-    assert found["sitegrid_journal_rows"] == found["sitegrid_merged_rows"] > 0
-    assert found["process_resident_memory_bytes"] > 20 * 2**20
+    metrics = scrape(url)
+    assert metrics["sitegrid_map_samples"] == 500
+    assert metrics["sitegrid_journal_rows"] == metrics["sitegrid_merged_rows"] > 0
+    assert metrics["process_resident_memory_bytes"] > 20 * 2**20
     end(agent)
     end(server)
 

@@ -115,21 +115,21 @@ def acknowledged(session: zenoh.Session, key: str, batch: bytes) -> list[bool]:
 @contextlib.contextmanager
 def listening(session: zenoh.Session, key: str) -> Iterator[list[bytes]]:
     """What arrives of a key; the router knows of it once a question behind it is answered."""
-    heard: list[bytes] = []
-    subscriber = session.declare_subscriber(key, lambda sample: heard.append(sample.payload.to_bytes()))
+    received: list[bytes] = []
+    subscriber = session.declare_subscriber(key, lambda sample: received.append(sample.payload.to_bytes()))
     assert answers(session, keys.map_query(SITE, "info"))
-    yield heard
+    yield received
     subscriber.undeclare()
 
 
-def put_until(heard: list[bytes], wanted: bytes, put: Callable[[], object]) -> None:
+def put_until(received: list[bytes], payload: bytes, put: Callable[[], object]) -> None:
     """Put again and again until it arrives: a router's knowledge of listeners spreads by itself."""
 
     def arrived() -> bool:
         put()
-        return wanted in heard
+        return payload in received
 
-    wait_until(arrived, 10.0, f"{wanted!r} heard")
+    wait_until(arrived, 10.0, f"{payload!r} received")
 
 
 # --- who may, can ----------------------------------------------------------------------------------------------------
@@ -137,10 +137,10 @@ def put_until(heard: list[bytes], wanted: bytes, put: Callable[[], object]) -> N
 
 def test_a_machine_gets_its_acknowledgements_from_the_map_server(guarded: Guarded):
     with guarded.session("loader-1") as session, connect(guarded.endpoint, keys=guarded.keys / "loader-1") as client:
-        before = client.info()["journalled"]
+        before = client.info().journalled
         for _ in range(200):  # faster than any rate limit: these never fall under one
             assert acknowledged(session, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
-        assert client.info(after=before + 200)["journalled"] == before + 200
+        assert client.info(after=before + 200).journalled == before + 200
 
 
 def test_agent_and_simulator_work_with_keys_as_without(guarded: Guarded, tmp_path: Path):
@@ -182,24 +182,24 @@ def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_
 
 def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "guest") as client:
-        assert client.info()["site"]["name"] == SITE
+        assert client.info().site.name == SITE
         with pytest.raises(LinkError, match="or these keys may not ask this"):
             client.distrust("loader-1", "because")
         guest = client.session
         assert answers(guest, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == []
         assert answers(guest, keys.ingest(SITE, "guest"), guarded.batch("guest")) == []
-        with guarded.session("boss") as boss, listening(boss, keys.poses_all(SITE)) as heard:
+        with guarded.session("boss") as boss, listening(boss, keys.poses_all(SITE)) as received:
             guest.put(keys.pose(SITE, "loader-1"), b"forged")
             guest.put(keys.pose(SITE, "guest"), b"forged")
             assert answers(guest, keys.map_query(SITE, "info"))  # what was put before it has been judged
             with guarded.session("loader-1") as loader:
-                put_until(heard, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
-            assert set(heard) == {b"own"}
+                put_until(received, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
+            assert set(received) == {b"own"}
 
 
 def test_only_an_admin_commands(guarded: Guarded):
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "boss") as client:
-        assert client.trust("loader-1", "seen to")["trusted"]
+        assert client.trust("loader-1", "seen to").trusted
 
 
 # --- who has no name that counts -------------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ def with_certificate(guarded: Guarded, folder: Path, authority: Any, days: float
 
 def own_authority(guarded: Guarded) -> Any:
     place = guarded.keys / "authority"
-    return certificates.Pair((place / "cert.pem").read_bytes(), (place / "key.pem").read_bytes())
+    return certificates.KeyPair((place / "cert.pem").read_bytes(), (place / "key.pem").read_bytes())
 
 
 def refusal(config: SessionConfig) -> str:
@@ -327,13 +327,13 @@ def test_a_forged_pose_reaches_nobody(guarded: Guarded):
     with (
         guarded.session("guest") as guest,
         guarded.session("loader-1") as loader,
-        listening(guest, keys.poses_all(SITE)) as heard,
+        listening(guest, keys.poses_all(SITE)) as received,
     ):
         for key in (keys.pose(SITE, "loader-2"), keys.poses_all(SITE), f"sitegrid/{SITE}/**"):
             loader.put(key, b"forged")
         loader.delete(keys.pose(SITE, "loader-1"))
-        put_until(heard, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
-        assert set(heard) == {b"own"}, guarded.still_works()
+        put_until(received, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
+        assert set(received) == {b"own"}, guarded.still_works()
 
 
 def test_nobody_shows_presence_in_anothers_name(guarded: Guarded):
@@ -355,12 +355,12 @@ def test_a_forged_change_of_the_map_reaches_nobody(guarded: Guarded):
         guarded.session("guest") as guest,
         guarded.session("loader-1") as loader,
         guarded.session("server") as server,
-        listening(guest, keys.changed(SITE)) as heard,
+        listening(guest, keys.changed(SITE)) as received,
     ):
         loader.put(keys.changed(SITE), b"forged")
         assert answers(loader, keys.map_query(SITE, "info"))
-        put_until(heard, b"true", lambda: server.put(keys.changed(SITE), b"true"))
-        assert set(heard) == {b"true"}, guarded.still_works()
+        put_until(received, b"true", lambda: server.put(keys.changed(SITE), b"true"))
+        assert set(received) == {b"true"}, guarded.still_works()
 
 
 def test_nobody_listens_to_what_is_not_theirs(guarded: Guarded):
@@ -393,9 +393,9 @@ def test_a_fake_map_server_is_never_asked(guarded: Guarded, mode: str):
         lies = [fake.declare_queryable(key, lie, complete=True) for key in everything]
         assert answers(fake, keys.map_query(SITE, "info"), allowed_destination=zenoh.Locality.REMOTE)  # after those
         for target in (zenoh.QueryTarget.ALL, zenoh.QueryTarget.BEST_MATCHING):
-            found = answers(loader, keys.map_query(SITE, "info"), target=target)
-            assert len(found) == 1
-            assert b"a lie" not in found
+            replies = answers(loader, keys.map_query(SITE, "info"), target=target)
+            assert len(replies) == 1
+            assert b"a lie" not in replies
         assert acknowledged(loader, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
         assert asked == [], guarded.still_works()
         for queryable in lies:
@@ -408,7 +408,7 @@ def test_oversize_payloads_stay_at_the_router(guarded: Guarded):
         assert answers(loader, own, bytes(MAX_BATCH_BYTES)), "the map server itself says what is wrong with it"
         assert answers(loader, own, bytes(MAX_BATCH_BYTES + SPARE_BYTES + 1)) == []
         assert answers(guest, keys.map_query(SITE, "info"), bytes(2**20 + 1)) == []
-        with listening(guest, keys.poses_all(SITE)) as heard:
+        with listening(guest, keys.poses_all(SITE)) as received:
             huge = bytes(MAX_SMALL_BYTES + 1)
 
             def put() -> None:
@@ -417,20 +417,20 @@ def test_oversize_payloads_stay_at_the_router(guarded: Guarded):
                 time.sleep(0.03)  # beyond the rate limit, which counts what is too large
                 loader.put(keys.pose(SITE, "loader-1"), b"small")
 
-            put_until(heard, b"small", put)
-            assert huge not in heard, guarded.still_works()
+            put_until(received, b"small", put)
+            assert huge not in received, guarded.still_works()
 
 
 def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
     with guarded.session("guest") as guest, guarded.session("loader-1") as loader:
-        with listening(guest, keys.poses_all(SITE)) as heard:
-            put_until(heard, b"first", lambda: loader.put(keys.pose(SITE, "loader-1"), b"first"))
+        with listening(guest, keys.poses_all(SITE)) as received:
+            put_until(received, b"first", lambda: loader.put(keys.pose(SITE, "loader-1"), b"first"))
             began = time.monotonic()
             for _ in range(2000):
                 loader.put(keys.pose(SITE, "loader-1"), b"flood")
-            put_until(heard, b"last", lambda: loader.put(keys.pose(SITE, "loader-1"), b"last"))
+            put_until(received, b"last", lambda: loader.put(keys.pose(SITE, "loader-1"), b"last"))
             most = 50 * (time.monotonic() - began) + 5
-        assert heard.count(b"flood") <= most, guarded.still_works()
+        assert received.count(b"flood") <= most, guarded.still_works()
 
 
 # --- revoked ---------------------------------------------------------------------------------------------------------
@@ -443,7 +443,7 @@ def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, chil
     with site.session("loader-1") as loader, site.session("loader-2") as other:
         assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == [True]
         site.make_keys("revoke", "loader-1")
-        assert site.router.expect("renewed", 10.0)["names"] == len(ROLES), f"router pid {site.router.pid}"
+        assert site.router.expect("reloaded", 10.0)["names"] == len(ROLES), f"router pid {site.router.pid}"
         wait_until(
             lambda: acknowledged(other, keys.ingest(SITE, "loader-2"), site.batch("loader-2")) == [True],
             20.0,
@@ -452,7 +452,7 @@ def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, chil
         wait_until(lambda: bool(loader.info.routers_zid()), 10.0, "the link is there again")
         assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == []
     site.make_keys("add", "loader-1")
-    site.router.expect("renewed", 10.0)
+    site.router.expect("reloaded", 10.0)
     with site.session("loader-1") as repaired:
         wait_until(
             lambda: acknowledged(repaired, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == [True],
@@ -472,7 +472,7 @@ def test_a_broken_register_changes_nothing(guarded: Guarded):
     wait_until(lambda: "the rules stay as they were" in log.read_text(), 10.0, "said so")
     assert guarded.still_works()
     register.write_bytes(whole)
-    assert guarded.router.expect("renewed", 10.0)["names"] == len(ROLES) + 1, "and the map server"
+    assert guarded.router.expect("reloaded", 10.0)["names"] == len(ROLES) + 1, "and the map server"
     wait_until(lambda: guarded.router.code is None and answers_again(guarded), 10.0, "as before")
 
 

@@ -26,13 +26,13 @@ def test_several_machines_merge_into_one_grid(site_run: SiteRun):
         site_run.wait_merged(client, 50)
         during = client.info()
         assert sim.code is None, "the query is answered while machines drive"
-        assert client.point(0.0, 0.0, after=during["journalled"]).merged >= during["journalled"]
+        assert client.point(0.0, 0.0, after=during.journalled).merged >= during.journalled
         reports = site_run.end_of_agents()
         assert all(report["delivered"] for report in reports.values())
         info = client.info()
         region = client.region((0, 0, 200, 150), ["resistance", "visits"])
-    assert set(info["machines"]) == set(site_run.agents)
-    assert info["samples_merged"] + info["samples_too_unsure"] == sum(r["samples"] for r in reports.values())
+    assert set(info.machines) == set(site_run.agents)
+    assert info.samples_merged + info.samples_too_unsure == sum(r["samples"] for r in reports.values())
     known = np.isfinite(region["resistance"])
     assert known.sum() > 500
     assert np.nanmax(region["visits"]) >= 1
@@ -117,8 +117,8 @@ def test_two_sites_do_not_mix(tmp_path, children: Children):
     for run, report in zip(runs, reports, strict=True):
         with run.connect() as client:
             info = client.info()
-        assert list(info["machines"]) == [run.sim.names[0]]
-        assert info["machines"][run.sim.names[0]]["samples"] == report[run.sim.names[0]]["samples"] > 50
+        assert list(info.machines) == [run.sim.names[0]]
+        assert info.machines[run.sim.names[0]].samples == report[run.sim.names[0]]["samples"] > 50
     for server, run in zip(servers, runs, strict=True):
         server.stop()
         assert (run.audit().lost, run.audit().unrecorded) == (0, 0)
@@ -157,7 +157,7 @@ def test_queries_that_are_refused_are_counted_and_say_why(site_run: SiteRun):
         assert late.value.reason == "after_timeout"
         with pytest.raises(QueryError, match="at most 16000000 are answered"):
             client.region((0, 0, 1e5, 1e5))
-        counters = client.info()["counters"]
+        counters = client.info().counters
     assert counters["refused_query_unknown_layer"] == 1
     assert counters["refused_query_after_timeout"] == 1
     assert counters["refused_query_too_large"] == 1

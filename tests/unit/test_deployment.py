@@ -19,10 +19,10 @@ MACHINES = ["loader-1", "loader-2", "loader-3"]
 
 def tool(name: str) -> str:
     """The tool beside this Python, or on the path."""
-    found = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
-    if not found:
+    path = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
+    if not path:
         pytest.skip(f"{name} is not installed")
-    return found
+    return path
 
 
 def services() -> dict:
@@ -32,9 +32,9 @@ def services() -> dict:
 
 def commands() -> list[list[str]]:
     """The words after `sitegrid` of every command and health check."""
-    found = [list(service["command"]) for service in services().values()]
+    commands = [list(service["command"]) for service in services().values()]
     checks = [service["healthcheck"]["test"] for service in services().values() if "healthcheck" in service]
-    return found + [list(test[2:]) for test in checks if test[1] == "sitegrid"]
+    return commands + [list(test[2:]) for test in checks if test[1] == "sitegrid"]
 
 
 def test_compose_file_follows_the_specification():

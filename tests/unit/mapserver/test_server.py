@@ -7,17 +7,8 @@ import zenoh
 
 from mapserver.server import Server
 from protocol.errors import Refusal
-from protocol.queries.requests import (
-    Freshness,
-    InfoQuery,
-    PointQuery,
-    RegionQuery,
-    decode_error,
-    decode_info,
-    decode_point,
-    decode_region,
-    encode_query,
-)
+from protocol.queries.answer_codec import decode_error, decode_info, decode_point, decode_region
+from protocol.queries.requests import Freshness, InfoQuery, PointQuery, RegionQuery, encode_query
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
@@ -60,7 +51,7 @@ def refusal(client: zenoh.Session, name: str, parameters: dict[str, str]):
 
 
 def counters(client: zenoh.Session) -> dict[str, int]:
-    return decode_info(ask(client, InfoQuery()))["counters"]
+    return decode_info(ask(client, InfoQuery())).counters
 
 
 def test_a_batch_is_acknowledged_and_seen_by_a_query_that_waits_for_it(served):
@@ -81,7 +72,7 @@ def test_a_repeated_batch_is_trimmed_and_an_empty_one_asks_for_the_watermark(ser
     deliver(client, batch(samples(5)))
     assert deliver(client, batch(samples(7))) == Ack(7, 2, trimmed=5)
     assert deliver(client, batch(samples(0))) == Ack(7, 2)
-    assert decode_info(ask(client, InfoQuery()))["samples_merged"] == 7
+    assert decode_info(ask(client, InfoQuery())).samples_merged == 7
 
 
 def test_a_refused_batch_gets_its_reason(served):

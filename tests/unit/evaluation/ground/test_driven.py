@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evaluation.maps.score import by_border_distance, driven_cells, score_driven
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from protocol.site.ground_classes import UNKNOWN
 
 NAN = np.nan

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from evaluation.maps.score import score
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from protocol.site.ground_classes import SLOPE_LIMIT
 
 NAN = np.nan

@@ -6,7 +6,7 @@ import pytest
 
 from mapserver.pictures import frame, plotter
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from protocol.site.ground_classes import ZONES
 
 NAN = np.float32(np.nan)

@@ -10,7 +10,8 @@ from mapserver.layers.cell_layers import LAYERS, ReadConfig
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.answers import Answers
 from protocol.errors import QueryError, Refusal
-from protocol.queries.requests import PointQuery, RegionQuery, decode_info, decode_point, decode_region
+from protocol.queries.answer_codec import decode_info, decode_point, decode_region
+from protocol.queries.requests import PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
 
@@ -133,8 +134,8 @@ def test_answers_travel_as_bytes(answers):
     here = decode_region(answers.answer("region", {"bounds": "0,-2,2,0", "layers": "grade_east"}))
     np.testing.assert_allclose(here["grade_east"], [[np.nan, 0.01], [0.0, np.nan]], atol=1e-3)
     info = decode_info(answers.answer("info", {"after": "1"}))
-    assert info["layers"] == [*LAYERS, *AREA_LAYERS]
-    assert info["samples_merged"] == 80
+    assert info.layers == (*LAYERS, *AREA_LAYERS)
+    assert info.samples_merged == 80
 
 
 def test_an_answer_waits_for_the_row_asked_for(answers):

@@ -1,6 +1,7 @@
 """Maps as of any time, their differences, the history of a point; machines, changes and commands."""
 
 import threading
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,15 +12,7 @@ from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answers import Answers, Nobody, reads_past
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
-from protocol.queries.commands import TrustCommand, encode_command
-from protocol.queries.parameters import selector_of
-from protocol.queries.requests import (
-    MAX_SPANS,
-    HistoryQuery,
-    InfoQuery,
-    PointQuery,
-    RegionQuery,
-    When,
+from protocol.queries.answer_codec import (
     decode_changes,
     decode_error,
     decode_history,
@@ -29,8 +22,11 @@ from protocol.queries.requests import (
     decode_point,
     decode_region,
     encode_change,
-    encode_query,
 )
+from protocol.queries.answers import GroundChange
+from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.parameters import selector_of
+from protocol.queries.requests import MAX_SPANS, HistoryQuery, InfoQuery, PointQuery, RegionQuery, When, encode_query
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch
@@ -47,6 +43,7 @@ from tests.unit.mapserver.data import (
     samples,
     send,
 )
+from tests.unit.records import machine_state
 
 S, HOUR_NS = 10**9, 3600 * 10**9
 BOX = Bounds(-40, -40, 40, 40)
@@ -54,6 +51,9 @@ ROWS = {"a": random_samples(600, 5, std_m=1.0), "b": random_samples(600, 6, std_
 ROWS["b"]["stamp_ns"] += HOUR_NS
 NEWEST_NS = int(ROWS["b"]["stamp_ns"].max())
 NAMES = (*LAYERS, "resistance_filled", "grade_filled_std")
+
+
+CHANGE = GroundChange(1, NOW_NS, NOW_NS, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, None)
 
 
 class Watching(Nobody):
@@ -64,17 +64,17 @@ class Watching(Nobody):
         self._distrusted = frozenset(distrusted)
 
     def machines(self):
-        return [{"name": "a", "trusted": True}, {"name": "b", "trusted": False}]
+        return [machine_state("a"), machine_state("b", trusted=False)]
 
     def changes(self, after):
         self.asked.append(after)
-        return [{"id": after + 1}]
+        return [replace(CHANGE, id=after + 1)]
 
     def trust(self, machine, trusted, reason, wait_s):
         self.asked.append((machine, trusted, reason, wait_s))
         if machine not in "ab":
             return super().trust(machine, trusted, reason, wait_s)
-        return {"name": machine, "trusted": trusted is not False}
+        return asdict(machine_state(machine, trusted=trusted is not False))
 
     def distrusted(self):
         return self._distrusted
@@ -335,9 +335,9 @@ def test_the_keeper_is_asked(served):
     keeper = Watching()
     answers = served(keeper=keeper)
     assert decode_machines(answers.answer("machines", {"after": "1"})) == keeper.machines()
-    assert decode_changes(answers.answer("changes", {"after": "41"})) == [{"id": 42}]
+    assert decode_changes(answers.answer("changes", {"after": "41"})) == [replace(CHANGE, id=42)]
     row = decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
-    assert row == {"name": "b", "trusted": False, "merged": 4}
+    assert (row.name, row.trusted, row.merged) == ("b", False, 4)
     answers.obey("trust", {"machine": "b", "trusted": "auto"})
     assert keeper.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
     with pytest.raises(QueryError, match="`c` is not known") as caught:
@@ -380,9 +380,9 @@ def test_events_and_queries_below_the_map_do_not_meet(online):
     error = decode_error(get(client, keys.changed("pit"), {}).err.payload.to_bytes())
     assert error.reason == Refusal.UNKNOWN_QUERY
     get(client, keys.map_query("pit", "info"), {})  # the subscription has reached the server with this answer
-    server._publish({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})
+    server._publish(CHANGE)
     assert here.wait(WAIT_S)
-    assert heard == [encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
+    assert heard == [encode_change(CHANGE)]
     subscriber.undeclare()
 
 
@@ -391,15 +391,15 @@ def test_a_command_reaches_the_keeper_with_its_reason(online):
     get(client, keys.ingest("pit", "a"), {}, encode_batch(batch(samples(5))))
     command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")
     row = decode_machine(get(client, keys.admin("pit", "trust"), encode_command(command)).ok.payload.to_bytes())
-    assert (row["name"], row["trusted"], row["merged"]) == ("a", False, 1)
-    assert row["reason"] == command.reason
+    assert (row.name, row.trusted, row.merged) == ("a", False, 1)
+    assert row.reason == command.reason
     gone = {"x": "8.5", "y": "8.5", "layers": "weight"}
     for more in ({}, {"as_of": str(NOW_NS + HOUR_NS)}):
         point = decode_point(get(client, keys.map_query("pit", "point"), gone | more).ok.payload.to_bytes())
         assert np.isnan(point.values["weight"])
     [machine] = decode_machines(get(client, keys.map_query("pit", "machines"), {}).ok.payload.to_bytes())
-    assert machine["name"] == "a"
-    assert not machine["trusted"]
+    assert machine.name == "a"
+    assert not machine.trusted
 
 
 @pytest.mark.parametrize(
@@ -414,7 +414,7 @@ def test_a_refused_command_gets_its_reason_and_is_counted(online, name, paramete
     _, client = online
     assert decode_error(get(client, keys.admin("pit", name), parameters).err.payload.to_bytes()).reason == reason
     info = decode_info(get(client, keys.map_query("pit", "info"), {}).ok.payload.to_bytes())
-    assert info["counters"] == {f"refused_query_{reason}": 1}
+    assert info.counters == {f"refused_query_{reason}": 1}
 
 
 @pytest.mark.parametrize("slow", ["past", "command"])

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol.errors import ConfigError, LogFolderError, Refusal
@@ -192,6 +192,7 @@ def recordings(draw):
     return sorted(readings, key=lambda r: r.stamp_ns)
 
 
+@settings(max_examples=30)
 @given(recordings())
 def test_written_log_reads_back_exactly(tmp_path_factory, readings):
     where = tmp_path_factory.mktemp("log")

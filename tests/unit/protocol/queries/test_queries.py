@@ -1,4 +1,5 @@
 import math
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -7,22 +8,7 @@ from hypothesis import strategies as st
 
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
-from protocol.queries.commands import TrustCommand, encode_command, parse_command
-from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
-from protocol.queries.requests import (
-    ChangesQuery,
-    Freshness,
-    HistoryAnswer,
-    HistoryQuery,
-    InfoQuery,
-    MachinesQuery,
-    PointAnswer,
-    PointQuery,
-    Region,
-    RegionQuery,
-    Span,
-    When,
-    check_size,
+from protocol.queries.answer_codec import (
     decode_change,
     decode_changes,
     decode_error,
@@ -40,11 +26,37 @@ from protocol.queries.requests import (
     encode_machine,
     encode_machines,
     encode_point,
-    encode_query,
     encode_region,
+)
+from protocol.queries.answers import (
+    GroundChange,
+    HistoryAnswer,
+    HistorySpan,
+    MachineState,
+    MapInfo,
+    PointAnswer,
+    Region,
+    SampleCounts,
+    SiteInfo,
+    TrustAnswer,
+)
+from protocol.queries.commands import TrustCommand, encode_command, parse_command
+from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
+from protocol.queries.requests import (
+    ChangesQuery,
+    Freshness,
+    HistoryQuery,
+    InfoQuery,
+    MachinesQuery,
+    PointQuery,
+    RegionQuery,
+    When,
+    check_size,
+    encode_query,
     parse_query,
 )
 from protocol.site.geometry import MAX_CELLS, Bounds
+from protocol.site.site_config import KnownGround, SiteConfig
 from protocol.wire.codec import pack
 
 positions = st.floats(-1e15, 1e15)
@@ -278,7 +290,10 @@ def test_point_whose_values_are_no_numbers_is_refused():
 
 
 def test_history_round_trips_and_keeps_unknown_as_nan():
-    spans = (Span(10, 19, {"resistance": math.nan, "visits": 3}), Span(30, 39, {"resistance": 0.5, "visits": 1.0}))
+    spans = (
+        HistorySpan(10, 19, {"resistance": math.nan, "visits": 3}),
+        HistorySpan(30, 39, {"resistance": 0.5, "visits": 1.0}),
+    )
     got = decode_history(encode_history(HistoryAnswer(0.5, -0.5, spans, 7, 8)))
     assert (got.x_m, got.y_m, got.merged, got.stamp_ns) == (0.5, -0.5, 7, 8)
     assert [(span.first_ns, span.last_ns) for span in got.spans] == [(10, 19), (30, 39)]
@@ -301,19 +316,83 @@ def test_malformed_history_is_refused(spans, words):
         decode_history(pack({"x_m": 0.5, "y_m": 0.5, "spans": spans, "merged": 1, "stamp_ns": 1}))
 
 
-def test_tables_round_trip():
-    rows = [{"name": "a", "evidence": {"shift_m": 1.5}, "reasons": ["gain"]}, {"name": "b"}]
-    assert decode_machines(encode_machines(rows)) == rows
-    assert decode_changes(encode_changes(rows)) == rows
-    assert decode_machine(encode_machine(rows[0])) == rows[0]
-    assert decode_change(encode_change(rows[0])) == rows[0]
+MACHINE = MachineState("a", True, "", "", 0, False, ("gain",), {"shift_m": 1.5}, 1, 7, 0, 5)
+CHANGE = GroundChange(1, 5, 6, (0.0, 0.0, 1.0, 2.0), 7, 0.25, None, None, None)
+SITE = SiteConfig("pit", 48.0, 11.0, known_ground=(KnownGround("pad", 0.01, ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))),))
+INFO = MapInfo(
+    site=SiteInfo(**vars(SITE), frame=SITE.frame, crs=SITE.crs),
+    journalled=5,
+    merged=5,
+    snapshot=0,
+    samples_merged=40,
+    samples_too_unsure=2,
+    cells=7,
+    bounds=(0, -16, 16, 16),
+    stamp_ns=9,
+    wall_ns=10,
+    version="1.0",
+    machines={"a": SampleCounts(1, 42, 0, 9)},
+    distrusted=("b",),
+    counters={"refused_gap": 2},
+    layers=("resistance",),
+)
+
+
+def test_records_round_trip():
+    assert decode_machines(encode_machines([MACHINE])) == [MACHINE]
+    assert decode_changes(encode_changes([CHANGE])) == [CHANGE]
+    assert decode_change(encode_change(CHANGE)) == CHANGE
+    assert decode_info(encode_info(INFO)) == INFO
+    assert decode_info(encode_info(replace(INFO, bounds=None))).bounds is None
+    answer = TrustAnswer(**vars(MACHINE), merged=3)
+    assert decode_machine(encode_machine(answer)) == answer
+
+
+def test_fields_of_a_newer_server_are_ignored():
+    assert decode_changes(encode_changes([{**asdict(CHANGE), "volume_m3": 4.0}])) == [CHANGE]
+    site = {**asdict(INFO.site), "datum": "WGS84"}
+    assert decode_info(encode_info({**asdict(INFO), "site": site, "load": 0.5})) == INFO
+
+
+@pytest.mark.parametrize("name", [item.name for item in fields(MapInfo)])
+def test_info_without_a_field_is_refused(name):
+    table = {key: value for key, value in asdict(INFO).items() if key != name}
+    with pytest.raises(MessageError, match=f"info.{name}: missing"):
+        decode_info(encode_info(table))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"cells": "many"}, "info.cells: int expected, not str"),
+        ({"cells": None}, "info.cells: missing"),
+        ({"bounds": [1, 2]}, "info.bounds: 4 values expected, not 2"),
+        ({"bounds": 7}, "info.bounds: list expected"),
+        ({"machines": {"a": {"spools": 1}}}, "info.machines.a.samples: missing"),
+        ({"machines": {b"a": {}}}, "info.machines: the name b'a' is no text"),
+        ({"counters": {"batches": 1.5}}, "info.counters.batches: int expected"),
+        ({"layers": [1]}, r"info.layers\[0\]: str expected"),
+        (
+            {"site": {**asdict(INFO.site), "known_ground": [{"name": "pad", "c_rr": 2.0, "outline": []}]}},
+            "not between 0",
+        ),
+    ],
+)
+def test_info_of_other_types_is_refused(values, words):
+    with pytest.raises(MessageError, match=words):
+        decode_info(encode_info({**asdict(INFO), **values}))
+
+
+def test_evidence_is_plain():
+    with pytest.raises(MessageError, match="bytes is no plain value"):
+        decode_machines(encode_machines([{**asdict(MACHINE), "evidence": {"x": b"1"}}]))
 
 
 @pytest.mark.parametrize("decode", [decode_machines, decode_changes])
 def test_a_table_whose_rows_are_no_maps_is_refused(decode):
     name = decode.__name__.removeprefix("decode_")
-    with pytest.raises(MessageError, match=rf"{name}\[1\]: map expected"):
-        decode(pack({name: [{}, 1]}))
+    with pytest.raises(MessageError, match=rf"{name}\[0\]: dict expected"):
+        decode(pack({name: [1, {}]}))
 
 
 def test_an_event_is_small():
@@ -322,8 +401,6 @@ def test_an_event_is_small():
     assert caught.value.reason is Refusal.TOO_LARGE
 
 
-def test_info_and_error_round_trip():
-    info = {"journalled": 5, "refused": {"gap": 2}, "machines": ["a"]}
-    assert decode_info(encode_info(info)) == info
+def test_error_round_trip():
     error = decode_error(encode_error(QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")))
     assert (error.reason, str(error)) == ("unknown_layer", "layer `x` is not known")

@@ -44,11 +44,6 @@ def test_sliver_is_one_cell():
     assert GridGeometry(1.0).window(Bounds(3.0, 3.0, 3.0 + 1e-12, 3.5)) == CellWindow(3, 3, 1, 1)
 
 
-def test_tiles():
-    geometry = GridGeometry(1.0, 64)
-    assert [geometry.tile_of(cell) for cell in (-65, -64, -1, 0, 63, 64)] == [-2, -1, -1, 0, 0, 1]
-
-
 @pytest.mark.parametrize("values", [(0, 0, 0, 1), (1, 0, 0, 1), (0, 2, 1, 1), (math.nan, 0, 1, 1), (0, 0, math.inf, 1)])
 def test_bounds_that_hold_nothing_are_refused(values):
     with pytest.raises(ValueError, match="bounds"):

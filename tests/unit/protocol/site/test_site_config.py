@@ -70,7 +70,6 @@ def test_frame_is_eight_hex_digits():
         {"origin_lat_deg": math.nan},
         {"cell_m": 0.0},
         {"cell_m": math.nan},
-        {"tile_cells": 63},
         {"extent_m": 0.0},
         {"extent_m": math.inf},
         {"clock": "sun"},

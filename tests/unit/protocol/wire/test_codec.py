@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, Encoder, Imu, columns
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
-from protocol.queries import requests
+from protocol.queries import answer_codec as answers
 from protocol.wire import codec
 from protocol.wire.codec import decode_batch, encode_batch
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
@@ -241,6 +241,7 @@ def reading_lists(draw):
     return readings
 
 
+@settings(max_examples=30)
 @given(names, st.integers(1, codec.MAX_SEQ), reading_lists(), st.booleans())
 def test_bundle_round_trip_in_the_order_of_stamps(machine, counter, readings, last):
     got = codec.decode_bundle(codec.encode_bundle(SensorBundle(machine, counter, tuple(readings), last)))
@@ -324,10 +325,10 @@ DECODERS = {
     "bundle": codec.decode_bundle,
     "pose": codec.decode_pose,
     "health": codec.decode_health,
-    "point": requests.decode_point,
-    "region": requests.decode_region,
-    "info": requests.decode_info,
-    "error": requests.decode_error,
+    "point": answers.decode_point,
+    "region": answers.decode_region,
+    "info": answers.decode_info,
+    "error": answers.decode_error,
 }
 FIELDS = [
     "v",
@@ -391,6 +392,7 @@ def test_any_bytes(data):
         attempt(decode, data)
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(messages)
 def test_any_message(message):

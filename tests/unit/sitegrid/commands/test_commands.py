@@ -64,6 +64,7 @@ def test_sim_writes_what_agents_need(tmp_path: Path):
     assert machine == load_scenario("paper_site").rigs()[1].machine
 
 
+@pytest.mark.slow  # it waits for a router
 def test_sim_publishes_nothing_without_a_router(capsys: pytest.CaptureFixture[str]):
     assert main(["sim", "--endpoint", free_endpoint(), "--seconds", "1"]) == 1
     assert "start one with `sitegrid router`" in capsys.readouterr().err
@@ -121,6 +122,7 @@ def test_router_says_where_it_cannot_listen(capsys: pytest.CaptureFixture[str]):
     assert "tcp/192.0.2.1:7447: cannot listen here" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # it waits for a router
 def test_connect_names_the_endpoint_that_does_not_answer():
     from sitegrid import connect
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.measure import table
 from sitegrid import cli
-from sitegrid.commands import eval as command
 
 MANIFEST = """
 [log]
@@ -86,7 +86,7 @@ def test_a_log_that_the_pipeline_cannot_run_is_one_line(tmp_path: Path, capsys: 
 
 
 def test_tables_for_people_line_up():
-    text = command.table([{"a": 1, "bb": None}, {"a": 22.5, "bb": "x"}])
+    text = table([{"a": 1, "bb": None}, {"a": 22.5, "bb": "x"}])
     assert text.splitlines() == ["   a  bb", "   1   -", "22.5   x"]
 
 

@@ -21,7 +21,7 @@ from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from sitegrid.cli import build_parser, main
 from sitegrid.security.access import access_control, router_settings
 from sitegrid.security.join import is_loopback, join
-from sitegrid.security.register import ROLES, Entry, Register, common_name, load_register, register_toml
+from sitegrid.security.register import ROLES, Register, RegisterEntry, common_name, load_register, register_toml
 
 x509 = pytest.importorskip("cryptography.x509", reason="cryptography is not installed")
 
@@ -32,9 +32,9 @@ SITE = "paper"
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A folder of keys of a site."""
-    found = tmp_path / "keys"
-    assert main(["keys", "init", "--dir", str(found), "--site", SITE, "--host", "10.0.0.5", "router.site"]) == 0
-    return found
+    made = tmp_path / "keys"
+    assert main(["keys", "init", "--dir", str(made), "--site", SITE, "--host", "10.0.0.5", "router.site"]) == 0
+    return made
 
 
 def act(folder: Path, action: str, *words: str) -> int:
@@ -70,12 +70,14 @@ def test_only_the_owner_reads_keys(folder: Path):
 def test_certificates_say_who_and_what_for(folder: Path):
     assert act(folder, "add", "loader-1") == 0
     for name, purpose in (("router", "serverAuth"), ("server", "clientAuth"), ("loader-1", "clientAuth")):
-        found = certificate(folder, name)
-        assert found.subject.rfc4514_string() == f"CN={name}"
-        assert found.public_key().curve.name == "secp256r1"
-        assert [use._name for use in found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value] == [purpose]
-        assert not found.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
-        found.verify_directly_issued_by(certificate(folder, "authority"))
+        issued = certificate(folder, name)
+        assert issued.subject.rfc4514_string() == f"CN={name}"
+        assert issued.public_key().curve.name == "secp256r1"
+        assert [use._name for use in issued.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value] == [
+            purpose
+        ]
+        assert not issued.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        issued.verify_directly_issued_by(certificate(folder, "authority"))
     hosts = certificate(folder, "router").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert hosts.get_values_for_type(x509.DNSName) == ["localhost", "router.site"]
     assert [str(ip) for ip in hosts.get_values_for_type(x509.IPAddress)] == ["127.0.0.1", "10.0.0.5"]
@@ -96,8 +98,8 @@ def test_init_takes_the_days_of_router_and_server(tmp_path: Path):
     assert lifetime(certificate(tmp_path, "router")).days == lifetime(certificate(tmp_path, "server")).days == 7
 
 
-def lifetime(of: x509.Certificate) -> timedelta:
-    return of.not_valid_after_utc - of.not_valid_before_utc
+def lifetime(issued: x509.Certificate) -> timedelta:
+    return issued.not_valid_after_utc - issued.not_valid_before_utc
 
 
 def test_no_certificate_outlives_its_authority():
@@ -184,13 +186,13 @@ def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys: pytest.Ca
     assert act(folder, "add", "loader-1") == 0
     assert act(folder, "revoke", "loader-1") == 0
     register = load_register(folder)
-    old = Entry("visitor", "1", NOW - timedelta(days=1))
+    old = RegisterEntry("visitor", "1", NOW - timedelta(days=1))
     (folder / "register.toml").write_text(register_toml(register.with_entry("old", old)))
     capsys.readouterr()
     assert act(folder, "list", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["site"] == SITE
-    rows = {row["name"]: row for row in found["names"]}
+    listed = json.loads(capsys.readouterr().out)
+    assert listed["site"] == SITE
+    rows = {row["name"]: row for row in listed["names"]}
     states = {name: (row["role"], row["state"], row["revoked"]) for name, row in rows.items()}
     assert states == {
         "loader-1": ("machine", "revoked", True),
@@ -225,10 +227,10 @@ def test_wrong_usage_exits_with_2():
 def test_without_cryptography_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    for name in ("sitegrid.security.certificates", "sitegrid.commands.keys"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
+    for name in ("certificates", "key_folder"):
+        monkeypatch.delitem(sys.modules, f"sitegrid.security.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
-    assert act(tmp_path, "list") == 1
+    assert act(tmp_path / "keys", "init") == 1
     assert "pip install 'sitegrid[security]'" in capsys.readouterr().err
 
 
@@ -243,7 +245,7 @@ def test_whoever_only_has_keys_needs_no_cryptography():
 
 
 def test_the_register_is_read_as_it_was_written(tmp_path: Path):
-    names = {"b": Entry("admin", "ff", NOW, 3, True, "key"), "a-1": Entry("machine", "0", NOW)}
+    names = {"b": RegisterEntry("admin", "ff", NOW, 3, True, "key"), "a-1": RegisterEntry("machine", "0", NOW)}
     register = Register("north", ("localhost", "::1"), names)
     (tmp_path / "register.toml").write_text(register_toml(register))
     assert load_register(tmp_path) == register
@@ -283,14 +285,14 @@ def test_only_machines_have_signing_keys_and_the_register_knows_them(folder: Pat
 
 
 def test_common_names_never_meet():
-    found = {common_name(name, issue) for name in ("a", "a-2", "a2", "a_2") for issue in (1, 2, 3)}
-    assert len(found) == 12
+    names = {common_name(name, issue) for name in ("a", "a-2", "a2", "a_2") for issue in (1, 2, 3)}
+    assert len(names) == 12
 
 
 # --- rules -----------------------------------------------------------------------------------------------------------
 
 NAMES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim"}
-REGISTER = Register(SITE, (), {n: Entry(r, "1", NOW) for n, r in {**NAMES, "server": "server"}.items()})
+REGISTER = Register(SITE, (), {n: RegisterEntry(r, "1", NOW) for n, r in {**NAMES, "server": "server"}.items()})
 
 
 def may(name: str, message: str, key: str, flow: str = "ingress", register: Register = REGISTER) -> bool:
@@ -356,23 +358,23 @@ def test_answers_and_events_go_only_to_whom_they_are_for():
 
 def test_every_key_that_exists_is_granted_to_somebody():
     for name, build in inspect.getmembers(keys, inspect.isfunction):
-        wanted = list(inspect.signature(build).parameters)
-        if build.__module__ != keys.__name__ or name.startswith("_") or wanted[:1] != ["site"]:
+        parameters = list(inspect.signature(build).parameters)
+        if build.__module__ != keys.__name__ or name.startswith("_") or parameters[:1] != ["site"]:
             continue
         values = {"site": SITE, "machine": "loader-1", "query": "info", "command": "trust"}
-        key = build(**{parameter: values[parameter] for parameter in wanted})
+        key = build(**{parameter: values[parameter] for parameter in parameters})
         messages = ("put", "query", "declare_subscriber", "liveliness_token", "liveliness_query", "declare_queryable")
         assert any(may(who, message, key) for who in REGISTER.names for message in messages), f"{name}: {key}"
 
 
 def test_rules_follow_the_certificate_and_end_with_it():
-    register = REGISTER.without("loader-2").with_entry("loader-1", Entry("machine", "2", NOW, issue=2))
+    register = REGISTER.without("loader-2").with_entry("loader-1", RegisterEntry("machine", "2", NOW, issue=2))
     subjects = {s["id"]: s["cert_common_names"] for s in access_control(register)["subjects"]}
     assert subjects["loader-1"] == ["loader-1.2"]
     assert "loader-2" not in subjects
     assert not may("loader-2", "query", keys.map_query(SITE, "info"), register=register)
     assert "router" not in {
-        s["id"] for s in access_control(REGISTER.with_entry("router", Entry("router", "3", NOW)))["subjects"]
+        s["id"] for s in access_control(REGISTER.with_entry("router", RegisterEntry("router", "3", NOW)))["subjects"]
     }
 
 
@@ -400,13 +402,13 @@ def test_with_keys_the_default_endpoint_has_tls(folder: Path):
 
 def test_keys_that_do_not_fit_are_named(folder: Path):
     keys_of = folder / "server"
-    for wanted, problem in (
+    for required, problem in (
         ({"role": "machine"}, "for role 'server', 'machine' is needed"),
         ({"name": "loader-1"}, "for name 'server', 'loader-1' is needed"),
         ({"site": "north"}, "for site 'paper', 'north' is needed"),
     ):
         with pytest.raises(ConfigError, match=problem):
-            join(DEFAULT_ENDPOINT, keys_of, **wanted)
+            join(DEFAULT_ENDPOINT, keys_of, **required)
     with pytest.raises(ConfigError, match="proves no names"):
         join("tcp/10.0.0.5:7447", keys_of)
     with pytest.raises(ConfigError, match="needs keys"):

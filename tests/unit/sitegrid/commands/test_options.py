@@ -12,7 +12,9 @@ from protocol.machine.log_folder import open_log
 from protocol.site.geometry import Bounds
 from sim.scenario.file import FOLDER, load_scenario
 from sitegrid.cli import build_parser
-from sitegrid.commands import agent, demo, plot, server
+from sitegrid.commands import agent, plot, server
+from sitegrid.demo.plan import DEFAULT_MANIFEST
+from sitegrid.pictures import draw
 from tests.paths import ROOT
 
 
@@ -50,10 +52,10 @@ class Nothing:
 def drawn(monkeypatch: pytest.MonkeyPatch) -> tuple[list[tuple[Any, ...]], Stop]:
     pictures: list[tuple[Any, ...]] = []
     stop = Stop()
-    monkeypatch.setattr(plot, "stop_flag", lambda: stop)
-    monkeypatch.setattr(plot, "connect", lambda *_, **__: Nothing())
-    monkeypatch.setattr(plot, "TrackRecorder", lambda *_: Nothing())
-    monkeypatch.setattr(plot, "draw", lambda _, *rest: pictures.append(rest))
+    monkeypatch.setattr(draw, "stop_flag", lambda: stop)
+    monkeypatch.setattr(draw, "connect", lambda *_, **__: Nothing())
+    monkeypatch.setattr(draw, "TrackRecorder", lambda *_: Nothing())
+    monkeypatch.setattr(draw, "draw", lambda _, *rest: pictures.append(rest))
     return pictures, stop
 
 
@@ -71,11 +73,11 @@ def test_plot_draws_once_what_it_is_told_to(drawn):
     plot.run(build_parser().parse_args(words))
     assert pictures == [(Path("a.png"), [1.0, 2.0, 3.0, 4.0], [], Path("t.npz"))]
     assert stop.waits == []
-    assert plot._bounds(None, [1.0, 2.0, 3.0, 4.0]) == Bounds(1, 2, 3, 4)
+    assert draw._bounds(None, [1.0, 2.0, 3.0, 4.0]) == Bounds(1, 2, 3, 4)
 
 
 def test_replay_takes_its_speed(husky_data: Path):
-    manifest = ROOT / demo.DEFAULT_MANIFEST
+    manifest = ROOT / DEFAULT_MANIFEST
     words = ["agent", "--spool", "x", "--driver", "replay", "--log", str(manifest), "--speed", "7"]
     log = open_log(manifest, husky_data)
     driver = agent._driver(build_parser().parse_args(words), log, None, log.site, log.machine)
@@ -95,8 +97,8 @@ def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch: pytes
             configs.append(given[3])
 
     monkeypatch.setattr(server, "stop_flag", Stop)
-    monkeypatch.setattr(server, "open_session", lambda _: Nothing())
-    monkeypatch.setattr(server, "Server", Failed)
+    monkeypatch.setattr("sitegrid.commands.server.open_session", lambda _: Nothing())
+    monkeypatch.setattr("mapserver.server.Server", Failed)
     words = ["server", "--site-file", str(site), "--store", str(tmp_path / "store"), "--config", str(options)]
     assert server.run(build_parser().parse_args(words)) == 1
     assert (configs[0].query_threads, configs[0].fold.std_cap_m) == (5, 2.0)

@@ -6,58 +6,42 @@ import json
 import threading
 from argparse import Namespace
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import replace
 
 import pytest
 import zenoh
 
 from protocol.errors import QueryError, Refusal
+from protocol.queries.answer_codec import encode_change, encode_changes, encode_error, encode_machine, encode_machines
+from protocol.queries.answers import GroundChange, TrustAnswer
 from protocol.queries.commands import TrustCommand, parse_command
 from protocol.queries.parameters import split_selector
-from protocol.queries.requests import (
-    ChangesQuery,
-    Freshness,
-    MachinesQuery,
-    encode_change,
-    encode_changes,
-    encode_error,
-    encode_machine,
-    encode_machines,
-    parse_query,
-)
+from protocol.queries.requests import ChangesQuery, Freshness, MachinesQuery, parse_query
 from protocol.wire import keys
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import build_parser, main
 from sitegrid.client import Client, connect
 from sitegrid.commands import query
+from sitegrid.process.lifetime import plain
+from tests.unit.records import machine_state
 
 WAIT_S = 20.0
 T0 = 1_750_000_000_000_000_000
 MACHINES = [
-    {"name": "a", "trusted": True, "by": "", "reasons": [], "since_ns": 0, "samples": 1200, "lost": 3, "newest_ns": T0},
-    {
-        "name": "b",
-        "trusted": False,
-        "by": "audit",
-        "reason": "",
-        "reasons": ["gain"],
-        "since_ns": T0 + 60 * 10**9,
-        "samples": 7,
-        "lost": 0,
-        "newest_ns": T0,
-    },
+    machine_state("a", samples=1200, lost=3, newest_ns=T0),
+    machine_state(
+        "b",
+        trusted=False,
+        by="audit",
+        since_ns=T0 + 60 * 10**9,
+        contradicts=True,
+        reasons=("gain",),
+        evidence={"gain": 1.6},
+        samples=7,
+        newest_ns=T0,
+    ),
 ]
-CHANGE = {
-    "id": 4,
-    "first_ns": T0,
-    "last_ns": T0 + 60 * 10**9,
-    "bounds": [10.0, -20.0, 40.0, 12.5],
-    "cells": 615,
-    "resistance_before": 0.25,
-    "resistance_after": 0.008,
-    "grade_before": None,
-    "grade_after": None,
-}
+CHANGE = GroundChange(4, T0, T0 + 60 * 10**9, (10.0, -20.0, 40.0, 12.5), 615, 0.25, 0.008, None, None)
 
 
 class FakeServer:
@@ -86,8 +70,8 @@ class FakeServer:
             if command.machine == "nobody":
                 query.reply_err(encode_error(QueryError(Refusal.UNKNOWN_MACHINE, "machine `nobody` is not known")))
                 return
-            row = {"name": command.machine, "trusted": command.trusted is not False, "merged": 17}
-            query.reply(query.key_expr, encode_machine(row))
+            machine = machine_state(command.machine, trusted=command.trusted is not False)
+            query.reply(query.key_expr, encode_machine(TrustAnswer(**vars(machine), merged=17)))
 
     def publish(self, payload: bytes) -> None:
         self.session.put(keys.changed("pit"), payload)
@@ -126,8 +110,8 @@ def sitegrid(server: FakeServer, *words: str) -> int:
 
 
 def test_commands_say_what_was_meant(server: FakeServer, client: Client):
-    assert client.trust("a") == {"name": "a", "trusted": True, "merged": 17}
-    assert client.distrust("a", "gain; x=1.6", wait_s=3.0)["trusted"] is False
+    assert client.trust("a") == TrustAnswer(**vars(machine_state("a")), merged=17)
+    assert not client.distrust("a", "gain; x=1.6", wait_s=3.0).trusted
     client.judge_automatically("a", wait_s=4.0)
     client.trust("a", "checked")
     assert server.asked == [
@@ -141,50 +125,51 @@ def test_commands_say_what_was_meant(server: FakeServer, client: Client):
     assert caught.value.reason == Refusal.UNKNOWN_MACHINE
 
 
-def test_machines_and_changes_are_plain_tables(server: FakeServer, client: Client):
+def test_machines_and_changes_are_records(server: FakeServer, client: Client):
     assert client.machines(after=3, wait_s=1.0) == MACHINES
     assert client.changes() == client.changes(after=3) == [CHANGE]
     assert server.asked == [MachinesQuery(Freshness(3, 1.0)), ChangesQuery(0), ChangesQuery(3)]
 
 
-class Heard:
-    """A callback that notes what it is called with."""
+class Callback:
+    """A callback that keeps what it is called with; change 666 makes it fail."""
 
     def __init__(self) -> None:
-        self.events: list[dict[str, Any]] = []
+        self.events: list[GroundChange] = []
         self._more = threading.Condition()
 
-    def __call__(self, event: dict[str, Any]) -> None:
+    def __call__(self, event: GroundChange) -> None:
         with self._more:
             self.events.append(event)
             self._more.notify_all()
-        if event.get("broken"):
+        if event.id == 666:
             raise RuntimeError("a bug in a callback")
 
-    def wait(self, n: int) -> list[dict[str, Any]]:
+    def wait(self, n: int) -> list[GroundChange]:
         with self._more:
             assert self._more.wait_for(lambda: len(self.events) >= n, WAIT_S)
             return list(self.events)
 
 
 def test_a_change_calls_back_until_it_is_closed(server: FakeServer, client: Client):
-    heard, other = Heard(), Heard()
-    listener = client.on_change(heard)
+    first, other = Callback(), Callback()
+    listener = client.on_change(first)
     client.on_change(other)
     client.changes()  # the server knows of the subscription with this answer
-    for payload in (b"no message", encode_change({"broken": True}), encode_change(CHANGE)):
+    failing = replace(CHANGE, id=666)
+    for payload in (b"no message", encode_change({"id": 5}), encode_change(failing), encode_change(CHANGE)):
         server.publish(payload)
-    assert heard.wait(2) == [{"broken": True}, CHANGE]
+    assert first.wait(2) == [failing, CHANGE]
     listener.close()
     listener.close()
-    server.publish(encode_change({"id": 5}))
-    assert other.wait(3)[2] == {"id": 5}
-    assert len(heard.events) == 2
+    server.publish(encode_change(replace(CHANGE, id=5)))
+    assert other.wait(3)[2].id == 5
+    assert len(first.events) == 2
 
 
 def test_a_slow_callback_stalls_nothing(server: FakeServer, client: Client):
     entered, release = threading.Event(), threading.Event()
-    quick = Heard()
+    quick = Callback()
 
     def slow(_: object) -> None:
         entered.set()
@@ -194,9 +179,9 @@ def test_a_slow_callback_stalls_nothing(server: FakeServer, client: Client):
     client.on_change(quick)
     client.changes()
     for i in range(600):  # more than Zenoh holds for a callback
-        server.publish(encode_change({"id": i}))
+        server.publish(encode_change(replace(CHANGE, id=i)))
     assert entered.wait(WAIT_S)
-    assert [event["id"] for event in quick.wait(600)] == list(range(600))
+    assert [event.id for event in quick.wait(600)] == list(range(600))
     assert client.changes() == [CHANGE]
     release.set()
 
@@ -223,7 +208,7 @@ def test_trust_and_distrust_reach_the_server(server: FakeServer, capsys: pytest.
     assert sitegrid(server, "trust", "b") == 0
     assert capsys.readouterr().out == "b is trusted, as of journal row 17\n"
     assert sitegrid(server, "trust", "b", "--auto", "--json") == 0
-    assert json.loads(capsys.readouterr().out) == {"name": "b", "trusted": True, "merged": 17}
+    assert json.loads(capsys.readouterr().out) == plain(TrustAnswer(**vars(machine_state("b")), merged=17))
     assert server.asked == [
         TrustCommand("b", False, "hit a wall; 3 m off", 5.0),
         TrustCommand("b", True),
@@ -247,7 +232,7 @@ def test_machines_are_a_table_for_people(server: FakeServer, capsys: pytest.Capt
     assert first.split() == ["a", "yes", "-", "1200", "3", "2025-06-15", "15:06:40Z", "-"]
     assert second.startswith("b        NO, by audit  2025-06-15 15:07:40Z  7        0     2025-06-15 15:06:40Z  gain")
     assert sitegrid(server, "query", "--after", "3", "machines", "--json") == 0
-    assert json.loads(capsys.readouterr().out) == {"machines": MACHINES}
+    assert json.loads(capsys.readouterr().out) == {"machines": plain(MACHINES)}
     assert server.asked[-1] == MachinesQuery(Freshness(3))
 
 
@@ -257,7 +242,7 @@ def test_changes_are_a_line_each(server: FakeServer, capsys: pytest.CaptureFixtu
         "4: 2025-06-15 15:06:40Z to 2025-06-15 15:07:40Z  10..40 x -20..12.5 m  615 cells  resistance 0.25 -> 0.008\n"
     )
     assert sitegrid(server, "query", "changes", "--json") == 0
-    assert json.loads(capsys.readouterr().out) == {"changes": [CHANGE]}
+    assert json.loads(capsys.readouterr().out) == {"changes": [plain(CHANGE)]}
     assert server.asked == [ChangesQuery(3), ChangesQuery(0)]
 
 
@@ -285,7 +270,7 @@ def test_changes_are_followed_until_stopped(
     def show(text: object, **_: object) -> None:
         shown.append(text if isinstance(text, str) else json.dumps(text))
         if len(shown) == 1:
-            server.publish(encode_change({**CHANGE, "cells": 700}))
+            server.publish(encode_change(replace(CHANGE, cells=700)))
         else:
             stop.set()
 

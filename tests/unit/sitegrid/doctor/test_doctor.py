@@ -26,7 +26,8 @@ from mapserver.ingest.store import Incoming, Store
 from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
-from protocol.queries.requests import InfoQuery, encode_info
+from protocol.queries.answer_codec import encode_info
+from protocol.queries.requests import InfoQuery
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_health
@@ -34,20 +35,18 @@ from protocol.wire.credentials import Identity
 from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
-from sitegrid.doctor import checks, probes
-from sitegrid.doctor.checks import Certificate, Finding, Level, Link, SpoolState, StoreState
+from sitegrid.doctor import disk, network
+from sitegrid.doctor.disk import SpoolState, StoreState
+from sitegrid.doctor.findings import Finding, Level
+from sitegrid.doctor.keys import Certificate, check_certificate, read_certificate
+from sitegrid.doctor.network import RouterLink
+from tests.unit.records import map_info
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 NOW_NS = 1_767_225_600_000_000_000
 SITE = SiteConfig("pit", 48.0, 11.0)
 WALL = replace(SITE, clock="wall", clock_tolerance_s=5.0)
-INFO = {
-    "site": {"name": "pit", "frame": SITE.frame},
-    "samples_merged": 300,
-    "cells": 250,
-    "journalled": 12,
-    "merged": 12,
-}
+INFO = map_info(SITE, samples_merged=300, cells=250, journalled=12, merged=12)
 SITE_TOML = 'name = "pit"\norigin_lat_deg = 48.0\norigin_lon_deg = 11.0\n'
 
 
@@ -64,36 +63,36 @@ def samples(n: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("link", "level", "words"),
     [
-        (Link("tcp/a:1", 0.012), Level.PASS, "answers in 12 ms"),
-        (Link("tcp/a:1", None, listens=False), Level.FAIL, "nothing listens at tcp/a:1; start `sitegrid router`"),
-        (Link("tcp/a:1", None, listens=True), Level.FAIL, "pass --keys"),
-        (Link("tls/a:1", None, listens=True, has_keys=True), Level.FAIL, "these keys may be of another site"),
+        (RouterLink("tcp/a:1", 0.012), Level.PASS, "answers in 12 ms"),
+        (RouterLink("tcp/a:1", None, listens=False), Level.FAIL, "nothing listens at tcp/a:1; start `sitegrid router`"),
+        (RouterLink("tcp/a:1", None, listens=True), Level.FAIL, "pass --keys"),
+        (RouterLink("tls/a:1", None, listens=True, has_keys=True), Level.FAIL, "these keys may be of another site"),
     ],
 )
-def test_router(link: Link, level: Level, words: str):
-    found = checks.check_link(link)
-    assert (found.level, words in str(found)) == (level, True)
+def test_router(link: RouterLink, level: Level, words: str):
+    finding = network.check_link(link)
+    assert (finding.level, words in str(finding)) == (level, True)
 
 
 def test_an_empty_answer_of_the_server_is_told_apart():
-    assert checks.check_server("pit", INFO, is_there=True).level is Level.PASS
-    behind = checks.check_server("pit", {**INFO, "merged": 10}, is_there=True)
-    assert "journal row 12, merged only up to 10" in behind.found
-    denied = checks.check_server("pit", None, is_there=True, role="visitor")
+    assert network.check_server("pit", INFO, is_there=True).level is Level.PASS
+    behind = network.check_server("pit", replace(INFO, merged=10), is_there=True)
+    assert "journal row 12, merged only up to 10" in behind.message
+    denied = network.check_server("pit", None, is_there=True, role="visitor")
     assert denied.level is Level.FAIL
     assert "the router denies the question" in denied.advice
-    absent = checks.check_server("pit", None, is_there=False)
+    absent = network.check_server("pit", None, is_there=False)
     assert "start `sitegrid server`" in absent.advice
     assert "revoked" not in absent.advice
-    assert "revoked" in checks.check_server("pit", None, is_there=False, role="machine").advice
+    assert "revoked" in network.check_server("pit", None, is_there=False, role="machine").advice
 
 
 def test_site_files_are_compared():
-    assert checks.check_site(SITE, INFO).level is Level.PASS
-    moved = checks.check_site(replace(SITE, origin_lat_deg=48.1), INFO)
+    assert network.check_site(SITE, INFO).level is Level.PASS
+    moved = network.check_site(replace(SITE, origin_lat_deg=48.1), INFO)
     assert moved.level is Level.FAIL
-    assert SITE.frame in moved.found
-    assert checks.check_site(replace(SITE, name="hill"), INFO).level is Level.FAIL
+    assert SITE.frame in moved.message
+    assert network.check_site(replace(SITE, name="hill"), INFO).level is Level.FAIL
 
 
 @pytest.mark.parametrize(
@@ -107,8 +106,8 @@ def test_site_files_are_compared():
     ],
 )
 def test_permission(answer: Any, is_there: bool, has_keys: bool, level: Level, words: str):
-    found = checks.check_permission("loader-1", answer, is_there=is_there, has_keys=has_keys)
-    assert (found.level, words in str(found)) == (level, True)
+    finding = network.check_permission("loader-1", answer, is_there=is_there, has_keys=has_keys)
+    assert (finding.level, words in str(finding)) == (level, True)
 
 
 @pytest.mark.parametrize(
@@ -125,20 +124,19 @@ def test_permission(answer: Any, is_there: bool, has_keys: bool, level: Level, w
     ],
 )
 def test_clock(offset_s: float, error_s: float, site: SiteConfig | None, level: Level, words: str):
-    found = checks.check_clock(offset_s, error_s, site)
-    assert (found.level, words in str(found)) == (level, True)
+    finding = network.check_clock(offset_s, error_s, site)
+    assert (finding.level, words in str(finding)) == (level, True)
 
 
 def test_the_offset_is_taken_at_the_middle_of_the_question():
     asked_ns = (10 * 10**9, 12 * 10**9)
-    assert probes.offset_of({"wall_ns": 8 * 10**9}, asked_ns) == (3.0, 1.0)
-    assert probes.offset_of({}, asked_ns) is None
+    assert network.offset_of(replace(INFO, wall_ns=8 * 10**9), asked_ns) == (3.0, 1.0)
 
 
 def test_versions():
-    assert checks.check_version("1.0", "1.0").level is Level.PASS
-    assert checks.check_version("1.0", "1.1").level is Level.WARN
-    assert checks.check_version("1.0", "unknown").level is Level.SKIP
+    assert network.check_version("1.0", "1.0").level is Level.PASS
+    assert network.check_version("1.0", "1.1").level is Level.WARN
+    assert network.check_version("1.0", "unknown").level is Level.SKIP
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------
@@ -154,13 +152,13 @@ GOOD = Certificate(
 )
 
 
-def level_of(found: Certificate, check: str, **given: str) -> tuple[Level, str]:
-    finding = next(f for f in checks.check_certificate(found, NOW, **given) if f.check == check)
+def level_of(certificate: Certificate, check: str, **given: str) -> tuple[Level, str]:
+    finding = next(f for f in check_certificate(certificate, NOW, **given) if f.check == check)
     return finding.level, str(finding)
 
 
 def test_a_good_certificate_passes():
-    findings = checks.check_certificate(GOOD, NOW, "pit", "loader-1")
+    findings = check_certificate(GOOD, NOW, "pit", "loader-1")
     assert [f.level for f in findings] == [Level.PASS] * 3
 
 
@@ -174,8 +172,8 @@ def test_a_good_certificate_passes():
     ],
 )
 def test_validity(change: dict[str, Any], level: Level, words: str):
-    found, text = level_of(replace(GOOD, **change), "certificate")
-    assert (found, words in text) == (level, True)
+    actual, text = level_of(replace(GOOD, **change), "certificate")
+    assert (actual, words in text) == (level, True)
 
 
 @pytest.mark.parametrize(
@@ -201,8 +199,8 @@ def test_names(common_name: str, given: dict[str, str], level: Level):
     ],
 )
 def test_chain(change: dict[str, Any], level: Level, words: str):
-    found, text = level_of(replace(GOOD, **change), "authority")
-    assert (found, words in text) == (level, True)
+    actual, text = level_of(replace(GOOD, **change), "authority")
+    assert (actual, words in text) == (level, True)
 
 
 @pytest.fixture(scope="module")
@@ -216,9 +214,11 @@ def key_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_folder_of_keys_is_read(key_folder: Path):
-    found = probes.read_certificate(key_folder / "loader-1")
-    assert (found.common_name, found.signed, found.fits, found.mode & 0o777) == ("loader-1", True, True, 0o600)
-    assert found.identity.expires == found.expires
+    certificate = read_certificate(key_folder / "loader-1")
+    assert (certificate.common_name, certificate.mode & 0o777) == ("loader-1", 0o600)
+    assert certificate.signed
+    assert certificate.fits
+    assert certificate.identity.expires == certificate.expires
 
 
 def copied(folder: Path, name: str, to: Path, **files: bytes) -> Path:
@@ -230,9 +230,9 @@ def copied(folder: Path, name: str, to: Path, **files: bytes) -> Path:
 
 def test_files_of_different_folders_are_noticed(key_folder: Path, tmp_path: Path):
     other = (key_folder / "loader-2" / "key.pem").read_bytes()
-    assert not probes.read_certificate(copied(key_folder, "loader-1", tmp_path / "a", key=other)).fits
+    assert not read_certificate(copied(key_folder, "loader-1", tmp_path / "a", key=other)).fits
     cert = (key_folder / "loader-2" / "cert.pem").read_bytes()
-    assert not probes.read_certificate(copied(key_folder, "loader-1", tmp_path / "b", ca=cert)).signed
+    assert not read_certificate(copied(key_folder, "loader-1", tmp_path / "b", ca=cert)).signed
 
 
 @pytest.mark.parametrize("broken", ["cert", "ca"])
@@ -258,9 +258,9 @@ def test_keys_that_soon_expire_are_told_of_and_their_name_is_used(key_folder: Pa
 
 
 def test_free_space(tmp_path: Path):
-    levels = [checks.check_disk("spool", free).level for free in (2**25, 2**29, 2**31)]
+    levels = [disk.check_disk("spool", free).level for free in (2**25, 2**29, 2**31)]
     assert levels == [Level.FAIL, Level.WARN, Level.PASS]
-    assert probes.free_bytes(tmp_path / "not" / "there" / "yet.db") > 0
+    assert disk.free_bytes(tmp_path / "not" / "there" / "yet.db") > 0
 
 
 @pytest.mark.parametrize(
@@ -274,24 +274,22 @@ def test_free_space(tmp_path: Path):
     ],
 )
 def test_spool(state: SpoolState, age_s: int, level: Level, words: str):
-    found = checks.check_spool(state, NOW_NS + age_s * 10**9)
-    assert (found.level, words in str(found)) == (level, True)
+    finding = disk.check_spool(state, NOW_NS + age_s * 10**9)
+    assert (finding.level, words in str(finding)) == (level, True)
 
 
 def test_an_agent_that_runs_is_taken_at_its_word():
     good = {"spool": {"depth": 3, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
-    assert checks.check_health("loader-1", good).level is Level.PASS
-    stuck = checks.check_health("loader-1", {**good, "uplink": {"problem": "no answer"}})
+    assert disk.check_health("loader-1", good).level is Level.PASS
+    stuck = disk.check_health("loader-1", {**good, "uplink": {"problem": "no answer"}})
     assert (stuck.level, stuck.advice) == (Level.WARN, "no answer")
-    lost = checks.check_health("loader-1", {**good, "spool": {"depth": 3, "dropped": 1}})
+    lost = disk.check_health("loader-1", {**good, "spool": {"depth": 3, "dropped": 1}})
     assert lost.level is Level.WARN
 
 
 def test_what_others_say_may_be_anything():
     for values in ({}, {"spool": 7, "uplink": "no"}, {"spool": [], "spool_problem": None}):
-        assert checks.check_health("loader-1", values).level is Level.PASS
-    assert checks.check_server("pit", {}, is_there=True).level is Level.PASS
-    assert checks.check_site(SITE, {"site": 3}).level is Level.FAIL
+        assert disk.check_health("loader-1", values).level is Level.PASS
 
 
 STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
@@ -308,23 +306,23 @@ STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
     ],
 )
 def test_store(state: StoreState, site: SiteConfig | None, level: Level, words: str):
-    found = checks.check_store(state, site)
-    assert (found.level, words in str(found)) == (level, True)
+    finding = disk.check_store(state, site)
+    assert (finding.level, words in str(finding)) == (level, True)
 
 
 def test_a_spool_is_read_without_a_trace(tmp_path: Path):
     with pytest.raises(StoreError, match="no such file"):
-        probes.read_spool(tmp_path / "spool.db")
+        disk.read_spool(tmp_path / "spool.db")
     with closing(Spool(tmp_path / "spool.db", SpoolConfig(max_samples=4))) as spool:
         spool.record(samples(6))
         head = spool.head(1)
         assert head
         spool.put_aside(head, "bad")
-        with pytest.raises(probes.InUseError, match="an agent has it open"):
-            probes.read_spool(tmp_path / "spool.db")
+        with pytest.raises(disk.InUseError, match="an agent has it open"):
+            disk.read_spool(tmp_path / "spool.db")
     before = sorted(tmp_path.iterdir())
-    state = probes.read_spool(tmp_path / "spool.db")
-    assert state == SpoolState(depth=3, dropped=2, put_aside=1, oldest_ns=NOW_NS + 3 * 10**9)
+    state = disk.read_spool(tmp_path / "spool.db")
+    assert state == SpoolState(depth=3, dropped=2, quarantined=1, oldest_ns=NOW_NS + 3 * 10**9)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -336,7 +334,7 @@ def test_a_spool_that_was_killed_is_read_with_its_log(tmp_path: Path):
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "spool.db")], check=True)
     assert (tmp_path / "spool.db-wal").stat().st_size > 0
-    assert probes.read_spool(tmp_path / "spool.db").depth == 7
+    assert disk.read_spool(tmp_path / "spool.db").depth == 7
 
 
 @pytest.mark.parametrize("broken", ["bytes", "schema"])
@@ -349,9 +347,9 @@ def test_a_spool_that_cannot_be_used_is_a_finding(tmp_path: Path, broken: str, c
             db.execute("PRAGMA user_version = 99")
     assert main(["doctor", "--endpoint", free_endpoint(), "--spool", str(path), "--json"]) == 1
     findings = json.loads(capsys.readouterr().out)["findings"]
-    found = next(f for f in findings if f["check"] == "spool")
-    assert found["level"] == "FAIL"
-    assert ("schema 99" if broken == "schema" else "no usable spool") in found["found"]
+    finding = next(f for f in findings if f["check"] == "spool")
+    assert finding["level"] == "FAIL"
+    assert ("schema 99" if broken == "schema" else "no usable spool") in finding["message"]
 
 
 def filled_store(folder: Path) -> None:
@@ -365,10 +363,10 @@ def filled_store(folder: Path) -> None:
 
 def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
     with pytest.raises(StoreError, match=r"holds no journal\.db"):
-        probes.read_store(tmp_path, time.time())
+        disk.read_store(tmp_path, time.time())
     filled_store(tmp_path)
     with closing(Store(tmp_path, SITE, ServerConfig(), time.time_ns)):
-        state = probes.read_store(tmp_path, time.time() + 100)
+        state = disk.read_store(tmp_path, time.time() + 100)
     assert state == StoreState("pit", SITE.frame, 3, 2, 0, 1, 1, state.snapshot_age_s)
     assert 99 < state.snapshot_age_s < 160
 
@@ -416,13 +414,13 @@ def test_a_healthy_site_passes_and_nothing_is_left_behind(site: Site, capsys):
         pass
     with closing(Server(site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)) as server:
         files = ("--site-file", site.site_file, "--store", site.folder / "store", "--spool", site.folder / "spool.db")
-        code, found = site.doctor(capsys, *files)
+        code, findings = site.doctor(capsys, *files)
         info = server.answers.info()
     assert code == 0
     passed = ("router", "server", "site", "permission", "spool", "spool disk", "store", "store disk")
-    assert {name: found[name].level for name in passed} == dict.fromkeys(passed, Level.PASS)
-    assert found["certificate"].level == Level.SKIP
-    assert found["permission"].found == "batches of doctor are taken"
+    assert {name: findings[name].level for name in passed} == dict.fromkeys(passed, Level.PASS)
+    assert findings["certificate"].level == Level.SKIP
+    assert findings["permission"].message == "batches of doctor are taken"
     assert set(info["machines"]) == {"loader-1"}
     assert info["journalled"] == 2
 
@@ -430,21 +428,21 @@ def test_a_healthy_site_passes_and_nothing_is_left_behind(site: Site, capsys):
 def test_the_wrong_site_file_is_found_out(site: Site, capsys):
     site.site_file.write_text(SITE_TOML.replace("48.0", "47.0"))
     with closing(Server(site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)):
-        code, found = site.doctor(capsys, "--site-file", site.site_file, "--machine", "loader-7")
+        code, findings = site.doctor(capsys, "--site-file", site.site_file, "--machine", "loader-7")
     assert code == 1
-    assert found["site"].level == Level.FAIL
-    assert found["permission"].level == Level.FAIL
-    assert "loader-7 (wrong_frame)" in found["permission"].found
+    assert findings["site"].level == Level.FAIL
+    assert findings["permission"].level == Level.FAIL
+    assert "loader-7 (wrong_frame)" in findings["permission"].message
 
 
 def test_a_router_without_a_server_is_found_out(site: Site, capsys):
-    code, found = site.doctor(capsys, "--site", "hill")
+    code, findings = site.doctor(capsys, "--site", "hill")
     assert code == 1
-    assert found["router"].level == Level.PASS
-    assert found["server"].found == "site hill: the router knows of no map server"
-    assert found["permission"].level == Level.SKIP
-    _, found = site.doctor(capsys, "--site-file", site.site_file)
-    assert found["permission"].found == "nobody takes batches of doctor"
+    assert findings["router"].level == Level.PASS
+    assert findings["server"].message == "site hill: the router knows of no map server"
+    assert findings["permission"].level == Level.SKIP
+    _, findings = site.doctor(capsys, "--site-file", site.site_file)
+    assert findings["permission"].message == "nobody takes batches of doctor"
 
 
 @contextlib.contextmanager
@@ -463,20 +461,27 @@ def answering(site: Site, key: str, data: bytes) -> Iterator[None]:
 
 def test_silence_of_a_server_that_is_there_is_called_a_denial(site: Site, capsys):
     with answering(site, keys.map_queries_all("pit"), b""), answering(site, keys.ingest_all("pit"), b""):
-        code, found = site.doctor(capsys, "--site-file", site.site_file)
+        code, findings = site.doctor(capsys, "--site-file", site.site_file)
     assert code == 1
-    assert found["server"].found == "site pit: a map server is there, but does not answer"
-    assert found["permission"].found == "a map server is there, but gives no answer to batches of doctor"
+    assert findings["server"].message == "site pit: a map server is there, but does not answer"
+    assert findings["permission"].message == "a map server is there, but gives no answer to batches of doctor"
 
 
 def test_clock_and_version_of_the_server_are_compared(site: Site, capsys, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sitegrid.commands.doctor.package_version", lambda: "1.0")
-    info = {**INFO, "wall_ns": time.time_ns() - 3600 * 10**9, "version": "0.9"}
+    monkeypatch.setattr("sitegrid.doctor.examine.package_version", lambda: "1.0")
+    info = replace(INFO, wall_ns=time.time_ns() - 3600 * 10**9, version="0.9")
     with answering(site, keys.map_query("pit", InfoQuery.name), encode_info(info)):
-        _, found = site.doctor(capsys, "--site", "pit")
-    assert found["clock"].level == Level.WARN
-    assert "s ahead of the map server's clock" in found["clock"].found
-    assert found["version"].found == "here 1.0, map server 0.9"
+        _, findings = site.doctor(capsys, "--site", "pit")
+    assert findings["clock"].level == Level.WARN
+    assert "s ahead of the map server's clock" in findings["clock"].message
+    assert findings["version"].message == "here 1.0, map server 0.9"
+
+
+def test_a_server_of_another_kind_is_a_finding(site: Site, capsys):
+    with answering(site, keys.map_query("pit", InfoQuery.name), encode_info({"site": 3})):
+        code, findings = site.doctor(capsys, "--site", "pit")
+    assert (code, findings["server"].level, findings["permission"].level) == (1, Level.FAIL, Level.SKIP)
+    assert findings["server"].message.endswith("cannot be read: info.journalled: missing")
 
 
 def test_a_running_agent_is_heard(site: Site, capsys):
@@ -492,12 +497,12 @@ def test_a_running_agent_is_heard(site: Site, capsys):
     with closing(Spool(site.folder / "spool.db", SpoolConfig())):
         _, unnamed = site.doctor(capsys, *words)
         teller.start()
-        _, heard = site.doctor(capsys, *words, "--machine", "loader-1")
+        _, named = site.doctor(capsys, *words, "--machine", "loader-1")
         done.set()
         teller.join()
-    assert "give --machine NAME" in unnamed["spool"].found
-    assert heard["spool"].found.startswith("loader-1 runs: 9 samples wait")
-    assert heard["spool"].advice == "no answer"
+    assert "give --machine NAME" in unnamed["spool"].message
+    assert named["spool"].message.startswith("loader-1 runs: 9 samples wait")
+    assert named["spool"].advice == "no answer"
 
 
 def test_people_read_one_line_each(capsys):

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from sitegrid.process.logs import JsonLines, Lines, start_logging
+from sitegrid.process.logs import JsonFormatter, TextFormatter, start_logging
 
 
 def record(message: str, *values: object, error: bool = False) -> logging.LogRecord:
@@ -24,15 +24,15 @@ def record(message: str, *values: object, error: bool = False) -> logging.LogRec
 
 
 def as_json(*given: Any, **options: Any) -> dict[str, Any]:
-    line = JsonLines().format(record(*given, **options))
+    line = JsonFormatter().format(record(*given, **options))
     assert "\n" not in line
     return json.loads(line)
 
 
 def test_json_holds_the_event_and_its_values():
-    found = as_json("refused machine=%s reason=%s seq=%d problem=%r", "loader-1", "gap", 7, 'say "lost"\nnow')
+    line = as_json("refused machine=%s reason=%s seq=%d problem=%r", "loader-1", "gap", 7, 'say "lost"\nnow')
     head = {"t": "2026-01-01T00:00:00.500Z", "level": "WARNING", "logger": "mapserver", "event": "refused"}
-    assert found == {**head, "machine": "loader-1", "reason": "gap", "seq": 7, "problem": 'say "lost"\nnow'}
+    assert line == {**head, "machine": "loader-1", "reason": "gap", "seq": 7, "problem": 'say "lost"\nnow'}
 
 
 @pytest.mark.parametrize(
@@ -48,19 +48,19 @@ def test_what_is_not_key_and_value_is_the_event_as_it_is(given: tuple[Any, ...],
 
 
 def test_json_has_values_of_every_kind_and_never_loses_a_field_of_its_own():
-    found = as_json("done level=%s took_s=%.3f share=%g path=%s", "high", float("nan"), 0.5, print)
-    assert (found["level"], found["took_s"], found["share"], found["path"]) == ("WARNING", "nan", 0.5, str(print))
+    line = as_json("done level=%s took_s=%.3f share=%g path=%s", "high", float("nan"), 0.5, print)
+    assert (line["level"], line["took_s"], line["share"], line["path"]) == ("WARNING", "nan", 0.5, str(print))
 
 
 def test_a_traceback_stays_in_the_line_of_json_and_follows_for_people():
     assert as_json("failed work=%s", "fold", error=True)["traceback"].endswith('ValueError: no "good"\nat all')
-    lines = Lines().format(record("failed work=%s", "fold", error=True)).splitlines()
+    lines = TextFormatter().format(record("failed work=%s", "fold", error=True)).splitlines()
     assert lines[0].endswith("failed work=fold")
     assert lines[1].startswith("Traceback")
 
 
 def test_people_read_one_line_per_event():
-    line = Lines().format(record("stopped why=%s", "a\r\nb"))
+    line = TextFormatter().format(record("stopped why=%s", "a\r\nb"))
     assert line == "2026-01-01T00:00:00.500Z level=WARNING logger=mapserver stopped why=a\\r\\nb"
 
 

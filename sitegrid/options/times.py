@@ -1,4 +1,4 @@
-"""Times as people write and read them, on the command line."""
+"""Times on the command line, as people write and read them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
 
 STAMP_HELP = "ISO 8601 (UTC unless it names a zone) or a stamp in ns"
-HELP = f"{STAMP_HELP}, or before the site's now: -2h, -30m, -90s"
+HELP = f"{STAMP_HELP}, or a duration before the newest sample of the site: -2h, -30m, -90s"
 _UNIT_S = {"d": 86_400, "h": 3600, "m": 60, "s": 1}
 _AGO = re.compile(r"-(\d+(?:\.\d+)?)([dhms])")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -33,7 +33,7 @@ class SiteTime:
         if not now_ns:
             raise ConfigError(option, "the site has no samples yet, so no now to count from; give a time")
         if now_ns + self.ns < 1:
-            raise ConfigError(option, f"so long before the site's now, {told(now_ns)}, is before 1970")
+            raise ConfigError(option, f"so long before the site's now, {utc_text(now_ns)}, is before 1970")
         return now_ns + self.ns
 
 
@@ -52,7 +52,7 @@ def parse_stamp(text: str) -> int:
     return ns
 
 
-def told(stamp_ns: int) -> str:
+def utc_text(stamp_ns: int) -> str:
     """A stamp as people read it, to the second; `never` for 0."""
     if not stamp_ns:
         return "never"

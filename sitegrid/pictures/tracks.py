@@ -43,7 +43,7 @@ class TrackRecorder:
     def _on_pose(self, sample: zenoh.Sample) -> None:
         try:
             pose = decode_pose(sample.payload.to_bytes())
-        except MessageError:  # a picture shows what can be read
+        except MessageError:  # a pose that cannot be read is not drawn
             return
         with self._lock:
             poses = self._poses.setdefault(pose.machine, [])

@@ -1,4 +1,4 @@
-"""Numbers, addresses and spans as arguments of the command line; what cannot be taken is told in one line."""
+"""Types of options: numbers and addresses; a wrong value is refused in one line."""
 
 from __future__ import annotations
 

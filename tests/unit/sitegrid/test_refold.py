@@ -22,12 +22,12 @@ from protocol.arrays import Table
 from protocol.config import from_table, load_toml
 from protocol.machine.samples import COLUMNS, empty
 from protocol.site.geometry import CellWindow
-from protocol.site.site_config import KnownGround, SiteConfig, load_site
+from protocol.site.site_config import KnownGround, SiteConfig, load_site, site_toml
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
+from sitegrid import refold as fold
 from sitegrid.cli import main
-from sitegrid.commands import fold
-from sitegrid.commands.times import parse_stamp
+from sitegrid.options.times import parse_stamp
 
 pytest.importorskip("pyarrow.parquet")
 SITE = SiteConfig("pit", 48.0, 11.0)
@@ -78,7 +78,7 @@ def make_store(
     with JournalReader(folder / JOURNAL_FILE) as reader:
         list(archive(folder / FOLDER, reader, site, int(T0 + archived * HOUR_NS), store._journal.forget))
     store.close()
-    (folder / "site.toml").write_text("\n".join(fold._site_lines(site)))
+    (folder / "site.toml").write_text(site_toml(site))
     return folder
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from sim.truth import TruthMap
-from sitegrid.truth import truth_layers
+from sitegrid.pictures.truth_layers import truth_layers
 
 
 def region(west: float, south: float, columns: int, rows: int, cell_m: float = 1.0) -> Region:
@@ -29,10 +29,10 @@ def test_cells_fall_on_their_places(truth: TruthMap):
 
 
 def test_beyond_the_simulated_site_nothing_is_known(truth: TruthMap):
-    found = truth_layers(truth, region(8, 19, 3, 2))["resistance"]
-    assert np.isnan(found[0]).all()
-    assert np.isnan(found[1, :2]).all()
-    assert found[1, 2] == 0
+    values = truth_layers(truth, region(8, 19, 3, 2))["resistance"]
+    assert np.isnan(values[0]).all()
+    assert np.isnan(values[1, :2]).all()
+    assert values[1, 2] == 0
     assert np.isnan(truth_layers(truth, region(-50, -50, 2, 2))["resistance"]).all()
 
 

@@ -1,4 +1,4 @@
-"""Times on the command line, and the questions about the past that they are for."""
+"""`sitegrid query`: options become queries, answers become lines or JSON."""
 
 from __future__ import annotations
 
@@ -10,38 +10,30 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from hypothesis import given
-from hypothesis import strategies as st
 
-from protocol.errors import ConfigError
-from protocol.machine.readings import MAX_STAMP_NS
+from protocol.queries.answer_codec import encode_history, encode_info, encode_point, encode_region
+from protocol.queries.answers import HistoryAnswer, HistorySpan, PointAnswer, Region
 from protocol.queries.parameters import split_selector
 from protocol.queries.requests import (
     Freshness,
-    HistoryAnswer,
     HistoryQuery,
     InfoQuery,
     MapQuery,
-    PointAnswer,
     PointQuery,
-    Region,
     RegionQuery,
-    Span,
     When,
-    encode_history,
-    encode_info,
-    encode_point,
-    encode_region,
     parse_query,
 )
 from protocol.site.geometry import Bounds
+from protocol.site.site_config import SiteConfig
 from sitegrid.cli import main
 from sitegrid.client import PAST_S, Client
 from sitegrid.commands import query
-from sitegrid.commands.times import SiteTime, parse_time, told
+from tests.unit.records import map_info
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
 S = 10**9
+SITE = SiteConfig("pit", 48.0, 11.0)
 
 
 class Session:
@@ -63,10 +55,10 @@ class Session:
 
     def _answer(self, asked: MapQuery) -> bytes:
         if isinstance(asked, InfoQuery):
-            return encode_info({"stamp_ns": self.now_ns})
+            return encode_info(map_info(SITE, stamp_ns=self.now_ns))
         if isinstance(asked, HistoryQuery):
-            first = Span(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
-            spans = (first, Span(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
+            first = HistorySpan(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
+            spans = (first, HistorySpan(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
             return encode_history(HistoryAnswer(0.5, 1.5, () if asked.x_m < 0 else spans, 17, T0))
         assert isinstance(asked, PointQuery | RegionQuery)
         stamp_ns = asked.when.as_of_ns or self.now_ns
@@ -90,81 +82,18 @@ def session(monkeypatch: pytest.MonkeyPatch) -> Session:
     return session
 
 
-# --- times -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "ns"),
-    [
-        ("2025-06-15T15:06:40", T0),  # without a zone: UTC
-        ("2025-06-15 15:06:40Z", T0),
-        ("2025-06-15T17:06:40+02:00", T0),
-        ("2025-06-15T15:06:40.000001", T0 + 1000),
-        ("2025-06-15", T0 - (15 * 3600 + 6 * 60 + 40) * S),
-        (str(T0 + 1), T0 + 1),
-        ("1", 1),
-    ],
-)
-def test_a_time_is_iso_or_a_stamp(text: str, ns: int):
-    assert parse_time(text) == SiteTime(ns)
-
-
-@pytest.mark.parametrize(
-    ("text", "s"), [("-90s", 90), ("-30m", 1800), ("-2h", 7200), ("-1.5h", 5400), ("-3d", 259_200), ("-0s", 0)]
-)
-def test_a_time_may_count_back_from_the_sites_now(text: str, s: int):
-    time = parse_time(text)
-    assert time == SiteTime(-s * S, from_now=True)
-    assert time.stamp("--as-of", lambda: T0) == T0 - s * S
-
-
-@given(st.integers(S, MAX_STAMP_NS))
-def test_every_stamp_is_a_time_and_is_told_to_the_second(ns: int):
-    assert parse_time(str(ns)).stamp("--as-of", lambda: pytest.fail("not needed")) == ns
-    assert parse_time(told(ns)).ns == ns // S * S
-
-
-def test_a_stamp_is_told_for_people():
-    assert (told(T0 + 999_999_999), told(0)) == ("2025-06-15 15:06:40Z", "never")
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("yesterday", "'yesterday' is no time: ISO 8601"),
-        ("", "'' is no time"),
-        ("2h", "'2h' is no time"),
-        ("-2", "'-2' is no time"),
-        ("-2w", "'-2w' is no time"),
-        ("2025-13-01", "is no time"),
-        ("0", "0 is not between the years 1970 and 2100"),
-        ("1969-12-31", "is not between"),
-        ("2101-01-01", "is not between"),
-        ("9" * 20, "is not between"),
-        ("9" * 5000, "is no time"),
-    ],
-)
-@pytest.mark.parametrize(("option", "ask"), [("--as-of", "point"), ("--to", "history")])
-def test_a_bad_time_is_a_usage_error_that_names_its_option(
-    capsys: pytest.CaptureFixture[str], text: str, words: str, option: str, ask: str
-):
-    with pytest.raises(SystemExit) as end:
-        main(["query", ask, "1", "2", option, text])
-    assert end.value.code == 2
-    err = capsys.readouterr().err
-    assert f"argument {option}: " in err
-    assert words in err
-
-
 def test_a_time_that_cannot_be_counted_names_its_option(session: Session, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(ConfigError, match="--minus: so long before the site's now, 2025-06-15 15:06:40Z, is before"):
-        parse_time("-99999d").stamp("--minus", lambda: T0)
     session.now_ns = 0
     assert main(["query", "point", "1", "2", "--as-of", "-2h"]) == 1
     assert "sitegrid: --as-of: the site has no samples yet" in capsys.readouterr().err
 
 
-# --- questions -------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("option", "ask"), [("--as-of", "point"), ("--minus", "point"), ("--to", "history")])
+def test_a_bad_time_is_a_usage_error_that_names_its_option(capsys: pytest.CaptureFixture[str], option: str, ask: str):
+    with pytest.raises(SystemExit) as end:
+        main(["query", ask, "1", "2", option, "yesterday"])
+    assert end.value.code == 2
+    assert f"argument {option}: 'yesterday' is no time" in capsys.readouterr().err
 
 
 def test_point_and_region_are_asked_as_of_a_time_and_less_another(session: Session):

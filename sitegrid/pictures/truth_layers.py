@@ -6,7 +6,7 @@ import numpy as np
 
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
-from protocol.queries.requests import Region
+from protocol.queries.answers import Region
 from sim.truth import TruthMap
 
 

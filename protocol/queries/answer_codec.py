@@ -1,0 +1,269 @@
+"""Answers to map queries, to MessagePack and back (docs/protocol.md, "Map queries").
+
+Reading ignores fields that it does not know, and refuses an answer without one that it does: a MessageError names it.
+"""
+
+from __future__ import annotations
+
+import functools
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from protocol.arrays import Floats32
+from protocol.errors import MessageError, QueryError, Refusal
+from protocol.queries.answers import (
+    GroundChange,
+    HistoryAnswer,
+    HistorySpan,
+    MachineState,
+    MapInfo,
+    PointAnswer,
+    Region,
+    TrustAnswer,
+)
+from protocol.site.geometry import MAX_CELLS
+from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, unpack
+
+MAX_REPLY_BYTES = 2**30
+MAX_CELL_M = 1e4
+MAX_PLACE_M = 1e7  # from the origin
+MAX_ITEMS = 100_000  # of one list
+T = TypeVar("T")
+_hints = functools.cache(typing.get_type_hints)
+
+
+# --- the map ---------------------------------------------------------------------------------------------------------
+
+
+def encode_point(answer: PointAnswer) -> bytes:
+    """Answer of `point`."""
+    place = {"x_m": answer.x_m, "y_m": answer.y_m}
+    return pack({**place, "values": _plain(answer.values), "merged": answer.merged, "stamp_ns": answer.stamp_ns})
+
+
+def decode_point(data: bytes) -> PointAnswer:
+    """Undo `encode_point`."""
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    x, y, values = take(table, "x_m", float), take(table, "y_m", float), _take_values(table)
+    return PointAnswer(x, y, values, take(table, "merged", int), take(table, "stamp_ns", int))
+
+
+def encode_region(region: Region) -> bytes:
+    """Answer of `region`: layers as float32 little-endian, row by row from the south."""
+    layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in region.layers.items()}
+    return pack(
+        {
+            "west_m": float(region.x_m[0] - region.cell_m / 2),
+            "south_m": float(region.y_m[0] - region.cell_m / 2),
+            "cell_m": region.cell_m,
+            "columns": len(region.x_m),
+            "rows": len(region.y_m),
+            "layers": layers,
+            "merged": region.merged,
+            "stamp_ns": region.stamp_ns,
+        }
+    )
+
+
+def decode_region(data: bytes) -> Region:
+    """Undo `encode_region`."""
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
+    if not (0 < cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
+    if not (tables := take(table, "layers", dict)):  # what is in them proves the number of cells
+        raise MessageError(Refusal.MISSING_FIELD, "empty", field="layers")
+    layers = {name: _decode_layer(tables, name, rows, columns) for name in tables}
+    west_m, south_m = (_take_place(table, name) for name in ("west_m", "south_m"))
+    return Region(
+        x_m=west_m + (np.arange(columns) + 0.5) * cell_m,
+        y_m=south_m + (np.arange(rows) + 0.5) * cell_m,
+        cell_m=cell_m,
+        layers=layers,
+        merged=take(table, "merged", int),
+        stamp_ns=take(table, "stamp_ns", int),
+    )
+
+
+def _take_place(table: dict[str, Any], name: str) -> float:
+    value: float = take(table, name, float)
+    if abs(value) > MAX_PLACE_M:
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{value} is beyond {MAX_PLACE_M:g} m", field=name)
+    return value
+
+
+def _decode_layer(layers: dict[str, Any], name: str, rows: int, columns: int) -> Floats32:
+    data: bytes = take(layers, name, bytes)
+    if type(name) is not str or len(data) != 4 * rows * columns:
+        problem = f"{len(data)} bytes, {columns} x {rows} cells take {4 * rows * columns}"
+        raise MessageError(Refusal.COLUMN_LENGTH, problem, field=f"layers.{name!s:.40}")
+    return np.frombuffer(data, "<f4").reshape(rows, columns)
+
+
+def encode_history(answer: HistoryAnswer) -> bytes:
+    """Answer of `history`."""
+    spans = [{"first_ns": s.first_ns, "last_ns": s.last_ns, "values": _plain(s.values)} for s in answer.spans]
+    place = {"x_m": answer.x_m, "y_m": answer.y_m}
+    return pack({**place, "spans": spans, "merged": answer.merged, "stamp_ns": answer.stamp_ns})
+
+
+def decode_history(data: bytes) -> HistoryAnswer:
+    """Undo `encode_history`."""
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    spans = tuple(
+        HistorySpan(take(span, "first_ns", int), take(span, "last_ns", int), _take_values(span))
+        for span in _take_tables(table, "spans")
+    )
+    x, y = take(table, "x_m", float), take(table, "y_m", float)
+    return HistoryAnswer(x, y, spans, take(table, "merged", int), take(table, "stamp_ns", int))
+
+
+def _plain(values: Mapping[str, float]) -> dict[str, float]:
+    return {name: float(value) for name, value in values.items()}
+
+
+def _take_values(table: dict[str, Any]) -> dict[str, float]:
+    values: dict[str, float] = take(table, "values", dict)
+    for name, value in values.items():
+        if type(name) is not str or type(value) is not float:  # NaN is unknown, so `take` would be too strict
+            raise MessageError(Refusal.WRONG_TYPE, "a number is expected", field=f"values.{name!s:.40}")
+    return values
+
+
+def _take_tables(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
+    rows: list[Any] = take(table, name, list)
+    for index, row in enumerate(rows):
+        if type(row) is not dict:
+            raise MessageError(Refusal.WRONG_TYPE, f"map expected, not {type(row).__name__}", field=name, row=index)
+    return rows
+
+
+# --- records ---------------------------------------------------------------------------------------------------------
+
+
+def encode_info(info: MapInfo | Mapping[str, Any]) -> bytes:
+    """Answer of `info`; here and below, a record or a table of its fields."""
+    return pack({"info": _table(info)})
+
+
+def decode_info(data: bytes) -> MapInfo:
+    """Undo `encode_info`."""
+    return _record(MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
+
+
+def encode_machines(machines: Iterable[MachineState | Mapping[str, Any]]) -> bytes:
+    """Answer of `machines`."""
+    return pack({"machines": [_table(machine) for machine in machines]})
+
+
+def decode_machines(data: bytes) -> list[MachineState]:
+    """Undo `encode_machines`."""
+    return _take_records(MachineState, data, "machines")
+
+
+def encode_machine(machine: TrustAnswer | Mapping[str, Any]) -> bytes:
+    """Answer to a command about one machine."""
+    return pack({"machine": _table(machine)})
+
+
+def decode_machine(data: bytes) -> TrustAnswer:
+    """Undo `encode_machine`."""
+    return _record(TrustAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
+
+
+def encode_changes(changes: Iterable[GroundChange | Mapping[str, Any]]) -> bytes:
+    """Answer of `changes`."""
+    return pack({"changes": [_table(change) for change in changes]})
+
+
+def decode_changes(data: bytes) -> list[GroundChange]:
+    """Undo `encode_changes`."""
+    return _take_records(GroundChange, data, "changes")
+
+
+def encode_change(change: GroundChange | Mapping[str, Any]) -> bytes:
+    """The event that an area changed, put on `map/changed`."""
+    return pack({"change": _table(change)})
+
+
+def decode_change(data: bytes) -> GroundChange:
+    """Undo `encode_change`."""
+    return _record(GroundChange, unpack(data, MAX_SMALL_BYTES), "change")
+
+
+def _table(record: Any) -> dict[str, Any]:
+    return dict(record) if isinstance(record, Mapping) else asdict(record)
+
+
+def _record(cls: type[T], table: dict[str, Any], name: str) -> T:
+    """Take the field `name` as a record."""
+    record: T = _value(cls, take(table, name, dict), name)
+    return record
+
+
+def _take_records(cls: type[T], data: bytes, name: str) -> list[T]:
+    rows: list[Any] = take(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), name, list)
+    return [_value(cls, row, f"{name}[{index}]") for index, row in enumerate(rows)]
+
+
+def _value(hint: Any, value: Any, field: str) -> Any:
+    """A plain value as its type hint says; `field` is its place in the answer."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is types.UnionType:
+        return None if value is None else _value(arguments[0], value, field)
+    if hint is Any:
+        check_plain(value, field)
+        return value
+    if is_dataclass(hint):
+        return _fields(hint, take({field: value}, field, dict), field)
+    if origin is Mapping:
+        return _mapping(arguments[1], take({field: value}, field, dict), field)
+    if origin is tuple:
+        return _tuple(arguments, take({field: value}, field, list), field)
+    return take({field: value}, field, hint)
+
+
+def _fields(cls: Any, table: dict[str, Any], field: str) -> Any:
+    hints = _hints(cls)
+    names = [item.name for item in fields(cls)]
+    if missing := [name for name in names if name not in table]:
+        raise MessageError(Refusal.MISSING_FIELD, "missing", field=f"{field}.{missing[0]}")
+    values = {name: _value(hints[name], table[name], f"{field}.{name}") for name in names}
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise MessageError(Refusal.OUT_OF_RANGE, str(error), field=field) from None
+
+
+def _mapping(hint: Any, table: dict[str, Any], field: str) -> dict[str, Any]:
+    for name in table:
+        if type(name) is not str:
+            raise MessageError(Refusal.WRONG_TYPE, f"the name {name!r:.40} is no text", field=field)
+    return {name: _value(hint, value, f"{field}.{name:.40}") for name, value in table.items()}
+
+
+def _tuple(hints: tuple[Any, ...], values: list[Any], field: str) -> tuple[Any, ...]:
+    if hints[-1] is Ellipsis:
+        hints = (hints[0],) * len(values)
+    if len(values) != len(hints):
+        raise MessageError(Refusal.WRONG_TYPE, f"{len(hints)} values expected, not {len(values)}", field=field)
+    return tuple(_value(h, value, f"{field}[{i}]") for i, (h, value) in enumerate(zip(hints, values, strict=True)))
+
+
+# --- refused ---------------------------------------------------------------------------------------------------------
+
+
+def encode_error(error: QueryError) -> bytes:
+    """Answer to a query or a command that is refused."""
+    return pack({"reason": error.reason, "problem": str(error)})
+
+
+def decode_error(data: bytes) -> QueryError:
+    """Undo `encode_error`."""
+    table = unpack(data, MAX_SMALL_BYTES)
+    return QueryError(take(table, "reason", str), take(table, "problem", str))

@@ -1,0 +1,130 @@
+"""The run of the demo: start every part, wait for the end, audit the samples, draw the pictures."""
+
+from __future__ import annotations
+
+import threading
+import time
+from argparse import Namespace
+from typing import Any
+
+from evaluation.audit import audit_store
+from evaluation.ground.truth import read_way
+from evaluation.maps.score import score, score_driven
+from evaluation.positions.live_error import position_rmse
+from mapserver.config import ServerConfig
+from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
+from protocol.errors import ConfigError, LinkError, QueryError
+from protocol.queries.answers import Region
+from protocol.site.site_config import load_site
+from sim.recorder import TRACKS_FOLDER
+from sim.truth import TruthMap
+from sitegrid.client import Client, connect
+from sitegrid.demo.log_replay import LogReplay
+from sitegrid.demo.parts import READY_S, start_agent, start_server, start_sim
+from sitegrid.demo.plan import DemoPlan, make_plan
+from sitegrid.demo.report import make_report, print_report
+from sitegrid.pictures.draw import draw, draw_both
+from sitegrid.pictures.tracks import TrackRecorder
+from sitegrid.pictures.truth_layers import truth_layers
+from sitegrid.process.children import Child, Children
+from sitegrid.process.lifetime import note, plain, say, stop_flag
+from sitegrid.process.progress import Display
+
+
+def run(arguments: Namespace) -> int:
+    """Run the demo; returns 1 if a sample was lost or counted twice, or a child failed."""
+    stop = stop_flag(None)  # it has children to end
+    began_s = time.monotonic()
+    plan = make_plan(arguments)
+    with Children(plan.work) as children:
+        result = _drive(plan, children, stop, Display("machines drive", headless=arguments.headless or arguments.json))
+    if result is None:
+        note("stopped; everything is ended")
+        return 130
+    result["wall_s"] = round(time.monotonic() - began_s, 1)
+    say(plain(result)) if arguments.json else print_report(result)
+    return 0 if result["lost"] == result["double"] == 0 else 1
+
+
+def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: Display) -> dict[str, Any] | None:
+    """Start everything, wait for the end, judge and draw; None if stopped on the way."""
+    children.start("router", "router", "--listen", plan.endpoint).expect("ready", READY_S)
+    server = start_server(plan, children, "server", plan.site_file)
+    agents = {path.stem: start_agent(plan, children, path) for path in plan.configs}
+    log_replay = LogReplay(plan, plan.log, children) if plan.log else None
+    for child in agents.values():
+        child.expect("ready", READY_S)
+    sim = start_sim(plan, children)
+    with connect(plan.endpoint, plan.scenario.site.name) as client:
+        tracks = TrackRecorder(client.session, plan.scenario.site.name)
+        with display:
+            if not _watch(plan, client, tracks, (sim, agents), (stop, display)):
+                return None
+        for child in agents.values():
+            child.expect("ended", READY_S)
+        region, pictures = _draw(plan, client, tracks)
+        rmse_m = position_rmse(tracks.poses(), plan.truth)
+        tracks.close()
+    log_report = log_replay.finish(plan) if log_replay else None
+    server.stop()
+    audits = {name: plan.work / f"{name}.audit" for name in agents}
+    audit = audit_store(audits, plan.work / "store", load_site(plan.site_file), ServerConfig())
+    truth = truth_layers(TruthMap.load(plan.true_map), region)
+    machines = [rig.machine for rig in plan.scenario.rigs()]
+    driven = [read_way(plan.truth / TRACKS_FOLDER / f"{m.name}.csv", m.load_centre_m).place_m for m in machines]
+    scores = score(region, truth), score_driven(region, truth, driven)
+    return make_report(plan, audit, scores, rmse_m, pictures, log_report)
+
+
+def _watch(
+    plan: DemoPlan,
+    client: Client,
+    tracks: TrackRecorder,
+    children: tuple[Child, dict[str, Child]],
+    control: tuple[threading.Event, Display],
+) -> bool:
+    """Show progress and redraw the map until the machines have driven; False if stopped."""
+    (sim, agents), (stop, display) = children, control
+    simulated_s, next_picture_s = 0.0, time.monotonic() + 3
+    while sim.code is None or any(agent.code is None for agent in agents.values()):
+        if stop.wait(0.25):
+            return False
+        for line in sim.lines():
+            simulated_s = line.get("simulated_s", simulated_s)
+        display.show(simulated_s, plan.scenario.seconds, _what(client))
+        if time.monotonic() >= next_picture_s:
+            draw(client, plan.out / "map.png", _whole(plan), tracks.tracks())
+            next_picture_s = time.monotonic() + 3
+    if sim.code:
+        raise ConfigError("sitegrid demo", f"the simulator ended with {sim.code}; see {plan.work / 'sim.log'}")
+    return True
+
+
+def _what(client: Client) -> str:
+    try:
+        info = client.info()
+    except (LinkError, QueryError):  # shown again in a moment
+        return "the map server is away"
+    return f"{info.samples_merged} samples, {info.cells} cells"
+
+
+def _whole(plan: DemoPlan) -> list[float]:
+    if not plan.true_map.exists():
+        return [0.0, 0.0, plan.scenario.ground.width_m, plan.scenario.ground.depth_m]
+    true = TruthMap.load(plan.true_map)
+    rows, columns = true.c_rr.shape
+    return [true.west_m, true.south_m, true.west_m + columns * true.cell_m, true.south_m + rows * true.cell_m]
+
+
+def _draw(plan: DemoPlan, client: Client, tracks: TrackRecorder) -> tuple[Region, list[str]]:
+    """Write the final pictures; returns the map and their files."""
+    region = client.region(tuple(_whole(plan)))  # type: ignore[arg-type]
+    truth = truth_layers(TruthMap.load(plan.true_map), region)
+    lines = tracks.tracks()
+    pictures = {
+        "map.png": draw_both(region, lines),
+        "difference.png": [draw_difference(region, truth, "resistance"), draw_difference(region, truth, "grade")],
+    }
+    for name, images in pictures.items():
+        write_image(plan.out / name, side_by_side(images))
+    return region, [str(plan.out / name) for name in pictures]

@@ -1,0 +1,186 @@
+"""Files and disks of this host: an agent's spool, a map server's store, and the space to write them."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import sqlite3
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
+from protocol.errors import StoreError
+from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.site.site_config import SiteConfig
+from sitegrid.doctor.findings import Finding, Level
+
+FREE_FAIL, FREE_WARN = 64 * 2**20, 2**30
+WAITING_S = 3600.0  # samples that are older have not been taken for long
+TAIL_ROWS = 20_000  # journal rows that a restart folds in some seconds
+
+
+# --- space -----------------------------------------------------------------------------------------------------------
+
+
+def free_bytes(path: Path) -> int:
+    """Free space for a file or folder that may not be there yet."""
+    place = path.absolute()
+    while not place.is_dir():
+        place = place.parent
+    return shutil.disk_usage(place).free
+
+
+def check_disk(what: str, free: int) -> Finding:
+    """Free space where a file grows [bytes]."""
+    message = f"{free / 2**30:.1f} GiB are free"
+    if free < FREE_FAIL:
+        return Finding(Level.FAIL, f"{what} disk", message, "make room now: soon nothing more can be written")
+    if free < FREE_WARN:
+        return Finding(Level.WARN, f"{what} disk", message, "make room")
+    return Finding(Level.PASS, f"{what} disk", message)
+
+
+# --- spool -----------------------------------------------------------------------------------------------------------
+
+
+class InUseError(StoreError):
+    """An agent has the spool open."""
+
+
+@dataclass(frozen=True)
+class SpoolState:
+    """A spool at rest. oldest_ns: stamp of the oldest sample, 0 for none."""
+
+    depth: int
+    dropped: int
+    quarantined: int
+    oldest_ns: int
+
+
+def read_spool(path: Path) -> SpoolState:
+    """The state of a spool at rest; StoreError where it cannot be used, InUseError while an agent runs on it."""
+    if not path.is_file():
+        raise StoreError(path, "no such file; an agent makes it when it starts")
+    try:
+        with closing(sqlite3.connect(_read_only(path), uri=True, timeout=0.2)) as db:
+            return _spool_state(path, db)
+    except sqlite3.Error as error:
+        if "locked" in str(error):
+            raise InUseError(path, "an agent has it open") from None
+        raise StoreError(path, f"is no usable spool: {error}") from None
+
+
+def _read_only(path: Path) -> str:
+    """A URI that writes nothing. A spool at rest has no write-ahead log: it is read without files beside it."""
+    log = path.with_name(f"{path.name}-wal")
+    at_rest = not log.exists() or log.stat().st_size == 0
+    return f"{path.absolute().as_uri()}?mode=ro" + ("&immutable=1" if at_rest else "")
+
+
+def _spool_state(path: Path, db: sqlite3.Connection) -> SpoolState:
+    (schema,) = db.execute("PRAGMA user_version").fetchone()
+    if schema != SPOOL_SCHEMA:
+        raise StoreError(path, f"has schema {schema}, this version knows {SPOOL_SCHEMA}")
+    (depth,), (quarantined,) = (db.execute(f"SELECT COUNT(*) FROM {t}").fetchone() for t in ("sample", "aside"))  # noqa: S608
+    (dropped,) = db.execute("SELECT value FROM meta WHERE key = 'dropped'").fetchone() or (0,)
+    oldest = db.execute("SELECT row FROM sample ORDER BY number LIMIT 1").fetchone()
+    oldest_ns = int(np.frombuffer(oldest[0], SAMPLE_DTYPE)["stamp_ns"][0]) if oldest else 0
+    return SpoolState(depth, int(dropped), quarantined, oldest_ns)
+
+
+def check_spool(state: SpoolState, now_ns: int) -> Finding:
+    """Depth, age of the oldest, and what will never reach the server."""
+    age_s = (now_ns - state.oldest_ns) * 1e-9 if state.oldest_ns else 0.0
+    message = f"{state.depth} samples wait" + (f", the oldest is of {_ago(age_s)}" if state.oldest_ns else "")
+    message += f"; {state.dropped} were dropped, {state.quarantined} put aside"
+    advice = []
+    if state.depth and age_s > WAITING_S:
+        advice.append("start its agent, and see what it says of its uplink")
+    if state.dropped:
+        advice.append("it was full: mend the link, or raise max_samples")
+    if state.quarantined:
+        advice.append("the map server refused samples: table `aside` has them and the reasons")
+    return Finding(Level.WARN if advice else Level.PASS, "spool", message, "; ".join(advice))
+
+
+def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
+    """A running agent, by the values of its health report: of another version, they may be anything."""
+    spool, uplink = (_table_of(values, part) for part in ("spool", "uplink"))
+    counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
+    message = f"{machine} runs: {counts[0]}; {counts[1]}, {spool.get('put_aside', '?')} put aside"
+    problems = [uplink.get("problem"), values.get("spool_problem"), values.get("calibration_problem")]
+    advice = "; ".join(str(problem) for problem in problems if problem)
+    lost = any(spool.get(key) for key in ("dropped", "put_aside"))
+    return Finding(Level.WARN if advice or lost else Level.PASS, "spool", message, advice)
+
+
+def _table_of(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    table = values.get(name)
+    return table if isinstance(table, Mapping) else {}
+
+
+# --- store -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StoreState:
+    """A store. snapshot_row, snapshot_age_s: of the newest snapshot, 0 and infinity where there is none."""
+
+    site: str
+    frame: str
+    schema: int
+    last_row: int
+    archived_row: int
+    machines: int
+    snapshot_row: int
+    snapshot_age_s: float
+
+
+def read_store(folder: Path, now_s: float) -> StoreState:
+    """The state of a store, also while a server uses it; StoreError where it cannot be used."""
+    from mapserver.evidence import (
+        snapshot,  # imported here: needs the `server` extra, which a machine's host does not have
+    )
+    from mapserver.ingest.store import JOURNAL_FILE
+    from mapserver.journal.journal import JournalReader
+    from mapserver.journal.schema import SCHEMA
+
+    if not (folder / JOURNAL_FILE).is_file():
+        raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")
+    with JournalReader(folder / JOURNAL_FILE) as journal:
+        journal.check()
+        last_row, archived = journal.last_row, journal.archived_row
+        machines = {machine for machine, _ in journal.marks()}
+        site, frame = journal.site, journal.frame
+    newest = next(iter(snapshot.rows_on_disk(folder)), 0)
+    age_s = now_s - (folder / f"snapshot-{newest}.npz").stat().st_mtime if newest else math.inf
+    return StoreState(site, frame, SCHEMA, last_row, archived, len(machines), newest, age_s)
+
+
+def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
+    """Whose store it is, and how long a restart takes."""
+    rows = f"{state.last_row} rows of {state.machines} machines, {state.archived_row} archived"
+    tail = state.last_row - state.snapshot_row
+    snapshot = f"snapshot of row {state.snapshot_row}, {_ago(state.snapshot_age_s)}" if state.snapshot_row else ""
+    message = f"site {state.site}, schema {state.schema}: {rows}; {snapshot or 'no snapshot'}"
+    if site and (site.name, site.frame) != (state.site, state.frame):
+        problem = f"it is of site {state.site} with frame {state.frame}, the site file {site.name} with {site.frame}"
+        return Finding(Level.FAIL, "store", problem, "choose another --store, or the site file that belongs to it")
+    if tail > TAIL_ROWS:
+        return Finding(Level.WARN, "store", message, f"a restart folds {tail} rows: see the log for failed snapshots")
+    return Finding(Level.PASS, "store", message)
+
+
+def _ago(age_s: float) -> str:
+    """An age as people read it."""
+    if age_s < 0:
+        return f"{-age_s:.0f} s from now"
+    for unit, s in (("d", 86_400), ("h", 3600), ("min", 60)):
+        if age_s >= 2 * s:
+            return f"{age_s / s:.0f} {unit} ago"
+    return f"{age_s:.0f} s ago"

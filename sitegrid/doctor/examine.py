@@ -1,0 +1,158 @@
+"""The examination of this host's part of a site: what is looked at, in which order, as far as options name it."""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import zenoh
+
+from protocol.errors import ConfigError, MessageError, SitegridError, StoreError
+from protocol.queries.answers import MapInfo
+from protocol.site.site_config import SiteConfig, load_site
+from protocol.version import package_version
+from protocol.wire import keys
+from protocol.wire.credentials import Identity, load_credentials
+from protocol.wire.keys import check_name
+from sitegrid.doctor import disk, network
+from sitegrid.doctor.findings import Finding, Level, skipped
+from sitegrid.doctor.keys import check_certificate, read_certificate
+from sitegrid.security.join import join
+
+ANYBODY = "doctor"  # where there are no keys, every name is as good
+ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
+OF_SERVER = ("server", "clock", "version", "permission")  # checks that need the map server
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is examined, as far as it is known. machine: empty where these keys send no samples."""
+
+    endpoint: str
+    site: str
+    machine: str
+    keys: Path | None
+    identity: Identity | None
+    site_file: SiteConfig | None
+    spool: Path | None
+    store: Path | None
+
+
+def examine(arguments: Namespace) -> list[Finding]:
+    """Check what the options name."""
+    findings, subject = _keys(arguments)
+    findings += _network(subject) if subject else [skipped("router", "these keys cannot be used")]
+    return findings + _store(arguments.store, subject.site_file if subject else None)
+
+
+def _subject(arguments: Namespace, identity: Identity | None) -> Subject:
+    site_file = load_site(arguments.site_file) if arguments.site_file else None
+    named = site_file.name if site_file else identity.site if identity else "paper"
+    machine = arguments.machine or ""
+    if not machine and (identity is None or identity.role == "machine"):
+        machine = identity.name if identity else ANYBODY
+    site = check_name(arguments.site or named, "--site")
+    if machine:
+        check_name(machine, "--machine")
+    files = (arguments.keys, identity, site_file, arguments.spool, arguments.store)
+    return Subject(arguments.endpoint, site, machine, *files)
+
+
+def _keys(arguments: Namespace) -> tuple[list[Finding], Subject | None]:
+    """Findings on the keys; with usable ones, also what else is to be examined."""
+    if arguments.keys is None:
+        return [skipped("certificate", "give --keys FOLDER, if the site has keys")], _subject(arguments, None)
+    try:
+        subject = _subject(arguments, load_credentials(arguments.keys).identity)
+        certificate = read_certificate(arguments.keys)
+    except ConfigError as error:
+        return [Finding(Level.FAIL, "certificate", str(error))], None
+    except ModuleNotFoundError:
+        return [skipped("certificate", "pip install 'sitegrid[security]'")], subject
+    site = arguments.site or (subject.site_file.name if subject.site_file else "")
+    findings = check_certificate(certificate, datetime.now(UTC), site, arguments.machine or "")
+    return findings, subject if findings[0].level != Level.FAIL else None
+
+
+def _network(subject: Subject) -> list[Finding]:
+    link, session = network.open_link(join(subject.endpoint, subject.keys, network.LINK_S))
+    if session is None:
+        rest = [skipped(name, "no way to the router") for name in OF_SERVER]
+        return [network.check_link(link), *rest, *_spool(subject, None)]
+    try:
+        return [network.check_link(link), *_server(subject, session), *_spool(subject, session)]
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
+    role = subject.identity.role if subject.identity else ""
+    if role and role not in ASKS_MAP:
+        return [skipped(name, f"keys of a {role} may not ask") for name in OF_SERVER]
+    try:
+        info, asked_ns = network.ask_info(session, subject.site)
+    except MessageError as error:
+        problem = f"site {subject.site}: the map server's answer cannot be read: {error}"
+        unread = Finding(Level.FAIL, "server", problem, "update the older side")
+        return [unread, *(skipped(name, "the server's answer cannot be read") for name in OF_SERVER[1:])]
+    is_there = info is not None or network.is_answered(session, keys.map_query(subject.site, "info"))
+    findings = [network.check_server(subject.site, info, is_there=is_there, role=role)]
+    if info is not None:
+        findings += _compared(subject.site_file, info, asked_ns)
+    return [*findings, _permission(subject, session, info)]
+
+
+def _compared(site: SiteConfig | None, info: MapInfo, asked_ns: tuple[int, int]) -> list[Finding]:
+    """What only a comparison with the map server shows."""
+    return [
+        network.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
+        network.check_clock(*network.offset_of(info, asked_ns), site),
+        network.check_version(package_version(), info.version),
+    ]
+
+
+def _permission(subject: Subject, session: zenoh.Session, info: MapInfo | None) -> Finding:
+    if not subject.machine:
+        return skipped("permission", "these keys send no samples")
+    if not (site := subject.site_file or (info and info.site)):
+        return skipped("permission", "give --site-file FILE, for the server does not say the site's frame")
+    answer = network.ask_permission(session, subject.site, subject.machine, site.frame, subject.keys)
+    is_there = answer is not None or network.is_answered(session, keys.ingest(subject.site, subject.machine))
+    return network.check_permission(subject.machine, answer, is_there=is_there, has_keys=subject.keys is not None)
+
+
+def _spool(subject: Subject, session: zenoh.Session | None) -> list[Finding]:
+    if subject.spool is None:
+        return [skipped("spool", "give --spool FILE")]
+    return [_spool_itself(subject, subject.spool, session), _space("spool", subject.spool)]
+
+
+def _spool_itself(subject: Subject, path: Path, session: zenoh.Session | None) -> Finding:
+    """The file; while an agent has it open, the agent's health report."""
+    try:
+        return disk.check_spool(disk.read_spool(path), time.time_ns())
+    except disk.InUseError:
+        name = subject.machine if subject.machine != ANYBODY else ""
+        if session and name and (health := network.receive_health(session, subject.site, name)):
+            return disk.check_health(name, health.values)
+        reason = f"{name} sends no health" if session and name else "give --machine NAME to receive its health"
+        return skipped("spool", f"an agent has {path} open, and {reason}")
+    except StoreError as error:
+        return Finding(Level.FAIL, "spool", str(error))
+
+
+def _store(folder: Path | None, site: SiteConfig | None) -> list[Finding]:
+    if folder is None:
+        return [skipped("store", "give --store FOLDER, where the map server runs")]
+    try:
+        store = disk.check_store(disk.read_store(folder, time.time()), site)
+    except SitegridError as error:
+        store = Finding(Level.FAIL, "store", str(error))
+    return [store, _space("store", folder)]
+
+
+def _space(what: str, path: Path) -> Finding:
+    return disk.check_disk(what, disk.free_bytes(path))

@@ -1,0 +1,229 @@
+"""The network as this host sees it: router, map server, clocks, versions, and the right to send samples.
+
+A denial is silent in Zenoh, so a check without an answer says what the silence may mean.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import socket
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from protocol.errors import LinkError, MessageError
+from protocol.machine.samples import empty
+from protocol.queries.answer_codec import decode_info
+from protocol.queries.answers import MapInfo
+from protocol.site.site_config import SiteConfig
+from protocol.version import UNKNOWN
+from protocol.wire import keys
+from protocol.wire.codec import decode_health, decode_reply, encode_batch
+from protocol.wire.credentials import SIGNING_FILE
+from protocol.wire.messages import Ack, Health, Refused, SampleBatch
+from protocol.wire.session import SessionConfig, open_session
+from sitegrid.doctor.findings import Finding, Level, skipped
+
+ANSWER_S = 5.0
+LINK_S = 3.0
+KNOWN_S = 1.0  # for the router's news of who answers
+HEALTH_S = 3.0  # an agent reports its health every second
+OFFSET_S = 1.0  # of two clocks, beyond which the ages on the map are off
+
+
+# --- router ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RouterLink:
+    """The way to the router. took_s: to open a session, None if there is none. listens: somebody takes connections."""
+
+    endpoint: str
+    took_s: float | None
+    listens: bool = False
+    has_keys: bool = False
+
+
+def open_link(config: SessionConfig) -> tuple[RouterLink, zenoh.Session | None]:
+    """Open a session, and tell how that went."""
+    has_keys = config.credentials is not None
+    if not _listens(config.endpoint):  # else Zenoh tries until the time is up
+        return RouterLink(config.endpoint, None, has_keys=has_keys), None
+    start_s = time.perf_counter()
+    try:
+        session = open_session(config)
+    except LinkError:
+        return RouterLink(config.endpoint, None, listens=True, has_keys=has_keys), None
+    return RouterLink(config.endpoint, time.perf_counter() - start_s, has_keys=has_keys), session
+
+
+def _listens(endpoint: str) -> bool:
+    """Whether somebody takes TCP connections at an endpoint."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), LINK_S).close()
+    except (OSError, ValueError, OverflowError):
+        return False
+    return True
+
+
+def check_link(link: RouterLink) -> Finding:
+    """Whether a session with the router could be opened."""
+    if link.took_s is not None:
+        return Finding(Level.PASS, "router", f"{link.endpoint} answers in {link.took_s * 1e3:.0f} ms")
+    if not link.listens:
+        advice = "start `sitegrid router`, or compare --endpoint, cables and firewalls"
+        return Finding(Level.FAIL, "router", f"nothing listens at {link.endpoint}", advice)
+    advice = "these keys may be of another site, outdated, or not those of its register" if link.has_keys else ""
+    advice = advice or "if it asks for keys, pass --keys"
+    return Finding(Level.FAIL, "router", f"{link.endpoint} takes connections, but lets this session not in", advice)
+
+
+# --- map server ------------------------------------------------------------------------------------------------------
+
+
+def is_answered(session: zenoh.Session, key: str) -> bool:
+    """Whether the router knows of somebody who answers on a key: it says so also where it lets nobody ask."""
+    querier: Any = session.declare_querier(key)  # its matching_status is an object, although declared a bool
+    try:
+        end_s = time.monotonic() + KNOWN_S
+        while not querier.matching_status.matching:
+            if time.monotonic() >= end_s:
+                return False
+            time.sleep(0.02)
+        return True
+    finally:
+        querier.undeclare()
+
+
+def ask_info(session: zenoh.Session, site: str) -> tuple[MapInfo | None, tuple[int, int]]:
+    """The server's `info`, None without an answer, and this host's clock before and after [ns].
+
+    MessageError where the answer cannot be read.
+    """
+    before_ns = time.time_ns()
+    data = _ask(session, keys.map_query(site, "info"), b"")
+    asked_ns = (before_ns, time.time_ns())
+    return (decode_info(data) if data else None), asked_ns
+
+
+def offset_of(info: MapInfo, asked_ns: tuple[int, int]) -> tuple[float, float]:
+    """How far this host's clock is ahead of the server's, and how well that is known [s]."""
+    before_ns, after_ns = asked_ns
+    return ((before_ns + after_ns) / 2 - info.wall_ns) * 1e-9, (after_ns - before_ns) / 2 * 1e-9
+
+
+def check_server(site: str, info: MapInfo | None, *, is_there: bool, role: str = "") -> Finding:
+    """Whether the map server answers. is_there: whether the router knows of one, role: what the keys are for."""
+    if info is not None:
+        text = f"site {site}: {info.samples_merged} samples in {info.cells} cells, journal row {info.journalled}"
+        behind = f", merged only up to {info.merged}" if info.merged != info.journalled else ""
+        return Finding(Level.PASS, "server", text + behind)
+    if is_there:
+        problem = f"site {site}: a map server is there, but does not answer"
+        advice = "the router denies the question (see `sitegrid keys list`), or the server hangs"
+        return Finding(Level.FAIL, "server", problem, advice)
+    problem = f"site {site}: the router knows of no map server"
+    advice = "start `sitegrid server`, or compare the name of the site"
+    if role:
+        advice += "; or these keys are revoked, or not in its register, and it shows them nothing"
+    return Finding(Level.FAIL, "server", problem, advice)
+
+
+def check_site(site: SiteConfig, info: MapInfo) -> Finding:
+    """Whether a site file means the same ground as the server."""
+    if (site.name, site.frame) == (info.site.name, info.site.frame):
+        return Finding(Level.PASS, "site", f"{site.name}, frame {site.frame}, as the map server has it")
+    problem = f"this is {site.name} with frame {site.frame}, the map server has {info.site.name} with {info.site.frame}"
+    return Finding(Level.FAIL, "site", problem, "compare name and origin in the site files")
+
+
+def check_clock(offset_s: float, error_s: float, site: SiteConfig | None) -> Finding:
+    """How far this host's clock is ahead of the server's. error_s: how well that is known."""
+    ahead = "ahead of" if offset_s > 0 else "behind"
+    message = f"{abs(offset_s):.2f} s {ahead} the map server's clock (+-{error_s:.2f} s)"
+    advice = "set both clocks by NTP (chrony, systemd-timesyncd)"
+    limit_s = site.clock_tolerance_s if site and site.clock == "wall" else math.inf
+    if offset_s - error_s > limit_s:
+        return Finding(Level.FAIL, "clock", f"{message}; samples are refused beyond {limit_s:g} s", advice)
+    if abs(offset_s) - error_s > OFFSET_S:
+        return Finding(Level.WARN, "clock", message, advice)
+    return Finding(Level.PASS, "clock", message)
+
+
+def check_version(own: str, other: str) -> Finding:
+    """Whether both sides run the same version; the wire has a version of its own, so others may work, too."""
+    if UNKNOWN in (own, other):
+        return skipped("version", f"here {own}, map server {other}: one of them runs without being installed")
+    if own == other:
+        return Finding(Level.PASS, "version", f"{own} on both sides")
+    return Finding(Level.WARN, "version", f"here {own}, map server {other}", "update the older side")
+
+
+# --- machines --------------------------------------------------------------------------------------------------------
+
+
+def ask_permission(
+    session: zenoh.Session, site: str, machine: str, frame: str, folder: Path | None
+) -> Ack | Refused | None:
+    """Send an empty batch of a random spool: the answer is its watermark, and no trace is left (docs/protocol.md).
+
+    folder: of the machine's keys, whose signature goes along where there is one.
+    """
+    key = keys.ingest(site, machine)
+    batch = encode_batch(SampleBatch(machine, secrets.randbits(64) or 1, 1, empty(), frame))
+    try:
+        data = _ask(session, key, batch, _signature(folder, key, batch))
+        return decode_reply(data) if data else None
+    except MessageError as error:
+        return Refused(error.reason, f"its answer cannot be read: {error}")
+
+
+def check_permission(machine: str, answer: Ack | Refused | None, *, is_there: bool, has_keys: bool) -> Finding:
+    """Whether batches of a machine are taken, by the answer to an empty one."""
+    if isinstance(answer, Ack):
+        return Finding(Level.PASS, "permission", f"batches of {machine} are taken")
+    if isinstance(answer, Refused):
+        problem = f"the map server refuses batches of {machine} ({answer.reason}): {answer.problem}"
+        return Finding(Level.FAIL, "permission", problem)
+    if not is_there:
+        problem = f"nobody takes batches of {machine}"
+        return Finding(Level.FAIL, "permission", problem, "start `sitegrid server`, or compare the name of the site")
+    problem = f"a map server is there, but gives no answer to batches of {machine}"
+    denied = "the router denies it: a machine may send under the name of its keys alone"
+    return Finding(
+        Level.FAIL, "permission", problem, denied if has_keys else "the router denies it, or the server hangs"
+    )
+
+
+def receive_health(session: zenoh.Session, site: str, machine: str) -> Health | None:
+    """The health report of a running agent; None if none comes in, or it cannot be read."""
+    with session.declare_subscriber(keys.health(site, machine), zenoh.handlers.RingChannel(1)) as subscriber:
+        end_s = time.monotonic() + HEALTH_S
+        while time.monotonic() < end_s:
+            if sample := subscriber.try_recv():
+                try:
+                    return decode_health(sample.payload.to_bytes())
+                except MessageError:
+                    return None
+            time.sleep(0.05)
+    return None
+
+
+def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | None = None) -> bytes | None:
+    for reply in session.get(key, payload=payload, attachment=attachment, timeout=ANSWER_S):
+        if reply.ok is not None:
+            return reply.ok.payload.to_bytes()
+    return None
+
+
+def _signature(folder: Path | None, key: str, payload: bytes) -> bytes | None:
+    if folder is None or not (folder / SIGNING_FILE).is_file():
+        return None
+    from sitegrid.security.signing import Signer  # imported here: needs the `security` extra
+
+    return Signer((folder / SIGNING_FILE).read_bytes()).sign(key, payload)

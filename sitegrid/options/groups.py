@@ -1,0 +1,47 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from argparse import SUPPRESS, ArgumentParser, _SubParsersAction
+from pathlib import Path
+from typing import TypeAlias
+
+from protocol.wire.session import DEFAULT_ENDPOINT
+
+Subparsers: TypeAlias = "_SubParsersAction[ArgumentParser]"  # argparse has no public name for it
+
+
+def add_command(commands: Subparsers, name: str, summary: str) -> ArgumentParser:
+    """Add `sitegrid NAME`, with the options of every command."""
+    parser: ArgumentParser = commands.add_parser(name, help=summary, description=_sentence(summary))
+    parser.add_argument("--json", action="store_true", help="print JSON for machines")
+    parser.add_argument("--verbose", action="store_true", help="log normal events too, not only warnings and errors")
+    return parser
+
+
+def add_action(actions: Subparsers, name: str, summary: str, description: str | None = None) -> ArgumentParser:
+    """Add the second word of a command, as `point` in `sitegrid query point`."""
+    parser: ArgumentParser = actions.add_parser(name, help=summary, description=description)
+    # without a default, which would overwrite a --json before the second word
+    parser.add_argument("--json", action="store_true", default=SUPPRESS, help="print JSON for machines")
+    return parser
+
+
+def add_network(parser: ArgumentParser) -> None:
+    """Options of a command that connects to the router."""
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="router to connect to (default %(default)s)")
+    parser.add_argument(
+        "--keys",
+        type=Path,
+        metavar="FOLDER",
+        help="folder with the keys of this process (see `sitegrid keys`); the default endpoint is tls/... then",
+    )
+
+
+def add_site(parser: ArgumentParser) -> None:
+    """The name of the site that is asked."""
+    parser.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
+
+
+def _sentence(summary: str) -> str:
+    return summary[0].upper() + summary[1:] + "."

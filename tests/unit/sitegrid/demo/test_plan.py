@@ -1,0 +1,78 @@
+"""The demo's plan: each option reaches what it should."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from protocol.errors import ConfigError
+from protocol.site.site_config import load_site
+from sitegrid.cli import build_parser
+from sitegrid.demo import plan as planning
+from sitegrid.demo.parts import start_sim
+from sitegrid.demo.plan import DEFAULT_MANIFEST, DemoPlan, make_plan
+from tests.paths import ROOT
+
+
+def plan_of(tmp_path: Path, *words: str) -> DemoPlan:
+    return make_plan(build_parser().parse_args(["demo", "--out", str(tmp_path), *words]))
+
+
+def test_options_reach_the_simulation(tmp_path: Path):
+    words = ("--seconds", "33", "--speed", "7", "--machines", "2", "--seed", "9", "--scenario", "repaved")
+    demo = plan_of(tmp_path, *words, "--world", "fast", "--no-log")
+    scenario = demo.scenario
+    assert (scenario.seconds, scenario.seed, scenario.world, len(scenario.change)) == (33, 9, "fast", 2)
+    assert (scenario.machine_names, demo.config.speed) == (("loader-1", "loader-2"), 7)
+
+
+def test_the_demo_drives_the_papers_site_in_pybullet_by_default(tmp_path: Path):
+    demo = plan_of(tmp_path, "--no-log")
+    assert (demo.scenario.site.name, demo.scenario.world) == ("paper", "pybullet")
+    assert len(demo.configs) == 3
+
+
+def test_every_option_is_passed_on_to_the_simulator(tmp_path: Path):
+    class Started:
+        def start(self, name: str, *words: object) -> list[str]:
+            return [str(word) for word in words]
+
+    options = ("--seconds", "33.0", "--speed", "7.0", "--machines", "2", "--seed", "9")
+    options = (*options, "--scenario", "repaved", "--world", "fast")
+    words = start_sim(plan_of(tmp_path, *options, "--no-log"), Started())
+    pairs = dict(zip(options[::2], options[1::2], strict=True))
+    assert all(words[words.index(name) + 1] == value for name, value in pairs.items())
+
+
+def test_the_plan_writes_a_file_for_the_site_and_each_machine(tmp_path: Path):
+    demo = plan_of(tmp_path, "--machines", "2", "--no-log")
+    assert [path.name for path in demo.configs] == ["loader-1.toml", "loader-2.toml"]
+    assert load_site(demo.site_file).name == "paper"
+    assert demo.out == tmp_path
+
+
+def test_an_earlier_run_is_cleared_away(tmp_path: Path):
+    (tmp_path / "work").mkdir()
+    old = tmp_path / "work" / "loader-9.db"
+    old.write_text("old")
+    plan_of(tmp_path, "--no-log")
+    assert not old.exists()
+
+
+def test_the_default_log_is_used_only_where_its_data_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    assert plan_of(tmp_path).log is None
+    manifest = ROOT / DEFAULT_MANIFEST
+    monkeypatch.setattr(planning, "DEFAULT_MANIFEST", manifest)
+    monkeypatch.setattr(planning, "DEFAULT_DATA", tmp_path)
+    assert plan_of(tmp_path).log.name == "rl_test1_husky"
+    assert plan_of(tmp_path, "--no-log").log is None
+
+
+def test_a_log_of_ones_own_needs_no_default(tmp_path: Path):
+    manifest = ROOT / DEFAULT_MANIFEST
+    demo = plan_of(tmp_path, "--log", str(manifest), "--data", str(tmp_path))
+    assert demo.log.data == tmp_path
+    with pytest.raises(ConfigError, match=r"nowhere.toml: no such file"):
+        plan_of(tmp_path, "--log", "nowhere.toml")

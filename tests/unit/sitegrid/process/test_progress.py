@@ -1,0 +1,36 @@
+"""Progress: a bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from sitegrid.process import progress
+from sitegrid.process.progress import Display
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_gets_a_bar_and_headless_gets_lines(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with Display("machines drive", headless=False) as display:
+        display.show(5, 10, "7 samples, 3 cells")
+        assert display._bar.tasks[0].completed == 5
+    with Display("machines drive", headless=True) as display:
+        assert display._bar is None
+        display.show(5, 10, "7 samples, 3 cells")
+    assert "5 of 10 s, 7 samples, 3 cells" in sys.stderr.getvalue()
+
+
+def test_plain_lines_come_now_and_then_only(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    now = iter([100.0, 100.0, 101.0, 106.0, 106.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    display = Display("machines drive", headless=True)
+    for second in (1, 2, 3):
+        display.show(second, 10, "recording")
+    assert capsys.readouterr().err.count("recording") == 2
