@@ -13,15 +13,16 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel, load_model
-from sim.machines.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
-from sim.machines.vehicle import Bodies
 from sim.scenario.file import load_scenario
 from sim.simulator import Simulator
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
+from sim.terrain.terrain import Terrain
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.fast import Fleet
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import STEP_S, FleetState, World, stack
+from sim.worlds.world import World
 
 WORLDS: dict[str, type[BulletWorld] | type[Fleet]] = {"pybullet": BulletWorld, "fast": Fleet}
 GRADE_15 = math.tan(math.radians(15))

@@ -12,8 +12,8 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection, SiteConfig
 from sim.config import STEP_MS, SimConfig, resolve
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
-from sim.machines.vehicle import Bodies
 from sim.operators.course import Start, lay_course, line_up
 from sim.operators.driver import DRIVER_STEPS, board, drive, hire, idle, look_out
 from sim.operators.traffic import APART_M, LOOK_OUT_STEPS
@@ -21,10 +21,11 @@ from sim.scenario.ground import lay, pave
 from sim.scenario.tables import Scenario
 from sim.sensors.rigs import draw_bodies
 from sim.sensors.sensors import Sensors, Span
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.terrain import Terrain
 from sim.truth import TRACK_DTYPE, TRACK_EVERY, TRACK_VALUES, TruthMap, truth_map
 from sim.worlds.fast import Fleet
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import STEP_S, FleetState, World, stack
+from sim.worlds.world import World
 
 STEP_NS = STEP_MS * 1_000_000
 

@@ -12,8 +12,8 @@ from scipy.ndimage import distance_transform_edt
 from protocol.arrays import Floats, Ints
 from protocol.site.ground_classes import UNKNOWN
 from sim.scenario.ground import GroundConfig, lay
+from sim.terrain.terrain import Terrain
 from sim.truth import TruthMap, truth_map
-from sim.worlds.terrain import Terrain
 
 CELL_M = 1.0  # of the cells that are judged, as a site's map has them
 

@@ -11,7 +11,7 @@ from protocol.arrays import Bools, Floats, Ints
 from sim.machines.model import MachineModel
 from sim.operators.course import Course, Start
 from sim.operators.traffic import Bodywork, clear_way
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 
 DRIVER_STEPS = 5  # of the world: drivers act at 20 Hz
 LOOK_AHEAD_M, LOOK_AHEAD_S = 2.5, 0.6

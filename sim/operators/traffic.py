@@ -8,7 +8,7 @@ import numpy as np
 
 from protocol.arrays import Floats, Ints
 from sim.operators.course import BEYOND_M, Course
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 
 LOOK_OUT_STEPS = 20  # of the world: drivers look about at 5 Hz
 OVERHANG_M = 2.2  # of frame or bucket beyond an axle

@@ -19,8 +19,8 @@ from sim.operators.routes import Leg, Route
 from sim.pictures.canvas import INK, Canvas, beside
 from sim.scenario.ground import Ramp, lay, soil_index
 from sim.scenario.tables import Change, Scenario
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import FleetState
+from sim.state import FleetState
+from sim.terrain.terrain import Terrain
 
 WIDTH_PX, HEIGHT_PX = 1380, 900  # of the ground, at most
 PALE = 0.6  # strength of the paper's colours, so that what is drawn on them can be read

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.machines.soil import SOILS
-from sim.worlds.terrain import Terrain
+from sim.terrain.soil import SOILS
+from sim.terrain.terrain import Terrain
 
 FILLET_M = 2.0  # length over which the foot and the crown of a ramp are rounded
 ROUGHNESS_LENGTH_M = 1.2

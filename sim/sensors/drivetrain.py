@@ -9,7 +9,7 @@ import numpy as np
 from protocol.arrays import Floats, Ints
 from sim.sensors.noise import Draws, GaussMarkov
 from sim.sensors.sensor_group import Bank, Unit
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 
 
 class EncoderBank(Bank):

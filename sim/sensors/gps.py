@@ -8,11 +8,11 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.site_config import Projection
-from sim.frames import map_from_base
 from sim.sensors.datasheets import BASE_RATE_HZ
+from sim.sensors.frames import map_from_base
 from sim.sensors.noise import Draws, GaussMarkov, generator, site_generator
 from sim.sensors.sensor_group import Bank, Unit
-from sim.worlds.world import STEP_S, FleetState
+from sim.state import STEP_S, FleetState
 
 AXES = np.array([1.0, 1.0, 5 / 3])  # heights are this much worse
 LEAST_M2 = 1e-4  # no receiver states a smaller variance

@@ -9,10 +9,10 @@ import numpy as np
 
 from protocol.arrays import Floats, Ints
 from protocol.machine.machine_config import BASE, FRONT
-from sim.frames import compose, cross, quaternion, rotation, seen_turned, turned
+from sim.sensors.frames import compose, cross, quaternion, rotation, seen_turned, turned
 from sim.sensors.noise import Draws, GaussMarkov
 from sim.sensors.sensor_group import Bank, Unit
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 
 _LEVEL = np.zeros(1)
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
-from sim.machines.vehicle import Bodies
 from sim.sensors.datasheets import GpsNoise
 from sim.sensors.noise import generator
 from sim.sensors.presets import Preset

@@ -13,7 +13,7 @@ from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import KINDS, Reading, columns
 from sim.sensors.datasheets import BASE_RATE_HZ
 from sim.sensors.rigs import Rig
-from sim.worlds.world import STEP_S, FleetState
+from sim.state import STEP_S, FleetState
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from sim.sensors.inertial import AttitudeBank, ImuBank
 from sim.sensors.noise import generator
 from sim.sensors.rigs import Rig
 from sim.sensors.sensor_group import Bank, Block, Unit
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 
 _BANKS: dict[str, type[Bank]] = {
     "imu": ImuBank,

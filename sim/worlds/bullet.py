@@ -9,15 +9,15 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
+from sim.machines.chassis import SETTLE_STEPS, TRACTION_USE, Bodies, chassis_of, drive_force_n, steering_radps
 from sim.machines.model import WHEELS, MachineModel
-from sim.machines.soil import TRACTION
-from sim.machines.vehicle import SETTLE_STEPS, TRACTION_USE, Bodies, chassis_of, drive_force_n, steering_radps
-from sim.worlds.multibody import MultiBodies
-from sim.worlds.observe import Burden, Drive, observe
-from sim.worlds.rigid import POINT_FRAME, Ground, look
-from sim.worlds.terrain import Terrain
+from sim.state import STEP_S, FleetState
+from sim.terrain.soil import TRACTION
+from sim.terrain.terrain import Terrain
+from sim.worlds.bullet_client import MultiBodies
+from sim.worlds.bullet_scene import POINT_FRAME, Ground, look
+from sim.worlds.bullet_state import Burden, Drive, observe
 from sim.worlds.tyre import Motion, TyreForces, Tyres, at_rest, radial_load, roll
-from sim.worlds.world import STEP_S, FleetState
 
 
 @dataclass(frozen=True, slots=True)

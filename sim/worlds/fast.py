@@ -13,9 +13,7 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
-from sim.machines.model import MachineModel
-from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import (
+from sim.machines.chassis import (
     SETTLE_STEPS,
     STANDSTILL_MPS,
     TRACTION_USE,
@@ -25,9 +23,11 @@ from sim.machines.vehicle import (
     steering_radps,
     weigh,
 )
+from sim.machines.model import MachineModel
+from sim.state import STEP_S, FleetState
+from sim.terrain.soil import C_RR, SLIP_STIFFNESS, TRACTION
+from sim.terrain.terrain import Terrain
 from sim.worlds import fast_kernels as k
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import STEP_S, FleetState
 
 _CONSTANTS = k.Constants(STEP_S, GRAVITY_MPS2, STANDSTILL_MPS, TRACTION_USE)
 _SOILS = np.array([C_RR, TRACTION, SLIP_STIFFNESS])

@@ -14,8 +14,8 @@ import numpy as np
 
 from protocol.arrays import Floats, Ints
 from protocol.units import GRAVITY_MPS2
-from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import STANDSTILL_MPS
+from sim.machines.chassis import STANDSTILL_MPS
+from sim.terrain.soil import C_RR, SLIP_STIFFNESS, TRACTION
 
 BRISTLE_DAMPING = 0.3  # of a wheel's share of the machine on its bristles, against critical; nothing at steady slip
 LONGEST_STRETCH = 2.5  # of a bristle, against where its tangent meets the traction limit: then the tread slides

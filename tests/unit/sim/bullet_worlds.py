@@ -7,12 +7,13 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel, load_model
-from sim.machines.vehicle import Bodies
+from sim.state import STEP_S, FleetState
+from sim.terrain.terrain import Terrain
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.fast import Fleet
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import STEP_S, FleetState, World
+from sim.worlds.world import World
 
 LOADER, TRUCK = load_model("wheel_loader"), load_model("dump_truck")
 GRADE_15 = math.tan(math.radians(15))

@@ -9,7 +9,7 @@ from protocol.arrays import Floats
 from sim.config import SimConfig
 from sim.scenario.tables import Scenario
 from sim.simulator import Simulator
-from sim.worlds.world import FleetState, stack
+from sim.state import FleetState, stack
 
 EVERY = 10  # steps between two states that are kept
 

@@ -15,7 +15,7 @@ from sim.sensors.presets import Preset, load_preset
 from sim.sensors.rigs import Faults, Rig, machine_config
 from sim.sensors.sensor_group import Block
 from sim.sensors.sensors import Sensors
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 
 SEED = 7
 LOADER = load_model("wheel_loader")

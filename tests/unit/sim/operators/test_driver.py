@@ -10,7 +10,7 @@ from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
 from sim.operators.driver import bend
 from sim.scenario.ground import lay
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 from tests.unit.sim.drives import Driven, drive
 
 

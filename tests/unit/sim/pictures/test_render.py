@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from sim.machines.soil import GRAVEL
 from sim.pictures.render import SKY_RGB, Camera, closeup, overview, render
+from sim.terrain.soil import GRAVEL
 from sim.worlds.fast import Fleet
 from tests.unit.sim.bullet_worlds import LOADER, placed, plane
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.machines.soil import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT
 from sim.scenario.file import load_scenario
 from sim.scenario.ground import GroundConfig, Ramp, Zone, lay, pave
+from sim.terrain.soil import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT
+from sim.terrain.terrain import Terrain
 from sim.truth import truth_map
-from sim.worlds.terrain import Terrain
 
 PAPER = load_scenario("paper_site").ground
 FOOT_M, TOP_M = PAPER.ramp[0].foot_m[0], PAPER.ramp[0].top_m[0]

@@ -6,7 +6,7 @@ import pytest
 
 from protocol.machine.machine_config import BASE, FRONT, Mount
 from sim.sensors.presets import Preset
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 from tests.unit.sim.sensor_rigs import (
     DGPS,
     GRAVITY_MPS2,

@@ -9,7 +9,7 @@ import pytest
 from protocol.machine.readings import Reading, columns, parse_reading
 from sim.sensors.rigs import Faults, Rig
 from sim.sensors.sensors import Sensors
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 from tests.unit.sim.sensor_rigs import (
     DGPS,
     PROJECTION,

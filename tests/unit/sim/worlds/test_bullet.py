@@ -10,11 +10,11 @@ import pytest
 
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
-from sim.machines.soil import SAND, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import Bodies
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.soil import SAND, SLIP_STIFFNESS, TRACTION
 from sim.worlds.bullet import BulletWorld
-from sim.worlds.world import STEP_S, FleetState, stack
 from tests.unit.sim.bullet_worlds import BOTH, LOADER, TRUCK, hold_speed, idle, placed, plane
 
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.machines.soil import C_RR, SLIP_STIFFNESS, SOILS, TRACTION
+from sim.terrain.soil import C_RR, SLIP_STIFFNESS, SOILS, TRACTION
 from sim.worlds.tyre import Motion, TyreForces, Tyres, TyreState, at_rest, radial_load, roll
 
 STEP_S = 0.01

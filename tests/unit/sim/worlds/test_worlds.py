@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from protocol.units import GRAVITY_MPS2
+from sim.machines.chassis import TRACTION_USE, Bodies
 from sim.machines.model import MachineModel
-from sim.machines.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
-from sim.machines.vehicle import TRACTION_USE, Bodies
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.fast import Fleet
-from sim.worlds.world import STEP_S, FleetState, World, stack
+from sim.worlds.world import World
 from tests.unit.sim.bullet_worlds import BOTH, EACH, GRADE_15, LOADER, TRUCK, hold_speed, idle, placed, plane
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
-from sim.machines.soil import C_RR
-from sim.worlds.rigid import BASE_POINT, Scene, articulation, attitude, plane_gradient
-from sim.worlds.world import STEP_S, FleetState
+from sim.state import STEP_S, FleetState
+from sim.terrain.soil import C_RR
+from sim.worlds.bullet_scene import BASE_POINT, Scene, articulation, attitude, plane_gradient
 
 _GRAVITY_UP = np.array([0.0, 0.0, GRAVITY_MPS2])
 

@@ -1,7 +1,7 @@
 import numpy as np
 
 from protocol.machine.machine_config import Mount
-from sim.frames import compose, cross, map_from_base, quaternion, rotation, seen_turned, turned
+from sim.sensors.frames import compose, cross, map_from_base, quaternion, rotation, seen_turned, turned
 
 ROLL, PITCH, YAW = 0.1, -0.3, 2.0
 ONE = (np.array([YAW]), np.array([PITCH]), np.array([ROLL]))

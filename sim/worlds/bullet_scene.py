@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.worlds.multibody import Frames
-from sim.worlds.terrain import Terrain
+from sim.terrain.terrain import Terrain
+from sim.worlds.bullet_client import Frames
 
 # Points that are followed, and the frame that each is fixed to: hubs and `base_link`.
 HUBS, BASE_POINT = slice(0, 4), 4

@@ -10,7 +10,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats
 from sim.machines.model import MachineModel
-from sim.worlds.world import STEP_S
+from sim.state import STEP_S
 
 # Of what the worst soil under a machine's wheels can take, with the torque split in proportion to the wheels' loads,
 # this is the most that traction control allows: a wheel at its peak would spin up without end.

@@ -8,12 +8,12 @@ import pytest
 
 from protocol.machine.machine_config import Mount
 from protocol.units import GRAVITY_MPS2
+from sim.machines.chassis import chassis_of, drive_force_n, steering_radps, weigh
 from sim.machines.model import MachineModel
-from sim.machines.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import chassis_of, drive_force_n, steering_radps, weigh
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
+from sim.terrain.terrain import Terrain
 from sim.worlds.fast import Fleet
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import STEP_S, FleetState, stack
 from tests.unit.sim.bullet_worlds import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, nominal, placed, plane
 
 
