@@ -1,4 +1,4 @@
-"""What is true of the ground and of the machines' ways, kept apart from what sensors say; for evaluation only."""
+"""The true ground and the machines' true tracks, kept apart from what sensors read; for evaluation only."""
 
 from __future__ import annotations
 

@@ -122,9 +122,9 @@ def steering_radps(chassis: Chassis, target_rad: Floats, articulation_rad: Float
     """Rate of articulation after a step: hydraulics close in on the target within their limits, with a lag."""
     most, fastest = chassis.max_articulation_rad, chassis.steer_radps
     target = np.minimum(np.maximum(target_rad, -most), most)
-    wanted = chassis.steer_gain_per_s * (target - articulation_rad)
-    wanted = np.minimum(np.maximum(wanted, -fastest), fastest)
-    return rate_radps + (wanted - rate_radps) * (STEP_S / chassis.steer_lag_s)
+    rate = chassis.steer_gain_per_s * (target - articulation_rad)
+    rate = np.minimum(np.maximum(rate, -fastest), fastest)
+    return rate_radps + (rate - rate_radps) * (STEP_S / chassis.steer_lag_s)
 
 
 def drive_force_n(chassis: Chassis, target_n: Floats, drive_n: Floats, most_n: Floats) -> Floats:

@@ -152,7 +152,7 @@ def _ground(client: int, terrain: Terrain, shades: list[Floats], folder: Path) -
 
 
 def _skirt(client: int, path: Path, edge: Floats, floor_m: float) -> None:
-    """Close the side below an edge (3, k) of the ground, so that the site is a block and no sheet."""
+    """Close the side below an edge (3, k) of the ground, so that the site looks like a solid block."""
     x, y, z = (
         np.stack([below, above])
         for below, above in zip((*edge[:2], np.full(edge.shape[1], floor_m)), edge, strict=True)

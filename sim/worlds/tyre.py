@@ -43,7 +43,7 @@ class TyreState:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class WheelMotion:
     """How wheels touch the ground: load [N], speed of the hub over it, ahead and to the left, and the soil's zone."""
 
     load_n: Floats
@@ -76,8 +76,8 @@ def radial_load(tyres: Tyres, squash_m: Floats, squash_mps: Floats) -> Floats:
     return np.where(squash_m > 0, np.maximum(load, 0.0), 0.0)
 
 
-def roll(
-    tyres: Tyres, state: TyreState, motion: Motion, drive_nm: Floats, brake_nm: Floats, dt: float
+def turn_wheels(
+    tyres: Tyres, state: TyreState, motion: WheelMotion, drive_nm: Floats, brake_nm: Floats, dt: float
 ) -> tuple[TyreState, TyreForces]:
     """Turn wheels by one step. drive_nm: torque on each wheel; brake_nm: the most its brake can hold.
 
@@ -88,7 +88,7 @@ def roll(
     stiffness = SLIP_STIFFNESS[zone] * load / tyres.relaxation_m
     damping = (2 * BRISTLE_DAMPING) * np.sqrt(stiffness * load / GRAVITY_MPS2)
 
-    # Share of the spring's force that is left near the traction limit, ahead and aside together.
+    # Share of the spring's force that is left near the traction limit, ahead and sideways together.
     pull = stiffness * np.hypot(state.ahead_m, state.left_m) + _NO_FORCE_N
     limit_or_one = np.maximum(limit, 1.0)
     share = limit * np.tanh(pull / limit_or_one) / pull

@@ -12,13 +12,13 @@ from sim.machines.model import MachineModel, load_model
 from sim.state import STEP_S, FleetState
 from sim.terrain.terrain import Terrain
 from sim.worlds.bullet import BulletWorld
-from sim.worlds.fast import Fleet
+from sim.worlds.fast import FastWorld
 from sim.worlds.world import World
 
 LOADER, TRUCK = load_model("wheel_loader"), load_model("dump_truck")
 GRADE_15 = math.tan(math.radians(15))
 BOTH = pytest.mark.parametrize("model", [LOADER, TRUCK], ids=lambda m: m.name)
-EACH = pytest.mark.parametrize("kind", [Fleet, BulletWorld], ids=["fast", "pybullet"])
+EACH = pytest.mark.parametrize("kind", [FastWorld, BulletWorld], ids=["fast", "pybullet"])
 MIDDLE = ((500.0, 500.0, 0.0),)
 
 

@@ -17,7 +17,7 @@ from sim.config import SimConfig, resolve
 from sim.publisher import Pace, run
 from sim.simulator import Simulator
 
-CONFIG = SimConfig(site="pit", world="fast", machines=2, seed=3, seconds=0.5, speed=0.0, wait_s=10.0)
+CONFIG = SimConfig(site="pit", world="fast", machines=2, seed=3, seconds=0.5, speed=0.0)
 
 
 class Listener:
@@ -95,9 +95,10 @@ def test_stop_ends_the_streams_early_and_cleanly() -> None:
 
 def test_machine_without_an_agent_is_named() -> None:
     endpoint = free_endpoint()
-    config = replace(CONFIG, wait_s=0.2, names=("red", "blue"))
+    config = replace(CONFIG, names=("red", "blue"))
     with ThreadPoolExecutor(1) as pool:
-        result = pool.submit(run, config, SessionConfig(endpoint, mode="router"), threading.Event())
+        session_config = SessionConfig(endpoint, mode="router")
+        result = pool.submit(run, config, session_config, threading.Event(), wait_s=0.2)
         with listening(SessionConfig(endpoint, wait_s=10.0), "pit", ("red",)), pytest.raises(LinkError, match="blue"):
             result.result(timeout=20)
 
@@ -125,10 +126,10 @@ class FakeStop(threading.Event):
 def test_run_takes_as_long_as_its_speed_says() -> None:
     stop = FakeStop()
     endpoint = free_endpoint()
-    config = replace(CONFIG, seconds=10.0, speed=4.0, wait_s=1e6)
+    config = replace(CONFIG, seconds=10.0, speed=4.0)
     with ThreadPoolExecutor(1) as pool:
         session_config = SessionConfig(endpoint, mode="router")
-        result = pool.submit(run, config, session_config, stop, clock=lambda: stop.now)
+        result = pool.submit(run, config, session_config, stop, clock=lambda: stop.now, wait_s=1e6)
         with listening(SessionConfig(endpoint, wait_s=10.0), "pit", resolve(config).machine_names):
             assert result.result(timeout=30).wall_s == pytest.approx(2.5)
 

@@ -20,9 +20,9 @@ def plan(monkeypatch: pytest.MonkeyPatch, scenario: str, **options: object) -> t
     label = Canvas.label
 
     def noted(self: Canvas, words: str, *rest: object) -> bool:
-        found = label(self, words, *rest)
-        written.extend([words] * found)
-        return found
+        has_room = label(self, words, *rest)
+        written.extend([words] * has_room)
+        return has_room
 
     monkeypatch.setattr(Canvas, "label", noted)
     simulator = Simulator(SimConfig(scenario=scenario, world="fast", **options))
@@ -77,7 +77,7 @@ def test_labels_lie_apart_until_there_is_no_room() -> None:
     assert (added > 0.75 * added[0]).all()  # only margins may be shared
 
 
-def test_one_sheet_is_written(tmp_path, monkeypatch) -> None:
+def test_one_picture_is_written(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(picture, "DRIVE_S", 1.0)
     cameras = []
     monkeypatch.setattr(picture, "render", lambda *scene: cameras.extend(scene[-1]) or render(*scene))

@@ -1,4 +1,4 @@
-"""What agents know of tyres and masses tells how far a machine's nose is up against the ground."""
+"""Squat follows from what agents know of tyres and masses: the nose-up angle of a machine against the ground."""
 
 import math
 
@@ -40,8 +40,10 @@ def test_squat_at_steady_speed_is_that_of_the_axles_loads(model: MachineModel, s
         world.set_payload(0, payload_kg)
         idle(world, 3.0, model.max_brake_n)
         last = hold_speed(world, 2.0, 8.0)[-100:]
-    found = -np.mean([state.pitch_rad[0] for state in last]) - slope
+    nose_up = -np.mean([state.pitch_rad[0] for state in last]) - slope
     force_x = GRAVITY_MPS2 * math.sin(slope) + float(np.mean([state.accel_mps2[0] for state in last]))
-    assert found == pytest.approx(nose_up_rad(machine, payload_kg, force_x, GRAVITY_MPS2 * math.cos(slope)), abs=0.0005)
+    assert nose_up == pytest.approx(
+        nose_up_rad(machine, payload_kg, force_x, GRAVITY_MPS2 * math.cos(slope)), abs=0.0005
+    )
     if full or slope_deg:
-        assert abs(found) > 0.002  # else there would be nothing to tell
+        assert abs(nose_up) > 0.002  # else there would be nothing to tell

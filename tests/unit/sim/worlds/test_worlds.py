@@ -13,7 +13,7 @@ from sim.machines.model import MachineModel
 from sim.state import STEP_S, FleetState, stack
 from sim.terrain.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
 from sim.worlds.bullet import BulletWorld
-from sim.worlds.fast import Fleet
+from sim.worlds.fast import FastWorld
 from sim.worlds.world import World
 from tests.unit.sim.bullet_worlds import BOTH, EACH, GRADE_15, LOADER, TRUCK, hold_speed, idle, placed, plane
 
@@ -22,7 +22,7 @@ from tests.unit.sim.bullet_worlds import BOTH, EACH, GRADE_15, LOADER, TRUCK, ho
 def test_worlds_offer_what_the_seam_asks_for(kind: type) -> None:
     for name in ("advance", "set_payload", "set_terrain", "close"):
         assert inspect.signature(getattr(kind, name)) == inspect.signature(getattr(World, name)), name
-    assert inspect.signature(kind) == inspect.signature(Fleet)
+    assert inspect.signature(kind) == inspect.signature(FastWorld)
 
 
 @EACH
@@ -218,7 +218,7 @@ def test_a_load_slows_a_machine_down(kind: type) -> None:
 
 
 @EACH
-def test_repaved_ground_is_felt(kind: type) -> None:
+def test_repaved_ground_acts_on_machines(kind: type) -> None:
     with placed(kind, plane(CONCRETE), LOADER) as world:
         hold_speed(world, 2.0, 4.0)
         assert world.state.c_rr[0] == pytest.approx(SOILS[CONCRETE].c_rr)
@@ -253,8 +253,8 @@ def test_grade_and_attitude_are_those_of_the_plane(kind: type, model: MachineMod
     assert rest.grade_n[0] == pytest.approx(-0.07, abs=1e-6)
     up = np.array([-0.12, 0.07, 1.0]) / math.sqrt(1 + 0.12**2 + 0.07**2)
     c, s = np.cos(yaw), np.sin(yaw)
-    felt = rest.force_mps2[0] / GRAVITY_MPS2  # the vertical as the rear frame sees it
-    np.testing.assert_allclose(felt[:2], [-up[0] * c - up[1] * s, up[0] * s - up[1] * c], atol=0.01)
+    up_seen = rest.force_mps2[0] / GRAVITY_MPS2  # the vertical as the rear frame sees it
+    np.testing.assert_allclose(up_seen[:2], [-up[0] * c - up[1] * s, up[0] * s - up[1] * c], atol=0.01)
 
 
 @EACH
@@ -267,9 +267,9 @@ def test_true_bodies_differ_from_the_model(kind: type) -> None:
 
 
 @BOTH
-def test_both_worlds_take_the_same_way_under_the_same_commands(model: MachineModel) -> None:
+def test_both_worlds_take_the_same_track_under_the_same_commands(model: MachineModel) -> None:
     weight_n, runs = model.mass_kg * GRAVITY_MPS2, []
-    for kind in (Fleet, BulletWorld):
+    for kind in (FastWorld, BulletWorld):
         with placed(kind, plane(2, 0.03, -0.02), model, starts=[(500, 500, 0.4)]) as world:
             states = []
             for i in range(1600):
@@ -278,12 +278,12 @@ def test_both_worlds_take_the_same_way_under_the_same_commands(model: MachineMod
                 states.append(world.advance(steer, drive * weight_n, brake * weight_n))
             runs.append(stack(states))
     fast, bullet = runs
-    way = np.hypot(np.diff(fast.x_m[:, 0]), np.diff(fast.y_m[:, 0])).cumsum()
+    driven = np.hypot(np.diff(fast.x_m[:, 0]), np.diff(fast.y_m[:, 0])).cumsum()
     apart = np.hypot(fast.x_m - bullet.x_m, fast.y_m - bullet.y_m)[:, 0]
-    assert way[599] > 5
-    assert way[-1] > 30
-    assert apart[599] < 0.006 * way[599]
-    assert apart.max() < 0.03 * way[-1]  # steering pushes PyBullet's frames a little ahead
+    assert driven[599] > 5
+    assert driven[-1] > 30
+    assert apart[599] < 0.006 * driven[599]
+    assert apart.max() < 0.03 * driven[-1]  # steering pushes PyBullet's frames a little ahead
     assert abs(fast.yaw_rad - bullet.yaw_rad).max() < 0.1
     np.testing.assert_allclose(fast.articulation_rad, bullet.articulation_rad, atol=0.01)
     np.testing.assert_allclose(fast.drive_n, bullet.drive_n, atol=1.0)
