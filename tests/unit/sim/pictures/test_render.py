@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from sim.pictures import render as render_module
 from sim.pictures.render import SKY_RGB, Camera, closeup, overview, render
 from sim.terrain.soil import GRAVEL
 from sim.worlds.fast import FastWorld
@@ -27,7 +28,8 @@ def test_machine_ground_and_sky_are_in_the_picture() -> None:
 
 @pytest.mark.parametrize(("rows", "columns"), [(4, 5), (3, 9), (7, 2)])
 @pytest.mark.parametrize(("width", "height"), [(160, 90), (90, 120)])
-def test_overview_sees_the_whole_site_and_fills_its_frame(rows, columns, width, height) -> None:
+def test_overview_sees_the_whole_site_and_fills_its_frame(rows, columns, width, height, monkeypatch) -> None:
+    monkeypatch.setattr(render_module, "TEXEL_M", 5.0)
     flat = plane(GRAVEL)
     terrain = type(flat)(np.zeros((rows, columns)), 50.0, flat.zones, 1000.0)
     with placed(FastWorld, terrain, LOADER, starts=[(15, 15, 0.5)]) as world:

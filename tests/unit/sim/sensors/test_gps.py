@@ -81,7 +81,7 @@ def test_fully_shared_drift_is_one_whatever_the_rates_and_the_other_machines() -
     def tracks(rigs: list[Rig]) -> dict[int, np.ndarray]:
         steps = np.arange(1, 201)
         span = Sensors(rigs, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(200, len(rigs)))
-        return {m: to_map(b.values[:, u]) for b in span.blocks for u, m in enumerate(b.machines.tolist())}
+        return {m: to_map(b.values[:, u]) for b in span.groups for u, m in enumerate(b.machines.tolist())}
 
     alone = tracks([rig(preset(5), only="gps")])
     mixed = tracks([rig(preset(5), only="gps"), rig(preset(10), only="gps"), rig(preset(5, 1.0), only="gps")])
