@@ -1,4 +1,4 @@
-"""What both worlds know of vehicles: what machines weigh and measure, and how their hydraulics and engine obey."""
+"""Figures of machines that both worlds use: geometry and weight, and the lags of hydraulics and engine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Bodies:
 
 
 class Chassis(NamedTuple):
-    """What the models of n machines say, arrays (n,), named as in `MachineModel`.
+    """Figures of n machines from their models, arrays (n,), named as in `MachineModel`.
 
     front_share, centre_height: of the empty machine; payload_*: the same for what it carries, alone. *_inertia: about
     its centre, empty; *_inertia_gain: what each kilogram that it carries adds.
@@ -57,7 +57,7 @@ class Chassis(NamedTuple):
 
 
 class Weight(NamedTuple):
-    """What machines weigh with what they carry, all (n,).
+    """Weight of n machines with their payload, all (n,).
 
     front_share: the front axle's, on the level. centre_height: of the centre of mass; inertias are about it.
     """

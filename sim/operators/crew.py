@@ -1,4 +1,4 @@
-"""What drivers know of their machines."""
+"""Figures of machines that their drivers know."""
 
 from __future__ import annotations
 

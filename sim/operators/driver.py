@@ -40,7 +40,7 @@ class Drivers:
 
 @dataclass(frozen=True)
 class Commands:
-    """What n drivers ask for: articulation, drive force, most force of the brakes; and the payload they carry."""
+    """Commands of n drivers: articulation, drive force, most force of the brakes; and the payload they carry."""
 
     steer_rad: Floats
     drive_n: Floats
@@ -69,7 +69,7 @@ def no_commands(machines: int) -> Commands:
 
 
 def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float) -> tuple[Drivers, Commands]:
-    """Return the drivers' next memory and what they ask for."""
+    """Drive one step; returns the drivers' next memory and their commands."""
     # Where on the leg the machine is; at its end it stops, waits, loads, and takes up the next leg.
     position = crew.joint_m(state)
     arrived = ~course.closed[old.leg] & (course.length_m[old.leg] - old.distance_m < STOP_M)

@@ -80,7 +80,7 @@ class GroundConfig:
     def contains(self, points_m: Floats, margin_m: float) -> Bools:
         """Whether points (k, 2) lie on the site, this far from its edges, (k,)."""
         inside = (points_m >= margin_m) & (points_m <= np.array([self.width_m, self.depth_m]) - margin_m)
-        return inside.all(axis=-1)
+        return np.logical_and(inside[:, 0], inside[:, 1])
 
 
 def soil_index(name: str) -> int:

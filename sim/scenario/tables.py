@@ -1,4 +1,4 @@
-"""Scenarios: what is simulated, as the tables of a TOML file say it."""
+"""Scenarios: the tables of a TOML file that describe what is simulated."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class FleetConfig:
 
 @dataclass(frozen=True)
 class FaultConfig(Faults):
-    """What is wrong with one machine."""
+    """The faults of one machine."""
 
     machine: str = ""
 
@@ -126,7 +126,7 @@ class ScheduledChange:
 
     @property
     def zone(self) -> ZoneConfig:
-        """The ground that it lays."""
+        """The ground that it becomes."""
         return ZoneConfig(self.soil, self.outline)
 
 

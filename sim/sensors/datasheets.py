@@ -1,4 +1,4 @@
-"""What sensors get wrong and how often they read: the parameters of all sensor models, as presets give them.
+"""Parameters of all sensor models: their errors and how often they read, as presets set them.
 
 Standard deviations are of one reading unless they say otherwise; `presets.toml` holds values and sources.
 """

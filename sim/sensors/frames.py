@@ -1,4 +1,4 @@
-"""What sensors need beside `protocol.rotations`: turned vectors, and products of vectors and quaternions.
+"""Rotated vectors, and products of vectors and of quaternions, for arrays of machines.
 
 Vectors and quaternions (x, y, z, w) hold their axes first: (3, ...) and (4, ...). Plain sums of products rather than
 `@` and `einsum`, which round differently with the number of machines: seeds would not repeat.

@@ -27,12 +27,12 @@ class FrameMotion:
     force_mps2: Floats
 
     def force_at(self, lever_m: Floats) -> Floats:
-        """Specific force at a place on the frame (3, 1, u)."""
+        """Specific force at a place r on the frame (3, 1, u): f + dw/dt x r + w x (w x r)."""
         turning = cross(self.rates_dot_radps2, lever_m) + cross(self.rates_radps, cross(self.rates_radps, lever_m))
         force: Floats = self.force_mps2 + turning
         return force
 
-    def beyond(self, joint_m: Floats, angle_rad: Floats, radps: Floats, radps2: Floats) -> FrameMotion:
+    def hinged(self, joint_m: Floats, angle_rad: Floats, radps: Floats, radps2: Floats) -> FrameMotion:
         """Motion of a frame hinged about z at a place on this one; angle of the hinge, its rate and acceleration."""
         rates = seen_turned(angle_rad, self.rates_radps)
         rates_dot = seen_turned(angle_rad, self.rates_dot_radps2)
@@ -93,7 +93,7 @@ class ImuGroup(SensorGroup):
         if not self._on_front:
             return rear
         hinge = (states.articulation_rad, states.articulation_radps, states.articulation_radps2)
-        return rear.beyond(self._joint_m, *(self.pick(q, rows) for q in hinge))
+        return rear.hinged(self._joint_m, *(self.pick(q, rows) for q in hinge))
 
 
 class AttitudeGroup(SensorGroup):

@@ -23,7 +23,7 @@ from sim.worlds.tyre import TyreForces, Tyres, WheelMotion, at_rest, radial_load
 
 @dataclass(frozen=True, slots=True)
 class Actuators:
-    """What machines do at the moment, all (n,): rate of articulation, drive force, and most force of the brakes."""
+    """Actuators of n machines, all (n,): rate of articulation, drive force, and most force of the brakes."""
 
     steering_radps: Floats
     drive_n: Floats
@@ -136,7 +136,7 @@ def _standing(terrain: Terrain, models: Sequence[MachineModel], starts: Floats) 
 
 
 def _points(models: Sequence[MachineModel]) -> Floats:
-    """The points of `rigid.POINT_FRAME` in the links of their frames, (n, 5, 3)."""
+    """The points of `bullet_scene.POINT_FRAME` in the links of their frames, (n, 5, 3)."""
     rows = []
     for model in models:
         robot = model.robot

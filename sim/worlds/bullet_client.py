@@ -1,4 +1,4 @@
-"""The edge to PyBullet: one world without ground that moves the frames of machines under given forces."""
+"""The only calls of PyBullet's physics: it moves the frames of machines under given forces, without ground."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class MultiBodies:
         self._link_from_inertial = np.swapaxes(rotations(inertial[:, :, 3:]), -1, -2)
 
     def read(self) -> Frames:
-        """Where everything is, and how it moves."""
+        """Read where all frames are, and how they move."""
         client, flat = self._client, list[float]()
         for machine in self._machines:
             body = machine.body

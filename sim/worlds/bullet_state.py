@@ -17,7 +17,7 @@ _GRAVITY_UP = np.array([0.0, 0.0, GRAVITY_MPS2])
 
 @dataclass(frozen=True, slots=True)
 class DriveTrain:
-    """What the drive train did: drive force, torque of all wheels together; spin and angle of the rear ones (n, 2)."""
+    """Drive train over one step: drive force, torque of all wheels together; spin and angle of the rear ones (n, 2)."""
 
     drive_n: Floats
     torque_nm: Floats
@@ -27,7 +27,7 @@ class DriveTrain:
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """What machines weigh with their payload, and the payload alone, both (n,)."""
+    """Mass of machines with their payload, and of the payload alone, both (n,)."""
 
     mass_kg: Floats
     payload_kg: Floats

@@ -39,7 +39,7 @@ class Moved(NamedTuple):
     turning: float
 
 
-class Axes(NamedTuple):
+class RearAxle(NamedTuple):
     """The rear axle's centre, and the direction of the rear frame."""
 
     x: float
@@ -178,7 +178,7 @@ def _touch(m: Record, grid: TerrainGrid, at: Moved) -> Contact:
     left_x, left_y = -half * sf, half * cf
 
     c, s = math.cos(at.yaw), math.sin(at.yaw)
-    rear_axle = Axes(at.x, at.y, c, s)
+    rear_axle = RearAxle(at.x, at.y, c, s)
     fl, east_fl, north_fl, zone_fl = _under(grid, rear_axle, ahead_x + left_x, ahead_y + left_y)
     fr, east_fr, north_fr, zone_fr = _under(grid, rear_axle, ahead_x - left_x, ahead_y - left_y)
     rl, east_rl, north_rl, zone_rl = _under(grid, rear_axle, 0.0, half)
@@ -200,7 +200,7 @@ def _touch(m: Record, grid: TerrainGrid, at: Moved) -> Contact:
 
 
 @_compiled
-def _under(grid: TerrainGrid, at: Axes, ahead: float, left: float) -> tuple[float, float, float, int]:
+def _under(grid: TerrainGrid, at: RearAxle, ahead: float, left: float) -> tuple[float, float, float, int]:
     """Height, its slopes to the east and north, and the zone at a place relative to the rear axle's centre."""
     x, y = at.x + at.cos_yaw * ahead - at.sin_yaw * left, at.y + at.sin_yaw * ahead + at.cos_yaw * left
     height, east, north = surface(grid, x, y)

@@ -35,7 +35,7 @@ class Tyres:
 
 @dataclass(frozen=True, slots=True)
 class TyreState:
-    """What wheels remember: spin, and the bristles' stretch ahead and to the left."""
+    """State of wheels: spin, and the bristles' stretch ahead and to the left."""
 
     spin_radps: Floats
     ahead_m: Floats
