@@ -3,7 +3,7 @@
 import pytest
 
 from sim.worlds.fast import FastWorld
-from tests.unit.sim.bullet_worlds import LOADER, idle, placed, plane
+from tests.unit.sim.planes import LOADER, idle, placed, plane
 
 
 @pytest.fixture(scope="session", autouse=True)

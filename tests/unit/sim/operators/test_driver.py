@@ -173,7 +173,7 @@ def test_without_give_way_machines_drive_on() -> None:
 @pytest.mark.slow
 def test_machines_do_not_touch_in_pybullet() -> None:
     """Contact shows as a jolt: nothing else on the site shakes a frame so hard."""
-    driven = drive(SimConfig(machines=6, seed=3), 100.0)
+    driven = drive(SimConfig(machines=6, seed=3), 80.0)
     level = driven.states.force_mps2[20:, :, :2]
     assert abs(level).max() < 6.0
-    assert (abs(driven.states.speed_mps).sum(axis=0) * 0.1 > 250).all()
+    assert (abs(driven.states.speed_mps).sum(axis=0) * 0.1 > 190).all()

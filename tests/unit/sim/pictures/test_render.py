@@ -5,7 +5,7 @@ from sim.pictures import render as render_module
 from sim.pictures.render import SKY_RGB, Camera, closeup, overview, render
 from sim.terrain.soil import GRAVEL
 from sim.worlds.fast import FastWorld
-from tests.unit.sim.bullet_worlds import LOADER, placed, plane
+from tests.unit.sim.planes import LOADER, placed, plane
 
 
 def test_machine_ground_and_sky_are_in_the_picture() -> None:

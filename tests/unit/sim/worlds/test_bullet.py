@@ -15,7 +15,7 @@ from sim.machines.model import MachineModel
 from sim.state import STEP_S, FleetState, stack
 from sim.terrain.soil import SAND, SLIP_STIFFNESS, TRACTION
 from sim.worlds.bullet import BulletWorld
-from tests.unit.sim.bullet_worlds import BOTH, LOADER, TRUCK, Lane, hold_speed, idle, lanes, placed, plane
+from tests.unit.sim.planes import BOTH, LOADER, TRUCK, Lane, hold_speed, idle, lanes, placed, plane
 
 
 def test_wheels_slip_as_the_soil_table_says() -> None:

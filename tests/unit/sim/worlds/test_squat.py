@@ -10,7 +10,7 @@ from sim.sensors.presets import load_preset
 from sim.sensors.rigs import machine_config
 from sim.state import stack
 from sim.worlds.bullet import BulletWorld
-from tests.unit.sim.bullet_worlds import LOADER, TRUCK, Lane, hold_speed, idle, lanes, of_each
+from tests.unit.sim.planes import LOADER, TRUCK, Lane, hold_speed, idle, lanes, of_each
 
 
 def load_difference_n(machine: MachineConfig, payload_kg: float, force_x_mps2: float, force_z_mps2: float) -> float:
