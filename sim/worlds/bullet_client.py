@@ -174,7 +174,7 @@ _ROTATIONS = np.array([_rotation(unit) for unit in np.eye(16).reshape(16, 4, 4)]
 
 
 def rotations(quaternions: Floats) -> Floats:
-    """Matrices (..., 3, 3) of unit quaternions (..., 4) x, y, z, w."""
+    """Matrices (..., 3, 3) of unit quaternions (..., 4) x, y, z, w; at every step, so as one matrix product."""
     squares = quaternions[..., :, None] * quaternions[..., None, :]
     flat: Floats = squares.reshape(-1, 16) @ _ROTATIONS
     return flat.reshape(*quaternions.shape[:-1], 3, 3)

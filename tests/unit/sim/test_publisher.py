@@ -72,11 +72,11 @@ def test_every_reading_arrives_in_counted_bundles(tmp_path: Path) -> None:
     simulator = Simulator(CONFIG)
     spans = [simulator.advance() for _ in range(10)]
     assert report.readings == sum(len(readings) for span in spans for readings in span.values())
-    for machine, heard in bundles.items():
-        assert [b.counter for b in heard] == list(range(1, 12))
-        assert [b.last for b in heard] == [False] * 10 + [True]
-        assert [list(b.readings) for b in heard] == [span[machine] for span in spans] + [[]]
-        assert len(list(open_log(tmp_path / "logs" / machine).readings())) == sum(len(b.readings) for b in heard)
+    for machine, received in bundles.items():
+        assert [b.counter for b in received] == list(range(1, 12))
+        assert [b.last for b in received] == [False] * 10 + [True]
+        assert [list(b.readings) for b in received] == [span[machine] for span in spans] + [[]]
+        assert len(list(open_log(tmp_path / "logs" / machine).readings())) == sum(len(b.readings) for b in received)
         assert (tmp_path / "truth" / "tracks" / f"{machine}.csv").exists()
     assert (tmp_path / "truth" / "truth_map.npz").exists()
 
@@ -88,9 +88,9 @@ def test_stop_ends_the_streams_early_and_cleanly() -> None:
 
     report, bundles = published(replace(CONFIG, seconds=0.0, speed=1.0), stop_at_first)
     assert report.stopped
-    for heard in bundles.values():
-        assert heard[-1].last
-        assert len(heard) == report.bundles + 1
+    for received in bundles.values():
+        assert received[-1].last
+        assert len(received) == report.bundles + 1
 
 
 def test_machine_without_an_agent_is_named() -> None:
