@@ -13,17 +13,18 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel, load_model
-from sim.machines.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
-from sim.machines.vehicle import Bodies
 from sim.scenario.file import load_scenario
 from sim.simulator import Simulator
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.soil import CONCRETE, GRAVEL, SOILS, WET_DIRT
+from sim.terrain.terrain import Terrain
 from sim.worlds.bullet import BulletWorld
-from sim.worlds.fast import Fleet
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import STEP_S, FleetState, World, stack
+from sim.worlds.fast import FastWorld
+from sim.worlds.world import World
 
-WORLDS: dict[str, type[BulletWorld] | type[Fleet]] = {"pybullet": BulletWorld, "fast": Fleet}
+WORLDS: dict[str, type[BulletWorld] | type[FastWorld]] = {"pybullet": BulletWorld, "fast": FastWorld}
 GRADE_15 = math.tan(math.radians(15))
 SPEED_MPS = 2.0
 TOUR_S = 125.0  # a lap of the longest tour of the paper's site
@@ -36,17 +37,27 @@ def run(seeds: Sequence[int], on_progress: Callable[[str], None] = lambda _: Non
 
     Returns one object with `rows` (experiment, world, measured, expected, error, unit, goal) and `tours`.
     """
+    return {"rows": experiments(on_progress), "tours": tours(seeds, on_progress)}
+
+
+def experiments(on_progress: Callable[[str], None]) -> list[Row]:
+    """Do all experiments in both worlds."""
     rows: list[Row] = []
     for name in WORLDS:
         for experiment in (_traction, _slope, _coast_down, _parking, _circle):
             on_progress(f"{name}: {experiment.__name__.strip('_').replace('_', ' ')}")
             rows += [{"experiment": experiment.__name__.strip("_"), "world": name, **row} for row in experiment(name)]
-    tours = []
+    return rows
+
+
+def tours(seeds: Sequence[int], on_progress: Callable[[str], None]) -> list[Row]:
+    """Drive each tour of the paper's site once per seed, in both worlds."""
+    rows = []
     for seed in seeds:
         for route in load_scenario("paper_site").route:
             on_progress(f"tour {route.name}, seed {seed}")
-            tours.append({"route": route.name, "seed": seed, **_apart(route.name, seed)})
-    return {"rows": rows, "tours": tours}
+            rows.append({"route": route.name, "seed": seed, **_apart(route.name, seed)})
+    return rows
 
 
 def _traction(world: str) -> list[Row]:
@@ -76,15 +87,15 @@ def _coast_down(world: str) -> list[Row]:
     turning = 1 + 4 * model.wheel_inertia_kgm2 / model.wheel_radius_m**2 / model.mass_kg
     with _alone(world, _plane(GRAVEL)) as one:
         _hold(one, 8.0)
-        start = float(_idle(one, 1.2)[-1].speed_mps[0])  # until the engine has let go
-        slower = (start - float(_idle(one, 0.5)[-1].speed_mps[0])) / 0.5
+        start = float(_roll_out(one, 1.2)[-1].speed_mps[0])  # until the engine has let go
+        slower = (start - float(_roll_out(one, 0.5)[-1].speed_mps[0])) / 0.5
     return [_row("gravel", slower, SOILS[GRAVEL].c_rr * GRAVITY_MPS2 / turning, "m/s2", relative=0.01)]
 
 
 def _parking(world: str) -> list[Row]:
     """Creep in 30 s on 15 degrees with the brakes on."""
     with _alone(world, _plane(CONCRETE, GRADE_15)) as one:
-        run = stack(_idle(one, 30.0, _loader().max_brake_n))
+        run = stack(_roll_out(one, 30.0, _loader().max_brake_n))
     creep = math.hypot(run.x_m[-1, 0] - run.x_m[0, 0], run.y_m[-1, 0] - run.y_m[0, 0])
     return [_row("concrete, 15 deg, 30 s", creep, 0.0, "m", absolute=0.01)]
 
@@ -154,7 +165,7 @@ def _hold(world: World, seconds: float, steer_rad: float = 0.0) -> list[FleetSta
     return states
 
 
-def _idle(world: World, seconds: float, brake_n: float = 0.0) -> list[FleetState]:
+def _roll_out(world: World, seconds: float, brake_n: float = 0.0) -> list[FleetState]:
     zero: Floats = np.zeros(1)
     return [world.advance(zero, zero, np.full(1, brake_n)) for _ in range(round(seconds / STEP_S))]
 

@@ -20,11 +20,12 @@ from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle
 from protocol.wire.session import SessionConfig, open_session
 from sim.config import SimConfig
-from sim.recorder import Recording, write_truth
+from sim.recorder import Recorder, write_truth
 from sim.simulator import Simulator
 
 MATCH_POLL_S = 0.05
 PROGRESS_S = 0.2
+WAIT_S = 30.0  # for subscribers: agents that are started by hand after the simulator have that long
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class Stream:
         self._publisher: Any = session.declare_publisher(keys.sensors(site, machine), congestion_control=block)
 
     @property
-    def heard(self) -> bool:
-        """Whether somebody subscribes."""
+    def has_subscriber(self) -> bool:
+        """Whether an agent subscribes."""
         return bool(self._publisher.matching_status.matching)
 
     def put(self, readings: tuple[Reading, ...] = (), *, last: bool = False) -> None:
@@ -93,17 +94,21 @@ def run(
     on_progress: Callable[[float], None] | None = None,
     truth_dir: Path | None = None,
     record_dir: Path | None = None,
+    wait_s: float = WAIT_S,
 ) -> SimReport:
     """Simulate and publish until `config.seconds` are over or `stop` is set.
 
-    Waits first until every machine has a subscriber, at most `config.wait_s`, else a LinkError. on_progress gets the
+    Waits first until every machine has a subscriber, at most wait_s, else a LinkError. on_progress gets the
     simulated time about five times a second. The truth and log folders are written at the end, whatever ends the run;
     readings are kept in memory for record_dir.
     """
     with contextlib.closing(Simulator(config)) as simulator, _streams(simulator, session_config) as streams:
-        recording = Recording(simulator) if record_dir else None
+        recording = Recorder(simulator) if record_dir else None
         progress = throttled(on_progress, clock) if on_progress else None
-        _await_subscribers(streams, simulator, session_config.endpoint, stop, clock)
+        if missing := _await_subscribers(streams, wait_s, stop, clock):
+            problem = f"nobody listens to machine {missing[0]} of site {simulator.site.name}"
+            advice = f"start its agent with `sitegrid agent`, within {wait_s:g} s"
+            raise LinkError(session_config.endpoint, f"{problem}: {advice}")
         try:
             report = _drive(simulator, streams, stop, clock, recording, progress)
         finally:
@@ -119,7 +124,7 @@ def _drive(
     streams: list[Stream],
     stop: threading.Event,
     clock: Callable[[], float],
-    recording: Recording | None,
+    recording: Recorder | None,
     progress: Callable[[float], None] | None,
 ) -> SimReport:
     start, bundles, readings = clock(), 0, 0
@@ -158,17 +163,15 @@ def _streams(simulator: Simulator, session_config: SessionConfig) -> Iterator[li
 
 
 def _await_subscribers(
-    streams: list[Stream], simulator: Simulator, endpoint: str, stop: threading.Event, clock: Callable[[], float]
-) -> None:
-    wait_s = simulator.config.wait_s
+    streams: list[Stream], wait_s: float, stop: threading.Event, clock: Callable[[], float]
+) -> list[str]:
+    """Wait until every machine has a subscriber, or the run is stopped; returns the machines that got none in time."""
     deadline = clock() + wait_s
-    while unheard := [s.machine for s in streams if not s.heard]:
-        if stop.is_set():
-            return
+    while (missing := [s.machine for s in streams if not s.has_subscriber]) and not stop.is_set():
         if clock() >= deadline:
-            problem = f"nobody listens to machine {unheard[0]} of site {simulator.site.name}"
-            raise LinkError(endpoint, f"{problem}: start its agent with `sitegrid agent`, within {wait_s:g} s")
+            return missing
         stop.wait(MATCH_POLL_S)
+    return []
 
 
 def throttled(call: Callable[[float], None], clock: Callable[[], float]) -> Callable[[float], None]:

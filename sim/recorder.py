@@ -17,7 +17,7 @@ from sim.truth import MAP_FILE, save_tracks
 TRACKS_FOLDER = "tracks"
 
 
-class Recording:
+class Recorder:
     """Keeps readings in memory, to be written as one log folder per machine."""
 
     def __init__(self, simulator: Simulator) -> None:
@@ -62,7 +62,7 @@ def record(
     with contextlib.closing(Simulator(config)) as simulator:
         if simulator.bundles is None:
             raise ConfigError("seconds", "a recording needs an end: set seconds above 0")
-        recording = Recording(simulator)
+        recording = Recorder(simulator)
         for _ in range(simulator.bundles):
             if stop and stop.is_set():
                 break

@@ -11,22 +11,27 @@ from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection, SiteConfig
-from sim.config import STEP_MS, SimConfig, resolve
+from sim.config import SimConfig, resolve
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
-from sim.machines.vehicle import Bodies
-from sim.operators.course import Start, lay_course, line_up
-from sim.operators.driver import DRIVER_STEPS, board, drive, hire, idle, look_out
+from sim.operators.course import Start, build_course, spread_starts
+from sim.operators.crew import crew_of
+from sim.operators.driver import DRIVER_STEPS, at_start, drive, look_out, no_commands
 from sim.operators.traffic import APART_M, LOOK_OUT_STEPS
-from sim.scenario.ground import lay, pave
+from sim.scenario.ground import build_terrain, with_zone
 from sim.scenario.tables import Scenario
 from sim.sensors.rigs import draw_bodies
-from sim.sensors.sensors import Sensors, Span
+from sim.sensors.sensors import FleetReadings, Sensors
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.terrain import Terrain
 from sim.truth import TRACK_DTYPE, TRACK_EVERY, TRACK_VALUES, TruthMap, truth_map
-from sim.worlds.fast import Fleet
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import STEP_S, FleetState, World, stack
+from sim.worlds.fast import FastWorld
+from sim.worlds.world import World
 
+STEP_MS = 10
 STEP_NS = STEP_MS * 1_000_000
+BUNDLE_MS = 50  # simulated time in one message: five steps, so that messages to agents come at 20 Hz
+START_NS = 1_767_225_600_000_000_000  # stamp of the start, 2026-01-01T00:00:00Z: fixed, so that seeds repeat runs
 
 
 class Simulator:
@@ -35,24 +40,24 @@ class Simulator:
     site, machines: what agents may know. truth_map, tracks(): what only an evaluation may see. close() ends the world.
     """
 
-    def __init__(self, config: SimConfig, scenario: Scenario | None = None) -> None:
-        """scenario: in place of the one that config names."""
-        self.config = config
+    def __init__(self, config: SimConfig, scenario: Scenario | None = None, *, bundle_ms: int = BUNDLE_MS) -> None:
+        """scenario: in place of the one that config names. bundle_ms: a multiple of STEP_MS."""
+        self.config, self._bundle_ms = config, bundle_ms
         self.scenario: Scenario = scenario or resolve(config)
         self.site: SiteConfig = self.scenario.site
         rigs = self.scenario.rigs()
         self.machines: tuple[MachineConfig, ...] = tuple(rig.machine for rig in rigs)
         self.models: tuple[MachineModel, ...] = tuple(rig.model for rig in rigs)
-        self.terrain: Terrain = lay(self.scenario.ground, self.scenario.seed)
+        self.terrain: Terrain = build_terrain(self.scenario.ground, self.scenario.seed)
         self._changes = sorted(self.scenario.change, key=lambda change: change.at_s)
 
         routes, speeds, shares = zip(*self.scenario.journeys(), strict=True)
         try:
-            starts = line_up(routes, shares, APART_M if self.scenario.give_way else 0.0)
+            starts = spread_starts(routes, shares, APART_M if self.scenario.give_way else 0.0)
         except ValueError as error:
             raise ConfigError(f"scenario {config.scenario}", str(error)) from None
-        self._course = lay_course(routes, speeds)
-        self._crew, self._drivers, self._commands = hire(self.models), board(starts), idle(len(starts))
+        self._course = build_course(routes, speeds)
+        self._crew, self._drivers, self._commands = crew_of(self.models), at_start(starts), no_commands(len(starts))
         bodies = draw_bodies(rigs, self.scenario.seed)
         self._world = build_world(self.scenario.world, self.terrain, self.models, bodies, starts)
         for machine, start in enumerate(starts):
@@ -72,7 +77,7 @@ class Simulator:
     def bundles(self) -> int | None:
         """How many bundles the run has; None if it ends only when it is stopped."""
         seconds = self.scenario.seconds
-        return -int(-seconds * 1000 // self.config.bundle_ms) if seconds else None
+        return -int(-seconds * 1000 // self._bundle_ms) if seconds else None
 
     @property
     def state(self) -> FleetState:
@@ -84,12 +89,12 @@ class Simulator:
         span = self.sense()
         return {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
 
-    def sense(self) -> Span:
+    def sense(self) -> FleetReadings:
         """Simulate the span of one bundle; returns the readings of all machines as columns."""
-        count = self.config.bundle_ms // STEP_MS
+        count = self._bundle_ms // STEP_MS
         states = stack([self.step() for _ in range(count)])
         steps = np.arange(self._steps - count + 1, self._steps + 1)
-        stamps_ns = self.config.start_ns + steps * STEP_NS
+        stamps_ns = START_NS + steps * STEP_NS
         due = steps % TRACK_EVERY == 0
         if due.any():
             self._tracks.append(_track_rows(stamps_ns[due], states, due))
@@ -100,7 +105,7 @@ class Simulator:
         self._world.close()
 
     def tracks(self) -> dict[str, Table]:
-        """True way of each machine so far: rows of `truth.TRACK_DTYPE` at 10 Hz."""
+        """True track of each machine so far: rows of `truth.TRACK_DTYPE` at 10 Hz."""
         empty = np.empty((0, len(self.machines)), TRACK_DTYPE)
         rows = np.concatenate([empty, *self._tracks])
         return {machine.name: rows[:, i].copy() for i, machine in enumerate(self.machines)}
@@ -122,7 +127,7 @@ class Simulator:
         """
         state = self._world.state
         while self._changes and self._changes[0].at_s <= self.simulated_s:
-            self._repave()
+            self._change_ground()
         if self._steps % LOOK_OUT_STEPS == 0 and self.scenario.give_way and len(self.machines) > 1:
             self._drivers = look_out(self._course, self._crew, self._drivers, state)
         if self._steps % DRIVER_STEPS == 0:
@@ -135,10 +140,10 @@ class Simulator:
         commands = self._commands
         return self._world.advance(commands.steer_rad, commands.drive_n, commands.brake_n)
 
-    def _repave(self) -> None:
+    def _change_ground(self) -> None:
         change = self._changes.pop(0)
         self._truth_maps.append((change.at_s, self.truth_map))
-        self.terrain = pave(self.terrain, change.zone)
+        self.terrain = with_zone(self.terrain, change.zone)
         self._world.set_terrain(self.terrain)
 
 
@@ -152,7 +157,7 @@ def build_world(
     base = joint - rear_m[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     places: Floats = np.column_stack([base, heading])
     if name == "fast":
-        return Fleet(terrain, models, bodies, places)
+        return FastWorld(terrain, models, bodies, places)
     from sim.worlds.bullet import BulletWorld  # imported here: the fast world needs no PyBullet
 
     return BulletWorld(terrain, models, bodies, places)

@@ -1,4 +1,4 @@
-"""What is true of the ground and of the machines' ways, kept apart from what sensors say; for evaluation only."""
+"""The true ground and the machines' true tracks, kept apart from what sensors read; for evaluation only."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from protocol.arrays import Floats32, Table
 from protocol.errors import StoreError
-from sim.machines.soil import C_RR
-from sim.worlds.terrain import Terrain
+from sim.terrain.soil import C_RR
+from sim.terrain.terrain import Terrain
 
 TRACK_EVERY = 10  # steps: 10 Hz
 # Column of a track -> what it takes from the state record [m, rad, m/s, kg, -, m/m]

@@ -11,9 +11,9 @@ from scipy.ndimage import distance_transform_edt
 
 from protocol.arrays import Floats, Ints
 from protocol.site.ground_classes import UNKNOWN
-from sim.scenario.ground import GroundConfig, lay
+from sim.scenario.ground import GroundConfig, build_terrain
+from sim.terrain.terrain import Terrain
 from sim.truth import TruthMap, truth_map
-from sim.worlds.terrain import Terrain
 
 CELL_M = 1.0  # of the cells that are judged, as a site's map has them
 
@@ -79,8 +79,8 @@ class Ground:
 
 def lay_ground(config: GroundConfig, seed: int, cell_m: float = CELL_M) -> Ground:
     """The ground that a simulation of this seed drives on."""
-    terrain = lay(config, seed)
-    profile = lay(replace(config, roughness_m=0.0), seed)
+    terrain = build_terrain(config, seed)
+    profile = build_terrain(replace(config, roughness_m=0.0), seed)
     return Ground(terrain, profile, truth_map(terrain, config.width_m, config.depth_m, cell_m))
 
 

@@ -1,1 +1,1 @@
-"""Kinds of machines: their bodies, joints and places, what they weigh, and the soils they roll on."""
+"""Kinds of machines: bodies, joints and weights, and how steering and engine respond."""

@@ -12,7 +12,8 @@ from protocol.arrays import Floats
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import BASE, FRONT, Mount
-from sim.machines.urdf import Mass, Pose, Robot, joined, read_urdf, rpy_rad
+from protocol.rotations import rpy_from_matrix
+from sim.machines.urdf import Mass, Robot, Transform, combined, read_urdf
 
 FOLDER = Path(__file__).parent
 PAYLOAD = "payload_link"
@@ -81,7 +82,7 @@ class MachineModel:
         share = payload_kg / load.mass_kg
         scaled = Mass(payload_kg, load.centre_m, share * load.inertia_kgm2)
         empty = [(pose, mass) for pose, mass in parts if mass is not load]
-        return joined([*empty, (self.robot.place(PAYLOAD, BASE), scaled)])
+        return combined([*empty, (self.robot.place(PAYLOAD, BASE), scaled)])
 
     @property
     def payload_centre_m(self) -> Floats:
@@ -106,7 +107,7 @@ class MachineModel:
         """IMUs: the frame that carries each, and its mount there. The origin of `front_link` is the joint."""
         return tuple((frame, _mount(pose)) for frame, pose in self._places("imu"))
 
-    def _places(self, kind: str) -> list[tuple[str, Pose]]:
+    def _places(self, kind: str) -> list[tuple[str, Transform]]:
         names = sorted(name for name in self.robot.links if name.startswith(f"{kind}_link_"))
         frames = [self.robot.carrier(name, (BASE, FRONT)) for name in names]
         return [(frame, self.robot.place(name, frame)) for name, frame in zip(names, frames, strict=True)]
@@ -122,7 +123,7 @@ def load_model(name: str) -> MachineModel:
     return from_table(MachineModel, {"name": name, **load_toml(path)}, str(path))
 
 
-def _mount(pose: Pose) -> Mount:
+def _mount(pose: Transform) -> Mount:
     x, y, z = (np.round(pose.xyz_m, 6) + 0.0).tolist()  # no -0.0
-    roll, pitch, yaw = (np.round(np.degrees(rpy_rad(pose.rotation)), 4) + 0.0).tolist()
+    roll, pitch, yaw = (np.round(np.degrees(rpy_from_matrix(pose.rotation)), 4) + 0.0).tolist()
     return Mount((x, y, z), (roll, pitch, yaw))

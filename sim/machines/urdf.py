@@ -1,6 +1,7 @@
 """URDF files: links, joints and places, and the few rigid bodies that a physics engine has to move.
 
-Only what our machines need: inertia, boxes to collide, fixed, revolute and continuous joints.
+Own code for what our machines need (inertia, boxes to collide, fixed, revolute and continuous joints): PyBullet's
+loader puts the centres of mass of merged links in wrong places, and yourdfpy merges no links and needs a mesh library.
 """
 
 from __future__ import annotations
@@ -15,17 +16,18 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.errors import ConfigError
+from protocol.rotations import matrix_from_rpy, rpy_from_matrix
 
 
 @dataclass(frozen=True)
-class Pose:
+class Transform:
     """A frame in another one: origin (3,) [m] and rotation (3, 3); `a @ b` is b, given in a, in the parent of a."""
 
     xyz_m: Floats
     rotation: Floats
 
-    def __matmul__(self, inner: Pose) -> Pose:
-        return Pose(self.xyz_m + self.rotation @ inner.xyz_m, self.rotation @ inner.rotation)
+    def __matmul__(self, inner: Transform) -> Transform:
+        return Transform(self.xyz_m + self.rotation @ inner.xyz_m, self.rotation @ inner.rotation)
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Mass:
 class Box:
     """A box that collides: its middle in the link, and its size (3,) [m]."""
 
-    pose: Pose
+    pose: Transform
     size_m: Floats
 
 
@@ -62,7 +64,7 @@ class Joint:
     kind: str
     parent: str
     child: str
-    pose: Pose
+    pose: Transform
     axis: Floats
     lower_rad: float
     upper_rad: float
@@ -76,9 +78,9 @@ class Robot:
     links: dict[str, Link]
     joints: dict[str, Joint]  # by child
 
-    def place(self, link: str, frame: str) -> Pose:
-        """Pose of a link in a frame above it, all joints at angle 0."""
-        pose = Pose(np.zeros(3), np.eye(3))
+    def place(self, link: str, frame: str) -> Transform:
+        """Transform of a link in a frame above it, all joints at angle 0."""
+        pose = Transform(np.zeros(3), np.eye(3))
         while link != frame:
             joint = self.joints[link]
             pose, link = joint.pose @ pose, joint.parent
@@ -103,9 +105,9 @@ def read_urdf(path: Path) -> Robot:
     return Robot(root.get("name", path.stem), links, joints)
 
 
-def joined(masses: Iterable[tuple[Pose, Mass]]) -> Mass:
-    """Join masses, each given in the frame of its pose, into one (parallel axes)."""
-    moved = [(mass.mass_kg, pose @ Pose(mass.centre_m, np.eye(3)), mass.inertia_kgm2) for pose, mass in masses]
+def combined(masses: Iterable[tuple[Transform, Mass]]) -> Mass:
+    """Combine masses, each given in the frame of its pose, into one (parallel axes theorem)."""
+    moved = [(mass.mass_kg, pose @ Transform(mass.centre_m, np.eye(3)), mass.inertia_kgm2) for pose, mass in masses]
     total = sum(kg for kg, _, _ in moved)
     centre = sum((kg * at.xyz_m for kg, at, _ in moved), np.zeros(3)) / max(total, 1e-9)
     inertia = np.zeros((3, 3))
@@ -118,13 +120,13 @@ def joined(masses: Iterable[tuple[Pose, Mass]]) -> Mass:
 def rigid_urdf(robot: Robot, bodies: tuple[str, ...], mass_factor: float) -> str:
     """Rewrite a robot with these links alone, all others joined to the one that carries them (wheels do not turn).
 
-    PyBullet's own URDF_MERGE_FIXED_LINKS puts the centres of mass in wrong places. mass_factor: scales all masses.
+    In place of PyBullet's URDF_MERGE_FIXED_LINKS. mass_factor: scales all masses.
     """
     root = ET.Element("robot", name=robot.name)
     for body in bodies:
         parts = [link for name, link in robot.links.items() if robot.carrier(name, bodies) == body]
         poses = [robot.place(part.name, body) for part in parts]
-        mass = joined((pose, part.mass) for pose, part in zip(poses, parts, strict=True))
+        mass = combined((pose, part.mass) for pose, part in zip(poses, parts, strict=True))
         link = ET.SubElement(root, "link", name=body)
         _write_inertial(link, mass, mass_factor)
         for pose, part in zip(poses, parts, strict=True):
@@ -137,24 +139,6 @@ def rigid_urdf(robot: Robot, bodies: tuple[str, ...], mass_factor: float) -> str
     return ET.tostring(root, encoding="unicode")
 
 
-def rpy_rad(rotation: Floats) -> Floats:
-    """Roll, pitch and yaw (3,) of a rotation matrix (yaw @ pitch @ roll)."""
-    r = rotation
-    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
-    return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
-
-
-def _rotation(rpy: Floats) -> Floats:
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-
-
 def _numbers(text: str) -> Floats:
     return np.array([float(word) for word in text.split()])
 
@@ -163,11 +147,11 @@ def _text(numbers: Floats) -> str:
     return " ".join(repr(float(n)) for n in numbers)
 
 
-def _pose(element: ET.Element) -> Pose:
+def _pose(element: ET.Element) -> Transform:
     origin = element.find("origin")
     attributes = {} if origin is None else origin.attrib
-    turn = _rotation(_numbers(attributes.get("rpy", "0 0 0")))
-    return Pose(_numbers(attributes.get("xyz", "0 0 0")), turn)
+    rotation = matrix_from_rpy(*_numbers(attributes.get("rpy", "0 0 0")))
+    return Transform(_numbers(attributes.get("xyz", "0 0 0")), rotation)
 
 
 def _link(name: str, element: ET.Element) -> Link:
@@ -206,13 +190,13 @@ def _joint(element: ET.Element) -> Joint:
     )
 
 
-def _write_origin(parent: ET.Element, pose: Pose) -> None:
-    ET.SubElement(parent, "origin", xyz=_text(pose.xyz_m), rpy=_text(rpy_rad(pose.rotation)))
+def _write_origin(parent: ET.Element, pose: Transform) -> None:
+    ET.SubElement(parent, "origin", xyz=_text(pose.xyz_m), rpy=_text(rpy_from_matrix(pose.rotation)))
 
 
 def _write_inertial(link: ET.Element, mass: Mass, factor: float) -> None:
     inertial = ET.SubElement(link, "inertial")
-    _write_origin(inertial, Pose(mass.centre_m, np.eye(3)))
+    _write_origin(inertial, Transform(mass.centre_m, np.eye(3)))
     ET.SubElement(inertial, "mass", value=repr(float(mass.mass_kg * factor)))
     i = mass.inertia_kgm2 * factor
     values = {"ixx": i[0, 0], "iyy": i[1, 1], "izz": i[2, 2], "ixy": i[0, 1], "ixz": i[0, 2], "iyz": i[1, 2]}

@@ -1,1 +1,1 @@
-"""Who drives: routes, pure pursuit along them, and regard for other machines."""
+"""Drivers: routes, pure pursuit along them, and waiting for other machines."""

@@ -33,20 +33,20 @@ class Course:
     payload_kg: Floats
     following: Ints
 
-    def at(self, leg: Ints, way_m: Floats) -> tuple[Floats, Floats]:
-        """Point (n, 2) after way_m (n,) along legs (n,), and the direction of the leg there (n, 2)."""
-        index, share = self._locate(leg, way_m)
+    def at(self, leg: Ints, distance_m: Floats) -> tuple[Floats, Floats]:
+        """Point (n, 2) after distance_m (n,) along legs (n,), and the direction of the leg there (n, 2)."""
+        index, share = self._locate(leg, distance_m)
         here = self.points[index]
         step = self.points[index + 1] - here
         return here + share[:, None] * step, step / self.spacing_m[leg][:, None]
 
-    def limit(self, leg: Ints, way_m: Floats) -> Floats:
+    def limit(self, leg: Ints, distance_m: Floats) -> Floats:
         """Speed to aim at [m/s]."""
-        limit: Floats = self.limits_mps[self._locate(leg, way_m)[0]]
+        limit: Floats = self.limits_mps[self._locate(leg, distance_m)[0]]
         return limit
 
-    def _locate(self, leg: Ints, way_m: Floats) -> tuple[Ints, Floats]:
-        steps = way_m / self.spacing_m[leg]
+    def _locate(self, leg: Ints, distance_m: Floats) -> tuple[Ints, Floats]:
+        steps = distance_m / self.spacing_m[leg]
         whole = np.maximum(np.floor(steps), 0.0)
         index = np.minimum(self.first[leg] + whole.astype(np.int64), self.last[leg] - 1)
         return index, steps - whole
@@ -54,16 +54,16 @@ class Course:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a machine begins: leg of the course, way along it [m], what it carries [kg]; its joint and its heading."""
+    """Where a machine begins: leg of the course, distance along it [m], payload [kg], joint (2,) [m], heading [rad]."""
 
     leg: int
-    way_m: float
+    distance_m: float
     payload_kg: float
     joint_m: Floats
     heading_rad: float
 
 
-def lay_course(routes: Sequence[Route], drive_mps: Sequence[float]) -> Course:
+def build_course(routes: Sequence[Route], drive_mps: Sequence[float]) -> Course:
     """Prepare one route and one speed per machine."""
     legs = [leg for route in routes for leg in route.legs]
     speeds = [speed for route, speed in zip(routes, drive_mps, strict=True) for _ in route.legs]
@@ -87,10 +87,10 @@ def lay_course(routes: Sequence[Route], drive_mps: Sequence[float]) -> Course:
     )
 
 
-def line_up(routes: Sequence[Route], shares: Sequence[float], apart_m: float = 0.0) -> list[Start]:
+def spread_starts(routes: Sequence[Route], shares: Sequence[float], apart_m: float = 0.0) -> list[Start]:
     """Place one machine per route, each after a share (0 to 1) of its cycle, moved on until it is apart from others.
 
-    A ValueError tells that there is no room.
+    Raises ValueError where there is no room.
     """
     starts: list[Start] = []
     begin = 0
@@ -109,15 +109,15 @@ def line_up(routes: Sequence[Route], shares: Sequence[float], apart_m: float = 0
 
 def _start(route: Route, begin: int, share: float) -> Start:
     """Find the place on the route, and what the machine carries there."""
-    way = share % 1.0 * route.length_m
+    distance = share % 1.0 * route.length_m
     number = 0
-    while number < len(route.legs) - 1 and way >= route.legs[number].length_m:
-        way -= route.legs[number].length_m
+    while number < len(route.legs) - 1 and distance >= route.legs[number].length_m:
+        distance -= route.legs[number].length_m
         number += 1
     leg = route.legs[number]
     before = [*route.legs[number:], *route.legs[:number]]
     payload = next((other.payload_kg for other in reversed(before) if other.payload_kg is not None), 0.0)
-    index = min(int(way / leg.spacing_m), len(leg.points) - 1)
+    index = min(int(distance / leg.spacing_m), len(leg.points) - 1)
     line = _beyond(leg)
     ahead = line[index + 1] - line[index]
     heading = math.atan2(ahead[1], ahead[0]) + math.pi * leg.reverse

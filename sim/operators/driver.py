@@ -1,4 +1,4 @@
-"""Drivers: pure pursuit along routes, forwards and in reverse, a speed controller, stops, and regard for others."""
+"""Drivers: pure pursuit along routes, forwards and in reverse, a speed controller, stops, and waiting for others."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
-from sim.machines.model import MachineModel
 from sim.operators.course import Course, Start
-from sim.operators.traffic import Bodywork, clear_way
-from sim.worlds.world import FleetState
+from sim.operators.crew import Crew
+from sim.operators.traffic import clear_distance
+from sim.state import FleetState
 
 DRIVER_STEPS = 5  # of the world: drivers act at 20 Hz
 LOOK_AHEAD_M, LOOK_AHEAD_S = 2.5, 0.6
@@ -22,29 +22,15 @@ STOP_M, STANDING_MPS = 0.3, 0.03  # a leg's end is reached this close to it, and
 
 
 @dataclass(frozen=True)
-class Crew:
-    """What the drivers of n machines know of them; all (n,)."""
-
-    rear_m: Floats
-    front_m: Floats
-    max_articulation_rad: Floats
-    mass_kg: Floats
-    max_drive_n: Floats
-    max_brake_n: Floats
-    max_power_w: Floats
-    body: Bodywork
-
-
-@dataclass(frozen=True)
 class Drivers:
-    """What n drivers keep in mind: leg and way along it [m], speed aimed at [m/s], integral of the controller [N].
+    """Memory of n drivers: leg and distance along it [m], speed aimed at [m/s], integral of the controller [N].
 
-    waited_s: how long they have stood at the end of their leg. payload_kg: what they carry. clear_m: way that is free
-    of other machines.
+    waited_s: how long they have stood at the end of their leg. payload_kg: what they carry. clear_m: distance
+    ahead that is free of other machines.
     """
 
     leg: Ints
-    way_m: Floats
+    distance_m: Floats
     aim_mps: Floats
     integral_n: Floats
     waited_s: Floats
@@ -54,7 +40,7 @@ class Drivers:
 
 @dataclass(frozen=True)
 class Commands:
-    """What n drivers ask for: articulation, drive force, most force of the brakes; and the payload they carry."""
+    """Commands of n drivers: articulation, drive force, most force of the brakes; and the payload they carry."""
 
     steer_rad: Floats
     drive_n: Floats
@@ -62,30 +48,12 @@ class Commands:
     payload_kg: Floats
 
 
-def hire(models: Sequence[MachineModel]) -> Crew:
-    """One driver per machine."""
-
-    def of(name: str) -> Floats:
-        return np.array([getattr(model, name) for model in models])
-
-    return Crew(
-        rear_m=of("rear_to_joint_m"),
-        front_m=of("front_to_joint_m"),
-        max_articulation_rad=of("max_articulation_rad"),
-        mass_kg=of("mass_kg"),
-        max_drive_n=of("max_drive_n"),
-        max_brake_n=of("max_brake_n"),
-        max_power_w=of("max_power_w"),
-        body=Bodywork(of("front_to_joint_m"), of("rear_to_joint_m")),
-    )
-
-
-def board(starts: Sequence[Start]) -> Drivers:
+def at_start(starts: Sequence[Start]) -> Drivers:
     """Drivers before the first step."""
     zero = np.zeros(len(starts))
     return Drivers(
         leg=np.array([start.leg for start in starts]),
-        way_m=np.array([start.way_m for start in starts]),
+        distance_m=np.array([start.distance_m for start in starts]),
         aim_mps=zero,
         integral_n=zero,
         waited_s=zero,
@@ -94,35 +62,36 @@ def board(starts: Sequence[Start]) -> Drivers:
     )
 
 
-def idle(machines: int) -> Commands:
-    """What is asked for before drivers act: nothing."""
+def no_commands(machines: int) -> Commands:
+    """Commands before drivers act: nothing is asked for."""
     zero = np.zeros(machines)
     return Commands(zero, zero, zero, zero)
 
 
 def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float) -> tuple[Drivers, Commands]:
-    """Return the drivers' next memory and what they ask for."""
+    """Drive one step; returns the drivers' next memory and their commands."""
     # Where on the leg the machine is; at its end it stops, waits, loads, and takes up the next leg.
-    position = joint(crew, state)
-    arrived = ~course.closed[old.leg] & (course.length_m[old.leg] - old.way_m < STOP_M)
+    position = crew.joint_m(state)
+    arrived = ~course.closed[old.leg] & (course.length_m[old.leg] - old.distance_m < STOP_M)
     standing = np.abs(state.speed_mps) < STANDING_MPS
     waited = np.where(arrived & standing, old.waited_s + dt, 0.0)
-    payload = _load(course, old, waited, dt)
+    payload = _payload(course, old, waited, dt)
     done = waited > course.wait_s[old.leg]
     leg = np.where(done, course.following[old.leg], old.leg)
-    way = _follow(course, leg, np.where(done, 0.0, old.way_m), position)
+    distance = _nearest_distance(course, leg, np.where(done, 0.0, old.distance_m), position)
     arrived &= ~done
     travel = course.travel[leg]
 
     # Steer for a point ahead.
     speed = travel * state.speed_mps
-    target = course.at(leg, way + LOOK_AHEAD_M + LOOK_AHEAD_S * np.abs(speed))[0] - position
-    heading = state.yaw_rad + state.articulation_rad * crew.rear_m / (crew.rear_m + crew.front_m)
+    target = course.at(leg, distance + LOOK_AHEAD_M + LOOK_AHEAD_S * np.abs(speed))[0] - position
+    wheelbase = crew.rear_to_joint_m + crew.front_to_joint_m
+    heading = state.yaw_rad + state.articulation_rad * crew.rear_to_joint_m / wheelbase
     steer = travel * pursue(crew, target, np.where(travel < 0, heading + np.pi, heading))
 
-    # Keep the speed that the way allows; gently up, and at once down.
-    limit = np.where(travel < 0, REVERSE_SHARE, 1.0) * course.limit(leg, way + LOOK_AHEAD_S * speed)
-    to_go = np.where(course.closed[leg], np.inf, course.length_m[leg] - way)
+    # Keep the speed that the leg allows; gently up, and at once down.
+    limit = np.where(travel < 0, REVERSE_SHARE, 1.0) * course.limit(leg, distance + LOOK_AHEAD_S * speed)
+    to_go = np.where(course.closed[leg], np.inf, course.length_m[leg] - distance)
     limit = np.minimum(limit, np.sqrt(2 * STOP_MPS2 * np.maximum(to_go - 0.5 * STOP_M, 0.05)))
     limit = np.where(arrived, 0.0, np.minimum(limit, np.sqrt(2 * START_MPS2 * old.clear_m)))
     aim = np.minimum(limit, np.maximum(old.aim_mps, 0.0) + START_MPS2 * dt)
@@ -134,29 +103,23 @@ def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float
         brake_n=np.where(halt, crew.max_brake_n, 0.0),
         payload_kg=payload,
     )
-    return Drivers(leg, way, aim, integral, np.where(done, 0.0, waited), payload, old.clear_m), commands
+    return Drivers(leg, distance, aim, integral, np.where(done, 0.0, waited), payload, old.clear_m), commands
 
 
 def look_out(course: Course, crew: Crew, old: Drivers, state: FleetState) -> Drivers:
-    """Drivers look how far their way is clear of other machines."""
-    return replace(old, clear_m=clear_way(course, crew.body, old.leg, old.way_m, joint(crew, state), state))
-
-
-def joint(crew: Crew, state: FleetState) -> Floats:
-    """Position (n, 2) of the articulation joint, which follows the route."""
-    x = state.x_m + crew.rear_m * np.cos(state.yaw_rad)
-    return np.stack([x, state.y_m + crew.rear_m * np.sin(state.yaw_rad)], axis=-1)
+    """Drivers look how far the leg ahead is clear of other machines."""
+    return replace(old, clear_m=clear_distance(course, crew, old.leg, old.distance_m, state))
 
 
 def pursue(crew: Crew, target_m: Floats, heading_rad: Floats) -> Floats:
     """Articulation (n,) whose circle leads the joint through the target (n, 2), given relative to it in `map`.
 
-    On a circle of curvature k each frame is turned from the joint's way by asin(k l), l from its axle to the joint.
+    On a circle of curvature k each frame is turned from the joint's track by asin(k l), l from its axle to the joint.
     """
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     left = target_m[:, 1] * c - target_m[:, 0] * s
     curvature = 2 * left / np.maximum((target_m**2).sum(axis=-1), 1.0)
-    articulation = bend(crew.rear_m, crew.front_m, curvature)
+    articulation = bend(crew.rear_to_joint_m, crew.front_to_joint_m, curvature)
     return np.minimum(np.maximum(articulation, -crew.max_articulation_rad), crew.max_articulation_rad)
 
 
@@ -172,21 +135,22 @@ def hold_speed(crew: Crew, aim_mps: Floats, speed_mps: Floats, integral_n: Float
     strongest = np.minimum(crew.max_drive_n, crew.max_power_w / np.maximum(np.abs(speed_mps), 0.6))
     grown = integral_n + INTEGRAL_PER_S2 * crew.mass_kg * dt * error
     integral = np.minimum(np.maximum(grown, -crew.max_brake_n), strongest)
-    wanted = GAIN_PER_S * crew.mass_kg * error + integral
-    return np.minimum(np.maximum(wanted, -crew.max_brake_n), strongest), integral
+    force = GAIN_PER_S * crew.mass_kg * error + integral
+    return np.minimum(np.maximum(force, -crew.max_brake_n), strongest), integral
 
 
-def _follow(course: Course, leg: Ints, way_m: Floats, position_m: Floats) -> Floats:
-    """Way along the leg of the point nearest to the machine; a lap's end is its start."""
-    nearest, direction = course.at(leg, way_m)
-    way = way_m + ((position_m - nearest) * direction).sum(axis=-1)
-    lap: Floats = way - np.where(course.closed[leg] & (way >= course.length_m[leg]), course.length_m[leg], 0.0)
+def _nearest_distance(course: Course, leg: Ints, distance_m: Floats, position_m: Floats) -> Floats:
+    """Distance along the leg of its point nearest to the machine; a lap's end is its start."""
+    nearest, direction = course.at(leg, distance_m)
+    distance = distance_m + ((position_m - nearest) * direction).sum(axis=-1)
+    length = course.length_m[leg]
+    lap: Floats = distance - np.where(course.closed[leg] & (distance >= length), length, 0.0)
     return lap
 
 
-def _load(course: Course, old: Drivers, waited_s: Floats, dt: float) -> Floats:
+def _payload(course: Course, old: Drivers, waited_s: Floats, dt: float) -> Floats:
     """Payloads change evenly while the machines wait."""
-    wanted, wait_s = course.payload_kg[old.leg], course.wait_s[old.leg]
-    changes: Bools = (waited_s > 0) & ~np.isnan(wanted)
+    target_kg, wait_s = course.payload_kg[old.leg], course.wait_s[old.leg]
+    changes: Bools = (waited_s > 0) & ~np.isnan(target_kg)
     share = dt / np.maximum(wait_s - waited_s + dt, dt)
-    return np.where(changes, old.payload_kg + np.minimum(share, 1.0) * (wanted - old.payload_kg), old.payload_kg)
+    return np.where(changes, old.payload_kg + np.minimum(share, 1.0) * (target_kg - old.payload_kg), old.payload_kg)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocol.arrays import Floats
+from protocol.rotations import wrap_angle
 
 SPACING_M, FINE_M = 0.5, 0.1  # between points of a leg, and while corners are rounded
 ROUNDING_M = 7.0  # of a right angle this leaves a radius of 0.886 times as much; flatter corners come out wider
@@ -42,10 +43,10 @@ class Leg:
         return float(np.arctan2(first[1], first[0])), float(np.arctan2(last[1], last[0]))
 
     def curvature(self) -> Floats:
-        """Signed curvature at every point [1/m], positive to the left of the way; 0 at the ends of an open leg."""
+        """Signed curvature at every point [1/m], positive to the left; 0 at the ends of an open leg."""
         step = np.roll(self.points, -1, axis=0) - self.points
         heading = np.arctan2(step[:, 1], step[:, 0])
-        turn = (heading - np.roll(heading, 1) + np.pi) % (2 * np.pi) - np.pi
+        turn = wrap_angle(heading - np.roll(heading, 1))
         if not self.closed:
             turn[[0, -1]] = 0.0
         curvature: Floats = turn / self.spacing_m
@@ -64,19 +65,19 @@ class Route:
         return sum(leg.length_m for leg in self.legs)
 
     def reversed(self) -> Route:
-        """The same closed tour driven the other way round."""
+        """The same closed tour driven in the opposite direction."""
         (tour,) = self.legs
         return Route((replace(tour, points=tour.points[::-1].copy()),))
 
 
 def tour(corners: Corners, rounding_m: float = ROUNDING_M) -> Route:
-    """A closed route: a polygon with corners rounded by a Gaussian of `rounding_m` along the way."""
+    """A closed route: a polygon with corners rounded by a Gaussian of `rounding_m` along it."""
     outline = _resample(np.array([*corners, corners[0]], float), FINE_M, closed=True)
     points = _smooth(outline.points, rounding_m / outline.spacing_m)
     return Route((_resample(np.vstack([points, points[:1]]), SPACING_M, closed=True),))
 
 
-def way(corners: Corners, rounding_m: float = ROUNDING_M) -> Leg:
+def open_leg(corners: Corners, rounding_m: float = ROUNDING_M) -> Leg:
     """An open leg along corners; it keeps its ends and their directions, where the first and last straight are long."""
     outline = _resample(np.array(corners, float), FINE_M, closed=False).points
     # Continued by its point reflections, so that smoothing leaves the ends where they are.

@@ -49,10 +49,10 @@ class Canvas:
 
     def arrows(self, px: Floats, colour: Colour, *, both_ways: bool = False) -> None:
         """Draw heads along a line in the direction of its points, or in both by turns."""
-        ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(px, axis=0).T))])
-        count = max(1, round(ways[-1] / ARROW_EVERY_PX))
+        lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(px, axis=0).T))])
+        count = max(1, round(lengths[-1] / ARROW_EVERY_PX))
         for k in range(count):
-            i = int(np.searchsorted(ways, (k + ARROW_AT) / count * ways[-1]))
+            i = int(np.searchsorted(lengths, (k + ARROW_AT) / count * lengths[-1]))
             before, after = px[max(i - 2, 0)], px[min(i + 2, len(px) - 1)]
             sign = -1 if both_ways and k % 2 else 1
             self.head(px[i], sign * (after - before), colour, 8.0)
@@ -132,9 +132,9 @@ def beside(px: Floats, shift_px: float) -> Floats:
 def _dashes(px: Floats, *, closed: bool) -> list[Floats]:
     """Pieces of a line as long as the gaps between them."""
     line = np.vstack([px, px[:1]]) if closed else px
-    ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    even = np.linspace(0.0, ways[-1], 4 * max(1, round(ways[-1] / DASH_PX / 2)) + 1)
-    places = np.stack([np.interp(even, ways, line[:, 0]), np.interp(even, ways, line[:, 1])], axis=1)
+    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    even = np.linspace(0.0, lengths[-1], 4 * max(1, round(lengths[-1] / DASH_PX / 2)) + 1)
+    places = np.stack([np.interp(even, lengths, line[:, 0]), np.interp(even, lengths, line[:, 1])], axis=1)
     return [places[i : i + 3] for i in range(0, len(places) - 2, 4)]
 
 

@@ -20,7 +20,7 @@ from sim.simulator import Simulator
 
 DRIVE_S = 20.0  # simulated time after which the views are taken
 LEAST_PX, GAP_PX, CAPTION_PX = 1200, 14, 30
-WIDE, TALL = 0.66, 0.37  # the overview's share of the sheet's width, and its height over that width
+WIDE, TALL = 0.66, 0.37  # the overview's share of the picture's width, and its height over that width
 CLOSEUPS = 2
 
 
@@ -92,7 +92,7 @@ def _column(images: Sequence[Image]) -> Image:
 
 
 def _below(plan: Image, views: Image) -> Image:
-    """One sheet: the plan above, the views below, white around both."""
+    """Join both: the plan above, the views below, white around both."""
     width = views.shape[1] + 2 * GAP_PX
     plan = np.pad(plan, ((0, GAP_PX), (0, width - plan.shape[1]), (0, 0)), constant_values=255)
     views = np.pad(views, ((0, GAP_PX), (GAP_PX, GAP_PX), (0, 0)), constant_values=255)

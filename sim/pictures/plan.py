@@ -17,10 +17,10 @@ from protocol.site.ground_classes import ZONES
 from sim.machines.model import MachineModel
 from sim.operators.routes import Leg, Route
 from sim.pictures.canvas import INK, Canvas, beside
-from sim.scenario.ground import Ramp, lay, soil_index
-from sim.scenario.tables import Change, Scenario
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import FleetState
+from sim.scenario.ground import RampConfig, build_terrain, soil_index
+from sim.scenario.tables import Scenario, ScheduledChange
+from sim.state import FleetState
+from sim.terrain.terrain import Terrain
 
 WIDTH_PX, HEIGHT_PX = 1380, 900  # of the ground, at most
 PALE = 0.6  # strength of the paper's colours, so that what is drawn on them can be read
@@ -37,9 +37,9 @@ ROUTE_COLOURS: tuple[Colour, ...] = (
 
 
 def draw_plan(scenario: Scenario, models: Sequence[MachineModel], start: FleetState) -> Image:
-    """Draw the plan in a sheet with axes in metres and a legend. start: of the machines."""
+    """Draw the plan in a frame with axes in metres and a legend. start: of the machines."""
     ground = scenario.ground
-    terrain = lay(replace(ground, roughness_m=0.0), 0)
+    terrain = build_terrain(replace(ground, roughness_m=0.0), 0)
     px_per_m = min(WIDTH_PX / ground.width_m, HEIGHT_PX / ground.depth_m)
     step_m = _contour_step_m(terrain)
     image = _paint(terrain, px_per_m, step_m)
@@ -121,17 +121,17 @@ def _levels(heights: Floats, step_m: float) -> tuple[int, int]:
     return math.floor(lowest + 1e-6) + 1, math.ceil(highest - 1e-6) - 1
 
 
-def _draw_ramp(canvas: Canvas, ramp: Ramp, terrain: Terrain, step_m: float) -> None:
+def _draw_ramp(canvas: Canvas, ramp: RampConfig, terrain: Terrain, step_m: float) -> None:
     """An arrow uphill with its angle, and the heights of the contours, where there is most room on the slope."""
     lines = _across(canvas, ramp, terrain)
-    ways = [canvas.pixels(np.linspace(line[0], line[-1], 9))[1:-1] for line in lines]
-    if (best := _freest(canvas, ways)) is not None:
-        way = ways[best]
-        ahead = way if ramp.rise_m > 0 else way[::-1]
+    arrows = [canvas.pixels(np.linspace(line[0], line[-1], 9))[1:-1] for line in lines]
+    if (best := _freest(canvas, arrows)) is not None:
+        arrow = arrows[best]
+        ahead = arrow if ramp.rise_m > 0 else arrow[::-1]
         canvas.line(ahead[[0, -1]], INK)
         canvas.head(ahead[-1], ahead[-1] - ahead[0], INK, 8.0)
-        angle = math.degrees(math.atan2(abs(ramp.rise_m), float(np.hypot(*ramp.way_m))))
-        canvas.label(f"{angle:.0f} deg uphill", way[len(way) // 2], INK)
+        angle = math.degrees(math.atan2(abs(ramp.rise_m), float(np.hypot(*ramp.run_m))))
+        canvas.label(f"{angle:.0f} deg uphill", arrow[len(arrow) // 2], INK)
     crossed = [_crossings(line, terrain, step_m) for line in lines]
     rows = [canvas.pixels(points) for points, _ in crossed]
     if (best := _freest(canvas, rows)) is not None:
@@ -156,18 +156,18 @@ def _freest(canvas: Canvas, rows: Sequence[Floats]) -> int | None:
     return best if costs and math.isfinite(costs[best]) else None
 
 
-def _across(canvas: Canvas, ramp: Ramp, terrain: Terrain) -> list[Floats]:
+def _across(canvas: Canvas, ramp: RampConfig, terrain: Terrain) -> list[Floats]:
     """Lines (k, 2) from foot to top inside the picture, all over the width of a slope; the middle first."""
     size = np.array([(n - 1) * terrain.cell_m for n in reversed(terrain.heights_m.shape)])
-    side = np.array([-ramp.way_m[1], ramp.way_m[0]]) / np.hypot(*ramp.way_m)
-    line = np.array(ramp.foot_m) + np.linspace(0.0, 1.0, 60)[:, None] * ramp.way_m
+    side = np.array([-ramp.run_m[1], ramp.run_m[0]]) / np.hypot(*ramp.run_m)
+    line = np.array(ramp.foot_m) + np.linspace(0.0, 1.0, 60)[:, None] * ramp.run_m
     reach = float(np.hypot(*size))
     moved = [line + shift * side for shift in np.arange(-reach, reach, 10.0 / canvas.px_per_m)]
     inside = [m for m in moved if (m >= 0).all() and (m <= size).all()]
     return sorted(inside, key=lambda m: float(np.hypot(*(m.mean(axis=0) - size / 2))))
 
 
-def _hatch(canvas: Canvas, change: Change) -> None:
+def _hatch(canvas: Canvas, change: ScheduledChange) -> None:
     """Show ground that will change: stripes in the colour that it will have, and an outline."""
     outline = canvas.pixels(np.array(change.outline))
     inside = np.zeros(canvas.busy.shape, np.uint8)
@@ -178,7 +178,7 @@ def _hatch(canvas: Canvas, change: Change) -> None:
     canvas.line(outline, INK, closed=True, dashed=True, thick=1)
 
 
-def _label_change(canvas: Canvas, change: Change) -> None:
+def _label_change(canvas: Canvas, change: ScheduledChange) -> None:
     words = f"after {change.at_s:g} s: {change.soil}"
     canvas.label(words, canvas.pixels(np.array(change.outline)).mean(axis=0), INK)
 
@@ -187,7 +187,7 @@ def _label_change(canvas: Canvas, change: Change) -> None:
 
 
 def _draw_route(canvas: Canvas, route: Route, colour: Colour, lane: float, *, both_ways: bool) -> list[Floats]:
-    """Draw the legs; each keeps to its right, so that ways there and back lie apart. Returns their pixels."""
+    """Draw the legs; each keeps to its right, so that lines there and back lie apart. Returns their pixels."""
     lines = []
     for leg in route.legs:
         shift = LANE_PX * (lane if leg.closed else 1.0)

@@ -13,9 +13,9 @@ import numpy as np
 from protocol.arrays import AnyArray, Floats, Ints
 from protocol.site.ground_classes import ZONES
 from sim.machines.model import FOLDER, MachineModel
+from sim.state import FleetState
+from sim.terrain.terrain import Terrain
 from sim.worlds.pybullet_import import pybullet
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import FleetState
 
 MESH_M, MAX_NODES = 1.0, 60_000  # between the nodes of the drawn ground; of a large site it is more
 TEXEL_M, MAX_TEXELS = 0.1, 6_000_000  # size of a texel, likewise
@@ -152,7 +152,7 @@ def _ground(client: int, terrain: Terrain, shades: list[Floats], folder: Path) -
 
 
 def _skirt(client: int, path: Path, edge: Floats, floor_m: float) -> None:
-    """Close the side below an edge (3, k) of the ground, so that the site is a block and no sheet."""
+    """Close the side below an edge (3, k) of the ground, so that the site looks like a solid block."""
     x, y, z = (
         np.stack([below, above])
         for below, above in zip((*edge[:2], np.full(edge.shape[1], floor_m)), edge, strict=True)

@@ -1,1 +1,1 @@
-"""What is simulated: scenario files, their tables, and the ground that they describe."""
+"""Scenarios: their files, their tables, and the ground that they describe."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
+from protocol.rotations import wrap_angle
 from sim.machines.model import MachineModel, load_model
 from sim.operators.driver import bend
 from sim.operators.routes import Leg, Route
@@ -47,8 +48,8 @@ def check(scenario: Scenario, where: str) -> None:
         place = f'{where} [[route]] "{name}"'
         _check_joints(route, place)
         points = np.vstack([leg.points for leg in route.legs])
-        outside = [p for p in points if not scenario.ground.contains(p, MARGIN_M)]
-        if outside:
+        outside = points[~scenario.ground.contains(points, MARGIN_M)]
+        if len(outside):
             x, y = outside[0]
             size = f"{scenario.ground.width_m:g} x {scenario.ground.depth_m:g} m"
             raise ConfigError(place, f"leaves the map at ({x:.0f}, {y:.0f}): keep {MARGIN_M:g} m inside its {size}")
@@ -96,7 +97,7 @@ def _check_joints(route: Route, place: str) -> None:
         if gap > MAX_GAP_M:
             raise ConfigError(place, f"leg {i + 1} ends {gap:.1f} m from where the next begins")
         turn = after.headings()[0] - leg.headings()[1] + math.pi * (after.reverse != leg.reverse)
-        bent = abs(math.degrees((turn + math.pi) % (2 * math.pi) - math.pi))
+        bent = abs(math.degrees(wrap_angle(turn)))
         if bent > MAX_BEND_DEG:
             what = "turn around" if after.reverse == leg.reverse else "reverse"
             raise ConfigError(place, f"after leg {i + 1} machines would have to {what} with a bend of {bent:.0f} deg")

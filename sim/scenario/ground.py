@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from protocol.arrays import Floats, Ints
-from sim.machines.soil import SOILS
-from sim.worlds.terrain import Terrain
+from protocol.arrays import Bools, Floats, Ints
+from sim.terrain.soil import SOILS
+from sim.terrain.terrain import Terrain
 
 FILLET_M = 2.0  # length over which the foot and the crown of a ramp are rounded
 ROUGHNESS_LENGTH_M = 1.2
@@ -20,7 +20,7 @@ Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Zone:
+class ZoneConfig:
     """A polygon of one soil. outline: corners in `map` [m]."""
 
     soil: str
@@ -33,7 +33,7 @@ class Zone:
 
 
 @dataclass(frozen=True)
-class Ramp:
+class RampConfig:
     """A plane slope from its foot to its top, as wide as the site; beyond both the ground is level."""
 
     foot_m: Point
@@ -41,16 +41,16 @@ class Ramp:
     rise_m: float
 
     def __post_init__(self) -> None:
-        if not np.hypot(*self.way_m) > 0:
+        if not np.hypot(*self.run_m) > 0:
             raise ValueError("foot_m, top_m: the same place")
-        if abs(self.rise_m) > np.hypot(*self.way_m):
-            raise ValueError(f"rise_m: {self.rise_m:g} m over {np.hypot(*self.way_m):.1f} m is steeper than 45 degrees")
+        if abs(self.rise_m) > np.hypot(*self.run_m):
+            raise ValueError(f"rise_m: {self.rise_m:g} m over {np.hypot(*self.run_m):.1f} m is steeper than 45 degrees")
 
     @property
-    def way_m(self) -> Floats:
+    def run_m(self) -> Floats:
         """From foot to top (2,)."""
-        way: Floats = np.array(self.top_m) - np.array(self.foot_m)
-        return way
+        run: Floats = np.array(self.top_m) - np.array(self.foot_m)
+        return run
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class GroundConfig:
     soil: str
     cell_m: float = 0.25
     roughness_m: float = 0.01
-    zone: tuple[Zone, ...] = ()
-    ramp: tuple[Ramp, ...] = ()
+    zone: tuple[ZoneConfig, ...] = ()
+    ramp: tuple[RampConfig, ...] = ()
 
     def __post_init__(self) -> None:
         soil_index(self.soil)
@@ -77,10 +77,10 @@ class GroundConfig:
         if self.width_m * self.depth_m / self.cell_m**2 > MAX_NODES:
             raise ValueError(f"cell_m: {self.cell_m:g} m is too fine for so large a site, over {MAX_NODES} nodes")
 
-    def contains(self, points_m: Floats, margin_m: float) -> bool:
-        """Whether all points (k, 2) lie on the site, this far from its edges."""
+    def contains(self, points_m: Floats, margin_m: float) -> Bools:
+        """Whether points (k, 2) lie on the site, this far from its edges, (k,)."""
         inside = (points_m >= margin_m) & (points_m <= np.array([self.width_m, self.depth_m]) - margin_m)
-        return bool(inside.all())
+        return np.logical_and(inside[:, 0], inside[:, 1])
 
 
 def soil_index(name: str) -> int:
@@ -91,7 +91,7 @@ def soil_index(name: str) -> int:
     return names.index(name)
 
 
-def lay(ground: GroundConfig, seed: int) -> Terrain:
+def build_terrain(ground: GroundConfig, seed: int) -> Terrain:
     """Make the terrain; its unevenness is drawn from the seed."""
     rows, columns = round(ground.depth_m / ground.cell_m), round(ground.width_m / ground.cell_m)
     heights = _profile(ground, rows, columns)
@@ -100,11 +100,11 @@ def lay(ground: GroundConfig, seed: int) -> Terrain:
     zones = np.full((rows, columns), soil_index(ground.soil), np.int64)
     terrain = Terrain(heights, ground.cell_m, zones, ground.cell_m)
     for zone in ground.zone:
-        terrain = pave(terrain, zone)
+        terrain = with_zone(terrain, zone)
     return terrain
 
 
-def pave(terrain: Terrain, zone: Zone) -> Terrain:
+def with_zone(terrain: Terrain, zone: ZoneConfig) -> Terrain:
     """The same terrain with one zone laid over it."""
     zones = terrain.zones.astype(np.uint8)
     corners = np.round(np.array(zone.outline) / terrain.zone_cell_m).astype(np.int32)
@@ -118,19 +118,19 @@ def _profile(ground: GroundConfig, rows: int, columns: int) -> Floats:
     x, y = np.meshgrid(np.arange(columns + 1) * ground.cell_m, np.arange(rows + 1) * ground.cell_m)
     heights: Floats = np.zeros_like(x)
     for ramp in ground.ramp:
-        length = float(np.hypot(*ramp.way_m))
-        east, north = ramp.way_m / length
+        length = float(np.hypot(*ramp.run_m))
+        east, north = ramp.run_m / length
         along = (x - ramp.foot_m[0]) * east + (y - ramp.foot_m[1]) * north
-        # a running mean of the clipped way, by its antiderivative
+        # a running mean of the clipped distance, by its antiderivative
         ahead, behind = (_area(along + side * FILLET_M / 2, length) for side in (1, -1))
         heights += ramp.rise_m / length * (ahead - behind) / FILLET_M
     return heights
 
 
-def _area(way: Floats, length: float) -> Floats:
-    """Antiderivative of min(max(way, 0), length)."""
-    inside = np.clip(way, 0, length)
-    area: Floats = 0.5 * inside**2 + length * np.maximum(way - length, 0)
+def _area(distance: Floats, length: float) -> Floats:
+    """Antiderivative of min(max(distance, 0), length)."""
+    inside = np.clip(distance, 0, length)
+    area: Floats = 0.5 * inside**2 + length * np.maximum(distance - length, 0)
     return area
 
 

@@ -1,4 +1,4 @@
-"""Scenarios: what is simulated, as the tables of a TOML file say it."""
+"""Scenarios: the tables of a TOML file that describe what is simulated."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from protocol.site.site_config import NAME, SiteConfig
 from sim.machines.model import load_model
-from sim.operators.routes import ROUNDING_M, Leg, Route, tour, way
-from sim.scenario.ground import GroundConfig, Point, Zone
+from sim.operators.routes import ROUNDING_M, Leg, Route, open_leg, tour
+from sim.scenario.ground import GroundConfig, Point, ZoneConfig
 from sim.sensors.presets import Preset, load_preset
 from sim.sensors.rigs import Faults, Rig, machine_config
 
@@ -23,7 +23,7 @@ GOLDEN = 0.618  # the golden section spreads any number of machines over a route
 
 @dataclass(frozen=True)
 class LegConfig:
-    """One leg of a work cycle: corners of its way [m], backwards or not, and what happens at its end."""
+    """One leg of a work cycle: corners of its line [m], backwards or not, and what happens at its end."""
 
     corners: tuple[Point, ...]
     reverse: bool = False
@@ -63,9 +63,9 @@ class RouteConfig:
 class FleetConfig:
     """Machines of one kind. name: of a single one; counted ones are numbered, name-1, name-2, ...
 
-    routes: taken in turn; other_way: every second lap of turns the other way round. start: share of the cycle at which
-    the first begins. gps, imu, attitude: numbers of the sensors, as the machine's URDF has them. payload: whether they
-    weigh what they carry; None: if it changes on a route of theirs.
+    routes: taken in turn; other_way: every second round of turns is driven in the opposite direction. start: share of
+    the cycle at which the first begins. gps, imu, attitude: numbers of the sensors, as the machine's URDF has them.
+    payload: whether they weigh what they carry; None: if it changes on a route of theirs.
     """
 
     name: str
@@ -106,13 +106,13 @@ class FleetConfig:
 
 @dataclass(frozen=True)
 class FaultConfig(Faults):
-    """What is wrong with one machine."""
+    """The faults of one machine."""
 
     machine: str = ""
 
 
 @dataclass(frozen=True)
-class Change:
+class ScheduledChange:
     """Ground that becomes another soil while machines drive. at_s: simulated seconds after the start."""
 
     at_s: float
@@ -125,14 +125,14 @@ class Change:
         self.zone  # noqa: B018 - checks soil and outline
 
     @property
-    def zone(self) -> Zone:
-        """The ground that it lays."""
-        return Zone(self.soil, self.outline)
+    def zone(self) -> ZoneConfig:
+        """The ground that it becomes."""
+        return ZoneConfig(self.soil, self.outline)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """What is simulated. world: pybullet, or fast. give_way: drivers wait for machines in their way."""
+    """What is simulated. world: pybullet, or fast. give_way: drivers wait for machines ahead of them."""
 
     description: str
     site: SiteConfig
@@ -144,7 +144,7 @@ class Scenario:
     seconds: float = 120.0
     give_way: bool = True
     fault: tuple[FaultConfig, ...] = ()
-    change: tuple[Change, ...] = ()
+    change: tuple[ScheduledChange, ...] = ()
     presets: Mapping[str, Preset] = field(default_factory=dict)
     names: tuple[str, ...] = ()
 
@@ -226,5 +226,5 @@ def _few(names: Sequence[str]) -> str:
 
 
 def _leg(config: LegConfig) -> Leg:
-    line = way(config.corners, config.rounding_m)
+    line = open_leg(config.corners, config.rounding_m)
     return replace(line, reverse=config.reverse, wait_s=config.wait_s, payload_kg=config.payload_kg)

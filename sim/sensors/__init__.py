@@ -1,1 +1,1 @@
-"""What machines' sensors read of a true state: models of their errors, and rigs of them."""
+"""Sensor models: readings of a true state with their errors, and the sensors of each machine."""

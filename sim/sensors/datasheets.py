@@ -1,4 +1,4 @@
-"""What sensors get wrong and how often they read: the parameters of all sensor models, as presets give them.
+"""Parameters of all sensor models: their errors and how often they read, as presets set them.
 
 Standard deviations are of one reading unless they say otherwise; `presets.toml` holds values and sources.
 """
@@ -158,14 +158,14 @@ class BodySpread:
         _check(self, (0, 0.1), "wheel_radius")
 
 
-def _check(sheet: Any, limits: tuple[float, float], *names: str) -> None:
+def _check(noise: Any, limits: tuple[float, float], *names: str) -> None:
     low, high = limits
     for name in names:
-        value = getattr(sheet, name)
+        value = getattr(noise, name)
         if not low <= value <= high:  # also false for NaN
             raise ValueError(f"{name}: {value!r} is not between {low:g} and {high:g}")
 
 
-def _check_rate(sheet: Any) -> None:
-    if sheet.rate_hz < 1 or BASE_RATE_HZ % sheet.rate_hz:
-        raise ValueError(f"rate_hz: {sheet.rate_hz!r} does not divide {BASE_RATE_HZ}")
+def _check_rate(noise: Any) -> None:
+    if noise.rate_hz < 1 or BASE_RATE_HZ % noise.rate_hz:
+        raise ValueError(f"rate_hz: {noise.rate_hz!r} does not divide {BASE_RATE_HZ}")

@@ -8,14 +8,14 @@ import numpy as np
 
 from protocol.arrays import Floats, Ints
 from sim.sensors.noise import Draws, GaussMarkov
-from sim.sensors.sensor_group import Bank, Unit
-from sim.worlds.world import FleetState
+from sim.sensors.sensor_group import SensorGroup, SensorUnit
+from sim.state import FleetState
 
 
-class EncoderBank(Bank):
+class EncoderGroup(SensorGroup):
     """Counts the rear wheels' turns; slip and the wheels' true radius are in what it counts."""
 
-    def __init__(self, units: Sequence[Unit]) -> None:
+    def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
         self._ticks_per_rad = self.per_unit(lambda unit: unit.sensor.ticks_per_rev) / (2 * np.pi)
 
@@ -25,10 +25,10 @@ class EncoderBank(Bank):
         return ticks
 
 
-class TorqueBank(Bank):
+class TorqueGroup(SensorGroup):
     """Drive torque at the wheels, as the drive train reports it."""
 
-    def __init__(self, units: Sequence[Unit]) -> None:
+    def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
         noises = [unit.rig.preset.torque for unit in units]
         self._white_nm, scale = np.array([(noise.white_nm, noise.scale) for noise in noises]).T
@@ -41,7 +41,7 @@ class TorqueBank(Bank):
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """Torque of all wheels together."""
-        draws = self._draws.take(len(steps))
+        draws = self._draws.next_rows(len(steps))
         scale = self._scale * np.where(self.faulty(steps), self._fault, 1.0)
         values: Floats = (
             scale * self.pick(states.torque_nm, rows) + self._slow.run(draws[:1]) + self._white_nm * draws[1]
@@ -49,10 +49,10 @@ class TorqueBank(Bank):
         return values
 
 
-class ArticulationBank(Bank):
+class ArticulationGroup(SensorGroup):
     """Angle of the joint."""
 
-    def __init__(self, units: Sequence[Unit]) -> None:
+    def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
         noises = [unit.rig.preset.articulation for unit in units]
         self._white_rad, zero_rad = np.radians([(noise.white_deg, noise.zero_deg) for noise in noises]).T
@@ -61,15 +61,15 @@ class ArticulationBank(Bank):
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """Angle of the front frame."""
-        noise = self._zero_rad + self._white_rad * self._draws.take(len(steps))
+        noise = self._zero_rad + self._white_rad * self._draws.next_rows(len(steps))
         values: Floats = self.pick(states.articulation_rad, rows) + noise
         return values
 
 
-class PayloadBank(Bank):
+class PayloadGroup(SensorGroup):
     """What the machine carries, as its weighing system states it: never less than nothing."""
 
-    def __init__(self, units: Sequence[Unit]) -> None:
+    def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
         self._white_kg, scale = np.array([(u.rig.preset.payload.white_kg, u.rig.preset.payload.scale) for u in units]).T
         self._scale = 1 + scale * self.per_unit(lambda unit: unit.rng.standard_normal())
@@ -77,6 +77,6 @@ class PayloadBank(Bank):
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """Weight of the payload."""
-        noise = self._white_kg * self._draws.take(len(steps))
+        noise = self._white_kg * self._draws.next_rows(len(steps))
         weighed: Floats = np.maximum(self._scale * self.pick(states.payload_kg, rows) + noise, 0.0)
         return weighed

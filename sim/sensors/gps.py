@@ -8,20 +8,20 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.site_config import Projection
-from sim.frames import map_from_base
 from sim.sensors.datasheets import BASE_RATE_HZ
+from sim.sensors.frames import map_from_base
 from sim.sensors.noise import Draws, GaussMarkov, generator, site_generator
-from sim.sensors.sensor_group import Bank, Unit
-from sim.worlds.world import STEP_S, FleetState
+from sim.sensors.sensor_group import SensorGroup, SensorUnit
+from sim.state import STEP_S, FleetState
 
 AXES = np.array([1.0, 1.0, 5 / 3])  # heights are this much worse
 LEAST_M2 = 1e-4  # no receiver states a smaller variance
 
 
-class GpsBank(Bank):
+class GpsGroup(SensorGroup):
     """Receivers. They state their total variances; errors run on while they are silent."""
 
-    def __init__(self, units: Sequence[Unit], seed: int, projection: Projection) -> None:
+    def __init__(self, units: Sequence[SensorUnit], seed: int, projection: Projection) -> None:
         super().__init__(units)
         self._projection = projection
         noises = [unit.rig.preset.gps for unit in units]
@@ -44,18 +44,18 @@ class GpsBank(Bank):
         lever = self._lever_m + self._off_m * self.faulty(steps)
         attitude = [self.pick(angle, rows) for angle in (states.yaw_rad, states.pitch_rad, states.roll_rad)]
         base = np.stack([self.pick(place, rows) for place in (states.x_m, states.y_m, states.z_m)])
-        draws = self._draws.take(len(steps))
+        draws = self._draws.next_rows(len(steps))
         errors = self._drift.run(draws[:3]) + self._white_m[:, None] * draws[3:]
         if self._common:
             errors += self._shared_m[:, None] * self._common.at(steps)
         fixes = self._projection.to_geodetic_many(*(base + map_from_base(lever, *attitude) + errors))
         return np.concatenate([fixes, np.broadcast_to(self._variances, base.shape)])
 
-    def heard(self, steps: Ints) -> Bools:
+    def valid(self, steps: Ints) -> Bools:
         """False for outage_s of every outage_period_s."""
         time_s = steps[:, None] * STEP_S + self._phase_s
-        heard: Bools = time_s % self._period_s >= self._outage_s - 1e-9
-        return heard
+        valid: Bools = time_s % self._period_s >= self._outage_s - 1e-9
+        return valid
 
 
 class SiteDrift:
@@ -75,14 +75,14 @@ class SiteDrift:
 
     def at(self, steps: Ints) -> Floats:
         """Run on to the last of these steps; returns the drift after each."""
-        drift = self._drift.run(self._draws.take(int(steps[-1]) - self._step))
+        drift = self._drift.run(self._draws.next_rows(int(steps[-1]) - self._step))
         rows = steps - self._step - 1
         self._step = int(steps[-1])
         picked: Floats = drift[:, rows[:, None], self._process_of]
         return picked
 
 
-def _phase(unit: Unit, seed: int) -> float:
+def _phase(unit: SensorUnit, seed: int) -> float:
     """Where in its outage period a receiver starts, 0..1: in turn on one machine, machines independently."""
     receivers = [sensor for sensor in unit.rig.machine.sensors if sensor.kind == "gps"]
     turn = receivers.index(unit.sensor) / len(receivers)

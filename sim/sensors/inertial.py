@@ -9,16 +9,17 @@ import numpy as np
 
 from protocol.arrays import Floats, Ints
 from protocol.machine.machine_config import BASE, FRONT
-from sim.frames import compose, cross, quaternion, rotation, seen_turned, turned
+from protocol.rotations import quaternion_from_rpy
+from sim.sensors.frames import compose, cross, rotation, seen_turned, turned
 from sim.sensors.noise import Draws, GaussMarkov
-from sim.sensors.sensor_group import Bank, Unit
-from sim.worlds.world import FleetState
+from sim.sensors.sensor_group import SensorGroup, SensorUnit
+from sim.state import FleetState
 
 _LEVEL = np.zeros(1)
 
 
 @dataclass(frozen=True)
-class Motion:
+class FrameMotion:
     """How a rigid frame moves, arrays (3, r, u) in its axes: rate, its derivative, specific force at its origin."""
 
     rates_radps: Floats
@@ -26,12 +27,12 @@ class Motion:
     force_mps2: Floats
 
     def force_at(self, lever_m: Floats) -> Floats:
-        """Specific force at a place on the frame (3, 1, u)."""
+        """Specific force at a place r on the frame (3, 1, u): f + dw/dt x r + w x (w x r)."""
         turning = cross(self.rates_dot_radps2, lever_m) + cross(self.rates_radps, cross(self.rates_radps, lever_m))
         force: Floats = self.force_mps2 + turning
         return force
 
-    def beyond(self, joint_m: Floats, angle_rad: Floats, radps: Floats, radps2: Floats) -> Motion:
+    def hinged(self, joint_m: Floats, angle_rad: Floats, radps: Floats, radps2: Floats) -> FrameMotion:
         """Motion of a frame hinged about z at a place on this one; angle of the hinge, its rate and acceleration."""
         rates = seen_turned(angle_rad, self.rates_radps)
         rates_dot = seen_turned(angle_rad, self.rates_dot_radps2)
@@ -39,13 +40,13 @@ class Motion:
         rates_dot[1] -= radps * rates[0]
         rates_dot[2] += radps2
         rates[2] += radps
-        return Motion(rates, rates_dot, seen_turned(angle_rad, self.force_at(joint_m)))
+        return FrameMotion(rates, rates_dot, seen_turned(angle_rad, self.force_at(joint_m)))
 
 
-class ImuBank(Bank):
+class ImuGroup(SensorGroup):
     """Gyroscopes and accelerometers; three axes of rate, then three of force."""
 
-    def __init__(self, units: Sequence[Unit]) -> None:
+    def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
         noises = [unit.rig.preset.imu for unit in units]
         self._gyro_white = np.radians([noise.gyro_white_degps for noise in noises])
@@ -74,33 +75,34 @@ class ImuBank(Bank):
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """Angular rate and specific force in the sensor's frame."""
         motion = self._motion(rows, states)
-        felt = (motion.rates_radps, motion.force_at(self._lever_m))
-        values: Floats = np.concatenate([turned(self._sensor_from_frame, vector) for vector in felt])
+        truth = (motion.rates_radps, motion.force_at(self._lever_m))
+        values: Floats = np.concatenate([turned(self._sensor_from_frame, vector) for vector in truth])
         values *= self._scale
         values += self._zero
-        draws = self._draws.take(len(steps))
+        draws = self._draws.next_rows(len(steps))
         values += self._drift.run(draws[:6])
         shaking = self._vibration * np.minimum(np.abs(self.pick(states.speed_mps, rows)) / self._full_mps, 1.0)
         values[:3] += self._gyro_white * draws[6:9]
         values[3:] += np.hypot(self._force_white, shaking) * draws[9:]
         return values
 
-    def _motion(self, rows: Ints, states: FleetState) -> Motion:
+    def _motion(self, rows: Ints, states: FleetState) -> FrameMotion:
         """Motion of the frames that carry the sensors."""
-        rear = Motion(*(self.pick(q, rows) for q in (states.rates_radps, states.rates_dot_radps2, states.force_mps2)))
+        rates = (states.rates_radps, states.rates_dot_radps2)
+        rear = FrameMotion(*(self.pick(quantity, rows) for quantity in (*rates, states.force_mps2)))
         if not self._on_front:
             return rear
         hinge = (states.articulation_rad, states.articulation_radps, states.articulation_radps2)
-        return rear.beyond(self._joint_m, *(self.pick(q, rows) for q in hinge))
+        return rear.hinged(self._joint_m, *(self.pick(q, rows) for q in hinge))
 
 
-class AttitudeBank(Bank):
+class AttitudeGroup(SensorGroup):
     """Attitude and heading references: quaternion `map_from_sensor` and the variances that they state.
 
     Errors of roll and pitch turn about the sensor's own x and y, the error of the heading about the vertical.
     """
 
-    def __init__(self, units: Sequence[Unit]) -> None:
+    def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
         noises = [unit.rig.preset.attitude for unit in units]
         drift = np.radians([(n.tilt_drift_deg, n.tilt_drift_deg, n.heading_drift_deg) for n in noises]).T
@@ -113,16 +115,17 @@ class AttitudeBank(Bank):
         self._drift = GaussMarkov(drift, time_s, 1 / noises[0].rate_hz, start[3:])
         self._draws = Draws([unit.rng for unit in units], 6)
         roll, pitch, yaw = np.radians(self.per_unit(lambda unit: unit.sensor.mount.rpy_deg))
-        self._frame_from_sensor = quaternion(yaw, pitch, roll)[:, None]
+        self._frame_from_sensor = quaternion_from_rpy(roll, pitch, yaw)[:, None]
         self._on_front = units[0].sensor.frame == FRONT
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """Quaternion x, y, z, w, and the variances of roll, pitch and yaw."""
-        draws = self._draws.take(len(steps))
+        draws = self._draws.next_rows(len(steps))
         roll, pitch, heading = self._drift.run(draws[:3]) + self._white[:, None] * draws[3:] + self._offset
         yaw = self.pick(states.yaw_rad, rows) + heading
-        orientation = quaternion(yaw, self.pick(states.pitch_rad, rows), self.pick(states.roll_rad, rows))
+        orientation = quaternion_from_rpy(self.pick(states.roll_rad, rows), self.pick(states.pitch_rad, rows), yaw)
         if self._on_front:
-            orientation = compose(orientation, quaternion(self.pick(states.articulation_rad, rows), _LEVEL, _LEVEL))
-        orientation = compose(compose(orientation, self._frame_from_sensor), quaternion(_LEVEL, pitch, roll))
+            angle = self.pick(states.articulation_rad, rows)
+            orientation = compose(orientation, quaternion_from_rpy(_LEVEL, _LEVEL, angle))
+        orientation = compose(compose(orientation, self._frame_from_sensor), quaternion_from_rpy(roll, pitch, _LEVEL))
         return np.concatenate([orientation, np.broadcast_to(self._variances, draws[:3].shape)])

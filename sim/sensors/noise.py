@@ -45,7 +45,7 @@ class Draws:
         self._block = np.empty((len(rngs), BLOCK_ROWS, width))
         self._used = BLOCK_ROWS
 
-    def take(self, rows: int) -> Floats:
+    def next_rows(self, rows: int) -> Floats:
         """The next rows of all sensors, (width, rows, units)."""
         out = np.empty((self._block.shape[2], rows, len(self._rngs)))
         done = 0
@@ -68,7 +68,7 @@ class GaussMarkov:
     """Exponentially correlated errors of `sigma` (axes, units); time_s: (units,). `start`: unit normals (axes, units).
 
     They start in their stationary distribution. Exact discretisation of b' = -b/tau + w: b+ = a b + sigma
-    sqrt(1 - a^2) w with a = exp(-dt/tau) (EVIDENCE: Gazebo's plugin puts dt where sqrt(dt) belongs).
+    sqrt(1 - a^2) w with a = exp(-dt/tau) (Gazebo's plugin has dt where sqrt(dt) belongs).
     """
 
     def __init__(self, sigma: Floats, time_s: Floats, dt: float, start: Floats) -> None:

@@ -1,4 +1,4 @@
-"""Presets: named sets of sensor errors, as bad as real sensors. `sim/sensors/presets.toml` is their library."""
+"""Presets: named sets of sensor errors, like those of real sensors; `sim/sensors/presets.toml` is their library."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LIBRARY = Path(__file__).parent / "presets.toml"
 
 @dataclass(frozen=True)
 class Preset:
-    """What all sensors of a machine get wrong, by their kind, and how far its body is from nominal."""
+    """Errors of all sensors of a machine, by their kind, and how far its body is from nominal."""
 
     name: str
     gps: GpsNoise

@@ -1,4 +1,4 @@
-"""Machines as the simulator knows them: what their agents may know, how bad their sensors are, and what is broken."""
+"""The sensors of each machine: what its agent may know, the errors of its sensors, and its faults."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
-from sim.machines.vehicle import Bodies
 from sim.sensors.datasheets import GpsNoise
 from sim.sensors.noise import generator
 from sim.sensors.presets import Preset
@@ -18,7 +18,7 @@ from sim.sensors.presets import Preset
 
 @dataclass(frozen=True)
 class Faults:
-    """What is wrong with a machine, from from_s (simulated) on, beyond what its preset says.
+    """Faults of a machine from from_s (simulated) on, beyond the errors of its preset.
 
     torque_scale: factor on what the drive train reports. antenna_off_m: how far the antennas really sit from where the
     config says, in `base_link`. clock_off_s: what the stamps of all its sensors are ahead.

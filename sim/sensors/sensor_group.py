@@ -1,4 +1,4 @@
-"""Banks: all sensors of one kind, rate and frame, of all machines, that are read together as arrays."""
+"""Sensor groups: all sensors of one kind, rate and frame, of all machines, that are read together as arrays."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import KINDS, Reading, columns
 from sim.sensors.datasheets import BASE_RATE_HZ
 from sim.sensors.rigs import Rig
-from sim.worlds.world import STEP_S, FleetState
+from sim.state import STEP_S, FleetState
 
 
 @dataclass(frozen=True)
-class Unit:
+class SensorUnit:
     """One sensor of one machine, and its generator. machine: its place in the fleet."""
 
     machine: int
@@ -27,11 +27,11 @@ class Unit:
 
 
 @dataclass(frozen=True)
-class Block:
-    """Readings of one bank as columns: r instants by u sensors.
+class GroupReadings:
+    """Readings of one group as columns: r instants by u sensors.
 
     machines (u,), names: whose reading and of which sensor. values: (r, u, c), the kind's columns in the order of
-    `protocol.machine.readings.columns`. heard: (r, u), false where a sensor is silent.
+    `protocol.machine.readings.columns`. valid: (r, u), false where a sensor is silent.
     """
 
     kind: str
@@ -39,19 +39,19 @@ class Block:
     names: tuple[str, ...]
     stamps_ns: Ints
     values: Floats
-    heard: Bools
+    valid: Bools
 
     def readings(self, unit: int) -> list[Reading]:
         """Readings of one sensor, as objects."""
-        cls, name, heard = KINDS[self.kind], self.names[unit], self.heard[:, unit].tolist()
-        rows = zip(heard, self.stamps_ns[:, unit].tolist(), self.values[:, unit].tolist(), strict=True)
-        return [cls(name, stamp, *values) for audible, stamp, values in rows if audible]
+        cls, name, valid = KINDS[self.kind], self.names[unit], self.valid[:, unit].tolist()
+        rows = zip(valid, self.stamps_ns[:, unit].tolist(), self.values[:, unit].tolist(), strict=True)
+        return [cls(name, stamp, *values) for is_valid, stamp, values in rows if is_valid]
 
 
-class Bank(ABC):
+class SensorGroup(ABC):
     """Sensors of one kind, rate and frame. Inside, arrays hold axes first, then readings, then sensors: (c, r, u)."""
 
-    def __init__(self, units: Sequence[Unit]) -> None:
+    def __init__(self, units: Sequence[SensorUnit]) -> None:
         self.units = units
         kind = units[0].sensor.kind
         self.machines: Ints = np.array([unit.machine for unit in units])
@@ -60,37 +60,37 @@ class Bank(ABC):
         self._faulty_from_s = np.array([fault.from_s for fault in faults])
         self._clock_off_ns: Ints = np.array([round(fault.clock_off_s * 1e9) for fault in faults])
         names, stamps = tuple(unit.sensor.name for unit in units), np.empty((0, len(units)), np.int64)
-        values, heard = np.empty((*stamps.shape, len(columns(kind)))), np.ones(stamps.shape, bool)
-        self._nothing = Block(kind, self.machines, names, stamps, values, heard)
+        values, valid = np.empty((*stamps.shape, len(columns(kind)))), np.ones(stamps.shape, bool)
+        self._nothing = GroupReadings(kind, self.machines, names, stamps, values, valid)
 
-    def sample(self, steps: Ints, stamps_ns: Ints, states: FleetState) -> Block:
-        """Read off states, arrays (k, n, ...), after the steps with these numbers (k,), at those that are due."""
+    def sample(self, steps: Ints, stamps_ns: Ints, states: FleetState) -> GroupReadings:
+        """Read states (k, n, ...) after the steps with these numbers (k,), at the steps that are due."""
         rows: Ints = np.flatnonzero(steps % self._every == 0)
         if not rows.size:
             return self._nothing
         due = steps[rows]
         stamps = stamps_ns[rows, None] + self._clock_off_ns * self.faulty(due)
         values = self.read(due, rows, states).transpose(1, 2, 0)
-        return Block(self._nothing.kind, self.machines, self._nothing.names, stamps, values, self.heard(due))
+        return GroupReadings(self._nothing.kind, self.machines, self._nothing.names, stamps, values, self.valid(due))
 
     @abstractmethod
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """Values (c, r, u) at these rows of the states. steps: their numbers."""
 
-    def heard(self, steps: Ints) -> Bools:
-        """Whether sensors speak, (r, u)."""
+    def valid(self, steps: Ints) -> Bools:
+        """Whether the readings are valid, (r, u): a silent sensor has none."""
         return np.ones((len(steps), len(self.units)), bool)
 
     def faulty(self, steps: Ints) -> Bools:
-        """Whether the machine's faults are there yet, (r, u)."""
-        there: Bools = steps[:, None] * STEP_S >= self._faulty_from_s - 1e-9
-        return there
+        """Whether the machine's faults have begun, (r, u)."""
+        begun: Bools = steps[:, None] * STEP_S >= self._faulty_from_s - 1e-9
+        return begun
 
     def pick(self, quantity: Floats, rows: Ints) -> Floats:
         """A quantity of the states (k, n) or (k, n, c) for these sensors, (r, u) or (c, r, u)."""
         picked = quantity[rows].take(self.machines, axis=1)
         return picked if picked.ndim == 2 else np.ascontiguousarray(picked.transpose(2, 0, 1))
 
-    def per_unit(self, value: Callable[[Unit], object]) -> Floats:
+    def per_unit(self, value: Callable[[SensorUnit], object]) -> Floats:
         """A number or array of each sensor as one array, sensors last."""
         return np.ascontiguousarray(np.moveaxis(np.array([value(unit) for unit in self.units], float), 0, -1))

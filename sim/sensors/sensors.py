@@ -8,36 +8,36 @@ from dataclasses import dataclass
 from protocol.arrays import Ints
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection
-from sim.sensors.drivetrain import ArticulationBank, EncoderBank, PayloadBank, TorqueBank
-from sim.sensors.gps import GpsBank
-from sim.sensors.inertial import AttitudeBank, ImuBank
+from sim.sensors.drivetrain import ArticulationGroup, EncoderGroup, PayloadGroup, TorqueGroup
+from sim.sensors.gps import GpsGroup
+from sim.sensors.inertial import AttitudeGroup, ImuGroup
 from sim.sensors.noise import generator
 from sim.sensors.rigs import Rig
-from sim.sensors.sensor_group import Bank, Block, Unit
-from sim.worlds.world import FleetState
+from sim.sensors.sensor_group import GroupReadings, SensorGroup, SensorUnit
+from sim.state import FleetState
 
-_BANKS: dict[str, type[Bank]] = {
-    "imu": ImuBank,
-    "attitude": AttitudeBank,
-    "torque": TorqueBank,
-    "encoder": EncoderBank,
-    "articulation": ArticulationBank,
-    "payload": PayloadBank,
+_GROUPS: dict[str, type[SensorGroup]] = {
+    "imu": ImuGroup,
+    "attitude": AttitudeGroup,
+    "torque": TorqueGroup,
+    "encoder": EncoderGroup,
+    "articulation": ArticulationGroup,
+    "payload": PayloadGroup,
 }
 
 
 @dataclass(frozen=True)
-class Span:
-    """What all sensors said over a span of time. places: of each machine, block and column of each of its sensors."""
+class FleetReadings:
+    """Readings of all sensors over a span of time. places: group and column of each sensor of each machine."""
 
-    blocks: tuple[Block, ...]
+    groups: tuple[GroupReadings, ...]
     places: Sequence[Sequence[tuple[int, int]]]
 
     def readings(self, machine: int) -> list[Reading]:
         """Readings of one machine in the order of their stamps; of one stamp, in the order of its sensors."""
-        found = [reading for block, unit in self.places[machine] for reading in self.blocks[block].readings(unit)]
-        found.sort(key=lambda reading: reading.stamp_ns)
-        return found
+        own = [reading for group, unit in self.places[machine] for reading in self.groups[group].readings(unit)]
+        own.sort(key=lambda reading: reading.stamp_ns)
+        return own
 
 
 class Sensors:
@@ -48,7 +48,7 @@ class Sensors:
     """
 
     def __init__(self, rigs: Sequence[Rig], seed: int, projection: Projection) -> None:
-        groups: dict[tuple[str, int, str], list[Unit]] = {}
+        groups: dict[tuple[str, int, str], list[SensorUnit]] = {}
         places: list[list[tuple[tuple[str, int, str], int]]] = []
         for i, rig in enumerate(rigs):
             places.append([])
@@ -56,14 +56,14 @@ class Sensors:
                 key = (sensor.kind, rig.preset.rate_hz(sensor.kind), sensor.frame)
                 group = groups.setdefault(key, [])
                 places[i].append((key, len(group)))
-                group.append(Unit(i, rig, sensor, generator(seed, i, sensor.name)))
+                group.append(SensorUnit(i, rig, sensor, generator(seed, i, sensor.name)))
         number = {key: i for i, key in enumerate(groups)}
-        self._places = [[(number[key], unit) for key, unit in of_machine] for of_machine in places]
-        self._banks = [
-            GpsBank(units, seed, projection) if kind == "gps" else _BANKS[kind](units)
+        self._places = [[(number[key], unit) for key, unit in sensors] for sensors in places]
+        self._groups = [
+            GpsGroup(units, seed, projection) if kind == "gps" else _GROUPS[kind](units)
             for (kind, _, _), units in groups.items()
         ]
 
-    def sample(self, steps: Ints, stamps_ns: Ints, states: FleetState) -> Span:
-        """Read off the states (arrays (k, n, ...)) after the steps with these numbers; their order is that of time."""
-        return Span(tuple(bank.sample(steps, stamps_ns, states) for bank in self._banks), self._places)
+    def sample(self, steps: Ints, stamps_ns: Ints, states: FleetState) -> FleetReadings:
+        """Read the states (arrays (k, n, ...)) after the steps with these numbers; their order is that of time."""
+        return FleetReadings(tuple(group.sample(steps, stamps_ns, states) for group in self._groups), self._places)

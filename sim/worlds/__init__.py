@@ -1,1 +1,1 @@
-"""What moves machines over the ground: PyBullet's rigid bodies, or a fast model of many machines."""
+"""Worlds, which move machines over the ground: PyBullet's rigid bodies, or a fast model of many machines."""

@@ -8,21 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocol.arrays import Floats
+from protocol.rotations import quaternion_from_rpy
 from protocol.units import GRAVITY_MPS2
+from sim.machines.chassis import SETTLE_STEPS, TRACTION_USE, Bodies, chassis_of, drive_force_n, steering_radps
 from sim.machines.model import WHEELS, MachineModel
-from sim.machines.soil import TRACTION
-from sim.machines.vehicle import SETTLE_STEPS, TRACTION_USE, Bodies, chassis_of, drive_force_n, steering_radps
-from sim.worlds.multibody import MultiBodies
-from sim.worlds.observe import Burden, Drive, observe
-from sim.worlds.rigid import POINT_FRAME, Ground, look
-from sim.worlds.terrain import Terrain
-from sim.worlds.tyre import Motion, TyreForces, Tyres, at_rest, radial_load, roll
-from sim.worlds.world import STEP_S, FleetState
+from sim.state import STEP_S, FleetState
+from sim.terrain.soil import TRACTION
+from sim.terrain.terrain import Terrain
+from sim.worlds.bullet_client import MultiBodies
+from sim.worlds.bullet_scene import POINT_FRAME, WheelGround, scene_at
+from sim.worlds.bullet_state import DriveTrain, Weights, state_from_scenes
+from sim.worlds.tyre import TyreForces, Tyres, WheelMotion, at_rest, radial_load, turn_wheels
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
-    """What machines do at the moment, all (n,): rate of articulation, drive force, and most force of the brakes."""
+class Actuators:
+    """Actuators of n machines, all (n,): rate of articulation, drive force, and most force of the brakes."""
 
     steering_radps: Floats
     drive_n: Floats
@@ -40,21 +41,21 @@ class BulletWorld:
         self._terrain, self._bodies, self._chassis = terrain, bodies, chassis_of(models)
         mass_factor = bodies.mass_kg / np.array([m.mass_kg for m in models])
         self._multi = MultiBodies(models, mass_factor, _standing(terrain, models, starts), STEP_S)
-        self._burden = Burden(bodies.mass_kg, np.zeros(len(models)))
+        self._weights = Weights(bodies.mass_kg, np.zeros(len(models)))
         for machine in range(len(models)):
             self.set_payload(machine, 0.0)
 
         self._tyres, self._free_radius_m = _tyres(models, bodies), _free_radius_m(models, bodies)
         self._arms_m = _points(models) - self._multi.centres_m[:, POINT_FRAME]
         self._rolling = at_rest((len(models), 4))
-        self._scene = look(terrain, self._multi.read(), self._arms_m)
+        self._scene = scene_at(terrain, self._multi.read(), self._arms_m)
         self._wheel_load_n = self._loads(self._scene.ground)
 
         zero, hold = np.zeros(len(models)), np.array([m.max_brake_n for m in models])
         wheels = np.zeros((len(models), 2))
-        self._inputs = Inputs(zero, zero, zero)
-        self._state = observe(
-            self._scene, self._scene, self._wheel_load_n, self._burden, Drive(zero, zero, wheels, wheels)
+        self._actuators = Actuators(zero, zero, zero)
+        self._state = state_from_scenes(
+            self._scene, self._scene, self._wheel_load_n, self._weights, DriveTrain(zero, zero, wheels, wheels)
         )
         for _ in range(SETTLE_STEPS):
             self.advance(zero, zero, hold)
@@ -65,17 +66,12 @@ class BulletWorld:
         """The state after the last step."""
         return self._state
 
-    @property
-    def wheel_loads_n(self) -> Floats:
-        """Load of each wheel (n, 4): front left, front right, rear left, rear right."""
-        return self._wheel_load_n
-
     def set_payload(self, machine: int, payload_kg: float) -> None:
         """Change what one machine carries."""
         self._multi.set_payload(machine, payload_kg)
-        carried = self._burden.payload_kg.copy()  # past states keep theirs
+        carried = self._weights.payload_kg.copy()  # past states keep theirs
         carried[machine] = payload_kg
-        self._burden = Burden(self._bodies.mass_kg + carried, carried)
+        self._weights = Weights(self._bodies.mass_kg + carried, carried)
 
     def set_terrain(self, terrain: Terrain) -> None:
         """Change the ground under the machines."""
@@ -87,7 +83,7 @@ class BulletWorld:
 
     def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
         """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
-        self._inputs = self._obey(steer_rad, drive_n, brake_n)
+        self._actuators = self._follow_commands(steer_rad, drive_n, brake_n)
 
         # What the ground does to the wheels where they are now.
         ground, load = self._scene.ground, self._wheel_load_n
@@ -97,32 +93,32 @@ class BulletWorld:
 
         # Where that takes the machines.
         before = self._scene
-        self._multi.step(in_map, ground.point_m, self._inputs.steering_radps)
-        self._scene = look(self._terrain, self._multi.read(), self._arms_m, ground.point_m)
+        self._multi.step(in_map, ground.point_m, self._actuators.steering_radps)
+        self._scene = scene_at(self._terrain, self._multi.read(), self._arms_m, ground.point_m)
         self._wheel_load_n = self._loads(self._scene.ground)
         rear = self._rolling.spin_radps[:, 2:]
         turned = self._state.wheel_rad + STEP_S * rear
-        drive = Drive(self._inputs.drive_n, forces.torque_nm.sum(axis=-1), rear, turned)
-        self._state = observe(before, self._scene, self._wheel_load_n, self._burden, drive)
+        drive = DriveTrain(self._actuators.drive_n, forces.torque_nm.sum(axis=-1), rear, turned)
+        self._state = state_from_scenes(before, self._scene, self._wheel_load_n, self._weights, drive)
         return self._state
 
-    def _obey(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> Inputs:
+    def _follow_commands(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> Actuators:
         """Hydraulics and engine follow with their lags."""
-        old = self._inputs
+        old = self._actuators
         steering = steering_radps(self._chassis, steer_rad, self._state.articulation_rad, old.steering_radps)
         least = TRACTION[self._scene.ground.zone].min(axis=-1)
         grip = TRACTION_USE * least * self._state.load_n
-        return Inputs(steering, drive_force_n(self._chassis, drive_n, old.drive_n, grip), brake_n)
+        return Actuators(steering, drive_force_n(self._chassis, drive_n, old.drive_n, grip), brake_n)
 
-    def _loads(self, ground: Ground) -> Floats:
+    def _loads(self, ground: WheelGround) -> Floats:
         return radial_load(self._tyres, self._free_radius_m - ground.gap_m, -ground.velocity_mps[..., 2])
 
-    def _roll(self, ground: Ground, load: Floats) -> TyreForces:
+    def _roll(self, ground: WheelGround, load: Floats) -> TyreForces:
         """Turn the wheels; drive and brakes are split in proportion to the wheels' loads."""
-        motion = Motion(load, ground.velocity_mps[..., 0], ground.velocity_mps[..., 1], ground.zone)
+        motion = WheelMotion(load, ground.velocity_mps[..., 0], ground.velocity_mps[..., 1], ground.zone)
         lever = load * (self._tyres.radius_m / np.maximum(load.sum(axis=-1, keepdims=True), 1.0))
-        drive, brake = lever * self._inputs.drive_n[:, None], lever * self._inputs.brake_n[:, None]
-        self._rolling, forces = roll(self._tyres, self._rolling, motion, drive, brake, STEP_S)
+        drive, brake = lever * self._actuators.drive_n[:, None], lever * self._actuators.brake_n[:, None]
+        self._rolling, forces = turn_wheels(self._tyres, self._rolling, motion, drive, brake, STEP_S)
         return forces
 
 
@@ -136,18 +132,11 @@ def _standing(terrain: Terrain, models: Sequence[MachineModel], starts: Floats) 
     rear = 0.5 * (left + right)
     pitch = -np.arctan((terrain.height(x + ahead_x, y + ahead_y) - rear) / wheelbase)
     roll = np.arcsin(np.clip((left - right) / (2 * half_track) * np.cos(pitch), -1, 1))
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll / 2, pitch / 2, yaw / 2]), np.sin([roll / 2, pitch / 2, yaw / 2])
-    quaternion = (
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    )
-    return np.stack([x, y, rear, *quaternion], axis=-1)
+    return np.stack([x, y, rear, *quaternion_from_rpy(roll, pitch, yaw)], axis=-1)
 
 
 def _points(models: Sequence[MachineModel]) -> Floats:
-    """The points of `rigid.POINT_FRAME` in the links of their frames, (n, 5, 3)."""
+    """The points of `bullet_scene.POINT_FRAME` in the links of their frames, (n, 5, 3)."""
     rows = []
     for model in models:
         robot = model.robot

@@ -1,6 +1,6 @@
 """The fast world: articulated machines as kinematics of two frames, all at once (numba, no PyBullet).
 
-Neither axle slips sideways. Along the way, drive force and brakes against rolling resistance, gravity and the inertia
+Neither axle slips sideways. Along the track, drive force and brakes against rolling resistance, gravity and the inertia
 of the body and its wheels. One joint lets all wheels touch, so the rear frame rests on three points: one axle's wheels
 and the other axle's centre; their plane is its attitude once the tyres have settled.
 """
@@ -8,14 +8,13 @@ and the other axle's centre; their plane is its attitude once the tyres have set
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 
-from protocol.arrays import Floats
+from protocol.arrays import Floats, Table
 from protocol.units import GRAVITY_MPS2
-from sim.machines.model import MachineModel
-from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import (
+from sim.machines.chassis import (
     SETTLE_STEPS,
     STANDSTILL_MPS,
     TRACTION_USE,
@@ -25,15 +24,19 @@ from sim.machines.vehicle import (
     steering_radps,
     weigh,
 )
+from sim.machines.model import MachineModel
+from sim.state import STEP_S, FleetState
+from sim.terrain.soil import C_RR, SLIP_STIFFNESS, TRACTION
+from sim.terrain.terrain import Terrain
 from sim.worlds import fast_kernels as k
-from sim.worlds.terrain import Terrain
-from sim.worlds.world import STEP_S, FleetState
+from sim.worlds.fast_records import MACHINE, STATE
 
 _CONSTANTS = k.Constants(STEP_S, GRAVITY_MPS2, STANDSTILL_MPS, TRACTION_USE)
 _SOILS = np.array([C_RR, TRACTION, SLIP_STIFFNESS])
+_IN_BOTH = [field.name for field in fields(FleetState) if field.name in (STATE.names or ())]
 
 
-class Fleet:
+class FastWorld:
     """n machines on one terrain. starts: x, y [m] and yaw [rad] of each `base_link`, (n, 3)."""
 
     def __init__(self, terrain: Terrain, models: Sequence[MachineModel], bodies: Bodies, starts: Floats) -> None:
@@ -41,8 +44,8 @@ class Fleet:
         self._terrain, self._bodies, self._chassis = terrain, bodies, chassis_of(models)
         self._payload_kg = np.zeros(n)
         self._weigh()
-        self._rows = np.zeros((k.ROWS, n))
-        self._rows[[k.X, k.Y, k.YAW]] = np.transpose(starts)
+        self._rows = np.zeros(n, STATE)
+        self._rows["x_m"], self._rows["y_m"], self._rows["yaw_rad"] = starts.T
         k.settle(self._machines, terrain.grid, self._rows)
         for _ in range(SETTLE_STEPS):
             self.advance(np.zeros(n), np.zeros(n), np.full(n, np.inf))
@@ -55,8 +58,8 @@ class Fleet:
     def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
         """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
         rows, chassis = self._rows, self._chassis
-        steering = steering_radps(chassis, steer_rad, rows[k.BEND], rows[k.STEERING])
-        drive = drive_force_n(chassis, drive_n, rows[k.DRIVE], rows[k.GRIP])
+        steering = steering_radps(chassis, steer_rad, rows["articulation_rad"], rows["articulation_radps"])
+        drive = drive_force_n(chassis, drive_n, rows["drive_n"], rows["grip_n"])
         brake, machines, ground = np.ascontiguousarray(brake_n, float), self._machines, self._terrain.grid
         self._rows = k.advance(_CONSTANTS, _SOILS, machines, ground, rows, steering, drive, brake)
         self._state = _state(self._rows, self._weight.mass_kg, self._payload_kg)
@@ -79,46 +82,11 @@ class Fleet:
     def _weigh(self) -> None:
         chassis, bodies = self._chassis, self._bodies
         self._weight = weigh(chassis, bodies, self._payload_kg)
-        values = (
-            chassis.rear_to_joint_m,
-            chassis.front_to_joint_m,
-            chassis.half_track_m,
-            chassis.rolls_with_front,
-            *self._weight,
-            chassis.tyre_stiffness_npm,
-            chassis.tyre_damping_nspm,
-            bodies.wheel_radius_m,
-            chassis.wheel_inertia_kgm2,
-        )
-        self._machines = np.array(values, float)  # rows of `kernels.Machine`
+        values = chassis._asdict() | self._weight._asdict() | {"wheel_radius_m": bodies.wheel_radius_m}
+        self._machines = np.empty(len(bodies.mass_kg), MACHINE)
+        for name in MACHINE.names or ():
+            self._machines[name] = values[name]
 
 
-def _state(rows: Floats, mass_kg: Floats, payload_kg: Floats) -> FleetState:
-    return FleetState(
-        x_m=rows[k.X],
-        y_m=rows[k.Y],
-        z_m=rows[k.Z],
-        yaw_rad=rows[k.YAW],
-        pitch_rad=rows[k.PITCH],
-        roll_rad=rows[k.ROLL],
-        speed_mps=rows[k.SPEED],
-        accel_mps2=rows[k.ACCEL],
-        pitch_radps=rows[k.PITCHING],
-        roll_radps=rows[k.ROLLING],
-        rates_radps=rows[k.RATES : k.RATES + 3].T,
-        rates_dot_radps2=rows[k.RATES_DOT : k.RATES_DOT + 3].T,
-        force_mps2=rows[k.FORCE : k.FORCE + 3].T,
-        articulation_rad=rows[k.BEND],
-        articulation_radps=rows[k.STEERING],
-        articulation_radps2=rows[k.STEERING_DOT],
-        drive_n=rows[k.DRIVE],
-        torque_nm=rows[k.TORQUE],
-        load_n=rows[k.LOAD],
-        mass_kg=mass_kg,
-        payload_kg=payload_kg,
-        wheel_radps=rows[k.SPIN : k.SPIN + 2].T,
-        wheel_rad=rows[k.TURNED : k.TURNED + 2].T,
-        c_rr=rows[k.C_RR],
-        grade_e=rows[k.GRADE_E],
-        grade_n=rows[k.GRADE_N],
-    )
+def _state(rows: Table, mass_kg: Floats, payload_kg: Floats) -> FleetState:
+    return FleetState(mass_kg=mass_kg, payload_kg=payload_kg, **{name: rows[name] for name in _IN_BOTH})

@@ -1,6 +1,7 @@
-"""The fast world's inner loops, compiled by numba: the ground at places, and one step of machines.
+"""One step of the fast world's machines, compiled by numba.
 
-All of them are in this file, and constants of other files are passed in: numba's cache notices changes here alone.
+All of it is in this long file, and constants of other files are passed in: numba's cache notices changes in the file of
+the function that is called, and in no other. After a change in `terrain/lookup.py`, touch this file.
 """
 
 from __future__ import annotations
@@ -11,28 +12,11 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from protocol.arrays import Floats, Ints
+from protocol.arrays import Floats, Table
+from sim.terrain.lookup import TerrainGrid, surface, zone
+from sim.worlds.fast_records import Record
 
 _compiled = numba.njit(cache=True, inline="always", error_model="numpy")
-
-# Rows of the state (ROWS, n), as `world.FleetState` explains them; vectors begin at theirs. GRIP: the most drive force.
-# CRAB: how far a machine moves off its heading to the left, because tyres push aside only while they slip aside. RIDE:
-# how high the body's centre is, and how fast it rises. *_AIM: where ride, pitch and roll would settle.
-X, Y, Z, YAW, PITCH, ROLL, SPEED, ACCEL, PITCHING, ROLLING = range(10)
-RATES, RATES_DOT, FORCE = 10, 13, 16
-BEND, STEERING, STEERING_DOT, DRIVE, TORQUE, LOAD = range(19, 25)
-SPIN, TURNED = 25, 27
-C_RR, GRADE_E, GRADE_N, GRIP, CRAB, RIDE, RIDING, RIDE_AIM, PITCH_AIM, ROLL_AIM = range(29, 39)
-ROWS = 39
-
-
-class Grid(NamedTuple):
-    """Arrays of `terrain.Terrain`."""
-
-    heights_m: Floats
-    cell_m: float
-    zones: Ints
-    zone_cell_m: float
 
 
 class Constants(NamedTuple):
@@ -42,24 +26,6 @@ class Constants(NamedTuple):
     gravity: float
     standstill_mps: float
     traction_use: float
-
-
-class Machine(NamedTuple):
-    """One machine, as `vehicle.Chassis` and `vehicle.Weight` explain it."""
-
-    rear_to_joint_m: float
-    front_to_joint_m: float
-    half_track_m: float
-    rolls_with_front: float
-    mass_kg: float
-    front_share: float
-    centre_height_m: float
-    pitch_inertia_kgm2: float
-    roll_inertia_kgm2: float
-    tyre_stiffness_npm: float
-    tyre_damping_nspm: float
-    wheel_radius_m: float
-    wheel_inertia_kgm2: float
 
 
 class Moved(NamedTuple):
@@ -73,11 +39,20 @@ class Moved(NamedTuple):
     turning: float
 
 
+class RearAxle(NamedTuple):
+    """The rear axle's centre, and the direction of the rear frame."""
+
+    x: float
+    y: float
+    cos_yaw: float
+    sin_yaw: float
+
+
 class Contact(NamedTuple):
     """The ground under a machine.
 
     z: below the rear axle. slope: of the plane on which the rear frame rests, along its axes. climb: mean slope of the
-    ground right under an axle's wheels, the way they roll. grade: of the plane through all wheels, in `map`. zones:
+    ground right under an axle's wheels, in their direction. grade: of the plane through all wheels, in `map`. zones:
     front left, front right, rear left, rear right.
     """
 
@@ -91,7 +66,7 @@ class Contact(NamedTuple):
     zones: tuple[int, int, int, int]
 
 
-class Moves(NamedTuple):
+class Rates(NamedTuple):
     """How a machine moves.
 
     turning: of the rear frame. accel, force_left: acceleration ahead and specific force to the left, of the last step.
@@ -110,10 +85,10 @@ class Moves(NamedTuple):
 
 
 class Forces(NamedTuple):
-    """Forces along the way, and what follows from them.
+    """Forces along the track, and what follows from them.
 
-    grip: the most drive force that spins up no wheel. tyres: what drive and brakes make them push with. crab: angle by
-    which all wheels slip aside. wheel_ratio: wheel speed over ground speed.
+    grip: the most drive force that spins up no wheel. tyres: the tyres' force under drive and brakes. crab: angle by
+    which all wheels slip sideways. wheel_ratio: wheel speed over ground speed.
     """
 
     load: float
@@ -126,121 +101,74 @@ class Forces(NamedTuple):
 
 
 @_compiled
-def surface(heights: Floats, cell: float, x: float, y: float) -> tuple[float, float, float]:
-    """Height, bilinear between the nodes, and its slopes to the east and north; beyond the edges, the edge goes on."""
-    rows, columns = heights.shape
-    u, v = x / cell, y / cell
-    i, j = min(max(int(u), 0), columns - 2), min(max(int(v), 0), rows - 2)
-    a, b = min(max(u - i, 0.0), 1.0), min(max(v - j, 0.0), 1.0)
-    h00, h10, h01, h11 = heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1]
-    south, north = h00 + a * (h10 - h00), h01 + a * (h11 - h01)
-    east = (h10 - h00) * (1 - b) + (h11 - h01) * b
-    return south + b * (north - south), east / cell, (north - south) / cell
-
-
-@_compiled
-def zone(zones: Ints, cell: float, x: float, y: float) -> int:
-    """Zone of the cell; beyond the edges, the edge goes on."""
-    rows, columns = zones.shape
-    found: int = zones[min(max(int(y / cell), 0), rows - 1), min(max(int(x / cell), 0), columns - 1)]
-    return found
-
-
-@_compiled
-def surfaces(grid: Grid, x: Floats, y: Floats) -> Floats:
-    """`surface` of places (k,), as (3, k)."""
-    found, heights, cell = np.empty((3, x.size)), grid.heights_m, grid.cell_m
-    for i in range(x.size):
-        found[0, i], found[1, i], found[2, i] = surface(heights, cell, x[i], y[i])
-    return found
-
-
-@_compiled
-def zones(grid: Grid, x: Floats, y: Floats) -> Ints:
-    """`zone` of places (k,)."""
-    found, cells, cell = np.empty(x.size, np.int64), grid.zones, grid.zone_cell_m
-    for i in range(x.size):
-        found[i] = zone(cells, cell, x[i], y[i])
-    return found
-
-
-@_compiled
 def advance(
-    k: Constants, soils: Floats, rows: Floats, grid: Grid, old: Floats, steering: Floats, drive: Floats, brake: Floats
-) -> Floats:
+    k: Constants, soils: Floats, machines: Table, grid: TerrainGrid, old: Table, steering: Floats, drive: Floats,
+    brake: Floats,
+) -> Table:  # fmt: skip
     """Advance machines by one step.
 
-    soils: resistance, traction and slip stiffness of each zone, (3, zones). rows: those of `Machine`, (9, n).
-    old: (ROWS, n). The rest (n,): rate of articulation, drive force, and most force of the brakes.
+    soils: resistance, traction and slip stiffness of each zone, (3, zones). machines: MACHINE (n,). old: STATE (n,).
+    The rest (n,): rate of articulation, drive force, and most force of the brakes.
     """
     new = np.empty_like(old)
-    for i in range(old.shape[1]):
+    for i in range(old.size):
         # Move, then look up the ground at the new place, and the forces there.
-        m = _machine(rows, i)
-        moved = _move(k.dt_s, m, old, steering[i], i)
-        ground = _touch(m, grid.heights_m, grid.cell_m, grid.zones, grid.zone_cell_m, moved)
-        _ride(k.dt_s, m, ground, old, new, i)
-        moves = Moves(
+        m, before, now = machines[i], old[i], new[i]
+        moved = _move(k.dt_s, m, before, steering[i])
+        ground = _touch(m, grid, moved)
+        _ride(k.dt_s, m, ground, before, now)
+        rates = Rates(
             speed=moved.speed,
             turning=moved.turning,
-            accel=old[ACCEL, i],
-            force_left=old[FORCE + 1, i],
-            lifting=(new[RIDING, i] - old[RIDING, i]) / k.dt_s + old[ACCEL, i] * math.sin(new[PITCH_AIM, i]),
-            riding=new[RIDING, i],
-            pitch=new[PITCH, i],
-            pitching=new[PITCHING, i],
-            pitching_dot=(new[PITCHING, i] - old[PITCHING, i]) / k.dt_s,
+            accel=before.accel_mps2,
+            force_left=before.force_mps2[1],
+            lifting=(now.ride_mps - before.ride_mps) / k.dt_s + before.accel_mps2 * math.sin(now.pitch_aim_rad),
+            riding=now.ride_mps,
+            pitch=now.pitch_rad,
+            pitching=now.pitch_radps,
+            pitching_dot=(now.pitch_radps - before.pitch_radps) / k.dt_s,
         )
-        forces = _forces(k, soils, m, ground, moves, drive[i], brake[i])
+        forces = _forces(k, soils, m, ground, rates, drive[i], brake[i])
 
-        new[X, i], new[Y, i], new[YAW, i] = moved.x, moved.y, moved.yaw
-        new[Z, i] = ground.z + new[RIDE, i] - new[RIDE_AIM, i]
-        new[BEND, i], new[STEERING, i] = moved.bend, steering[i]
-        new[STEERING_DOT, i] = (steering[i] - old[STEERING, i]) / k.dt_s
-        new[SPEED, i], new[ACCEL, i] = moved.speed, forces.accel
-        new[DRIVE, i], new[TORQUE, i], new[GRIP, i] = drive[i], forces.tyres * m.wheel_radius_m, forces.grip
-        new[LOAD, i], new[C_RR, i], new[CRAB, i] = forces.load, forces.c_rr, forces.crab
-        new[GRADE_E, i], new[GRADE_N, i] = ground.grade_e, ground.grade_n
-        _turn_wheels(k.dt_s, forces.wheel_ratio / m.wheel_radius_m, m.half_track_m, moved, old, new, i)
-        _feel(k, m, moved, moves, old, new, i)
+        now.x_m, now.y_m, now.yaw_rad = moved.x, moved.y, moved.yaw
+        now.z_m = ground.z + now.ride_m - now.ride_aim_m
+        now.articulation_rad, now.articulation_radps = moved.bend, steering[i]
+        now.articulation_radps2 = (steering[i] - before.articulation_radps) / k.dt_s
+        now.speed_mps, now.accel_mps2 = moved.speed, forces.accel
+        now.drive_n, now.torque_nm, now.grip_n = drive[i], forces.tyres * m.wheel_radius_m, forces.grip
+        now.load_n, now.c_rr, now.crab_rad = forces.load, forces.c_rr, forces.crab
+        now.grade_e, now.grade_n = ground.grade_e, ground.grade_n
+        _turn_wheels(k.dt_s, forces.wheel_ratio / m.wheel_radius_m, m.half_track_m, moved, before, now)
+        _inertial(k, m, moved, rates, before, now)
     return new
 
 
 @_compiled
-def _machine(rows: Floats, i: int) -> Machine:
-    return Machine(
-        rear_to_joint_m=rows[0, i],
-        front_to_joint_m=rows[1, i],
-        half_track_m=rows[2, i],
-        rolls_with_front=rows[3, i],
-        mass_kg=rows[4, i],
-        front_share=rows[5, i],
-        centre_height_m=rows[6, i],
-        pitch_inertia_kgm2=rows[7, i],
-        roll_inertia_kgm2=rows[8, i],
-        tyre_stiffness_npm=rows[9, i],
-        tyre_damping_nspm=rows[10, i],
-        wheel_radius_m=rows[11, i],
-        wheel_inertia_kgm2=rows[12, i],
-    )
+def settle(machines: Table, grid: TerrainGrid, state: Table) -> None:
+    """Put bodies, STATE (n,), down where they will rest."""
+    for i in range(state.size):
+        m, now = machines[i], state[i]
+        at = Moved(now.x_m, now.y_m, now.yaw_rad, now.articulation_rad, 0.0, 0.0)
+        _aim(m, _touch(m, grid, at), now)
+        now.ride_m, now.pitch_rad, now.roll_rad = now.ride_aim_m, now.pitch_aim_rad, now.roll_aim_rad
 
 
 @_compiled
-def _move(dt: float, m: Machine, old: Floats, steering: float, i: int) -> Moved:
+def _move(dt: float, m: Record, before: Record, steering: float) -> Moved:
     """Move both frames; neither axle slips sideways.
 
     With arms L_r and L_f to the joint: (L_f + L_r cos g) dyaw/dt = v sin g - L_f dg/dt.
     """
     rear, front = m.rear_to_joint_m, m.front_to_joint_m
-    bend, speed = old[BEND, i] + dt * steering, old[SPEED, i] + dt * old[ACCEL, i]
+    bend, speed = before.articulation_rad + dt * steering, before.speed_mps + dt * before.accel_mps2
     turning = (speed * math.sin(bend) - front * steering) / (front + rear * math.cos(bend))
-    level, heading = dt * speed * math.cos(old[PITCH, i]), old[YAW, i] + 0.5 * dt * turning + old[CRAB, i]
-    x, y = old[X, i] + level * math.cos(heading), old[Y, i] + level * math.sin(heading)
-    return Moved(x, y, old[YAW, i] + dt * turning, bend, speed, turning)
+    level, heading = dt * speed * math.cos(before.pitch_rad), before.yaw_rad + 0.5 * dt * turning + before.crab_rad
+    x, y = before.x_m + level * math.cos(heading), before.y_m + level * math.sin(heading)
+    return Moved(x, y, before.yaw_rad + dt * turning, bend, speed, turning)
 
 
 @_compiled
-def _touch(m: Machine, heights: Floats, cell: float, zones: Ints, zone_cell: float, at: Moved) -> Contact:
+def _touch(m: Record, grid: TerrainGrid, at: Moved) -> Contact:
     """Look up the ground under the wheels."""
     # From the rear axle's centre, along the rear frame's axes: the front axle's centre, and the left half of the axle.
     cf, sf = math.cos(at.bend), math.sin(at.bend)
@@ -250,18 +178,15 @@ def _touch(m: Machine, heights: Floats, cell: float, zones: Ints, zone_cell: flo
     left_x, left_y = -half * sf, half * cf
 
     c, s = math.cos(at.yaw), math.sin(at.yaw)
-    fl, east_fl, north_fl, zone_fl = _under(
-        heights, cell, zones, zone_cell, at, c, s, ahead_x + left_x, ahead_y + left_y
-    )
-    fr, east_fr, north_fr, zone_fr = _under(
-        heights, cell, zones, zone_cell, at, c, s, ahead_x - left_x, ahead_y - left_y
-    )
-    rl, east_rl, north_rl, zone_rl = _under(heights, cell, zones, zone_cell, at, c, s, 0.0, half)
-    rr, east_rr, north_rr, zone_rr = _under(heights, cell, zones, zone_cell, at, c, s, 0.0, -half)
+    rear_axle = RearAxle(at.x, at.y, c, s)
+    fl, east_fl, north_fl, zone_fl = _under(grid, rear_axle, ahead_x + left_x, ahead_y + left_y)
+    fr, east_fr, north_fr, zone_fr = _under(grid, rear_axle, ahead_x - left_x, ahead_y - left_y)
+    rl, east_rl, north_rl, zone_rl = _under(grid, rear_axle, 0.0, half)
+    rr, east_rr, north_rr, zone_rr = _under(grid, rear_axle, 0.0, -half)
     z = 0.5 * (rl + rr)
     rise, front, rear = 0.5 * (fl + fr) - z, 0.5 * (fl - fr), 0.5 * (rl - rr)
 
-    if m.rolls_with_front > 0:
+    if m.rolls_with_front:
         own_ahead, own_left = _plane(ahead_x, ahead_y, rise, left_x, left_y, front)
     else:
         own_ahead, own_left = _plane(ahead_x, ahead_y, rise, 0.0, half, rear)
@@ -275,21 +200,11 @@ def _touch(m: Machine, heights: Floats, cell: float, zones: Ints, zone_cell: flo
 
 
 @_compiled
-def _under(
-    heights: Floats,
-    cell: float,
-    zones: Ints,
-    zone_cell: float,
-    at: Moved,
-    c: float,
-    s: float,
-    ahead: float,
-    left: float,
-) -> tuple[float, float, float, int]:
+def _under(grid: TerrainGrid, at: RearAxle, ahead: float, left: float) -> tuple[float, float, float, int]:
     """Height, its slopes to the east and north, and the zone at a place relative to the rear axle's centre."""
-    x, y = at.x + c * ahead - s * left, at.y + s * ahead + c * left
-    height, east, north = surface(heights, cell, x, y)
-    return height, east, north, zone(zones, zone_cell, x, y)
+    x, y = at.x + at.cos_yaw * ahead - at.sin_yaw * left, at.y + at.sin_yaw * ahead + at.cos_yaw * left
+    height, east, north = surface(grid, x, y)
+    return height, east, north, zone(grid, x, y)
 
 
 @_compiled
@@ -301,40 +216,34 @@ def _plane(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> 
 
 @_compiled
 def _forces(
-    k: Constants,
-    soils: Floats,
-    m: Machine,
-    ground: Contact,
-    moves: Moves,
-    drive: float,
-    brake: float,
+    k: Constants, soils: Floats, m: Record, ground: Contact, rates: Rates, drive: float, brake: float
 ) -> Forces:
-    """Forces along the way."""
+    """Forces along the track."""
     # The ground's normal force, shifted to the rear uphill, under power and as the nose drops; what soil makes of it.
-    speed, weight = moves.speed, m.mass_kg * k.gravity
+    speed, weight = rates.speed, m.mass_kg * k.gravity
     level = weight / math.sqrt(1 + ground.grade_e**2 + ground.grade_n**2)
-    load = max(level + m.mass_kg * moves.lifting, 0.1 * level)
+    load = max(level + m.mass_kg * rates.lifting, 0.1 * level)
     pitched = weight * ground.slope_ahead / math.sqrt(1 + ground.slope_ahead**2)
-    tilting = (pitched + m.mass_kg * moves.accel) * m.centre_height_m + m.pitch_inertia_kgm2 * moves.pitching_dot
+    tilting = (pitched + m.mass_kg * rates.accel) * m.centre_height_m + m.pitch_inertia_kgm2 * rates.pitching_dot
     front = min(max(m.front_share * load - tilting / (m.rear_to_joint_m + m.front_to_joint_m), 0.0), load)
-    nose_up = -moves.pitch
+    nose_up = -rates.pitch
     climb = weight * math.sin(nose_up)
     climb += front * math.sin(math.atan(ground.climb_front) - nose_up)
     climb += (load - front) * math.sin(math.atan(ground.climb_rear) - nose_up)
-    resistance = _borne(soils, 0, ground.zones, front, load)
-    traction = _borne(soils, 1, ground.zones, front, load)
-    stiffness = _borne(soils, 2, ground.zones, front, load)
+    resistance = _borne(soils[0], ground.zones, front, load)
+    traction = _borne(soils[1], ground.zones, front, load)
+    stiffness = _borne(soils[2], ground.zones, front, load)
 
     # Brakes take what they can, down to standstill at the end of the next step, and hold it there.
     # Of a body that pitches, `base_link` moves otherwise than its centre, v' + q' h = F / m - q w.
-    centre_mps = speed + moves.pitching * m.centre_height_m
-    upward_mps = moves.riding * math.cos(nose_up) - centre_mps * math.sin(nose_up)
-    tipping = m.mass_kg * (moves.pitching_dot * m.centre_height_m + moves.pitching * upward_mps)
+    centre_mps = speed + rates.pitching * m.centre_height_m
+    upward_mps = rates.riding * math.cos(nose_up) - centre_mps * math.sin(nose_up)
+    tipping = m.mass_kg * (rates.pitching_dot * m.centre_height_m + rates.pitching * upward_mps)
     inertia = m.mass_kg + 4 * m.wheel_inertia_kgm2 / m.wheel_radius_m**2
-    # Wheels that push aside slip aside; in a curve, v' = F / m + w v_left then slows the machine down.
+    # Wheels under side force slip sideways; in a curve, v' = F / m + w v_left then slows the machine down.
     moving = math.tanh(speed / k.standstill_mps)
-    crab = -m.mass_kg * moves.force_left / stiffness * moving
-    drag = -m.mass_kg * moves.turning * speed * crab
+    crab = -m.mass_kg * rates.force_left / stiffness * moving
+    drag = -m.mass_kg * rates.turning * speed * crab
     against = resistance * moving + drag + climb + tipping
     to_stop = inertia * speed / k.dt_s + drive - against
     most = k.traction_use * traction
@@ -351,80 +260,72 @@ def _forces(
 
 
 @_compiled
-def _borne(soils: Floats, value: int, zones: tuple[int, int, int, int], front: float, load: float) -> float:
+def _borne(values: Floats, zones: tuple[int, int, int, int], front: float, load: float) -> float:
     """Sum of a soil's value times the wheels' loads; the wheels of an axle bear the same."""
     fl, fr, rl, rr = zones
-    ahead, behind = soils[value, fl] + soils[value, fr], soils[value, rl] + soils[value, rr]
+    ahead, behind = values[fl] + values[fr], values[rl] + values[rr]
     total: float = 0.5 * (front * ahead + (load - front) * behind)
     return total
 
 
 @_compiled
-def _turn_wheels(
-    dt: float, radps_per_mps: float, half_track: float, at: Moved, old: Floats, new: Floats, i: int
-) -> None:
+def _turn_wheels(dt: float, radps_per_mps: float, half_track: float, at: Moved, before: Record, now: Record) -> None:
     """Turn the rear wheels, each as fast as its side moves."""
-    aside = at.turning * half_track
-    new[SPIN, i], new[SPIN + 1, i] = (at.speed - aside) * radps_per_mps, (at.speed + aside) * radps_per_mps
+    faster = at.turning * half_track
+    now.wheel_radps[0], now.wheel_radps[1] = (at.speed - faster) * radps_per_mps, (at.speed + faster) * radps_per_mps
     for side in range(2):
-        new[TURNED + side, i] = old[TURNED + side, i] + dt * new[SPIN + side, i]
+        now.wheel_rad[side] = before.wheel_rad[side] + dt * now.wheel_radps[side]
 
 
 @_compiled
-def settle(rows: Floats, grid: Grid, state: Floats) -> None:
-    """Put bodies (ROWS, n) down where they will rest."""
-    for i in range(state.shape[1]):
-        m = _machine(rows, i)
-        at = Moved(state[X, i], state[Y, i], state[YAW, i], state[BEND, i], 0.0, 0.0)
-        _aim(m, _touch(m, grid.heights_m, grid.cell_m, grid.zones, grid.zone_cell_m, at), state, i)
-        state[RIDE, i], state[PITCH, i], state[ROLL, i] = state[RIDE_AIM, i], state[PITCH_AIM, i], state[ROLL_AIM, i]
-
-
-@_compiled
-def _aim(m: Machine, ground: Contact, new: Floats, i: int) -> None:
+def _aim(m: Record, ground: Contact, now: Record) -> None:
     """Where the body would settle on the plane that carries it."""
     slope = math.sqrt(1 + ground.slope_ahead**2)
-    new[PITCH_AIM, i] = -math.atan(ground.slope_ahead)
-    new[ROLL_AIM, i] = math.atan(ground.slope_left / slope)
-    new[RIDE_AIM, i] = ground.z + m.front_share * (m.rear_to_joint_m + m.front_to_joint_m) * ground.slope_ahead
+    now.pitch_aim_rad = -math.atan(ground.slope_ahead)
+    now.roll_aim_rad = math.atan(ground.slope_left / slope)
+    now.ride_aim_m = ground.z + m.front_share * (m.rear_to_joint_m + m.front_to_joint_m) * ground.slope_ahead
 
 
 @_compiled
-def _ride(dt: float, m: Machine, ground: Contact, old: Floats, new: Floats, i: int) -> None:
+def _ride(dt: float, m: Record, ground: Contact, old: Record, now: Record) -> None:
     """Let the body bounce, pitch and roll on its tyres; the joint leaves roll to the wheels of one axle."""
-    _aim(m, ground, new, i)
+    _aim(m, ground, now)
     wheelbase = m.rear_to_joint_m + m.front_to_joint_m
     ahead = m.front_share * wheelbase
-    along, aside = 2 * (ahead**2 + (wheelbase - ahead) ** 2), 2 * m.half_track_m**2
-    _spring(dt, m, 4 / m.mass_kg, (RIDE, RIDING, RIDE_AIM), old, new, i)
-    _spring(dt, m, along / m.pitch_inertia_kgm2, (PITCH, PITCHING, PITCH_AIM), old, new, i)
-    _spring(dt, m, aside / m.roll_inertia_kgm2, (ROLL, ROLLING, ROLL_AIM), old, new, i)
+    along, across = 2 * (ahead**2 + (wheelbase - ahead) ** 2), 2 * m.half_track_m**2
+    ride = (old.ride_m, old.ride_mps, old.ride_aim_m)
+    pitch = (old.pitch_rad, old.pitch_radps, old.pitch_aim_rad)
+    roll = (old.roll_rad, old.roll_radps, old.roll_aim_rad)
+    now.ride_m, now.ride_mps = _spring(dt, m, 4 / m.mass_kg, ride, now.ride_aim_m)
+    now.pitch_rad, now.pitch_radps = _spring(dt, m, along / m.pitch_inertia_kgm2, pitch, now.pitch_aim_rad)
+    now.roll_rad, now.roll_radps = _spring(dt, m, across / m.roll_inertia_kgm2, roll, now.roll_aim_rad)
 
 
 @_compiled
-def _spring(dt: float, m: Machine, ease: float, where: tuple[int, int, int], old: Floats, new: Floats, i: int) -> None:
-    """One step of a value on tyres, towards an aim that moves; ease: lever arms of the tyres squared, over inertia."""
-    value, rate, aim = where
-    stiffness, damping = m.tyre_stiffness_npm, m.tyre_damping_nspm
-    aiming = (new[aim, i] - old[aim, i]) / dt
-    push = stiffness * (new[aim, i] - old[value, i]) + damping * (aiming - old[rate, i])
-    new[rate, i] = old[rate, i] + dt * ease * push
-    new[value, i] = old[value, i] + dt * new[rate, i]
+def _spring(dt: float, m: Record, ease: float, old: tuple[float, float, float], aim: float) -> tuple[float, float]:
+    """One step of a value on tyres, towards an aim that moves; returns the value and its rate.
+
+    old: value, rate and aim. ease: lever arms of the tyres squared, over inertia.
+    """
+    value, rate, old_aim = old
+    force = m.tyre_stiffness_npm * (aim - value) + m.tyre_damping_nspm * ((aim - old_aim) / dt - rate)
+    rate += dt * ease * force
+    return value + dt * rate, rate
 
 
 @_compiled
-def _feel(k: Constants, m: Machine, moved: Moved, moves: Moves, old: Floats, new: Floats, i: int) -> None:
-    """What gyroscope and accelerometer at `base_link` feel."""
-    pitch, pitching, roll, rolling = new[PITCH, i], new[PITCHING, i], new[ROLL, i], new[ROLLING, i]
+def _inertial(k: Constants, m: Record, moved: Moved, rates: Rates, before: Record, now: Record) -> None:
+    """Angular rate and specific force at `base_link`, as gyroscope and accelerometer measure them."""
+    pitch, pitching, roll, rolling = now.pitch_rad, now.pitch_radps, now.roll_rad, now.roll_radps
     cp, sp, cr, sr = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
-    about_x = rolling - moved.turning * sp
-    about_y = pitching * cr + moved.turning * sr * cp
     about_z = moved.turning * cr * cp - pitching * sr
-    new[RATES, i], new[RATES + 1, i], new[RATES + 2, i] = about_x, about_y, about_z
+    now.rates_radps[0] = rolling - moved.turning * sp
+    now.rates_radps[1] = pitching * cr + moved.turning * sr * cp
+    now.rates_radps[2] = about_z
     for axis in range(3):
-        new[RATES_DOT + axis, i] = (new[RATES + axis, i] - old[RATES + axis, i]) / k.dt_s
+        now.rates_dot_radps2[axis] = (now.rates_radps[axis] - before.rates_radps[axis]) / k.dt_s
     # The rear axle is raised as the centre is, and by the pitch.
-    raised = moves.lifting + m.front_share * (m.rear_to_joint_m + m.front_to_joint_m) * moves.pitching_dot
-    new[FORCE, i] = new[ACCEL, i] - k.gravity * sp
-    new[FORCE + 1, i] = moved.speed * about_z + k.gravity * cp * sr
-    new[FORCE + 2, i] = raised + k.gravity * cp * cr
+    raised = rates.lifting + m.front_share * (m.rear_to_joint_m + m.front_to_joint_m) * rates.pitching_dot
+    now.force_mps2[0] = now.accel_mps2 - k.gravity * sp
+    now.force_mps2[1] = moved.speed * about_z + k.gravity * cp * sr
+    now.force_mps2[2] = raised + k.gravity * cp * cr

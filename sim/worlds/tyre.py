@@ -14,8 +14,8 @@ import numpy as np
 
 from protocol.arrays import Floats, Ints
 from protocol.units import GRAVITY_MPS2
-from sim.machines.soil import C_RR, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import STANDSTILL_MPS
+from sim.machines.chassis import STANDSTILL_MPS
+from sim.terrain.soil import C_RR, SLIP_STIFFNESS, TRACTION
 
 BRISTLE_DAMPING = 0.3  # of a wheel's share of the machine on its bristles, against critical; nothing at steady slip
 LONGEST_STRETCH = 2.5  # of a bristle, against where its tangent meets the traction limit: then the tread slides
@@ -35,7 +35,7 @@ class Tyres:
 
 @dataclass(frozen=True, slots=True)
 class TyreState:
-    """What wheels remember: spin, and the bristles' stretch ahead and to the left."""
+    """State of wheels: spin, and the bristles' stretch ahead and to the left."""
 
     spin_radps: Floats
     ahead_m: Floats
@@ -43,7 +43,7 @@ class TyreState:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class WheelMotion:
     """How wheels touch the ground: load [N], speed of the hub over it, ahead and to the left, and the soil's zone."""
 
     load_n: Floats
@@ -76,8 +76,8 @@ def radial_load(tyres: Tyres, squash_m: Floats, squash_mps: Floats) -> Floats:
     return np.where(squash_m > 0, np.maximum(load, 0.0), 0.0)
 
 
-def roll(
-    tyres: Tyres, state: TyreState, motion: Motion, drive_nm: Floats, brake_nm: Floats, dt: float
+def turn_wheels(
+    tyres: Tyres, state: TyreState, motion: WheelMotion, drive_nm: Floats, brake_nm: Floats, dt: float
 ) -> tuple[TyreState, TyreForces]:
     """Turn wheels by one step. drive_nm: torque on each wheel; brake_nm: the most its brake can hold.
 
@@ -88,7 +88,7 @@ def roll(
     stiffness = SLIP_STIFFNESS[zone] * load / tyres.relaxation_m
     damping = (2 * BRISTLE_DAMPING) * np.sqrt(stiffness * load / GRAVITY_MPS2)
 
-    # Share of the spring's force that is left near the traction limit, ahead and aside together.
+    # Share of the spring's force that is left near the traction limit, ahead and sideways together.
     pull = stiffness * np.hypot(state.ahead_m, state.left_m) + _NO_FORCE_N
     limit_or_one = np.maximum(limit, 1.0)
     share = limit * np.tanh(pull / limit_or_one) / pull

@@ -13,11 +13,11 @@ from threading import Event
 from protocol.machine.log_folder import open_log, write_log
 from sim.config import SimConfig
 from sim.recorder import record
+from sim.simulator import START_NS
 
 SECONDS = 160
 SPEED = 4.0  # times real time: about 25 samples a second and machine
 IDLE = "idle"
-START_NS = SimConfig().start_ns  # what stamps of recordings begin with
 AGENT = """
 linger_s = 20.0
 [pipeline.localisation]

@@ -207,7 +207,7 @@ S_BEND = (Leg(4, 0.5), Leg(5), Leg(4, 0, 0.25), Leg(5), Leg(4, 0, -0.3), Leg(8))
 @cache
 def simulated(seed: int, seconds: float, **options: Any) -> tuple[SiteConfig, MachineConfig, list[Reading], Table]:
     """Site, machine, readings and true track of one simulated loader."""
-    simulator = Simulator(SimConfig(world="fast", machines=1, seed=seed, seconds=seconds, bundle_ms=1000, **options))
+    simulator = Simulator(SimConfig(world="fast", machines=1, seed=seed, seconds=seconds, **options), bundle_ms=1000)
     readings: list[Reading] = []
     for _ in range(simulator.bundles or 0):
         readings += simulator.advance()["loader-1"]

@@ -9,7 +9,7 @@ from protocol.arrays import Floats
 from sim.config import SimConfig
 from sim.scenario.tables import Scenario
 from sim.simulator import Simulator
-from sim.worlds.world import FleetState, stack
+from sim.state import FleetState, stack
 
 EVERY = 10  # steps between two states that are kept
 
@@ -28,14 +28,12 @@ class Driven:
 def drive(config: SimConfig, seconds: float) -> Driven:
     with closing(Simulator(config)) as simulator:
         states, payloads, off, joints = [], [], [], []
-        rear = np.array([model.rear_to_joint_m for model in simulator.models])
         lines = [np.vstack([leg.points for leg in route.legs]) for route, _, _ in simulator.scenario.journeys()]
         for i in range(round(seconds * 100)):
             state = simulator.step()
             if i % EVERY:
                 continue
-            yaw = np.stack([np.cos(state.yaw_rad), np.sin(state.yaw_rad)], -1)
-            joint = np.stack([state.x_m, state.y_m], -1) + rear[:, None] * yaw
+            joint = simulator._crew.joint_m(state)
             states.append(state)
             payloads.append(simulator._drivers.payload_kg)
             joints.append(joint)

@@ -13,9 +13,9 @@ from sim.machines.model import load_model
 from sim.sensors.datasheets import GpsNoise
 from sim.sensors.presets import Preset, load_preset
 from sim.sensors.rigs import Faults, Rig, machine_config
-from sim.sensors.sensor_group import Block
+from sim.sensors.sensor_group import GroupReadings
 from sim.sensors.sensors import Sensors
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 
 SEED = 7
 LOADER = load_model("wheel_loader")
@@ -30,11 +30,11 @@ def perfect() -> Preset:
     return Preset("perfect", *(_quiet(getattr(DGPS, f.name)) for f in fields(Preset) if f.name != "name"))
 
 
-def _quiet(sheet: object) -> object:
-    assert is_dataclass(sheet)
-    names = [f.name for f in fields(sheet) if f.type == "float" and not f.name.endswith(KEPT)]
-    zeros = replace(sheet, **dict.fromkeys(names, 0.0))
-    return replace(zeros, scale=1.0) if isinstance(sheet, GpsNoise) else zeros
+def _quiet(noise: object) -> object:
+    assert is_dataclass(noise)
+    names = [f.name for f in fields(noise) if f.type == "float" and not f.name.endswith(KEPT)]
+    zeros = replace(noise, **dict.fromkeys(names, 0.0))
+    return replace(zeros, scale=1.0) if isinstance(noise, GpsNoise) else zeros
 
 
 def noisy(kind: str, **values: float) -> Preset:
@@ -53,7 +53,7 @@ def rig(
     payload: bool = False,
     faults: Faults = Faults(),  # noqa: B008 - frozen
 ) -> Rig:
-    """A loader with these sensors. only: leave all other kinds aside."""
+    """A loader with these sensors. only: leave all other kinds out."""
     machine = machine_config("loader", LOADER, preset, tuple(gps), tuple(imu), tuple(attitude), payload=payload)
     kept = tuple(s for s in machine.sensors if only in (None, s.kind))
     return Rig(replace(machine, sensors=kept), LOADER, preset, faults)
@@ -66,16 +66,16 @@ def still(k: int, n: int = 1, **values: object) -> FleetState:
     return FleetState(**{name: np.broadcast_to(given.get(name, 0.0), shape) for name, shape in arrays.items()})
 
 
-def blocks(rigs: Sequence[Rig], states: FleetState, seed: int = SEED) -> dict[str, Block]:
+def groups(rigs: Sequence[Rig], states: FleetState, seed: int = SEED) -> dict[str, GroupReadings]:
     """What sensors say of states at 100 Hz, by kind."""
     steps = np.arange(1, len(states.x_m) + 1)
     span = Sensors(rigs, seed, PROJECTION).sample(steps, steps * 10_000_000, states)
-    return {block.kind: block for block in span.blocks}
+    return {group.kind: group for group in span.groups}
 
 
 def values(one: Rig, kind: str, seconds: float, n: int = 1, **states: object) -> np.ndarray:
     """Readings (r, n, columns) of n machines with one and the same rig."""
-    return blocks([one] * n, still(round(100 * seconds), n, **states))[kind].values
+    return groups([one] * n, still(round(100 * seconds), n, **states))[kind].values
 
 
 def to_map(fixes: np.ndarray) -> np.ndarray:
@@ -92,5 +92,5 @@ def check_deviation(errors: np.ndarray, std: float, draws: int) -> None:
 
 def check_correlation(errors: np.ndarray, lag: int, expected: float, draws: int) -> None:
     """Errors (r, ...) that many rows apart correlate like this. draws: as in check_deviation."""
-    found = (errors[lag:] * errors[:-lag]).mean() / (errors**2).mean()
-    assert found == pytest.approx(expected, abs=5 / math.sqrt(draws)), f"seed {SEED}"
+    correlation = (errors[lag:] * errors[:-lag]).mean() / (errors**2).mean()
+    assert correlation == pytest.approx(expected, abs=5 / math.sqrt(draws)), f"seed {SEED}"

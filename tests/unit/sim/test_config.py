@@ -37,10 +37,6 @@ def test_values_that_the_example_shows_are_those_of_the_scenario(tmp_path: Path)
         ("machines", 1001),
         ("speed", -0.5),
         ("speed", float("nan")),
-        ("bundle_ms", 0),
-        ("bundle_ms", 55),
-        ("start_ns", 0),
-        ("wait_s", -1.0),
     ],
 )
 def test_bad_option_is_refused_by_name(name: str, value: object) -> None:

@@ -17,7 +17,7 @@ from sim.config import SimConfig, resolve
 from sim.publisher import Pace, run
 from sim.simulator import Simulator
 
-CONFIG = SimConfig(site="pit", world="fast", machines=2, seed=3, seconds=0.5, speed=0.0, wait_s=10.0)
+CONFIG = SimConfig(site="pit", world="fast", machines=2, seed=3, seconds=0.5, speed=0.0)
 
 
 class Listener:
@@ -72,11 +72,11 @@ def test_every_reading_arrives_in_counted_bundles(tmp_path: Path) -> None:
     simulator = Simulator(CONFIG)
     spans = [simulator.advance() for _ in range(10)]
     assert report.readings == sum(len(readings) for span in spans for readings in span.values())
-    for machine, heard in bundles.items():
-        assert [b.counter for b in heard] == list(range(1, 12))
-        assert [b.last for b in heard] == [False] * 10 + [True]
-        assert [list(b.readings) for b in heard] == [span[machine] for span in spans] + [[]]
-        assert len(list(open_log(tmp_path / "logs" / machine).readings())) == sum(len(b.readings) for b in heard)
+    for machine, received in bundles.items():
+        assert [b.counter for b in received] == list(range(1, 12))
+        assert [b.last for b in received] == [False] * 10 + [True]
+        assert [list(b.readings) for b in received] == [span[machine] for span in spans] + [[]]
+        assert len(list(open_log(tmp_path / "logs" / machine).readings())) == sum(len(b.readings) for b in received)
         assert (tmp_path / "truth" / "tracks" / f"{machine}.csv").exists()
     assert (tmp_path / "truth" / "truth_map.npz").exists()
 
@@ -88,16 +88,17 @@ def test_stop_ends_the_streams_early_and_cleanly() -> None:
 
     report, bundles = published(replace(CONFIG, seconds=0.0, speed=1.0), stop_at_first)
     assert report.stopped
-    for heard in bundles.values():
-        assert heard[-1].last
-        assert len(heard) == report.bundles + 1
+    for received in bundles.values():
+        assert received[-1].last
+        assert len(received) == report.bundles + 1
 
 
 def test_machine_without_an_agent_is_named() -> None:
     endpoint = free_endpoint()
-    config = replace(CONFIG, wait_s=0.2, names=("red", "blue"))
+    config = replace(CONFIG, names=("red", "blue"))
     with ThreadPoolExecutor(1) as pool:
-        result = pool.submit(run, config, SessionConfig(endpoint, mode="router"), threading.Event())
+        session_config = SessionConfig(endpoint, mode="router")
+        result = pool.submit(run, config, session_config, threading.Event(), wait_s=0.2)
         with listening(SessionConfig(endpoint, wait_s=10.0), "pit", ("red",)), pytest.raises(LinkError, match="blue"):
             result.result(timeout=20)
 
@@ -125,10 +126,10 @@ class FakeStop(threading.Event):
 def test_run_takes_as_long_as_its_speed_says() -> None:
     stop = FakeStop()
     endpoint = free_endpoint()
-    config = replace(CONFIG, seconds=10.0, speed=4.0, wait_s=1e6)
+    config = replace(CONFIG, seconds=10.0, speed=4.0)
     with ThreadPoolExecutor(1) as pool:
         session_config = SessionConfig(endpoint, mode="router")
-        result = pool.submit(run, config, session_config, stop, clock=lambda: stop.now)
+        result = pool.submit(run, config, session_config, stop, clock=lambda: stop.now, wait_s=1e6)
         with listening(SessionConfig(endpoint, wait_s=10.0), "pit", resolve(config).machine_names):
             assert result.result(timeout=30).wall_s == pytest.approx(2.5)
 

@@ -12,16 +12,16 @@ from evaluation.ground.score import Judged, c_rr_bias, figures, gather, judge, p
 from evaluation.ground.truth import Ground, Way, border_distance, lay_ground, read_way
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.ground_classes import UNKNOWN
-from sim.scenario.ground import GroundConfig, Ramp, Zone
+from sim.scenario.ground import GroundConfig, RampConfig, ZoneConfig
 
 SPEED_MPS, EVERY_M = 2.0, 0.5
 BORDER_M = 20.0
 START_NS = 10**15
 LAG = SamplingConfig(lag_s=0.5)
-WET = Zone("wet dirt", ((BORDER_M, 0.0), (60.0, 0.0), (60.0, 20.0), (BORDER_M, 20.0)))
+WET = ZoneConfig("wet dirt", ((BORDER_M, 0.0), (60.0, 0.0), (60.0, 20.0), (BORDER_M, 20.0)))
 
 
-def ground(*zones: Zone, ramp: tuple[Ramp, ...] = (), roughness_m: float = 0.0) -> Ground:
+def ground(*zones: ZoneConfig, ramp: tuple[RampConfig, ...] = (), roughness_m: float = 0.0) -> Ground:
     return lay_ground(GroundConfig(60.0, 20.0, "dry dirt", zone=zones, ramp=ramp, roughness_m=roughness_m), seed=1)
 
 
@@ -93,7 +93,7 @@ def test_a_change_that_is_never_noticed_has_no_lag_and_one_that_is_noticed_befor
 
 @pytest.mark.parametrize(("soil", "width_m", "count"), [("wet dirt", 3.0, 0), ("wet dirt", 5.0, 2), ("gravel", 5.0, 2)])
 def test_only_zones_that_last_have_a_lag(soil, width_m, count):
-    strip = Zone(soil, ((20.0, 0.0), (20.0 + width_m, 0.0), (20.0 + width_m, 20.0), (20.0, 20.0)))
+    strip = ZoneConfig(soil, ((20.0, 0.0), (20.0 + width_m, 0.0), (20.0 + width_m, 20.0), (20.0, 20.0)))
     assert len(crossings(drive_east(), ground(strip), START_NS)) == count
 
 
@@ -146,7 +146,7 @@ def test_gradients_are_compared_along_the_true_heading():
 def test_slopes_have_cells_and_edges_of_their_own():
     """15 degrees from x = 20 to 30; foot and crown are rounded over 2 m, and left out 2 m around."""
     rise = 10 * np.tan(np.radians(15))
-    ramped = ground(ramp=(Ramp((20.0, 0.0), (30.0, 0.0), rise),))
+    ramped = ground(ramp=(RampConfig((20.0, 0.0), (30.0, 0.0), rise),))
     way = drive_east()
     way = replace(way, gradient=ramped.slope(way.place_m))
     seen = ramped.slope(way.place_m)[:, 0]

@@ -94,7 +94,7 @@ def test_a_belief_is_taken_once_per_step_with_nothing_that_came_later():
 
 
 def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipeline():
-    simulator = Simulator(SimConfig(world="fast", machines=1, seed=3, seconds=30.0, bundle_ms=1000))
+    simulator = Simulator(SimConfig(world="fast", machines=1, seed=3, seconds=30.0), bundle_ms=1000)
     readings = [r for _ in range(simulator.bundles or 0) for r in simulator.advance()["loader-1"]]
     site, machine = simulator.site, simulator.machines[0]
     traces, judged = [], []

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.machine.machine_config import MachineConfig, Mount
+from protocol.machine.machine_config import MachineConfig
 from sim.machines.model import BASE, FOLDER, FRONT, PAYLOAD, WHEELS, MachineModel, load_model
-from sim.machines.urdf import Mass, Pose, joined, read_urdf, rigid_urdf, rpy_rad
-from tests.unit.sim.bullet_worlds import LOADER, TRUCK
+from sim.machines.urdf import Mass, Transform, combined, read_urdf, rigid_urdf
+from tests.unit.sim.planes import LOADER, TRUCK
 
 BOTH = pytest.mark.parametrize("model", [LOADER, TRUCK], ids=lambda m: m.name)
 
@@ -51,7 +51,7 @@ def test_payload_moves_the_weight_to_where_it_lies(model: MachineModel) -> None:
 
 
 @BOTH
-def test_sensors_stand_where_the_issue_wants_them(model: MachineModel) -> None:
+def test_antennas_stand_high_and_imus_on_both_frames(model: MachineModel) -> None:
     assert len(model.gps_mounts()) == 3
     assert min(mount.xyz_m[2] for mount in model.gps_mounts()) > 3
     assert [frame for frame, _ in model.imu_mounts()] == [FRONT, FRONT, BASE, BASE]
@@ -82,18 +82,18 @@ def test_broken_urdf_is_refused_with_its_name(tmp_path) -> None:
 
 
 def test_joining_masses_is_steiner_and_does_not_depend_on_the_order() -> None:
-    turned = Pose(np.array([2.0, 0, 0]), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
-    straight = Pose(np.zeros(3), np.eye(3))
+    turned = Transform(np.array([2.0, 0, 0]), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
+    straight = Transform(np.zeros(3), np.eye(3))
     parts = [
         (straight, Mass(3.0, np.array([0.0, 0, 1]), np.diag([1.0, 2, 3]))),
         (turned, Mass(1.0, np.zeros(3), np.diag([4.0, 5, 6]))),
     ]
-    whole = joined(parts)
+    whole = combined(parts)
     np.testing.assert_allclose(whole.centre_m, [0.5, 0, 0.75])
     # reduced mass 0.75 kg at a distance (2, 0, -1)
     expected = np.diag([1.0 + 5, 2 + 4, 3 + 6]) + 0.75 * np.array([[1.0, 0, 2], [0, 5, 0], [2, 0, 4]])
     np.testing.assert_allclose(whole.inertia_kgm2, expected, atol=1e-12)
-    other = joined(parts[::-1])
+    other = combined(parts[::-1])
     np.testing.assert_allclose(other.inertia_kgm2, whole.inertia_kgm2, atol=1e-12)
 
 
@@ -104,18 +104,12 @@ def test_the_few_rigid_bodies_weigh_and_lie_as_the_whole(model: MachineModel, tm
     path.write_text(rigid_urdf(model.robot, (BASE, *turning), 1.1), encoding="utf-8")
     rigid = read_urdf(path)
     parts = [(rigid.place(name, BASE), link.mass) for name, link in rigid.links.items()]
-    whole, full = joined(parts), model.weight(model.payload_kg)
+    whole, full = combined(parts), model.weight(model.payload_kg)
     assert whole.mass_kg == pytest.approx(1.1 * full.mass_kg)
     np.testing.assert_allclose(whole.centre_m, full.centre_m, atol=1e-9)
     np.testing.assert_allclose(whole.inertia_kgm2, 1.1 * full.inertia_kgm2, rtol=1e-9, atol=1e-6)
     boxes = sum(len(link.boxes) for link in rigid.links.values())
     assert boxes == sum(len(link.boxes) for link in model.robot.links.values()) >= 2
-
-
-def test_angles_of_a_rotation_come_back() -> None:
-    rpy_deg = (10.0, -20.0, 130.0)
-    rotation = Mount(rpy_deg=rpy_deg).base_from_sensor()
-    np.testing.assert_allclose(np.degrees(rpy_rad(rotation)), rpy_deg)
 
 
 def test_every_model_file_loads() -> None:

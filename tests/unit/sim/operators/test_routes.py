@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from sim.operators.course import BEYOND_M, lay_course, line_up
-from sim.operators.routes import SPACING_M, Route, speed_limits, tour, way
+from sim.operators.course import BEYOND_M, build_course, spread_starts
+from sim.operators.routes import SPACING_M, Route, open_leg, speed_limits, tour
 
 SQUARE = ((0.0, 0.0), (100.0, 0.0), (100.0, 100.0), (0.0, 100.0))
 HOOK = ((0.0, 0.0), (40.0, 0.0), (50.0, 20.0), (50.0, 60.0))
@@ -21,11 +21,11 @@ def test_tour_is_even_closed_and_rounded() -> None:
 
 
 def test_open_way_keeps_its_ends_and_their_directions() -> None:
-    leg = way(HOOK, 5.0)
+    leg = open_leg(HOOK, 5.0)
     np.testing.assert_allclose(leg.points[[0, -1]], [HOOK[0], HOOK[-1]], atol=1e-3)
     assert leg.headings() == pytest.approx((0.0, math.pi / 2), abs=1e-3)
     assert leg.length_m == pytest.approx((len(leg.points) - 1) * leg.spacing_m)
-    short = way(((5.0, 5.0), (5.0, 9.0)))
+    short = open_leg(((5.0, 5.0), (5.0, 9.0)))
     np.testing.assert_allclose(short.points[:, 0], 5.0, atol=1e-3)
     assert short.length_m == pytest.approx(4.0, abs=1e-3)
 
@@ -44,14 +44,14 @@ def test_drivers_slow_down_for_curves_in_time() -> None:
     assert limit.min() == pytest.approx(math.sqrt(0.9 / np.abs(lap.curvature()).max()))
     braking = (limit**2 - np.roll(limit, -1) ** 2) / (2 * lap.spacing_m)
     assert braking.max() <= 0.5 + 1e-9
-    leg = way(HOOK, 5.0)
+    leg = open_leg(HOOK, 5.0)
     braking = np.diff(speed_limits(leg, 6.0)[::-1] ** 2) / (2 * leg.spacing_m)
     assert braking.max() <= 0.5 + 1e-9
 
 
 def test_course_follows_laps_and_goes_straight_on_beyond_open_ends() -> None:
-    lap, hook = tour(SQUARE), way(HOOK)
-    course = lay_course([lap, Route((hook,))], [4.0, 2.0])
+    lap, hook = tour(SQUARE), open_leg(HOOK)
+    course = build_course([lap, Route((hook,))], [4.0, 2.0])
     legs = np.array([0, 1])
     start, direction = course.at(legs, np.zeros(2))
     np.testing.assert_allclose(start, [lap.legs[0].points[0], hook.points[0]])
@@ -68,11 +68,11 @@ def test_course_follows_laps_and_goes_straight_on_beyond_open_ends() -> None:
 def test_machines_line_up_by_share_and_apart() -> None:
     routes = [tour(SQUARE)] * 4
     length = routes[0].length_m
-    starts = line_up(routes, [0.0, 0.25, 0.25, 1.0])
-    assert [round(s.way_m / length, 2) for s in starts] == [0.0, 0.25, 0.25, 0.0]
-    apart = line_up(routes, [0.0, 0.25, 0.25, 1.0], 12.0)
+    starts = spread_starts(routes, [0.0, 0.25, 0.25, 1.0])
+    assert [round(s.distance_m / length, 2) for s in starts] == [0.0, 0.25, 0.25, 0.0]
+    apart = spread_starts(routes, [0.0, 0.25, 0.25, 1.0], 12.0)
     joints = np.array([s.joint_m for s in apart])
     gaps = np.hypot(*(joints[:, None] - joints[None]).transpose(2, 0, 1)) + 1e3 * np.eye(4)
     assert 12.0 <= gaps.min() < 13.0
     with pytest.raises(ValueError, match="no room for 60 machines 12 m apart"):
-        line_up([routes[0]] * 60, [0.0] * 60, 12.0)
+        spread_starts([routes[0]] * 60, [0.0] * 60, 12.0)

@@ -1,16 +1,17 @@
 import numpy as np
 import pytest
 
-from sim.machines.soil import GRAVEL
+from sim.pictures import render as render_module
 from sim.pictures.render import SKY_RGB, Camera, closeup, overview, render
-from sim.worlds.fast import Fleet
-from tests.unit.sim.bullet_worlds import LOADER, placed, plane
+from sim.terrain.soil import GRAVEL
+from sim.worlds.fast import FastWorld
+from tests.unit.sim.planes import LOADER, placed, plane
 
 
 def test_machine_ground_and_sky_are_in_the_picture() -> None:
     terrain = plane(GRAVEL)
     terrain = type(terrain)(np.zeros((3, 3)), 15.0, terrain.zones, 1000.0)
-    with placed(Fleet, terrain, LOADER, starts=[(15, 15, 0.5)]) as world:
+    with placed(FastWorld, terrain, LOADER, starts=[(15, 15, 0.5)]) as world:
         camera = closeup(world.state, 0, LOADER)
         small = Camera(camera.target_m, camera.distance_m, camera.yaw_deg, 10.0, width=320, height=180)
         (image,) = render(terrain, [LOADER], world.state, [small])
@@ -27,10 +28,11 @@ def test_machine_ground_and_sky_are_in_the_picture() -> None:
 
 @pytest.mark.parametrize(("rows", "columns"), [(4, 5), (3, 9), (7, 2)])
 @pytest.mark.parametrize(("width", "height"), [(160, 90), (90, 120)])
-def test_overview_sees_the_whole_site_and_fills_its_frame(rows, columns, width, height) -> None:
+def test_overview_sees_the_whole_site_and_fills_its_frame(rows, columns, width, height, monkeypatch) -> None:
+    monkeypatch.setattr(render_module, "TEXEL_M", 5.0)
     flat = plane(GRAVEL)
     terrain = type(flat)(np.zeros((rows, columns)), 50.0, flat.zones, 1000.0)
-    with placed(Fleet, terrain, LOADER, starts=[(15, 15, 0.5)]) as world:
+    with placed(FastWorld, terrain, LOADER, starts=[(15, 15, 0.5)]) as world:
         (image,) = render(terrain, [], world.state, [overview(terrain, width, height)])
     ground = (image != SKY_RGB[::-1]).any(axis=-1)
     assert not any(edge.any() for edge in (ground[0], ground[-1], ground[:, 0], ground[:, -1]))

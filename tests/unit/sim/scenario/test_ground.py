@@ -4,17 +4,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.machines.soil import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT
 from sim.scenario.file import load_scenario
-from sim.scenario.ground import GroundConfig, Ramp, Zone, lay, pave
+from sim.scenario.ground import GroundConfig, RampConfig, ZoneConfig, build_terrain, with_zone
+from sim.terrain.soil import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT
+from sim.terrain.terrain import Terrain
 from sim.truth import truth_map
-from sim.worlds.terrain import Terrain
 
 PAPER = load_scenario("paper_site").ground
 FOOT_M, TOP_M = PAPER.ramp[0].foot_m[0], PAPER.ramp[0].top_m[0]
 
 
-SMOOTH = lay(replace(PAPER, roughness_m=0.0), 0)
+SMOOTH = build_terrain(replace(PAPER, roughness_m=0.0), 0)
 
 
 def test_gradient_is_the_slope_of_the_height() -> None:
@@ -70,13 +70,13 @@ def test_foot_and_crown_of_a_ramp_are_rounded() -> None:
 
 
 def test_ramps_may_face_any_way() -> None:
-    ground = GroundConfig(100, 100, "gravel", 0.5, 0.0, ramp=(Ramp((30.0, 30.0), (60.0, 70.0), 5.0),))
-    east, north = lay(ground, 0).gradient(np.array([45.0]), np.array([50.0]))
+    ground = GroundConfig(100, 100, "gravel", 0.5, 0.0, ramp=(RampConfig((30.0, 30.0), (60.0, 70.0), 5.0),))
+    east, north = build_terrain(ground, 0).gradient(np.array([45.0]), np.array([50.0]))
     np.testing.assert_allclose([east[0], north[0]], np.array([0.6, 0.8]) * 5.0 / 50.0, atol=1e-3)
 
 
 def test_roughness_has_the_deviation_asked_for_and_follows_the_seed() -> None:
-    rough = [lay(replace(PAPER, roughness_m=0.02), seed).heights_m - SMOOTH.heights_m for seed in (3, 3, 4)]
+    rough = [build_terrain(replace(PAPER, roughness_m=0.02), seed).heights_m - SMOOTH.heights_m for seed in (3, 3, 4)]
     assert rough[0].std() == pytest.approx(0.02, rel=1e-6)
     assert np.array_equal(rough[0], rough[1])
     assert not np.array_equal(rough[0], rough[2])
@@ -84,9 +84,9 @@ def test_roughness_has_the_deviation_asked_for_and_follows_the_seed() -> None:
 
 def test_later_zones_cover_earlier_ones_and_paving_covers_all() -> None:
     square = ((2.0, 2.0), (8.0, 2.0), (8.0, 8.0), (2.0, 8.0))
-    ground = GroundConfig(10, 10, "sand", 0.5, 0.0, (Zone("gravel", square), Zone("wet dirt", square)))
-    before = lay(ground, 0)
-    after = pave(before, Zone("dry concrete", square))
+    ground = GroundConfig(10, 10, "sand", 0.5, 0.0, (ZoneConfig("gravel", square), ZoneConfig("wet dirt", square)))
+    before = build_terrain(ground, 0)
+    after = with_zone(before, ZoneConfig("dry concrete", square))
     places = np.array([1.0, 5.0]), np.array([1.0, 5.0])
     assert before.zone(*places).tolist() == [SAND, WET_DIRT]
     assert after.zone(*places).tolist() == [SAND, CONCRETE]
@@ -95,10 +95,10 @@ def test_later_zones_cover_earlier_ones_and_paving_covers_all() -> None:
 @pytest.mark.parametrize(
     ("make", "problem"),
     [
-        (lambda: Zone("lava", ((0, 0), (1, 0), (1, 1))), "soil: 'lava' is none of dry concrete, gravel"),
-        (lambda: Zone("sand", ((0, 0), (1, 0))), "outline: 2 corners"),
-        (lambda: Ramp((0, 0), (0, 0), 1.0), "foot_m, top_m"),
-        (lambda: Ramp((0, 0), (5, 0), 6.0), "rise_m: 6 m over 5.0 m is steeper"),
+        (lambda: ZoneConfig("lava", ((0, 0), (1, 0), (1, 1))), "soil: 'lava' is none of dry concrete, gravel"),
+        (lambda: ZoneConfig("sand", ((0, 0), (1, 0))), "outline: 2 corners"),
+        (lambda: RampConfig((0, 0), (0, 0), 1.0), "foot_m, top_m"),
+        (lambda: RampConfig((0, 0), (5, 0), 6.0), "rise_m: 6 m over 5.0 m is steeper"),
         (lambda: GroundConfig(5.0, 100, "sand"), "width_m: 5.0 is not between"),
         (lambda: GroundConfig(100, 100, "sand", math.nan), "cell_m: nan is not between"),
         (lambda: GroundConfig(100, 100, "sand", roughness_m=0.2), "roughness_m"),

@@ -10,7 +10,7 @@ from sim.machines.model import load_model
 from sim.operators.driver import bend
 from sim.operators.routes import tour
 from sim.scenario.file import FOLDER, load_scenario
-from sim.scenario.ground import lay
+from sim.scenario.ground import build_terrain
 
 LIBRARY = sorted(path.stem for path in FOLDER.glob("*.toml"))
 
@@ -38,7 +38,7 @@ def test_routes_are_drivable_and_stay_on_the_site(name: str) -> None:
     ground = scenario.ground
     for rig, (route, _, _) in zip(scenario.rigs(), scenario.journeys(), strict=True):
         for leg in route.legs:
-            assert ground.contains(leg.points, 3.0)
+            assert ground.contains(leg.points, 3.0).all()
             needed = bend(rig.model.rear_to_joint_m, rig.model.front_to_joint_m, np.abs(leg.curvature()).max())
             assert needed < rig.model.max_articulation_rad
 
@@ -49,10 +49,10 @@ def test_paper_tours_cover_all_zones_and_the_slope() -> None:
     legs = [route.legs[0] for route, _, _ in scenario.journeys()]
     assert all(leg.closed for leg in legs)
     points = np.vstack([leg.points for leg in legs])
-    share = np.bincount(lay(scenario.ground, 0).zone(*points.T), minlength=5) / len(points)
+    share = np.bincount(build_terrain(scenario.ground, 0).zone(*points.T), minlength=5) / len(points)
     assert share.min() > 0.05, share
     (ramp,) = scenario.ground.ramp
-    assert np.degrees(np.arctan(ramp.rise_m / np.hypot(*ramp.way_m))) == pytest.approx(15.0, abs=0.01)
+    assert np.degrees(np.arctan(ramp.rise_m / np.hypot(*ramp.run_m))) == pytest.approx(15.0, abs=0.01)
     assert ((points[:, 0] > ramp.foot_m[0]) & (points[:, 0] < ramp.top_m[0])).mean() > 0.05
 
 
@@ -93,7 +93,7 @@ def test_busy_site_has_a_hundred_machines_in_the_fast_world_both_ways_round() ->
 def test_loaders_reverse_over_the_ground_they_came_and_carry_a_load_once_a_tour() -> None:
     scenario = load_scenario("loading")
     (ramp,) = scenario.ground.ramp
-    terrain = lay(scenario.ground, 0)
+    terrain = build_terrain(scenario.ground, 0)
     assert [route.name for route in scenario.route] == ["west", "east", "middle", "yard"]
     for route, _, _ in scenario.journeys():
         changes = [leg.payload_kg for leg in route.legs if leg.payload_kg is not None]

@@ -11,9 +11,9 @@ from tests.unit.sim.sensor_rigs import (
     DGPS,
     PROJECTION,
     SEED,
-    blocks,
     check_correlation,
     check_deviation,
+    groups,
     noisy,
     perfect,
     rig,
@@ -32,34 +32,34 @@ def errors(preset: Preset, seconds: float, n: int = N) -> np.ndarray:
 
 @RATES
 def test_drift_has_its_deviation_and_correlation_time(rate_hz: int) -> None:
-    found = errors(noisy("gps", rate_hz=rate_hz, drift_std_m=1.2, drift_time_s=2.0), 6)
+    drift = errors(noisy("gps", rate_hz=rate_hz, drift_std_m=1.2, drift_time_s=2.0), 6)
     for axis, std in enumerate((1.2, 1.2, 2.0)):
-        check_deviation(found[..., axis], std, N)
-        check_correlation(found[..., axis], 2 * rate_hz, math.exp(-1), N)
+        check_deviation(drift[..., axis], std, N)
+        check_correlation(drift[..., axis], 2 * rate_hz, math.exp(-1), N)
 
 
 @RATES
 def test_white_noise_is_white(rate_hz: int) -> None:
-    found = errors(noisy("gps", rate_hz=rate_hz, white_std_m=0.7), 2)
+    drift = errors(noisy("gps", rate_hz=rate_hz, white_std_m=0.7), 2)
     for axis, std in enumerate((0.7, 0.7, 0.7 * 5 / 3)):
-        check_deviation(found[..., axis], std, found[..., axis].size)
-        check_correlation(found[..., axis], 1, 0.0, found[..., axis].size)
+        check_deviation(drift[..., axis], std, drift[..., axis].size)
+        check_correlation(drift[..., axis], 1, 0.0, drift[..., axis].size)
 
 
 def test_receivers_state_the_variance_of_their_errors() -> None:
     preset = replace(DGPS, gps=replace(DGPS.gps, scale=1.5, outage_s=0.0))
     stated = values(rig(preset, only="gps"), "gps", 0.2)[0, 0, 3:]
     assert stated == pytest.approx([1.5**2 * (1.2**2 + 0.7**2) * k for k in (1, 1, (5 / 3) ** 2)])
-    found = errors(preset, 0.2, 4 * N)
+    drift = errors(preset, 0.2, 4 * N)
     for axis in range(3):
-        check_deviation(found[..., axis], math.sqrt(stated[axis]), 4 * N)
+        check_deviation(drift[..., axis], math.sqrt(stated[axis]), 4 * N)
 
 
 def test_shared_drift_does_not_change_the_variance_over_many_seeds() -> None:
     preset = noisy("gps", drift_std_m=1.2, drift_time_s=5.0, shared=0.8)
     one, seeds = rig(preset, only="gps"), 300
-    found = [to_map(blocks([one], still(20), seed)["gps"].values)[0, 0] - [0.8, 0, 3.35] for seed in range(seeds)]
-    check_deviation(np.array(found)[:, :2], 1.2, 2 * seeds)
+    errors_m = [to_map(groups([one], still(20), seed)["gps"].values)[0, 0] - [0.8, 0, 3.35] for seed in range(seeds)]
+    check_deviation(np.array(errors_m)[:, :2], 1.2, 2 * seeds)
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.5, 1.0])
@@ -67,11 +67,11 @@ def test_shared_drift_correlates_receivers_and_machines(shared: float) -> None:
     preset = noisy("gps", drift_std_m=1.2, drift_time_s=0.2, shared=shared)
     two = [rig(preset, gps=(1, 2), only="gps")] * 2
     seconds = 400  # of which readings 0.2 s apart correlate by 1/e: half of them count
-    fixes = to_map(blocks(two, still(100 * seconds, 2))["gps"].values)
+    fixes = to_map(groups(two, still(100 * seconds, 2))["gps"].values)
     off = fixes - [[0.8, 0, 3.35], [0.3, 0.6, 3.35]] * 2
     for a, b in ((0, 1), (0, 2), (1, 2), (0, 3)):
-        found = (off[:, a] * off[:, b]).mean(axis=0) / (off**2).mean(axis=(0, 1))
-        np.testing.assert_allclose(found, shared, atol=5 / math.sqrt(seconds * 2.5), err_msg=f"{a} {b} seed {SEED}")
+        shares = (off[:, a] * off[:, b]).mean(axis=0) / (off**2).mean(axis=(0, 1))
+        np.testing.assert_allclose(shares, shared, atol=5 / math.sqrt(seconds * 2.5), err_msg=f"{a} {b} seed {SEED}")
 
 
 def test_fully_shared_drift_is_one_whatever_the_rates_and_the_other_machines() -> None:
@@ -81,7 +81,7 @@ def test_fully_shared_drift_is_one_whatever_the_rates_and_the_other_machines() -
     def tracks(rigs: list[Rig]) -> dict[int, np.ndarray]:
         steps = np.arange(1, 201)
         span = Sensors(rigs, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(200, len(rigs)))
-        return {m: to_map(b.values[:, u]) for b in span.blocks for u, m in enumerate(b.machines.tolist())}
+        return {m: to_map(b.values[:, u]) for b in span.groups for u, m in enumerate(b.machines.tolist())}
 
     alone = tracks([rig(preset(5), only="gps")])
     mixed = tracks([rig(preset(5), only="gps"), rig(preset(10), only="gps"), rig(preset(5, 1.0), only="gps")])
@@ -94,17 +94,17 @@ def test_fully_shared_drift_is_one_whatever_the_rates_and_the_other_machines() -
 @pytest.mark.parametrize(("outage_s", "period_s"), [(1.0, 10.0), (3.0, 6.0), (0.0, 10.0)])
 def test_receivers_are_silent_as_often_as_the_preset_says(rate_hz: int, outage_s: float, period_s: float) -> None:
     preset = noisy("gps", rate_hz=rate_hz, outage_s=outage_s, outage_period_s=period_s)
-    heard = blocks([rig(preset, gps=(1, 2, 3), only="gps")] * 50, still(3000, 50))["gps"].heard
-    assert (~heard).mean(axis=0) == pytest.approx(outage_s / period_s, abs=1e-12)  # 30 s are whole periods
+    valid = groups([rig(preset, gps=(1, 2, 3), only="gps")] * 50, still(3000, 50))["gps"].valid
+    assert (~valid).mean(axis=0) == pytest.approx(outage_s / period_s, abs=1e-12)  # 30 s are whole periods
 
 
 def test_outages_start_at_any_time() -> None:
-    heard = blocks([rig(DGPS, only="gps")] * N, still(20, N))["gps"].heard
-    assert (~heard).mean() == pytest.approx(0.1, abs=5 * math.sqrt(0.1 * 0.9 / N)), SEED
+    valid = groups([rig(DGPS, only="gps")] * N, still(20, N))["gps"].valid
+    assert (~valid).mean() == pytest.approx(0.1, abs=5 * math.sqrt(0.1 * 0.9 / N)), SEED
 
 
 def test_receivers_of_one_machine_are_silent_in_turn() -> None:
-    silent = ~blocks([rig(DGPS, gps=(1, 2, 3), only="gps")], still(1000))["gps"].heard
+    silent = ~groups([rig(DGPS, gps=(1, 2, 3), only="gps")], still(1000))["gps"].valid
     assert silent.sum(axis=0).tolist() == [5, 5, 5]
     assert silent.sum(axis=1).max() == 1
 
@@ -123,16 +123,16 @@ def test_silent_fixes_are_no_readings_but_their_errors_run_on() -> None:
 def test_antennas_sit_on_their_lever_arms() -> None:
     place = {"x_m": 100.0, "y_m": 50.0, "z_m": 6.0, "yaw_rad": math.pi / 2}
     one = rig(perfect(), gps=(1, 2), only="gps")
-    fixes = to_map(blocks([one], still(20, 1, **place))["gps"].values)[0]
+    fixes = to_map(groups([one], still(20, 1, **place))["gps"].values)[0]
     np.testing.assert_allclose(fixes, [[100, 50.8, 9.35], [99.4, 50.3, 9.35]], atol=1e-5)
-    nose_up = to_map(blocks([one], still(20, 1, **place, pitch_rad=-0.2))["gps"].values)[0]
+    nose_up = to_map(groups([one], still(20, 1, **place, pitch_rad=-0.2))["gps"].values)[0]
     np.testing.assert_allclose(nose_up[0, 1], 50 + 0.8 * math.cos(0.2) - 3.35 * math.sin(0.2), atol=1e-5)
-    left_up = to_map(blocks([one], still(20, 1, **place, roll_rad=0.2))["gps"].values)[0]
+    left_up = to_map(groups([one], still(20, 1, **place, roll_rad=0.2))["gps"].values)[0]
     np.testing.assert_allclose(left_up[0, 0], 100 + 3.35 * math.sin(0.2), atol=1e-5)
 
 
 def test_many_places_are_projected_like_single_ones() -> None:
     places = np.random.default_rng(SEED).uniform(-500, 500, (3, 4, 5))
-    found = PROJECTION.to_geodetic_many(*places)
+    geodetic = PROJECTION.to_geodetic_many(*places)
     for i, j in np.ndindex(4, 5):
-        assert tuple(found[:, i, j]) == PROJECTION.to_geodetic(*places[:, i, j].tolist())
+        assert tuple(geodetic[:, i, j]) == PROJECTION.to_geodetic(*places[:, i, j].tolist())

@@ -6,15 +6,15 @@ import pytest
 
 from protocol.machine.machine_config import BASE, FRONT, Mount
 from sim.sensors.presets import Preset
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 from tests.unit.sim.sensor_rigs import (
     DGPS,
     GRAVITY_MPS2,
     LOADER,
     SEED,
-    blocks,
     check_correlation,
     check_deviation,
+    groups,
     noisy,
     perfect,
     rig,
@@ -76,10 +76,10 @@ def test_imu_shakes_while_driving(speed: float, share: float) -> None:
 
 def test_imu_reads_in_its_own_axes() -> None:
     turning = {"rates_radps": (0.1, 0.2, 0.3)}
-    found = blocks([rig(perfect(), imu=(1, 2, 3, 4), only="imu")], still(1, 1, **turning))
-    assert found["imu"].names == ("imu-3", "imu-4")  # the last block: those on the front frame stand in another
+    motion = groups([rig(perfect(), imu=(1, 2, 3, 4), only="imu")], still(1, 1, **turning))
+    assert motion["imu"].names == ("imu-3", "imu-4")  # the last group: those on the front frame are in another
     front = [values(rig(perfect(), imu=(i,), only="imu"), "imu", 0.01, **turning)[0, 0] for i in (1, 2)]
-    rear = found["imu"].values[0]
+    rear = motion["imu"].values[0]
     for reading, signs in zip((*front, *rear), ([1, 2, 3], [1, -2, -3], [1, 2, 3], [2, -1, 3]), strict=True):
         np.testing.assert_allclose(reading[:3], [0.1 * s for s in signs], atol=1e-8)
         assert math.copysign(1, reading[5]) == math.copysign(1, signs[2])
@@ -96,7 +96,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 
 def place(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of `base_link` on a made-up way."""
+    """Pose of `base_link` on a made-up track."""
     at = np.array([3 * math.sin(0.5 * t), 2 * t - 0.3 * t**2, 0.2 * math.cos(2 * t)])
     return at, rotation(0.2 * math.sin(2 * t), -0.1 + 0.15 * math.cos(3 * t), 0.4 * t + 0.2 * math.sin(t))
 
@@ -113,7 +113,7 @@ def sensor_place(t: float, number: int) -> tuple[np.ndarray, np.ndarray]:
     return at + turn @ mount.xyz_m, turn @ mount.base_from_sensor()
 
 
-def felt(pose: object, t: float, h: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+def rate_and_force(pose: object, t: float, h: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
     """Angular rate and specific force of a moving frame, by finite differences."""
     (before, r0), (now, r1), (after, r2) = (pose(t + d) for d in (-h, 0.0, h))  # type: ignore[operator]
     spin = r1.T @ (r2 - r0) / (2 * h)
@@ -125,17 +125,17 @@ def felt(pose: object, t: float, h: float = 1e-3) -> tuple[np.ndarray, np.ndarra
 @pytest.mark.parametrize("t", [0.3, 1.1])
 def test_imus_on_both_frames_agree_with_finite_differences(number: int, t: float) -> None:
     h = 1e-3
-    rates, force = felt(place, t)
+    rates, force = rate_and_force(place, t)
     state = {
         "rates_radps": rates,
-        "rates_dot_radps2": (felt(place, t + h)[0] - felt(place, t - h)[0]) / (2 * h),
+        "rates_dot_radps2": (rate_and_force(place, t + h)[0] - rate_and_force(place, t - h)[0]) / (2 * h),
         "force_mps2": force,
         "articulation_rad": angle(t),
         "articulation_radps": (angle(t + h) - angle(t - h)) / (2 * h),
         "articulation_radps2": (angle(t + h) - 2 * angle(t) + angle(t - h)) / h**2,
     }
     reading = values(rig(perfect(), imu=(number,), only="imu"), "imu", 0.01, **state)[0, 0]
-    np.testing.assert_allclose(reading, np.concatenate(felt(lambda s: sensor_place(s, number), t)), atol=1e-4)
+    np.testing.assert_allclose(reading, np.concatenate(rate_and_force(lambda s: sensor_place(s, number), t)), atol=1e-4)
 
 
 # --- attitude --------------------------------------------------------------------------------------------------------
@@ -206,6 +206,6 @@ def test_attitude_states_the_variances_of_its_errors() -> None:
 def test_no_reading_writes_into_the_states() -> None:
     state = still(20, 2)
     copies = FleetState(*(np.array(getattr(state, f.name)) for f in fields(FleetState)))
-    blocks([rig(DGPS, gps=(1, 2), imu=(1, 3), attitude=(1, 3))] * 2, copies, SEED)
+    groups([rig(DGPS, gps=(1, 2), imu=(1, 3), attitude=(1, 3))] * 2, copies, SEED)
     for f in fields(FleetState):
         np.testing.assert_array_equal(getattr(copies, f.name), getattr(state, f.name))

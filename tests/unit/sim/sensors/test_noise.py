@@ -48,7 +48,7 @@ def test_gauss_markov_does_not_depend_on_the_length_of_runs() -> None:
 def test_draws_are_each_sensors_own_row_by_row() -> None:
     rows = 2 * BLOCK_ROWS + 17
     draws = Draws([np.random.default_rng(s) for s in (1, 2)], 3)
-    taken = np.concatenate([draws.take(n) for n in (1, BLOCK_ROWS + 5, rows - BLOCK_ROWS - 6)], axis=1)
+    taken = np.concatenate([draws.next_rows(n) for n in (1, BLOCK_ROWS + 5, rows - BLOCK_ROWS - 6)], axis=1)
     for unit, seed in enumerate((1, 2)):
         alone = np.random.default_rng(seed).standard_normal((rows, 3))
         np.testing.assert_array_equal(taken[:, :, unit], alone.T)

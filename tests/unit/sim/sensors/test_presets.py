@@ -12,7 +12,7 @@ from protocol.machine.machine_config import BASE, FRONT
 from sim.sensors.datasheets import EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise
 from sim.sensors.presets import LIBRARY, load_preset, parse_preset
 from sim.sensors.rigs import Rig, draw_bodies, machine_config
-from sim.sensors.sensors import _BANKS
+from sim.sensors.sensors import _GROUPS
 from tests.unit.sim.sensor_rigs import DGPS, LOADER, noisy, perfect, rig
 
 NAMES = tuple(load_toml(LIBRARY))
@@ -23,7 +23,7 @@ HARDER = ("dgps", "harsh")
 def test_every_preset_of_the_library_loads(name: str) -> None:
     preset = load_preset(name)
     assert preset.name == name
-    assert all(preset.rate_hz(kind) > 0 for kind in ("gps", *_BANKS))
+    assert all(preset.rate_hz(kind) > 0 for kind in ("gps", *_GROUPS))
 
 
 def test_the_library_has_the_presets_that_documents_name() -> None:
@@ -97,12 +97,12 @@ def test_unknown_preset_is_refused_with_the_known_ones() -> None:
 
 
 @pytest.mark.parametrize("kind", [f.name for f in fields(DGPS) if f.name != "name"])
-def test_every_value_of_a_sheet_has_its_range(kind: str) -> None:
-    sheet = getattr(DGPS, kind)
-    for field in fields(sheet):
+def test_every_value_has_its_range(kind: str) -> None:
+    noise = getattr(DGPS, kind)
+    for field in fields(noise):
         for bad in (math.nan, -1, 1e9):
             with pytest.raises(ValueError, match=rf"^{field.name}: .*"):
-                replace(sheet, **{field.name: bad})
+                replace(noise, **{field.name: bad})
 
 
 def test_rates_must_divide_those_of_the_world() -> None:

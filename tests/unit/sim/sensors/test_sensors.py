@@ -9,15 +9,15 @@ import pytest
 from protocol.machine.readings import Reading, columns, parse_reading
 from sim.sensors.rigs import Faults, Rig
 from sim.sensors.sensors import Sensors
-from sim.worlds.world import FleetState
+from sim.state import FleetState
 from tests.unit.sim.sensor_rigs import (
     DGPS,
     PROJECTION,
     SEED,
     WIDTHS,
-    blocks,
     check_correlation,
     check_deviation,
+    groups,
     noisy,
     perfect,
     rig,
@@ -51,8 +51,8 @@ def run(rigs: Sequence[Rig], seed: int = SEED, span: int = 5) -> list[list[Readi
         part = slice(start, min(start + span, STEPS))
         steps = np.arange(part.start, part.stop) + 1
         seen = sensors.sample(steps, steps * 10_000_000, cut(states, part))
-        for i, of_machine in enumerate(readings):
-            of_machine += seen.readings(i)
+        for i, machine_readings in enumerate(readings):
+            machine_readings += seen.readings(i)
     return readings
 
 
@@ -70,9 +70,9 @@ def test_same_seed_repeats_every_reading() -> None:
 @pytest.mark.parametrize("count", [1, 2, 7, 10])
 def test_readings_do_not_depend_on_other_machines(count: int) -> None:
     other = rig(noisy("gps", rate_hz=10, drift_std_m=9.0), gps=(1, 2, 3), imu=(2,))
-    found = run([FULL, *[other, FULL] * 5][:count])
+    readings = run([FULL, *[other, FULL] * 5][:count])
     for i in range(0, min(3, count), 2):
-        assert found[i] == BASE[i]
+        assert readings[i] == BASE[i]
 
 
 def test_readings_do_not_depend_on_other_sensors() -> None:
@@ -126,18 +126,18 @@ def test_readings_are_valid_and_plain() -> None:
         assert parse_reading(reading.kind, reading.sensor, reading.stamp_ns, row) == reading
 
 
-def test_blocks_say_whose_readings_they_hold() -> None:
+def test_groups_say_whose_readings_they_hold() -> None:
     steps = np.arange(1, 21)
     span = Sensors([FULL] * 3, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(20, 3))
-    for block in span.blocks:
-        rows, units = block.stamps_ns.shape
-        assert block.values.shape == (rows, units, len(columns(block.kind)))
-        assert block.heard.shape == (rows, units)
-        assert len(block.names) == len(block.machines) == units
-        for unit, machine in enumerate(block.machines.tolist()):
-            assert set(block.readings(unit)) <= set(span.readings(machine))
-    found = {(m, name) for b in span.blocks for m, name in zip(b.machines.tolist(), b.names, strict=True)}
-    assert found == {(m, sensor.name) for m in range(3) for sensor in FULL.machine.sensors}
+    for group in span.groups:
+        rows, units = group.stamps_ns.shape
+        assert group.values.shape == (rows, units, len(columns(group.kind)))
+        assert group.valid.shape == (rows, units)
+        assert len(group.names) == len(group.machines) == units
+        for unit, machine in enumerate(group.machines.tolist()):
+            assert set(group.readings(unit)) <= set(span.readings(machine))
+    readings = {(m, name) for g in span.groups for m, name in zip(g.machines.tolist(), g.names, strict=True)}
+    assert readings == {(m, sensor.name) for m in range(3) for sensor in FULL.machine.sensors}
 
 
 # --- drive train -----------------------------------------------------------------------------------------------------
@@ -145,9 +145,9 @@ def test_blocks_say_whose_readings_they_hold() -> None:
 
 def test_encoder_counts_whole_ticks_of_both_wheels() -> None:
     turns = np.repeat([[0.0, 0.01], [math.pi, 6.2], [2 * math.pi + 1e-9, 7.0], [-0.01, 0.0]], 5, axis=0)[:, None]
-    ticks = blocks([rig(DGPS, only="encoder")], still(20, 1, wheel_rad=turns))["encoder"].values[:, 0]
+    ticks = groups([rig(DGPS, only="encoder")], still(20, 1, wheel_rad=turns))["encoder"].values[:, 0]
     assert ticks.tolist() == [[0, 0], [50, 98], [100, 111], [-1, 0]]
-    fine = blocks([rig(noisy("encoder", ticks_per_rev=1000), only="encoder")], still(20, 1, wheel_rad=turns))
+    fine = groups([rig(noisy("encoder", ticks_per_rev=1000), only="encoder")], still(20, 1, wheel_rad=turns))
     assert fine["encoder"].values[:, 0].tolist() == [[0, 1], [500, 986], [1000, 1114], [-2, 0]]
 
 
@@ -202,7 +202,7 @@ def test_payload_has_a_scale_error_drawn_once() -> None:
 def test_payload_follows_what_is_carried_and_is_never_negative() -> None:
     carried = np.repeat([0.0, 1500.0, 4000.0], 100)[:, None]
     quiet, loud = (rig(noisy("payload", white_kg=kg), only="payload", payload=True) for kg in (0.0, 50.0))
-    assert blocks([quiet], still(300, payload_kg=carried))["payload"].values.ravel().tolist() == [0.0, 1500.0, 4000.0]
+    assert groups([quiet], still(300, payload_kg=carried))["payload"].values.ravel().tolist() == [0.0, 1500.0, 4000.0]
     empty = values(loud, "payload", 2.0, N)
     assert empty.min() == 0.0
     assert 0.4 < (empty > 0).mean() < 0.6
@@ -217,16 +217,16 @@ def faulty(**faults: object) -> list[Rig]:
 
 
 def test_torque_scale_counts_from_its_time_on() -> None:
-    block = blocks(faulty(torque_scale=1.6), still(400, 2, torque_nm=1e4))["torque"]
+    group = groups(faulty(torque_scale=1.6), still(400, 2, torque_nm=1e4))["torque"]
     early = np.arange(1, 201) * 0.02 < 2.0
-    np.testing.assert_allclose(block.values[early, :, 0], 1e4)
-    np.testing.assert_allclose(block.values[~early, 0, 0], 1.6e4)
-    np.testing.assert_allclose(block.values[~early, 1, 0], 1e4)
+    np.testing.assert_allclose(group.values[early, :, 0], 1e4)
+    np.testing.assert_allclose(group.values[~early, 0, 0], 1.6e4)
+    np.testing.assert_allclose(group.values[~early, 1, 0], 1e4)
 
 
 def test_antennas_are_off_from_their_time_on() -> None:
-    block = blocks(faulty(antenna_off_m=(0.0, 3.0, 0.5)), still(400, 2, yaw_rad=math.pi / 2))["gps"]
-    fixes, early = to_map(block.values), np.arange(1, 21) * 0.2 < 2.0 - 1e-9
+    group = groups(faulty(antenna_off_m=(0.0, 3.0, 0.5)), still(400, 2, yaw_rad=math.pi / 2))["gps"]
+    fixes, early = to_map(group.values), np.arange(1, 21) * 0.2 < 2.0 - 1e-9
     configured = np.array([0.0, 0.8, 3.35])
     np.testing.assert_allclose(fixes[early], np.broadcast_to(configured, fixes[early].shape), atol=1e-5)
     np.testing.assert_allclose(fixes[~early, 0] - configured, [[-3.0, 0.0, 0.5]] * 11, atol=1e-5)
@@ -237,8 +237,8 @@ def test_antennas_are_off_from_their_time_on() -> None:
 def test_clock_is_off_from_its_time_on(clock_off_s: float) -> None:
     rigs, steps = faulty(clock_off_s=clock_off_s), np.arange(1, 401)
     span = Sensors(rigs, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(400, 2))
-    for block in span.blocks:
-        wrong, right = block.stamps_ns.T
+    for group in span.groups:
+        wrong, right = group.stamps_ns.T
         late = right >= 2_000_000_000
         assert (wrong - right).tolist() == (late * round(clock_off_s * 1e9)).tolist()
     assert len(span.readings(0)) == len(span.readings(1))
@@ -248,10 +248,10 @@ def test_clock_is_off_from_its_time_on(clock_off_s: float) -> None:
 
 def test_faults_change_nothing_before_their_time() -> None:
     faults = Faults(from_s=STEPS / 100 - 1, torque_scale=2.0, antenna_off_m=(1.0, 1.0, 1.0), clock_off_s=5.0)
-    found = run([replace(FULL, faults=faults)])[0]
+    readings = run([replace(FULL, faults=faults)])[0]
     before = [reading for reading in BASE[0] if reading.stamp_ns < (STEPS - 100) * 10_000_000]
-    assert found[: len(before)] == before
-    assert found[len(before)] not in BASE[0]
+    assert readings[: len(before)] == before
+    assert readings[len(before)] not in BASE[0]
 
 
 @pytest.mark.parametrize(

@@ -10,30 +10,30 @@ import pytest
 
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
-from sim.machines.soil import SAND, SLIP_STIFFNESS, TRACTION
-from sim.machines.vehicle import Bodies
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.soil import SAND, SLIP_STIFFNESS, TRACTION
 from sim.worlds.bullet import BulletWorld
-from sim.worlds.world import STEP_S, FleetState, stack
-from tests.unit.sim.bullet_worlds import BOTH, LOADER, TRUCK, hold_speed, idle, placed, plane
+from tests.unit.sim.planes import BOTH, LOADER, TRUCK, Lane, hold_speed, idle, lanes, placed, plane
 
 
-@pytest.mark.parametrize("zone", [0, 3, SAND])
-def test_wheels_slip_as_the_soil_table_says(zone: int) -> None:
-    with placed(BulletWorld, plane(zone), LOADER) as world:
+def test_wheels_slip_as_the_soil_table_says() -> None:
+    zones = [0, 3, SAND]
+    with lanes(BulletWorld, [Lane(zone=zone) for zone in zones]) as world:
         last = hold_speed(world, 2.0, 7.0)[-1]
-    use = last.torque_nm[0] / LOADER.wheel_radius_m / last.load_n[0]
-    slip = np.arctanh(use / TRACTION[zone]) * TRACTION[zone] / SLIP_STIFFNESS[zone]
-    measured = 1 - last.speed_mps / (last.wheel_radps[0] * LOADER.wheel_radius_m)
-    np.testing.assert_allclose(measured, slip, rtol=0.02)
+    use = last.torque_nm / LOADER.wheel_radius_m / last.load_n
+    slip = np.arctanh(use / TRACTION[zones]) * TRACTION[zones] / SLIP_STIFFNESS[zones]
+    measured = 1 - last.speed_mps[:, None] / (last.wheel_radps * LOADER.wheel_radius_m)
+    np.testing.assert_allclose(measured.T, [slip, slip], rtol=0.02)
 
 
 def test_head_on_collision_stays_finite_and_nobody_passes_through() -> None:
     with placed(BulletWorld, plane(1), LOADER, LOADER, starts=[(490, 500, 0), (508, 500.3, math.pi)]) as world:
         states = []
         for _ in range(800):
-            push = np.clip(50e3 * (4.0 - world.state.speed_mps), -80e3, 100e3)
-            states.append(world.advance(np.zeros(2), push, np.zeros(2)))
+            drive = np.clip(50e3 * (4.0 - world.state.speed_mps), -80e3, 100e3)
+            states.append(world.advance(np.zeros(2), drive, np.zeros(2)))
     run = stack(states)
     assert all(np.isfinite(getattr(run, f.name)).all() for f in fields(FleetState))
     gap = np.hypot(run.x_m[:, 1] - run.x_m[:, 0], run.y_m[:, 1] - run.y_m[:, 0])
@@ -43,18 +43,19 @@ def test_head_on_collision_stays_finite_and_nobody_passes_through() -> None:
     assert abs(run.roll_rad).max() < 0.2
 
 
-@BOTH
-def test_wheels_carry_what_the_machine_carries(model: MachineModel) -> None:
-    grade = 0.1
-    with placed(BulletWorld, plane(2, grade), model) as world:
-        for payload in (0.0, model.payload_kg, 0.0):
-            world.set_payload(0, payload)
-            last = idle(world, 4.0, model.max_brake_n)
-            assert last.mass_kg[0] == model.mass_kg + payload
-            assert last.load_n[0] == pytest.approx(last.mass_kg[0] * GRAVITY_MPS2 / math.hypot(1, grade), rel=1e-3)
-            loads = world.wheel_loads_n[0]
-            shift = grade * model.centre_height_m(payload) / model.wheelbase_m
-            assert loads[:2].sum() / loads.sum() == pytest.approx(model.front_share(payload) - shift, abs=0.004)
+def test_wheels_carry_what_the_machine_carries() -> None:
+    grade, models = 0.1, (LOADER, TRUCK)
+    with lanes(BulletWorld, [Lane(model, 2) for model in models], grade) as world:
+        for share in (0.0, 1.0, 0.0):
+            for machine, model in enumerate(models):
+                world.set_payload(machine, share * model.payload_kg)
+            idle(world, 4.0, [model.max_brake_n for model in models])
+            for loads, model in zip(world._wheel_load_n, models, strict=True):
+                payload = share * model.payload_kg
+                weight_n = (model.mass_kg + payload) * GRAVITY_MPS2
+                assert loads.sum() == pytest.approx(weight_n / math.hypot(1, grade), rel=1e-3)
+                shift = grade * model.centre_height_m(payload) / model.wheelbase_m
+                assert loads[:2].sum() / loads.sum() == pytest.approx(model.front_share(payload) - shift, abs=0.004)
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def front_link(world: BulletWorld) -> Front:
 def test_front_frame_moves_as_the_rear_frame_and_the_joint_imply(model: MachineModel, ahead: int) -> None:
     zero = np.zeros(1)
     with placed(BulletWorld, plane(1, 0.04), model) as world:
-        for i in range(ahead):  # at the end it steers, on the way and back again
+        for i in range(ahead):  # at the end it steers, to the left and back again
             old = front_link(world)
             steer = np.array([0.4 * (100 < i < 350)])
             state = world.advance(steer, np.array([0.1 * model.mass_kg * GRAVITY_MPS2]), zero)
@@ -91,12 +92,12 @@ def test_front_frame_moves_as_the_rear_frame_and_the_joint_imply(model: MachineM
     arm = np.array([model.rear_to_joint_m, 0, model.wheel_radius_m])
     force = front_from_base @ (state.force_mps2[0] + np.cross(rates_dot, arm) + np.cross(rates, np.cross(rates, arm)))
 
-    felt = new.rotation.T @ ((new.velocity - old.velocity) / STEP_S + [0, 0, GRAVITY_MPS2])
+    measured = new.rotation.T @ ((new.velocity - old.velocity) / STEP_S + [0, 0, GRAVITY_MPS2])
     turn, old_turn = new.rotation.T @ new.rate, old.rotation.T @ old.rate
     assert abs(state.articulation_radps[0]) > 0.1
     held = slice(0 if model.rolls_with_front else 1, 3)  # the truck's front frame rolls by itself
     np.testing.assert_allclose(turn[held], own_rates[held], atol=0.002)
-    np.testing.assert_allclose(felt, force, atol=0.05)
+    np.testing.assert_allclose(measured, force, atol=0.05)
     dot = front_from_base @ (
         rates_dot + state.articulation_radps2[0] * up + np.cross(rates, state.articulation_radps[0] * up)
     )
@@ -104,7 +105,7 @@ def test_front_frame_moves_as_the_rear_frame_and_the_joint_imply(model: MachineM
 
 
 def digest() -> str:
-    """Fingerprint of a short drive of two machines, one of which is loaded on the way."""
+    """Fingerprint of a short drive of two machines, one of which is loaded halfway."""
     with placed(BulletWorld, plane(2, 0.05), LOADER, TRUCK, starts=[(500, 500, 0.3), (500, 520, 1)]) as world:
         states = []
         for i in range(200):

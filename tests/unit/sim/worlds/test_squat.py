@@ -1,17 +1,16 @@
-"""What agents know of tyres and masses tells how far a machine's nose is up against the ground."""
+"""Squat follows from what agents know of tyres and masses: the nose-up angle of a machine against the ground."""
 
 import math
 
-import numpy as np
 import pytest
 
 from protocol.machine.machine_config import MachineConfig
 from protocol.units import GRAVITY_MPS2
-from sim.machines.model import MachineModel
 from sim.sensors.presets import load_preset
 from sim.sensors.rigs import machine_config
+from sim.state import stack
 from sim.worlds.bullet import BulletWorld
-from tests.unit.sim.bullet_worlds import BOTH, hold_speed, idle, placed, plane
+from tests.unit.sim.planes import LOADER, TRUCK, Lane, hold_speed, idle, lanes, of_each
 
 
 def load_difference_n(machine: MachineConfig, payload_kg: float, force_x_mps2: float, force_z_mps2: float) -> float:
@@ -30,18 +29,21 @@ def nose_up_rad(machine: MachineConfig, payload_kg: float, force_x_mps2: float, 
     return more_n / (machine.axle_stiffness_npm * machine.wheelbase_m)
 
 
-@BOTH
-@pytest.mark.parametrize("slope_deg", [0, 15, -15])
-@pytest.mark.parametrize("full", [False, True], ids=["empty", "full"])
-def test_squat_at_steady_speed_is_that_of_the_axles_loads(model: MachineModel, slope_deg: int, *, full: bool) -> None:
-    machine = machine_config("a", model, load_preset("dgps"), (), (), ())
-    slope, payload_kg = math.radians(slope_deg), model.payload_kg * full
-    with placed(BulletWorld, plane(1, math.tan(slope)), model) as world:
-        world.set_payload(0, payload_kg)
-        idle(world, 3.0, model.max_brake_n)
-        last = hold_speed(world, 2.0, 8.0)[-100:]
-    found = -np.mean([state.pitch_rad[0] for state in last]) - slope
-    force_x = GRAVITY_MPS2 * math.sin(slope) + float(np.mean([state.accel_mps2[0] for state in last]))
-    assert found == pytest.approx(nose_up_rad(machine, payload_kg, force_x, GRAVITY_MPS2 * math.cos(slope)), abs=0.0005)
-    if full or slope_deg:
-        assert abs(found) > 0.002  # else there would be nothing to tell
+@pytest.mark.parametrize("slope_deg", [0, 15])
+def test_squat_at_steady_speed_is_that_of_the_axles_loads(slope_deg: int) -> None:
+    cases = [Lane(model, 1, yaw) for model in (LOADER, TRUCK) for yaw in (0.0, 0.0, math.pi, math.pi)]
+    payload_kg = of_each(cases, "payload_kg") * ([0, 1] * 4)  # empty and full
+    with lanes(BulletWorld, cases, math.tan(math.radians(slope_deg))) as world:
+        for i, payload in enumerate(payload_kg.tolist()):
+            world.set_payload(i, payload)
+        idle(world, 3.0, of_each(cases, "max_brake_n"))
+        last = stack(hold_speed(world, 2.0, 8.0)[-100:])
+    for i, case in enumerate(cases):
+        slope = math.radians(slope_deg) * math.cos(case.yaw)
+        nose_up = -last.pitch_rad[:, i].mean() - slope
+        force_x = GRAVITY_MPS2 * math.sin(slope) + float(last.accel_mps2[:, i].mean())
+        machine = machine_config("a", case.model, load_preset("dgps"), (), (), ())
+        expected = nose_up_rad(machine, payload_kg[i], force_x, GRAVITY_MPS2 * math.cos(slope))
+        assert nose_up == pytest.approx(expected, abs=0.0005)
+        if payload_kg[i] or slope_deg:
+            assert abs(nose_up) > 0.002  # else there would be nothing to see

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.machines.soil import C_RR, SLIP_STIFFNESS, SOILS, TRACTION
-from sim.worlds.tyre import Motion, TyreForces, Tyres, TyreState, at_rest, radial_load, roll
+from sim.terrain.soil import C_RR, SLIP_STIFFNESS, SOILS, TRACTION
+from sim.worlds.tyre import TyreForces, Tyres, TyreState, WheelMotion, at_rest, radial_load, turn_wheels
 
 STEP_S = 0.01
 RADIUS_M, LOAD_N = 0.75, 43e3
@@ -14,8 +14,8 @@ def tyres(n: int) -> Tyres:
     return Tyres(*(np.full(n, v) for v in (RADIUS_M, 9e5, 4e4, 0.4, 172.3)))
 
 
-def motion(speed: float, side: float, zone: int, load: float = LOAD_N) -> Motion:
-    return Motion(np.array([load]), np.array([speed]), np.array([side]), np.array([zone]))
+def motion(speed: float, side: float, zone: int, load: float = LOAD_N) -> WheelMotion:
+    return WheelMotion(np.array([load]), np.array([speed]), np.array([side]), np.array([zone]))
 
 
 def rolling(speed: float) -> TyreState:
@@ -23,10 +23,10 @@ def rolling(speed: float) -> TyreState:
 
 
 def settle(
-    state: TyreState, ground: Motion, drive_nm: float = 0.0, brake_nm: float = 0.0, steps: int = 600
+    state: TyreState, ground: WheelMotion, drive_nm: float = 0.0, brake_nm: float = 0.0, steps: int = 600
 ) -> tuple[TyreState, TyreForces]:
     for _ in range(steps):
-        state, forces = roll(tyres(1), state, ground, np.array([drive_nm]), np.array([brake_nm]), STEP_S)
+        state, forces = turn_wheels(tyres(1), state, ground, np.array([drive_nm]), np.array([brake_nm]), STEP_S)
     return state, forces
 
 
@@ -55,8 +55,8 @@ def test_forces_never_leave_the_friction_circle() -> None:
     for _ in range(200):
         zone = rng.integers(0, 5, n)
         load = rng.uniform(0, 2e5, n) * (rng.random(n) > 0.1)
-        ground = Motion(load, rng.normal(0, 4, n), rng.normal(0, 2, n), zone)
-        state, forces = roll(tyres(n), state, ground, rng.normal(0, 5e4, n), rng.exponential(2e4, n), STEP_S)
+        ground = WheelMotion(load, rng.normal(0, 4, n), rng.normal(0, 2, n), zone)
+        state, forces = turn_wheels(tyres(n), state, ground, rng.normal(0, 5e4, n), rng.exponential(2e4, n), STEP_S)
         assert (np.hypot(forces.traction_n, forces.left_n) <= TRACTION[zone] * load * (1 + 1e-9)).all()
         assert np.isfinite(state.spin_radps).all()
 

@@ -2,26 +2,44 @@
 
 import inspect
 import math
+from collections.abc import Sequence
 from dataclasses import fields
+from itertools import product
 
 import numpy as np
 import pytest
 
 from protocol.units import GRAVITY_MPS2
+from sim.machines.chassis import TRACTION_USE, Bodies
 from sim.machines.model import MachineModel
-from sim.machines.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
-from sim.machines.vehicle import TRACTION_USE, Bodies
+from sim.state import STEP_S, FleetState, stack
+from sim.terrain.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
 from sim.worlds.bullet import BulletWorld
-from sim.worlds.fast import Fleet
-from sim.worlds.world import STEP_S, FleetState, World, stack
-from tests.unit.sim.bullet_worlds import BOTH, EACH, GRADE_15, LOADER, TRUCK, hold_speed, idle, placed, plane
+from sim.worlds.fast import FastWorld
+from sim.worlds.world import World
+from tests.unit.sim.planes import (
+    BOTH,
+    EACH,
+    GRADE_15,
+    LOADER,
+    TRUCK,
+    Lane,
+    hold_speed,
+    idle,
+    lanes,
+    of_each,
+    placed,
+    plane,
+)
+
+MODELS = (LOADER, TRUCK)
 
 
 @EACH
 def test_worlds_offer_what_the_seam_asks_for(kind: type) -> None:
     for name in ("advance", "set_payload", "set_terrain", "close"):
         assert inspect.signature(getattr(kind, name)) == inspect.signature(getattr(World, name)), name
-    assert inspect.signature(kind) == inspect.signature(Fleet)
+    assert inspect.signature(kind) == inspect.signature(FastWorld)
 
 
 @EACH
@@ -61,163 +79,165 @@ def test_machines_start_at_rest_where_they_are_put(kind: type, model: MachineMod
     assert rest.load_n[0] == pytest.approx(model.mass_kg * GRAVITY_MPS2, rel=1e-3)
 
 
+def load_of(lanes: Sequence[Lane], slope_rad: float = 0.0) -> np.ndarray:
+    return of_each(lanes, "mass_kg") * GRAVITY_MPS2 * math.cos(slope_rad)
+
+
+def soil_of(lanes: Sequence[Lane]) -> np.ndarray:
+    """Rolling resistance under each machine."""
+    return np.array([SOILS[lane.zone].c_rr for lane in lanes])
+
+
+def traction_of(lanes: Sequence[Lane], state: FleetState) -> np.ndarray:
+    return state.torque_nm / of_each(lanes, "wheel_radius_m") / state.load_n
+
+
 @EACH
-@pytest.mark.parametrize("zone", range(5), ids=[s.name for s in SOILS])
-def test_steady_traction_on_the_level_is_the_rolling_resistance(kind: type, zone: int) -> None:
-    with placed(kind, plane(zone), LOADER) as world:
+def test_steady_traction_on_the_level_is_the_rolling_resistance(kind: type) -> None:
+    soils = [Lane(zone=zone) for zone in range(5)]
+    with lanes(kind, soils) as world:
         last = hold_speed(world, 2.0, 7.0)[-1]
-    ratio = last.torque_nm / LOADER.wheel_radius_m / last.load_n
-    assert ratio[0] == pytest.approx(SOILS[zone].c_rr, rel=0.01)
-    assert last.c_rr[0] == pytest.approx(SOILS[zone].c_rr)
-    assert last.load_n[0] == pytest.approx(17_500 * GRAVITY_MPS2, rel=1e-3)
+    np.testing.assert_allclose(traction_of(soils, last), soil_of(soils), rtol=0.01)
+    np.testing.assert_allclose(last.c_rr, soil_of(soils))
+    np.testing.assert_allclose(last.load_n, load_of(soils), rtol=1e-3)
 
 
 @EACH
-@BOTH
-@pytest.mark.parametrize("zone", [CONCRETE, WET_DIRT])
-@pytest.mark.parametrize("uphill", [1, -1])
-def test_steady_traction_on_15_degrees_adds_the_slope(kind: type, model: MachineModel, zone: int, uphill: int) -> None:
-    with placed(kind, plane(zone, uphill * GRADE_15), model) as world:
+def test_steady_traction_on_15_degrees_adds_the_slope(kind: type) -> None:
+    cases = [Lane(*case) for case in product(MODELS, (CONCRETE, WET_DIRT), (0.0, math.pi))]
+    uphill = np.array([1 if lane.yaw == 0 else -1 for lane in cases])
+    with lanes(kind, cases, GRADE_15) as world:
         last = hold_speed(world, 2.0, 10.0)[-1]
-    ratio = last.torque_nm / model.wheel_radius_m / last.load_n
-    assert ratio[0] == pytest.approx(SOILS[zone].c_rr + uphill * GRADE_15, abs=0.002)
-    assert last.load_n[0] == pytest.approx(model.mass_kg * GRAVITY_MPS2 * math.cos(math.radians(15)), rel=1e-3)
-    assert math.degrees(last.pitch_rad[0]) == pytest.approx(-15 * uphill, abs=0.4)  # tyres give way by some mm
+    np.testing.assert_allclose(traction_of(cases, last), soil_of(cases) + uphill * GRADE_15, atol=0.002)
+    np.testing.assert_allclose(last.load_n, load_of(cases, math.radians(15)), rtol=1e-3)
+    np.testing.assert_allclose(np.degrees(last.pitch_rad), -15 * uphill, atol=0.4)  # tyres give way by some mm
 
 
 @EACH
-@BOTH
-@pytest.mark.parametrize("zone", [1, SAND])
-def test_machine_rolls_out_by_its_resistance_and_stays(kind: type, model: MachineModel, zone: int) -> None:
-    turning = 1 + 4 * model.wheel_inertia_kgm2 / model.wheel_radius_m**2 / model.mass_kg
-    with placed(kind, plane(zone), model) as world:
+def test_machine_rolls_out_by_its_resistance_and_stays(kind: type) -> None:
+    cases = [Lane(*case) for case in product(MODELS, (1, SAND))]
+    radius, mass, wheel = (of_each(cases, name) for name in ("wheel_radius_m", "mass_kg", "wheel_inertia_kgm2"))
+    with lanes(kind, cases) as world:
         hold_speed(world, 5.0, 6.0)
-        start = idle(world, 1.2).speed_mps[0]  # until the engine has let go
-        slower = start - idle(world, 0.5).speed_mps[0]
-        assert slower / 0.5 == pytest.approx(SOILS[zone].c_rr * GRAVITY_MPS2 / turning, rel=0.01)
-        if zone == SAND:
-            end = idle(world, 4.0)
-            assert abs(end.speed_mps[0]) < 1e-3
-            np.testing.assert_allclose(end.force_mps2[0], [0, 0, GRAVITY_MPS2], atol=0.01)
+        start = idle(world, 1.2).speed_mps  # until the engine has let go
+        slower = start - idle(world, 0.5).speed_mps
+        end = idle(world, 4.0)
+    expected = soil_of(cases) * GRAVITY_MPS2 / (1 + 4 * wheel / radius**2 / mass)
+    np.testing.assert_allclose(slower / 0.5, expected, rtol=0.01)
+    stands = soil_of(cases) > 0.2
+    assert stands.any()
+    assert abs(end.speed_mps[stands]).max() < 1e-3
+    np.testing.assert_allclose(end.force_mps2[stands] - [0, 0, GRAVITY_MPS2], 0, atol=0.01)
 
 
+@pytest.mark.slow
 @EACH
-@BOTH
-@pytest.mark.parametrize("yaw", [0.0, 0.7, math.pi / 2])
-@pytest.mark.parametrize("zone", [CONCRETE, SAND])
-def test_braked_machine_holds_on_15_degrees(kind: type, model: MachineModel, yaw: float, zone: int) -> None:
-    with placed(kind, plane(zone, GRADE_15), model, starts=[(500, 500, yaw)]) as world:
+def test_braked_machine_holds_on_15_degrees(kind: type) -> None:
+    cases = [Lane(*case) for case in product(MODELS, (CONCRETE, SAND), (0.0, 0.7, math.pi / 2))]
+    with lanes(kind, cases, GRADE_15) as world:
         start = world.state
-        end = idle(world, 30.0, model.max_brake_n)
-    creep = math.hypot(end.x_m[0] - start.x_m[0], end.y_m[0] - start.y_m[0])
-    assert creep < 0.01
+        end = idle(world, 30.0, of_each(cases, "max_brake_n"))
+    assert np.hypot(end.x_m - start.x_m, end.y_m - start.y_m).max() < 0.01
     assert (end.wheel_radps == 0).all()
 
 
 @EACH
-@BOTH
-@pytest.mark.parametrize("direction", [1, -1])
-def test_brakes_stop_a_machine_and_never_push_it_back(kind: type, model: MachineModel, direction: int) -> None:
-    with placed(kind, plane(CONCRETE), model) as world:
+def test_brakes_stop_a_machine_and_never_drive_it_back(kind: type) -> None:
+    cases = [Lane(model) for model in (LOADER, TRUCK, LOADER, TRUCK)]
+    direction = np.array([1, 1, -1, -1])
+    zero = np.zeros(4)
+    with lanes(kind, cases) as world:
         start = hold_speed(world, 3.0 * direction, 5.0)[-1]
-        brake = np.array([0.2 * model.mass_kg * GRAVITY_MPS2])
-        states = stack([world.advance(np.zeros(1), np.zeros(1), brake) for _ in range(500)])
-    along = direction * states.speed_mps[:, 0]
-    slowing = (0.2 + SOILS[CONCRETE].c_rr) * GRAVITY_MPS2 / model.rotating_mass_factor
-    assert (along[20] - along[90]) / 0.7 == pytest.approx(slowing, rel=0.02)
-    assert start.speed_mps[0] * direction > 2.5
+        states = stack([world.advance(zero, zero, 0.2 * load_of(cases)) for _ in range(500)])
+    along = direction * states.speed_mps
+    slowing = (0.2 + SOILS[CONCRETE].c_rr) * GRAVITY_MPS2 / of_each(cases, "rotating_mass_factor")
+    np.testing.assert_allclose((along[20] - along[90]) / 0.7, slowing, rtol=0.02)
+    assert (start.speed_mps * direction).min() > 2.5
     assert along.min() > -0.08  # rocks on its tyres
-    assert abs(along[-1]) < 1e-3
+    assert abs(along[-1]).max() < 1e-3
     np.testing.assert_allclose(states.wheel_radps[-1], 0, atol=1e-9)
-    assert (direction * np.diff(states.wheel_rad[:, 0], axis=0)).min() > -1e-9
+    assert (direction[:, None] * np.diff(states.wheel_rad, axis=0)).min() > -1e-9
 
 
 @EACH
-@BOTH
-def test_reversing_mirrors_driving(kind: type, model: MachineModel) -> None:
-    with placed(kind, plane(WET_DIRT), model) as world:
+def test_reversing_mirrors_driving(kind: type) -> None:
+    cases = [Lane(model, WET_DIRT) for model in MODELS]
+    with lanes(kind, cases) as world:
         last = hold_speed(world, -2.0, 12.0)[-1]
-        first = world.state
-        turned = stack([first, *hold_speed(world, -2.0, 2.0, 0.3)])
-    assert last.speed_mps[0] == pytest.approx(-2.0, abs=1e-3)
-    assert last.x_m[0] < 485
-    assert last.torque_nm[0] / model.wheel_radius_m / last.load_n[0] == pytest.approx(-SOILS[WET_DIRT].c_rr, rel=0.01)
+        turned = hold_speed(world, -2.0, 2.0, 0.3)[-1]
+    np.testing.assert_allclose(last.speed_mps, -2.0, atol=1e-3)
+    assert last.x_m.max() < 485
     use = SOILS[WET_DIRT].c_rr
+    np.testing.assert_allclose(traction_of(cases, last), -use, rtol=0.01)
     slip = np.arctanh(use / TRACTION[WET_DIRT]) * TRACTION[WET_DIRT] / SLIP_STIFFNESS[WET_DIRT]
-    np.testing.assert_allclose(last.wheel_radps[0] * model.wheel_radius_m, -2.0 / (1 - slip), rtol=0.005)
+    wheel_mps = last.wheel_radps * of_each(cases, "wheel_radius_m")[:, None]
+    np.testing.assert_allclose(wheel_mps, -2.0 / (1 - slip), rtol=0.005)
     assert (last.wheel_rad < -10).all()
-    assert turned.rates_radps[-1, 0, 2] < -0.05  # left articulation backwards turns it to the right
+    assert turned.rates_radps[:, 2].max() < -0.05  # left articulation backwards turns it to the right
 
 
 @EACH
-@BOTH
-@pytest.mark.parametrize("steer", [0.2, -0.6])
-def test_turning_radius_is_that_of_the_articulation(kind: type, model: MachineModel, steer: float) -> None:
-    with placed(kind, plane(0), model) as world:
-        states = stack(hold_speed(world, 2.0, 16.0, steer)[700:])
-    x, y = states.x_m[:, 0], states.y_m[:, 0]
-    # algebraic circle fit: x^2 + y^2 = 2 a x + 2 b y + c
-    a, b, c = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], 1), x**2 + y**2, rcond=None)[0]
-    kinematic = (model.front_to_joint_m + model.rear_to_joint_m * math.cos(steer)) / math.sin(abs(steer))
-    assert math.sqrt(c + a * a + b * b) == pytest.approx(kinematic, rel=0.02)
-    rates, speed = states.rates_radps[-1, 0], states.speed_mps[-1, 0]
-    leaning = GRAVITY_MPS2 * math.sin(states.roll_rad[-1, 0])
-    assert states.force_mps2[-1, 0, 1] - leaning == pytest.approx(speed * rates[2], rel=0.02)
-    assert states.articulation_rad[-1, 0] == pytest.approx(steer, abs=1e-3)
+def test_turning_radius_is_that_of_the_articulation(kind: type) -> None:
+    cases = [Lane(model) for model in (LOADER, TRUCK, LOADER, TRUCK)]
+    steer = np.array([0.2, 0.2, -0.6, -0.6])
+    with lanes(kind, cases) as world:
+        states = stack(hold_speed(world, 2.0, 12.0, steer)[600:])
+    rear, front = of_each(cases, "rear_to_joint_m"), of_each(cases, "front_to_joint_m")
+    kinematic = (front + rear * np.cos(steer)) / np.sin(abs(steer))
+    for i, radius in enumerate(kinematic):
+        x, y = states.x_m[:, i], states.y_m[:, i]
+        # algebraic circle fit: x^2 + y^2 = 2 a x + 2 b y + c
+        a, b, c = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], 1), x**2 + y**2, rcond=None)[0]
+        assert math.sqrt(c + a * a + b * b) == pytest.approx(radius, rel=0.02)
+    leaning = GRAVITY_MPS2 * np.sin(states.roll_rad[-1])
+    sideways = states.speed_mps[-1] * states.rates_radps[-1, :, 2]
+    np.testing.assert_allclose(states.force_mps2[-1, :, 1] - leaning, sideways, rtol=0.02)
+    np.testing.assert_allclose(states.articulation_rad[-1], steer, atol=1e-3)
 
 
 @EACH
-@BOTH
-def test_steering_stays_within_its_limits(kind: type, model: MachineModel) -> None:
-    with placed(kind, plane(0), model) as world:
+def test_steering_stays_within_its_limits(kind: type) -> None:
+    cases = [Lane(model) for model in MODELS]
+    with lanes(kind, cases) as world:
         hold_speed(world, 1.0, 2.0)
         states = stack(hold_speed(world, 1.0, 5.0, 1.5))
-    angle, rate = states.articulation_rad[:, 0], states.articulation_radps[:, 0]
-    assert angle.max() == pytest.approx(model.max_articulation_rad, abs=2e-3)
-    assert abs(rate).max() == pytest.approx(model.steer_radps, rel=0.02)
-    np.testing.assert_allclose(np.diff(angle) / STEP_S, rate[1:], atol=0.01)
-    np.testing.assert_allclose(np.diff(rate) / STEP_S, states.articulation_radps2[1:, 0], atol=1e-9)
+    angle, rate = states.articulation_rad, states.articulation_radps
+    np.testing.assert_allclose(angle.max(axis=0), of_each(cases, "max_articulation_rad"), atol=2e-3)
+    np.testing.assert_allclose(abs(rate).max(axis=0), of_each(cases, "steer_radps"), rtol=0.02)
+    np.testing.assert_allclose(np.diff(angle, axis=0) / STEP_S, rate[1:], atol=0.01)
+    np.testing.assert_allclose(np.diff(rate, axis=0) / STEP_S, states.articulation_radps2[1:], atol=1e-9)
 
 
 @EACH
-def test_state_says_what_is_carried(kind: type) -> None:
-    with placed(kind, plane(0), LOADER, LOADER, starts=[(500, 500, 0), (500, 520, 0)]) as world:
-        assert world.state.payload_kg.tolist() == [0.0, 0.0]
-        world.set_payload(1, 3000.0)
-        state = idle(world, 0.01)
-        assert state.payload_kg.tolist() == [0.0, 3000.0]
-        assert state.mass_kg.tolist() == [17_500.0, 20_500.0]
-
-
-@EACH
-@BOTH
-def test_a_load_weighs_on_the_wheels(kind: type, model: MachineModel) -> None:
-    with placed(kind, plane(2, 0.1), model, model, starts=[(500, 500, 0), (500, 520, 0)]) as world:
-        for payload in (0.0, model.payload_kg, 0.0):
-            world.set_payload(1, payload)
-            last = idle(world, 4.0, 2 * model.max_brake_n)
-            np.testing.assert_allclose(last.mass_kg, [model.mass_kg, model.mass_kg + payload])
+def test_a_load_weighs_on_the_wheels(kind: type) -> None:
+    cases = [Lane(model, 2) for model in (LOADER, TRUCK, LOADER, TRUCK)]
+    with lanes(kind, cases, 0.1) as world:
+        for share in (0.0, 1.0, 0.0):
+            for machine in (2, 3):
+                world.set_payload(machine, share * cases[machine].model.payload_kg)
+            last = idle(world, 4.0, 2 * of_each(cases, "max_brake_n"))
+            payload = share * of_each(cases, "payload_kg") * [0, 0, 1, 1]
+            assert last.payload_kg.tolist() == payload.tolist()
+            np.testing.assert_allclose(last.mass_kg, of_each(cases, "mass_kg") + payload)
             np.testing.assert_allclose(last.load_n, last.mass_kg * GRAVITY_MPS2 / math.hypot(1, 0.1), rtol=1e-3)
 
 
 @EACH
 def test_a_load_slows_a_machine_down(kind: type) -> None:
-    gained = []
-    for payload in (0.0, TRUCK.payload_kg):
-        with placed(kind, plane(CONCRETE), TRUCK) as world:
-            world.set_payload(0, payload)
-            idle(world, 2.0, TRUCK.max_brake_n)
-            for _ in range(300):
-                state = world.advance(np.zeros(1), np.full(1, 50e3), np.zeros(1))
-        gained.append(state.accel_mps2[0])
-        rolling = 4 * TRUCK.wheel_inertia_kgm2 / TRUCK.wheel_radius_m**2
-        expected = (50e3 - SOILS[CONCRETE].c_rr * state.load_n[0]) / (state.mass_kg[0] + rolling)
-        assert state.accel_mps2[0] == pytest.approx(expected, rel=0.02)
-    assert gained[1] < 0.6 * gained[0]
+    trucks = [Lane(TRUCK), Lane(TRUCK)]
+    with lanes(kind, trucks) as world:
+        world.set_payload(1, TRUCK.payload_kg)
+        idle(world, 2.0, TRUCK.max_brake_n)
+        for _ in range(300):
+            state = world.advance(np.zeros(2), np.full(2, 50e3), np.zeros(2))
+    rolling = 4 * TRUCK.wheel_inertia_kgm2 / TRUCK.wheel_radius_m**2
+    expected = (50e3 - SOILS[CONCRETE].c_rr * state.load_n) / (state.mass_kg + rolling)
+    np.testing.assert_allclose(state.accel_mps2, expected, rtol=0.02)
+    assert state.accel_mps2[1] < 0.6 * state.accel_mps2[0]
 
 
 @EACH
-def test_repaved_ground_is_felt(kind: type) -> None:
+def test_repaved_ground_acts_on_machines(kind: type) -> None:
     with placed(kind, plane(CONCRETE), LOADER) as world:
         hold_speed(world, 2.0, 4.0)
         assert world.state.c_rr[0] == pytest.approx(SOILS[CONCRETE].c_rr)
@@ -228,17 +248,18 @@ def test_repaved_ground_is_felt(kind: type) -> None:
 
 
 @EACH
-@BOTH
 @pytest.mark.parametrize("grade", [0.0, GRADE_15])
-def test_traction_control_keeps_wheels_from_spinning_up(kind: type, model: MachineModel, grade: float) -> None:
-    with placed(kind, plane(SAND, grade), model) as world:
+def test_traction_control_keeps_wheels_from_spinning_up(kind: type, grade: float) -> None:
+    cases = [Lane(model, SAND) for model in MODELS]
+    with lanes(kind, cases, grade) as world:
         for _ in range(500):
-            state = world.advance(np.zeros(1), np.full(1, 1e6), np.zeros(1))
-    most = TRACTION_USE * TRACTION[SAND] * state.load_n[0]
-    assert state.drive_n[0] == pytest.approx(most, rel=0.01)
-    assert state.torque_nm[0] == pytest.approx(most * model.wheel_radius_m, rel=0.01)
-    slip = 1 - state.speed_mps[0] / (state.wheel_radps[0] * model.wheel_radius_m)
-    assert state.speed_mps[0] > 0.5
+            state = world.advance(np.zeros(2), np.full(2, 1e6), np.zeros(2))
+    most = TRACTION_USE * TRACTION[SAND] * state.load_n
+    np.testing.assert_allclose(state.drive_n, most, rtol=0.01)
+    radius = of_each(cases, "wheel_radius_m")
+    np.testing.assert_allclose(state.torque_nm, most * radius, rtol=0.01)
+    slip = 1 - state.speed_mps[:, None] / (state.wheel_radps * radius[:, None])
+    assert state.speed_mps.min() > 0.5
     assert slip.max() < 0.5
 
 
@@ -252,8 +273,8 @@ def test_grade_and_attitude_are_those_of_the_plane(kind: type, model: MachineMod
     assert rest.grade_n[0] == pytest.approx(-0.07, abs=1e-6)
     up = np.array([-0.12, 0.07, 1.0]) / math.sqrt(1 + 0.12**2 + 0.07**2)
     c, s = np.cos(yaw), np.sin(yaw)
-    felt = rest.force_mps2[0] / GRAVITY_MPS2  # the vertical as the rear frame sees it
-    np.testing.assert_allclose(felt[:2], [-up[0] * c - up[1] * s, up[0] * s - up[1] * c], atol=0.01)
+    up_seen = rest.force_mps2[0] / GRAVITY_MPS2  # the vertical as the rear frame sees it
+    np.testing.assert_allclose(up_seen[:2], [-up[0] * c - up[1] * s, up[0] * s - up[1] * c], atol=0.01)
 
 
 @EACH
@@ -265,24 +286,24 @@ def test_true_bodies_differ_from_the_model(kind: type) -> None:
     world.close()
 
 
-@BOTH
-def test_both_worlds_take_the_same_way_under_the_same_commands(model: MachineModel) -> None:
-    weight_n, runs = model.mass_kg * GRAVITY_MPS2, []
-    for kind in (Fleet, BulletWorld):
-        with placed(kind, plane(2, 0.03, -0.02), model, starts=[(500, 500, 0.4)]) as world:
+def test_both_worlds_take_the_same_track_under_the_same_commands() -> None:
+    cases = [Lane(model, 2, 0.4) for model in MODELS]
+    weight_n, runs = load_of(cases), []
+    for kind in (FastWorld, BulletWorld):
+        with lanes(kind, cases, 0.02) as world:
             states = []
-            for i in range(1600):
+            for i in range(1500):
                 # off, straight, to the left, and a stop
-                steer, drive, brake = np.array([[0.3 * (i > 600)], [0.1 * (i < 1200)], [0.2 * (i > 1200)]])
-                states.append(world.advance(steer, drive * weight_n, brake * weight_n))
+                steer, drive, brake = 0.3 * (i > 600), 0.1 * (i < 1200), 0.2 * (i > 1200)
+                states.append(world.advance(np.full(2, steer), drive * weight_n, brake * weight_n))
             runs.append(stack(states))
     fast, bullet = runs
-    way = np.hypot(np.diff(fast.x_m[:, 0]), np.diff(fast.y_m[:, 0])).cumsum()
-    apart = np.hypot(fast.x_m - bullet.x_m, fast.y_m - bullet.y_m)[:, 0]
-    assert way[599] > 5
-    assert way[-1] > 30
-    assert apart[599] < 0.006 * way[599]
-    assert apart.max() < 0.03 * way[-1]  # steering pushes PyBullet's frames a little ahead
+    driven = np.hypot(np.diff(fast.x_m, axis=0), np.diff(fast.y_m, axis=0)).cumsum(axis=0)
+    apart = np.hypot(fast.x_m - bullet.x_m, fast.y_m - bullet.y_m)
+    assert driven[599].min() > 5
+    assert driven[-1].min() > 30
+    assert (apart[599] < 0.006 * driven[599]).all()
+    assert (apart.max(axis=0) < 0.03 * driven[-1]).all()  # steering pushes PyBullet's frames a little ahead
     assert abs(fast.yaw_rad - bullet.yaw_rad).max() < 0.1
     np.testing.assert_allclose(fast.articulation_rad, bullet.articulation_rad, atol=0.01)
     np.testing.assert_allclose(fast.drive_n, bullet.drive_n, atol=1.0)

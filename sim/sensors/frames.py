@@ -1,4 +1,4 @@
-"""Rotations for arrays of machines (REP-103: pitch is positive nose down).
+"""Rotated vectors, and products of vectors and of quaternions, for arrays of machines.
 
 Vectors and quaternions (x, y, z, w) hold their axes first: (3, ...) and (4, ...). Plain sums of products rather than
 `@` and `einsum`, which round differently with the number of machines: seeds would not repeat.
@@ -49,17 +49,6 @@ def rotation(vector_rad: Floats) -> Floats:
     half = np.sinc(angle / (2 * np.pi))  # numpy's sinc(x) is sin(pi x) / (pi x)
     turn: Floats = np.eye(3) + np.sinc(angle / np.pi) * along + 0.5 * half**2 * (along @ along)
     return turn
-
-
-def quaternion(yaw_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> Floats:
-    """Unit quaternion (4, ...) of yaw @ pitch @ roll."""
-    cy, sy = np.cos(0.5 * yaw_rad), np.sin(0.5 * yaw_rad)
-    cp, sp = np.cos(0.5 * pitch_rad), np.sin(0.5 * pitch_rad)
-    cr, sr = np.cos(0.5 * roll_rad), np.sin(0.5 * roll_rad)
-    x = cy * cp * sr - sy * sp * cr
-    y = cy * sp * cr + sy * cp * sr
-    z = sy * cp * cr - cy * sp * sr
-    return np.stack([x, y, z, cy * cp * cr + sy * sp * sr])
 
 
 def compose(first: Floats, second: Floats) -> Floats:

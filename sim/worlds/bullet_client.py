@@ -1,4 +1,4 @@
-"""The edge to PyBullet: one world without ground that moves the frames of machines under given forces."""
+"""The only calls of PyBullet's physics: it moves the frames of machines under given forces, without ground."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class MultiBodies:
         self._link_from_inertial = np.swapaxes(rotations(inertial[:, :, 3:]), -1, -2)
 
     def read(self) -> Frames:
-        """Where everything is, and how it moves."""
+        """Read where all frames are, and how they move."""
         client, flat = self._client, list[float]()
         for machine in self._machines:
             body = machine.body
@@ -90,16 +90,16 @@ class MultiBodies:
 
     def step(self, forces_n: Floats, points_m: Floats, steering_radps: Floats) -> None:
         """Advance by dt with one force per wheel (n, 4, 3) at a point in `map`, and this rate of articulation (n,)."""
-        client, push, map_frame = self._client, pybullet.applyExternalForce, pybullet.WORLD_FRAME
+        client, apply, map_frame = self._client, pybullet.applyExternalForce, pybullet.WORLD_FRAME
         rows = zip(
             self._machines, self._steer_nm, forces_n.tolist(), points_m.tolist(), steering_radps.tolist(), strict=True
         )
         for machine, torque, force, point, rate in rows:
             body = machine.body
-            push(body, machine.front, force[0], point[0], map_frame, client)
-            push(body, machine.front, force[1], point[1], map_frame, client)
-            push(body, machine.rear, force[2], point[2], map_frame, client)
-            push(body, machine.rear, force[3], point[3], map_frame, client)
+            apply(body, machine.front, force[0], point[0], map_frame, client)
+            apply(body, machine.front, force[1], point[1], map_frame, client)
+            apply(body, machine.rear, force[2], point[2], map_frame, client)
+            apply(body, machine.rear, force[3], point[3], map_frame, client)
             pybullet.setJointMotorControl2(
                 body,
                 machine.articulation,
@@ -136,12 +136,12 @@ class MultiBodies:
         ]
         links = {info[12].decode(): info[0] for info in joints} | {BASE: -1}
         names = {info[1].decode(): info[0] for info in joints}
-        self._loosen(body, names)
+        self._remove_damping(body, names)
         load = model.robot.links[PAYLOAD].mass
         inertia = tuple((np.diag(load.inertia_kgm2) / load.mass_kg).tolist())
         return _Machine(body, links[FRONT], links[rear], links[PAYLOAD], names["articulation"], inertia)
 
-    def _loosen(self, body: int, joints: dict[str, int]) -> None:
+    def _remove_damping(self, body: int, joints: dict[str, int]) -> None:
         """Take away the damping and joint friction that PyBullet adds by itself."""
         for link in (-1, *joints.values()):
             pybullet.changeDynamics(
@@ -174,7 +174,7 @@ _ROTATIONS = np.array([_rotation(unit) for unit in np.eye(16).reshape(16, 4, 4)]
 
 
 def rotations(quaternions: Floats) -> Floats:
-    """Matrices (..., 3, 3) of unit quaternions (..., 4) x, y, z, w."""
+    """Matrices (..., 3, 3) of unit quaternions (..., 4) x, y, z, w; at every step, so as one matrix product."""
     squares = quaternions[..., :, None] * quaternions[..., None, :]
     flat: Floats = squares.reshape(-1, 16) @ _ROTATIONS
     return flat.reshape(*quaternions.shape[:-1], 3, 3)

@@ -1,4 +1,4 @@
-"""Kinematics of rigid frames for arrays of machines: points on frames, wheels on the ground, what sensors feel."""
+"""Scenes of rigid frames, for arrays of machines: points on the frames, and the ground under their wheels."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.worlds.multibody import Frames
-from sim.worlds.terrain import Terrain
+from sim.terrain.terrain import Terrain
+from sim.worlds.bullet_client import Frames
 
 # Points that are followed, and the frame that each is fixed to: hubs and `base_link`.
 HUBS, BASE_POINT = slice(0, 4), 4
@@ -28,7 +28,7 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class WheelGround:
     """Where wheels meet the ground; arrays (n, 4, ...).
 
     point_m: the place on the ground nearest to the hub. wheel_from_map: rows ahead, left and up of the ground there.
@@ -43,18 +43,19 @@ class Ground:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
-    """Everything seen at one instant."""
+class BodyScene:
+    """Frames, points and ground at one instant."""
 
     frames: Frames
     points: Points
-    ground: Ground
+    ground: WheelGround
 
 
-def look(terrain: Terrain, frames: Frames, arms_m: Floats, guess_m: Floats | None = None) -> Scene:
-    """Follow the points of frames and find the ground under their wheels; guess_m: the ground's points before."""
-    points = follow(frames, arms_m)
-    return Scene(frames, points, touch(terrain, frames, points, points.xyz_m[:, HUBS] if guess_m is None else guess_m))
+def scene_at(terrain: Terrain, frames: Frames, arms_m: Floats, guess_m: Floats | None = None) -> BodyScene:
+    """Find the points of frames and the ground under their wheels; guess_m: the ground's points before."""
+    points = points_on(frames, arms_m)
+    guess = points.xyz_m[:, HUBS] if guess_m is None else guess_m
+    return BodyScene(frames, points, ground_under(terrain, frames, points, guess))
 
 
 def cross(a: Floats, b: Floats) -> Floats:
@@ -64,14 +65,14 @@ def cross(a: Floats, b: Floats) -> Floats:
     return product
 
 
-def follow(frames: Frames, arms_m: Floats) -> Points:
-    """Follow points that lie at arms_m (n, 5, 3) from their frame's centre of mass, along its axes."""
+def points_on(frames: Frames, arms_m: Floats) -> Points:
+    """Move points that lie at arms_m (n, 5, 3) from their frame's centre of mass, along its axes."""
     arms = (frames.rotation[:, POINT_FRAME] @ arms_m[..., None])[..., 0]
     turning = cross(frames.rate_radps[:, POINT_FRAME], arms)
     return Points(frames.centre_m[:, POINT_FRAME] + arms, frames.velocity_mps[:, POINT_FRAME] + turning)
 
 
-def touch(terrain: Terrain, frames: Frames, points: Points, guess_m: Floats) -> Ground:
+def ground_under(terrain: Terrain, frames: Frames, points: Points, guess_m: Floats) -> WheelGround:
     """Find the ground under wheels. guess_m: the previous points on it; the hub's foot moves little in a step."""
     x, y = guess_m[..., 0], guess_m[..., 1]
     height, east, north = terrain.surface(x, y)
@@ -89,7 +90,7 @@ def touch(terrain: Terrain, frames: Frames, points: Points, guess_m: Floats) -> 
     ahead /= np.sqrt(np.vecdot(ahead, ahead))[..., None]
     axes = np.stack([ahead, cross(up, ahead), up], axis=-2)
     velocity = (axes @ points.velocity_mps[:, HUBS, :, None])[..., 0]
-    return Ground(hub - gap[..., None] * up, axes, gap, velocity, terrain.zone(x, y))
+    return WheelGround(hub - gap[..., None] * up, axes, gap, velocity, terrain.zone(x, y))
 
 
 def attitude(rotation: Floats) -> tuple[Floats, Floats, Floats]:

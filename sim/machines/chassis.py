@@ -1,4 +1,4 @@
-"""What both worlds know of vehicles: what machines weigh and measure, and how their hydraulics and engine obey."""
+"""Figures of machines that both worlds use: geometry and weight, and the lags of hydraulics and engine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats
 from sim.machines.model import MachineModel
-from sim.worlds.world import STEP_S
+from sim.state import STEP_S
 
 # Of what the worst soil under a machine's wheels can take, with the torque split in proportion to the wheels' loads,
 # this is the most that traction control allows: a wheel at its peak would spin up without end.
@@ -28,7 +28,7 @@ class Bodies:
 
 
 class Chassis(NamedTuple):
-    """What the models of n machines say, arrays (n,), named as in `MachineModel`.
+    """Figures of n machines from their models, arrays (n,), named as in `MachineModel`.
 
     front_share, centre_height: of the empty machine; payload_*: the same for what it carries, alone. *_inertia: about
     its centre, empty; *_inertia_gain: what each kilogram that it carries adds.
@@ -57,7 +57,7 @@ class Chassis(NamedTuple):
 
 
 class Weight(NamedTuple):
-    """What machines weigh with what they carry, all (n,).
+    """Weight of n machines with their payload, all (n,).
 
     front_share: the front axle's, on the level. centre_height: of the centre of mass; inertias are about it.
     """
@@ -122,9 +122,9 @@ def steering_radps(chassis: Chassis, target_rad: Floats, articulation_rad: Float
     """Rate of articulation after a step: hydraulics close in on the target within their limits, with a lag."""
     most, fastest = chassis.max_articulation_rad, chassis.steer_radps
     target = np.minimum(np.maximum(target_rad, -most), most)
-    wanted = chassis.steer_gain_per_s * (target - articulation_rad)
-    wanted = np.minimum(np.maximum(wanted, -fastest), fastest)
-    return rate_radps + (wanted - rate_radps) * (STEP_S / chassis.steer_lag_s)
+    rate = chassis.steer_gain_per_s * (target - articulation_rad)
+    rate = np.minimum(np.maximum(rate, -fastest), fastest)
+    return rate_radps + (rate - rate_radps) * (STEP_S / chassis.steer_lag_s)
 
 
 def drive_force_n(chassis: Chassis, target_n: Floats, drive_n: Floats, most_n: Floats) -> Floats:

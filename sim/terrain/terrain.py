@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.worlds import fast_kernels
+from sim.terrain import lookup
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,15 @@ class Terrain:
     zone_cell_m: float
 
     @cached_property
-    def grid(self) -> fast_kernels.Grid:
+    def grid(self) -> lookup.TerrainGrid:
         """The same as a tuple of arrays, for kernels."""
         heights, zones = np.ascontiguousarray(self.heights_m, float), np.ascontiguousarray(self.zones, np.int64)
-        return fast_kernels.Grid(heights, float(self.cell_m), zones, float(self.zone_cell_m))
+        return lookup.TerrainGrid(heights, float(self.cell_m), zones, float(self.zone_cell_m))
 
     def surface(self, x_m: Floats, y_m: Floats) -> Floats:
         """Height [m], bilinear, and its gradient to the east and north [m/m], as (3, ...)."""
-        found: Floats = fast_kernels.surfaces(self.grid, x_m.ravel(), y_m.ravel())
-        return found.reshape(3, *x_m.shape)
+        values: Floats = lookup.surfaces(self.grid, x_m.ravel(), y_m.ravel())
+        return values.reshape(3, *x_m.shape)
 
     def height(self, x_m: Floats, y_m: Floats) -> Floats:
         """Height [m], bilinear."""
@@ -47,5 +47,5 @@ class Terrain:
 
     def zone(self, x_m: Floats, y_m: Floats) -> Ints:
         """Index into `soil.SOILS`."""
-        found: Ints = fast_kernels.zones(self.grid, x_m.ravel(), y_m.ravel())
-        return found.reshape(x_m.shape)
+        indices: Ints = lookup.zones(self.grid, x_m.ravel(), y_m.ravel())
+        return indices.reshape(x_m.shape)

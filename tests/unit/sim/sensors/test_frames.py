@@ -1,7 +1,8 @@
 import numpy as np
 
 from protocol.machine.machine_config import Mount
-from sim.frames import compose, cross, map_from_base, quaternion, rotation, seen_turned, turned
+from protocol.rotations import quaternion_from_rpy
+from sim.sensors.frames import compose, cross, map_from_base, rotation, seen_turned, turned
 
 ROLL, PITCH, YAW = 0.1, -0.3, 2.0
 ONE = (np.array([YAW]), np.array([PITCH]), np.array([ROLL]))
@@ -22,11 +23,11 @@ def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 def test_frames_agree_with_the_mounts_rotation() -> None:
     turn = matrix(ROLL, PITCH, YAW)
     np.testing.assert_allclose(map_from_base(VECTOR[:, None], *ONE)[:, 0], turn @ VECTOR)
-    np.testing.assert_allclose(rotate(quaternion(*ONE), VECTOR[:, None])[:, 0], turn @ VECTOR)
+    np.testing.assert_allclose(rotate(quaternion_from_rpy(*ONE[::-1]), VECTOR[:, None])[:, 0], turn @ VECTOR)
 
 
 def test_quaternions_compose_like_matrices() -> None:
-    first, second = quaternion(*np.array([1.0, 0.2, -0.4])), quaternion(*np.array([-0.7, 0.5, 3.0]))
+    first, second = quaternion_from_rpy(-0.4, 0.2, 1.0), quaternion_from_rpy(3.0, 0.5, -0.7)
     expected = matrix(-0.4, 0.2, 1.0) @ matrix(3.0, 0.5, -0.7) @ VECTOR
     np.testing.assert_allclose(rotate(compose(first, second), VECTOR), expected)
 

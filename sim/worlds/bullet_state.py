@@ -1,4 +1,4 @@
-"""What a world of rigid bodies looks like to sensors: the state record from two scenes, one step apart."""
+"""The state of machines in the PyBullet world, from two scenes one step apart."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
-from sim.machines.soil import C_RR
-from sim.worlds.rigid import BASE_POINT, Scene, articulation, attitude, plane_gradient
-from sim.worlds.world import STEP_S, FleetState
+from sim.state import STEP_S, FleetState
+from sim.terrain.soil import C_RR
+from sim.worlds.bullet_scene import BASE_POINT, BodyScene, articulation, attitude, plane_gradient
 
 _GRAVITY_UP = np.array([0.0, 0.0, GRAVITY_MPS2])
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
-    """What the drive train did: drive force, torque of all wheels together; spin and angle of the rear ones (n, 2)."""
+class DriveTrain:
+    """Drive train over one step: drive force, torque of all wheels together; spin and angle of the rear ones (n, 2)."""
 
     drive_n: Floats
     torque_nm: Floats
@@ -26,15 +26,17 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True)
-class Burden:
-    """What machines weigh with their payload, and the payload alone, both (n,)."""
+class Weights:
+    """Mass of machines with their payload, and of the payload alone, both (n,)."""
 
     mass_kg: Floats
     payload_kg: Floats
 
 
-def observe(before: Scene, now: Scene, load_n: Floats, burden: Burden, drive: Drive) -> FleetState:
-    """Read off the state of machines. load_n: of each wheel, (n, 4).
+def state_from_scenes(
+    before: BodyScene, now: BodyScene, load_n: Floats, weights: Weights, drive: DriveTrain
+) -> FleetState:
+    """The state of machines. load_n: of each wheel, (n, 4).
 
     Accelerations are differences over the step, as an accelerometer that averages over its interval has them.
     """
@@ -66,8 +68,8 @@ def observe(before: Scene, now: Scene, load_n: Floats, burden: Burden, drive: Dr
         drive_n=drive.drive_n,
         torque_nm=drive.torque_nm,
         load_n=load,
-        mass_kg=burden.mass_kg,
-        payload_kg=burden.payload_kg,
+        mass_kg=weights.mass_kg,
+        payload_kg=weights.payload_kg,
         wheel_radps=drive.wheel_radps,
         wheel_rad=drive.wheel_rad,
         c_rr=(C_RR[now.ground.zone] * load_n).sum(axis=-1) / np.maximum(load, 1.0),
@@ -76,27 +78,26 @@ def observe(before: Scene, now: Scene, load_n: Floats, burden: Burden, drive: Dr
     )
 
 
-def _inertial(before: Scene, now: Scene) -> tuple[Floats, Floats, Floats]:
+def _inertial(before: BodyScene, now: BodyScene) -> tuple[Floats, Floats, Floats]:
     """Rate, its derivative, and specific force at `base_link`, each (n, 3) in its axes."""
     old_rates, rates = _in_base(before.frames.rate_radps[:, 0], before), _in_base(now.frames.rate_radps[:, 0], now)
-    change = now.points.velocity_mps[:, BASE_POINT] - before.points.velocity_mps[:, BASE_POINT]
-    feels = change / STEP_S + _GRAVITY_UP
-    force = _in_base(feels, now)
-    return rates, (rates - old_rates) / STEP_S, force
+    change_mps = now.points.velocity_mps[:, BASE_POINT] - before.points.velocity_mps[:, BASE_POINT]
+    force = change_mps / STEP_S + _GRAVITY_UP
+    return rates, (rates - old_rates) / STEP_S, _in_base(force, now)
 
 
-def _in_base(vector: Floats, scene: Scene) -> Floats:
+def _in_base(vector: Floats, scene: BodyScene) -> Floats:
     """Vectors (n, 3) of `map` along the axes of `base_link`."""
     turned: Floats = (vector[:, None, :] @ scene.frames.rotation[:, 0])[:, 0]
     return turned
 
 
-def _speed(scene: Scene) -> Floats:
+def _speed(scene: BodyScene) -> Floats:
     speed: Floats = np.vecdot(scene.points.velocity_mps[:, BASE_POINT], scene.frames.rotation[:, 0, :, 0])
     return speed
 
 
-def _bending(scene: Scene) -> Floats:
+def _bending(scene: BodyScene) -> Floats:
     """Rate of the joint's angle."""
     rate = scene.frames.rate_radps
     bending: Floats = np.vecdot(rate[:, 1] - rate[:, 0], scene.frames.rotation[:, 0, :, 2])
