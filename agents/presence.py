@@ -1,9 +1,10 @@
 """What others see of a machine: live pose, health, a liveliness token, and an answer to who it is.
 
 The token tells that an agent is there, for as long as the router believes so (up to the lease after a broken link). Who
-asks on the same key gets an answer from a live agent only: so a machine that restarts never takes its own dead
-predecessor for another agent. (A router passes nothing between two sessions in peer mode: of two agents that both
-started without a router, neither sees the other. Their samples have different identities all the same, see spool.py.)
+asks on the same key gets an answer from a live agent only: so a machine that restarts never mistakes its own
+killed predecessor for another agent. (A router passes nothing between two sessions in peer mode: of two agents that
+both started without a router, neither sees the other. Their samples have different identities all the same, see
+spool.py.)
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import zenoh
 
 from agents.agent import Agent, Places
 from agents.config import AgentConfig, load_agent
-from agents.delivery.uplink import Sign
+from agents.delivery.link import Sign
 from agents.drivers import Driver
 from agents.drivers.replay import Replay
 from agents.drivers.zenoh import ZenohDriver

@@ -262,7 +262,7 @@ def check_spool(state: SpoolState, now_ns: int) -> Finding:
     if state.dropped:
         advice.append("it was full: mend the link, or raise max_samples")
     if state.put_aside:
-        advice.append("the map server refused samples: table `aside` has them and the reasons")
+        advice.append("the map server refused samples: table `quarantine` has them and the reasons")
     return Finding(Level.WARN if advice else Level.PASS, "spool", found, "; ".join(advice))
 
 

@@ -234,9 +234,9 @@ def _read_only(path: Path) -> str:
 def _spool_state(path: Path, db: sqlite3.Connection) -> SpoolState:
     (schema,) = db.execute("PRAGMA user_version").fetchone()
     if schema != SPOOL_SCHEMA:
-        raise StoreError(path, f"has schema {schema}, this version knows {SPOOL_SCHEMA}; its agent converts older ones")
-    (depth,), (aside,) = (db.execute(f"SELECT COUNT(*) FROM {t}").fetchone() for t in ("sample", "aside"))  # noqa: S608
+        raise StoreError(path, f"has schema {schema}, this version knows {SPOOL_SCHEMA}")
+    (depth,), (quarantined,) = (db.execute(f"SELECT COUNT(*) FROM {t}").fetchone() for t in ("sample", "quarantine"))  # noqa: S608
     (dropped,) = db.execute("SELECT value FROM meta WHERE key = 'dropped'").fetchone() or (0,)
     oldest = db.execute("SELECT row FROM sample ORDER BY number LIMIT 1").fetchone()
     oldest_ns = int(np.frombuffer(oldest[0], SAMPLE_DTYPE)["stamp_ns"][0]) if oldest else 0
-    return SpoolState(depth, int(dropped), aside, oldest_ns)
+    return SpoolState(depth, int(dropped), quarantined, oldest_ns)

@@ -83,7 +83,7 @@ def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
         ("[pipeline.estimation.attitude]\nrate_walk = 0", "rate_walk"),
         ("[pipeline.localisation]\nrelock_fixes = 1.5", "relock_fixes"),
         ("[pipeline]\ngap_s = -1", "gap_s"),
-        ("[uplink]\nbatch_samples = 0", "batch_samples"),
+        ("[uplink]\ntimeout_s = 0", "timeout_s"),
         ("[spool]\nmax_samples = 0", "max_samples"),
         ("[holdout]\noff_s = 11", "off_s"),
         ("linger_s = -1", "linger_s"),

@@ -259,7 +259,7 @@ def test_head_ends_before_a_hole(tmp_path: Path) -> None:
     bad = spool.head(99)
     assert bad
     spool.acknowledge(spool.spool_id, 3)
-    spool.put_aside(type(bad)(bad.spool_id, 6, ROWS[5:6], 0), "too bad")
+    spool.quarantine(type(bad)(bad.spool_id, 6, ROWS[5:6], 0), "too bad")
     first = spool.head(99)
     assert first
     assert (first.first_seq, len(first.rows), first.lost_before) == (4, 2, 0)
@@ -268,8 +268,8 @@ def test_head_ends_before_a_hole(tmp_path: Path) -> None:
     assert rest
     assert (rest.first_seq, len(rest.rows), rest.lost_before) == (7, 4, 1)
     assert spool.counters()["put_aside"] == 1
-    aside = spool._db.execute("SELECT seq, row, problem FROM aside").fetchall()
-    assert aside == [(6, ROWS[5].tobytes(), "too bad")]
+    quarantined = spool._db.execute("SELECT seq, row, problem FROM quarantine").fetchall()
+    assert quarantined == [(6, ROWS[5].tobytes(), "too bad")]
     spool.close()
 
 
@@ -290,7 +290,7 @@ def test_full_spool_drops_the_oldest_counts_them_and_declares_them_lost(tmp_path
     again.close()
 
 
-def test_damaged_samples_are_put_aside_and_never_sent(tmp_path: Path) -> None:
+def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
     for number in (1, 2, 3, 6):
@@ -305,8 +305,8 @@ def test_damaged_samples_are_put_aside_and_never_sent(tmp_path: Path) -> None:
     assert (rest.first_seq, rest.lost_before) == (7, 1)
     assert hashes(rest.rows) == hashes(ROWS[6:10])
     assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10}
-    aside = spool._db.execute("SELECT seq, problem FROM aside ORDER BY seq").fetchall()
-    assert aside == [(seq, "damaged on the machine's disk") for seq in (1, 2, 3, 6)]
+    quarantined = spool._db.execute("SELECT seq, problem FROM quarantine ORDER BY seq").fetchall()
+    assert quarantined == [(seq, "damaged on the machine's disk") for seq in (1, 2, 3, 6)]
     spool.close()
 
 
@@ -317,8 +317,7 @@ def test_server_that_knows_less_than_it_acknowledged_is_told_what_is_lost(tmp_pa
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
     spool.acknowledge(spool.spool_id, 8)
-    assert spool.fall_back(spool.spool_id, 5)
-    assert not spool.fall_back(spool.spool_id, 5)
+    spool.lower_watermark(spool.spool_id, 5)
     head = spool.head(99)
     assert head
     assert (head.first_seq, head.lost_before) == (9, 3)
@@ -335,7 +334,7 @@ def test_earlier_runs_are_declared_again_to_a_server_that_was_set_back(tmp_path:
     spool.acknowledge(earlier, 3)
     spool.record(ROWS[3:5])
     spool.acknowledge(spool.spool_id, 1)
-    assert spool.fall_back(spool.spool_id, 0)
+    spool.lower_watermark(spool.spool_id, 0)
     head = spool.head(9)
     assert head
     assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 4, 0, 3)
@@ -406,28 +405,6 @@ def test_two_clones_that_both_send_lose_and_double_nothing(tmp_path: Path) -> No
         drain(clone, journal)
         clone.close()
     assert sorted(journal.values()) == sorted(hashes(ROWS[:8]) + hashes(ROWS[10:30]))
-
-
-def test_spool_of_schema_1_goes_on(tmp_path: Path) -> None:
-    """Its samples keep their identity; what is recorded from now on is a new run."""
-    db = sqlite3.connect(tmp_path / "spool.db", isolation_level=None)
-    db.execute("CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID")
-    db.execute("CREATE TABLE sample (seq INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL)")
-    db.execute("CREATE TABLE aside (spool_id TEXT, seq INTEGER, row BLOB, problem TEXT)")
-    meta = {"spool_id": f"{77:016x}", "newest": "5", "acknowledged": "2", "dropped": "1", "recorded": "5"}
-    db.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
-    db.executemany("INSERT INTO sample VALUES (?, ?, 1)", [(i + 1, ROWS[i].tobytes()) for i in range(3, 5)])
-    db.execute("PRAGMA user_version=1")
-    db.close()
-    spool = opened(tmp_path)
-    head = spool.head(9)
-    assert head
-    assert (head.spool_id, head.first_seq, head.lost_before) == (77, 4, 1)
-    assert hashes(head.rows) == hashes(ROWS[3:5])
-    assert spool.counters() == {"depth": 2, "dropped": 1, "put_aside": 0, "recorded": 5}
-    assert spool.record(ROWS[5:6]) == 1
-    spool.close()
-    opened(tmp_path).close()
 
 
 # --- errors ----------------------------------------------------------------------------------------------------------
@@ -505,14 +482,14 @@ def test_failed_commit_leaves_no_transaction_open(
     assert head
     attempts = (
         lambda: spool.acknowledge(spool.spool_id, 2),
-        lambda: spool.put_aside(head, "bad"),
+        lambda: spool.quarantine(head, "bad"),
         lambda: spool.finalise(1, ROWS[:1]),
-        lambda: spool.fall_back(spool.spool_id, -1),
-        spool.fork,
+        lambda: spool.lower_watermark(spool.spool_id, -1),
+        spool.start_new_run,
     )
     identity = spool.spool_id
     for attempt in attempts:
-        with pytest.raises(sqlite3.OperationalError, match="disk is full"):
+        with pytest.raises(StoreError, match="disk is full; look at the machine's disk"):
             attempt()
         assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 0, "recorded": 4}
         assert (spool.spool_id, spool.newest, spool.acknowledged) == (identity, 4, 0)
@@ -529,7 +506,7 @@ def test_bad_spool_option_is_refused_by_name() -> None:
 def test_disk_that_takes_nothing_is_named(tmp_path: Path) -> None:
     spool = Spool(tmp_path / "spool.db", SpoolConfig())
     spool._db.execute("PRAGMA query_only = ON")
-    with pytest.raises(StoreError, match=r"spool\.db: cannot be written: .*; look at the machine's disk"):
+    with pytest.raises(StoreError, match=r"spool\.db: cannot be used: .*; look at the machine's disk"):
         spool.record(made_up_samples(2))
     assert spool.newest == 0
     spool._db.execute("PRAGMA query_only = OFF")
@@ -560,7 +537,7 @@ def test_a_run_that_is_not_what_was_written_is_no_reason_to_send_under_another_i
 
 
 @pytest.mark.parametrize("row", ["x''", "x'0102'", "5", "'text'"])
-def test_a_sample_that_is_none_is_put_aside_and_the_others_are_sent(tmp_path: Path, row: str) -> None:
+def test_a_sample_that_is_none_is_quarantined_and_the_others_are_sent(tmp_path: Path, row: str) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:3])
     spool.close()
@@ -576,7 +553,7 @@ def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop
     spool.record(ROWS[:3])
     spool._db.execute("UPDATE sample SET crc32 = 1 WHERE number = 2")
     spool._db.execute("CREATE TRIGGER stays BEFORE DELETE ON sample BEGIN SELECT RAISE(IGNORE); END")
-    with pytest.raises(sqlite3.DatabaseError, match="the file is damaged"):
+    with pytest.raises(StoreError, match="the file is damaged"):
         spool.head(10)
     assert spool.counters()["put_aside"] == 0
     spool.close()
