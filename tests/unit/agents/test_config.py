@@ -80,7 +80,7 @@ def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
         ("[pipeline.sampling]\nevery = 2", "unknown key `every`"),
         ("[pipeline.sampling]\nevery_m = 0", "every_m"),
         ("[pipeline.sampling]\nevery_m = nan", "every_m"),
-        ("[pipeline.estimation.attitude]\nrate_walk = 0", "rate_walk"),
+        ("[pipeline.estimation]\nmass = 'guessed'", "mass"),
         ("[pipeline.localisation]\nrelock_fixes = 1.5", "relock_fixes"),
         ("[pipeline]\ngap_s = -1", "gap_s"),
         ("[uplink]\ntimeout_s = 0", "timeout_s"),
