@@ -33,7 +33,7 @@ MOST_UNSAVED = 100_000  # samples that wait in memory while the disk is full or 
 
 @dataclass(frozen=True)
 class Places:
-    """Files of an agent: its spool, and where asked for an audit file and one that keeps the calibration."""
+    """Files of an agent: its spool, and optionally an audit file and one for the calibration."""
 
     spool: Path
     audit: Path | None = None
@@ -145,12 +145,12 @@ class Agent:
         self._link.wake()
 
     def _yield_name(self) -> None:
-        """Send nothing while an earlier agent of the same name is alive; the samples wait in the spool."""
+        """Send nothing while an earlier agent of the same name runs; the samples wait in the spool."""
         rival = self._presence.look_around()
         self._uplink.held = (
             f"another agent of this name runs as {rival}: it sends, this one waits; stop one of them" if rival else ""
         )
 
     def _is_delivered(self) -> bool:
-        self._deliver(empty())  # what the disk did not take yet
+        self._deliver(empty())  # samples that are not on disk yet
         return not len(self._unsaved) and self._spool.is_settled()

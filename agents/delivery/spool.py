@@ -2,8 +2,9 @@
 
 Samples are numbered through in the file. What is recorded between one opening and the next is a **run**, with a random
 `spool_id` of its own; `seq` counts 1, 2, 3... within a run, so that seq = number - base. A file that was copied,
-cloned, restored from a backup or taken back by a lying disk therefore never gives one identity to two samples: what
-copies have in common has the same identity and the same bytes, what they record from then on has another spool_id.
+cloned, restored from a backup or set back by a disk that lies about its syncs therefore never gives one identity to two
+samples: what copies have in common has the same identity and the same bytes, what they record from then on has another
+spool_id.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty
 
-KEPT_RUNS = 16  # earlier runs that are declared again: a server restored from a backup learns what it has lost
+KEPT_RUNS = 16  # earlier runs that are declared again: so a server that was restored from a backup learns what it lost
 
 
 @dataclass(frozen=True)
@@ -321,7 +322,7 @@ class Spool:
         self._depth -= len(values)
 
     def _note(self, first_seq: int, rows: Table) -> None:
-        """Write the audit, if there is one: what a full disk keeps from it is added at the next opening."""
+        """Write the audit, if there is one: lines that a full disk prevents are added at the next opening."""
         if self._audit:
             with contextlib.suppress(OSError):
                 self._audit.recorded(self.spool_id, first_seq, rows)

@@ -90,7 +90,7 @@ class Calibrator:
         self._stamp_ns, self._passages = start.stamp_ns, start.passages
         self._aged_ns = start.stamp_ns
         self._past: deque[_Stretch] = deque(maxlen=KEPT)
-        self._under_way: list[Balance] = []  # of the present stretch
+        self._stretch: list[Balance] = []  # of the present stretch
         self._excluded: list[float] = []  # innovations, since the last that passed the gate
 
     @property
@@ -103,11 +103,11 @@ class Calibrator:
 
     def update(self, balance: Balance, dead_reckoning: DeadReckoning, known_c_rr: float | None) -> None:
         """Add a usable balance; known_c_rr: of the ground here, where the site states it."""
-        newest = self._under_way[-1] if self._under_way else balance
+        newest = self._stretch[-1] if self._stretch else balance
         if newest.direction != balance.direction or balance.stamp_ns - newest.stamp_ns > MAX_GAP_NS:
-            self._under_way.clear()
-        self._under_way.append(balance)
-        if balance.distance_m - self._under_way[0].distance_m < STRETCH_M:
+            self._stretch.clear()
+        self._stretch.append(balance)
+        if balance.distance_m - self._stretch[0].distance_m < STRETCH_M:
             return
         stretch = self._end_stretch(dead_reckoning)
         if known_c_rr is not None:
@@ -132,15 +132,15 @@ class Calibrator:
 
     def interrupt(self) -> None:
         """The stretch under way is not usable."""
-        self._under_way.clear()
+        self._stretch.clear()
 
     def _end_stretch(self, dead_reckoning: DeadReckoning) -> _Stretch:
-        pose, n = dead_reckoning.now(), len(self._under_way)
-        newest = self._under_way[-1]
+        pose, n = dead_reckoning.now(), len(self._stretch)
+        newest = self._stretch[-1]
         half = newest.direction * 0.5 * STRETCH_M  # the middle of it lies behind
         x, y = pose.x_m - half * math.cos(pose.angle_rad), pose.y_m - half * math.sin(pose.angle_rad)
-        unbalanced, share = (sum(getattr(b, name) for b in self._under_way) / n for name in ("unbalanced", "share"))
-        self._under_way = [newest]
+        unbalanced, share = (sum(getattr(b, name) for b in self._stretch) / n for name in ("unbalanced", "share"))
+        self._stretch = [newest]
         return _Stretch(newest.stamp_ns, x, y, pose.angle_rad, newest.direction, unbalanced, share)
 
     def _partner(self, stretch: _Stretch) -> _Stretch | None:

@@ -99,18 +99,18 @@ class _Frozen:
     def __init__(self) -> None:
         self.same_s = 0.0
         self._share = math.nan
-        self._taken = self._low = self._high = 0.0
+        self._motion = self._low = self._high = 0.0
 
     def update(self, balance: Balance, *, drives: bool) -> float:
         """Add a balance; returns the change [-]."""
-        taken = balance.share - balance.unbalanced
+        motion = balance.share - balance.unbalanced
         if not drives or balance.share != self._share:
             self.same_s, self._share = 0.0, balance.share
-            self._taken = self._low = self._high = taken
+            self._motion = self._low = self._high = motion
             return 0.0
         self.same_s += balance.dt_s
-        self._taken += min(balance.dt_s / MEAN_S, 1.0) * (taken - self._taken)
-        self._low, self._high = min(self._low, self._taken), max(self._high, self._taken)
+        self._motion += min(balance.dt_s / MEAN_S, 1.0) * (motion - self._motion)
+        self._low, self._high = min(self._low, self._motion), max(self._high, self._motion)
         return self._high - self._low
 
 

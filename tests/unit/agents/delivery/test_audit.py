@@ -89,7 +89,7 @@ def test_void_line_that_was_cut_off_voids_no_other_sample(path: Path) -> None:
     assert len(read_audit(path)) == 12
 
 
-def test_other_lines_are_left_out() -> None:
+def test_other_lines_are_skipped() -> None:
     assert parse(["", "+", "# a remark", "+ 07 1", "- 07", "* 07 1 aa", "+ 07 1 aa", "+ 07 2 bb # cut off"]) == {
         (7, 1): "aa"
     }

@@ -1,9 +1,11 @@
+import contextlib
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +28,19 @@ def opened(path: Path, max_samples: int = 1000, audit: AuditLog | None = None) -
 def kill(spool: Spool) -> None:
     """End the process that has it open."""
     spool._db.close()
+
+
+def changed(path: Path, statement: str) -> Path:
+    """The folder of a spool at rest, in whose file a statement was carried out."""
+    with contextlib.closing(sqlite3.connect(path / "spool.db")) as db, db:
+        db.execute(statement)
+    return path
+
+
+def quarantined(path: Path) -> list[tuple[int, bytes, str]]:
+    """Number, sample and problem of what a spool at rest has in quarantine."""
+    with contextlib.closing(sqlite3.connect(path / "spool.db")) as db:
+        return db.execute("SELECT seq, row, problem FROM quarantine ORDER BY seq").fetchall()
 
 
 def hashes(rows: np.ndarray) -> list[str]:
@@ -83,7 +98,6 @@ def test_openings_that_record_nothing_leave_nothing(tmp_path: Path) -> None:
         spool = opened(tmp_path)
         assert spool.head(9) is None
         assert spool.is_settled()
-        assert len(spool._runs) == 1
         spool.close()
 
 
@@ -95,11 +109,11 @@ def test_runs_come_out_one_after_the_other_and_are_closed(tmp_path: Path) -> Non
         ids.append(spool.spool_id)
         if i < 2:
             kill(spool)
-    found = []
+    heads = []
     while head := spool.head(3):
-        found.append((ids.index(head.spool_id), head.first_seq, len(head.rows), head.lost_before))
+        heads.append((ids.index(head.spool_id), head.first_seq, len(head.rows), head.lost_before))
         spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
-    assert found == [(i, *part) for i in range(3) for part in ((1, 3, 0), (4, 1, 0))]
+    assert heads == [(i, *part) for i in range(3) for part in ((1, 3, 0), (4, 1, 0))]
     assert spool.is_settled()
     spool.close()
 
@@ -140,8 +154,8 @@ def test_spool_that_another_process_has_open_is_refused(tmp_path: Path) -> None:
         "Spool(Path(sys.argv[1]), SpoolConfig())"
     )
     command = [sys.executable, "-c", script, str(tmp_path / "spool.db")]
-    found = subprocess.run(command, capture_output=True, text=True, env={"PYTHONPATH": str(ROOT)}, check=False)
-    assert "another agent is using this spool" in found.stderr
+    ended = subprocess.run(command, capture_output=True, text=True, env={"PYTHONPATH": str(ROOT)}, check=False)
+    assert "another agent is using this spool" in ended.stderr
     kill(spool)
     opened(tmp_path).close()
 
@@ -165,19 +179,19 @@ def test_spool_survives_kill_in_the_middle_of_writing(tmp_path: Path) -> None:
     command = [sys.executable, "-c", WRITER, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": str(ROOT)}) as writer:
         assert writer.stdout
-        told = 0
+        printed = 0
         for line in writer.stdout:
-            told = int(line)
-            if told >= 300:
+            printed = int(line)
+            if printed >= 300:
                 writer.send_signal(signal.SIGKILL)
                 break
-        told = max([told, *map(int, writer.stdout.read().split())])
+        printed = max([printed, *map(int, writer.stdout.read().split())])
     assert writer.returncode == -signal.SIGKILL
     audit = AuditLog(tmp_path / "audit.txt")
     spool = opened(tmp_path, 10**6, audit)
     head = spool.head(10**6)
     assert head
-    assert len(head.rows) >= told
+    assert len(head.rows) >= printed
     assert head.first_seq == 1
     assert hashes(head.rows) == hashes(made_up_samples(100_000)[: len(head.rows)])
     assert len(head.rows) == spool.counters()["recorded"]
@@ -268,9 +282,8 @@ def test_head_ends_before_a_hole(tmp_path: Path) -> None:
     assert rest
     assert (rest.first_seq, len(rest.rows), rest.lost_before) == (7, 4, 1)
     assert spool.counters()["put_aside"] == 1
-    quarantined = spool._db.execute("SELECT seq, row, problem FROM quarantine").fetchall()
-    assert quarantined == [(6, ROWS[5].tobytes(), "too bad")]
     spool.close()
+    assert quarantined(tmp_path) == [(6, ROWS[5].tobytes(), "too bad")]
 
 
 @pytest.mark.parametrize("limit", [1, 10])
@@ -293,21 +306,21 @@ def test_full_spool_drops_the_oldest_counts_them_and_declares_them_lost(tmp_path
 def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
-    for number in (1, 2, 3, 6):
-        spool._db.execute("UPDATE sample SET row = zeroblob(68) WHERE number = ?", (number,))
+    spool.close()
+    spool = opened(changed(tmp_path, "UPDATE sample SET row = zeroblob(68) WHERE number IN (1, 2, 3, 6)"))
     first = spool.head(2)
     assert first
     assert (first.first_seq, first.lost_before) == (4, 3)
     assert hashes(first.rows) == hashes(ROWS[3:5])
-    spool.acknowledge(spool.spool_id, 5)
+    spool.acknowledge(first.spool_id, 5)
     rest = spool.head(99)
     assert rest
     assert (rest.first_seq, rest.lost_before) == (7, 1)
     assert hashes(rest.rows) == hashes(ROWS[6:10])
     assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10}
-    quarantined = spool._db.execute("SELECT seq, problem FROM quarantine ORDER BY seq").fetchall()
-    assert quarantined == [(seq, "damaged on the machine's disk") for seq in (1, 2, 3, 6)]
     spool.close()
+    problem = "damaged on the machine's disk"
+    assert [(seq, why) for seq, _, why in quarantined(tmp_path)] == [(seq, problem) for seq in (1, 2, 3, 6)]
 
 
 # --- servers and files that are set back ------------------------------------------------------------------------------
@@ -421,61 +434,66 @@ def test_damaged_file_is_a_store_error(tmp_path: Path, damage: bytes) -> None:
 
 def test_spool_of_another_schema_is_a_store_error(tmp_path: Path) -> None:
     opened(tmp_path).close()
-    db = sqlite3.connect(tmp_path / "spool.db")
-    db.execute("PRAGMA user_version=99")
-    db.close()
     with pytest.raises(StoreError, match="schema 99"):
-        opened(tmp_path)
+        opened(changed(tmp_path, "PRAGMA user_version=99"))
 
 
 def test_spool_that_has_lost_its_numbers_is_a_store_error(tmp_path: Path) -> None:
     opened(tmp_path).close()
-    db = sqlite3.connect(tmp_path / "spool.db", isolation_level=None)
-    db.execute("DELETE FROM meta WHERE key = 'newest'")
-    db.close()
     with pytest.raises(StoreError):
-        opened(tmp_path)
+        opened(changed(tmp_path, "DELETE FROM meta WHERE key = 'newest'"))
 
 
-def test_failed_record_changes_nothing(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+class FullDisk(sqlite3.Connection):
+    """A disk that is full when it comes to some statement; SQLite rolls back by itself, or does not."""
+
+    rolls_back = False
+    full_at = "never"
+
+    def execute(self, statement: str, *values: object) -> sqlite3.Cursor:
+        self._fail(statement)
+        return super().execute(statement, *values)
+
+    def executemany(self, statement: str, values: Any) -> sqlite3.Cursor:
+        self._fail(statement)
+        return super().executemany(statement, values)
+
+    def _fail(self, statement: str) -> None:
+        if statement.startswith(self.full_at):
+            if self.rolls_back:
+                super().execute("ROLLBACK")
+            raise sqlite3.OperationalError("database or disk is full")
+
+
+class SpoolOnFullDisk(Spool):
+    def _connect(self, path: Path) -> sqlite3.Connection:
+        return connect(path, FullDisk)
+
+
+@pytest.mark.parametrize("statement", ["INSERT INTO sample", "REPLACE INTO meta", "COMMIT"])
+def test_failed_record_changes_nothing_and_names_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, statement: str
+) -> None:
+    spool = SpoolOnFullDisk(tmp_path / "spool.db", SpoolConfig())
     spool.record(ROWS[:2])
-    spool._db.execute("INSERT INTO sample VALUES (4, x'00', 1, NULL)")  # in the way
-    with pytest.raises(StoreError, match="UNIQUE"):
-        spool.record(ROWS[2:5])
-    spool._db.execute("DELETE FROM sample WHERE number = 4")
+    with monkeypatch.context() as patch:
+        patch.setattr(FullDisk, "full_at", statement)
+        with pytest.raises(StoreError, match=r"spool\.db: cannot be used: .* full; look at the machine's disk"):
+            spool.record(ROWS[2:5])
     assert spool.newest == 2
     assert spool.record(ROWS[2:5]) == 3
     assert spool.counters()["recorded"] == 5
     spool.close()
 
 
-class Full(sqlite3.Connection):
-    """A disk that is full when it comes to a commit; SQLite rolls back by itself, or does not."""
-
-    rolls_back = False
-    full = False
-
-    def execute(self, statement: str, *values: object) -> sqlite3.Cursor:
-        if self.full and statement == "COMMIT":
-            if self.rolls_back:
-                super().execute("ROLLBACK")
-            raise sqlite3.OperationalError("database or disk is full")
-        return super().execute(statement, *values)
-
-
 @pytest.mark.parametrize("rolls_back", [False, True])
 def test_failed_commit_leaves_no_transaction_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rolls_back: bool
 ) -> None:
-    class OnFull(Spool):
-        def _connect(self, path: Path) -> sqlite3.Connection:
-            return connect(path, Full)
-
-    monkeypatch.setattr(Full, "rolls_back", rolls_back)
-    spool = OnFull(tmp_path / "spool.db", SpoolConfig())
+    monkeypatch.setattr(FullDisk, "rolls_back", rolls_back)
+    spool = SpoolOnFullDisk(tmp_path / "spool.db", SpoolConfig())
     spool.record(ROWS[:4])
-    monkeypatch.setattr(Full, "full", True)
+    monkeypatch.setattr(FullDisk, "full_at", "COMMIT")
     with pytest.raises(StoreError, match="disk is full"):
         spool.record(ROWS[4:6])
     head = spool.head(9)
@@ -493,7 +511,7 @@ def test_failed_commit_leaves_no_transaction_open(
             attempt()
         assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 0, "recorded": 4}
         assert (spool.spool_id, spool.newest, spool.acknowledged) == (identity, 4, 0)
-    monkeypatch.setattr(Full, "full", False)
+    monkeypatch.setattr(FullDisk, "full_at", "never")
     assert spool.record(ROWS[4:6]) == 5
     spool.close()
 
@@ -503,26 +521,7 @@ def test_bad_spool_option_is_refused_by_name() -> None:
         SpoolConfig(max_samples=0)
 
 
-def test_disk_that_takes_nothing_is_named(tmp_path: Path) -> None:
-    spool = Spool(tmp_path / "spool.db", SpoolConfig())
-    spool._db.execute("PRAGMA query_only = ON")
-    with pytest.raises(StoreError, match=r"spool\.db: cannot be used: .*; look at the machine's disk"):
-        spool.record(made_up_samples(2))
-    assert spool.newest == 0
-    spool._db.execute("PRAGMA query_only = OFF")
-    assert spool.record(made_up_samples(2)) == 1
-    spool.close()
-
-
 # --- damage that SQLite does not see ---------------------------------------------------------------------------------
-
-
-def changed(path: Path, statement: str) -> Path:
-    db = sqlite3.connect(path / "spool.db")
-    db.execute(statement)
-    db.commit()
-    db.close()
-    return path
 
 
 @pytest.mark.parametrize("column", ["spool_id = '00000000000000ff'", "acknowledged = 2", "closed = 1", "crc32 = 5"])
@@ -551,8 +550,10 @@ def test_a_sample_that_is_none_is_quarantined_and_the_others_are_sent(tmp_path: 
 def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:3])
-    spool._db.execute("UPDATE sample SET crc32 = 1 WHERE number = 2")
-    spool._db.execute("CREATE TRIGGER stays BEFORE DELETE ON sample BEGIN SELECT RAISE(IGNORE); END")
+    spool.close()
+    changed(tmp_path, "UPDATE sample SET crc32 = 1 WHERE number = 2")
+    changed(tmp_path, "CREATE TRIGGER stays BEFORE DELETE ON sample BEGIN SELECT RAISE(IGNORE); END")
+    spool = opened(tmp_path)
     with pytest.raises(StoreError, match="the file is damaged"):
         spool.head(10)
     assert spool.counters()["put_aside"] == 0
