@@ -1,8 +1,8 @@
 """How a body sits on its tyres: the pitch that payload and longitudinal force add to that of the ground.
 
 Axle loads of a rigid body in balance, N_f = m (g cos(slope) l_c - f h) / L and N_r = m g cos(slope) - N_f, press tyres
-of stiffness k per axle by N / k; the nose rises by (N_r - N_f) / (k L). The empty machine stands level: its own pitch is
-subtracted.
+of stiffness k per axle by N / k; the nose rises by (N_r - N_f) / (k L). The empty machine stands level: its own pitch
+is subtracted.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ def _quiet() -> Iterator[None]:
     logging.disable(logging.NOTSET)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_or_double_in_any_world() -> None:
     lines: list[str] = []
     sums = run_seeds(0, 250, say=lines.append)
@@ -32,6 +33,7 @@ def test_nothing_is_lost_or_double_in_any_world() -> None:
         assert events[name] > 0, f"no {name} in these seeds"
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_or_double_with_the_real_store() -> None:
     lines: list[str] = []
     sums = run_seeds(0, 25, real=True, say=lines.append)
@@ -39,6 +41,7 @@ def test_nothing_is_lost_or_double_with_the_real_store() -> None:
     assert sums["recorded"] > 500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BUGS)
 def test_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     BUGS[name](monkeypatch)

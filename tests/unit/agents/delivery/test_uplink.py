@@ -8,9 +8,25 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agents.delivery.head import Head
 from agents.delivery.link import linger, perform
 from agents.delivery.spool import Spool, SpoolConfig
-from agents.delivery.uplink import BLOCKING, PASSING, Action, Pacing, Quarantine, Send, Uplink, UplinkConfig, Wait
+from agents.delivery.uplink import (
+    BLOCKING,
+    PASSING,
+    Action,
+    Delete,
+    LowerWatermark,
+    Pacing,
+    Quarantine,
+    ReadHead,
+    Send,
+    SpoolAction,
+    StartNewRun,
+    Uplink,
+    UplinkConfig,
+    Wait,
+)
 from mapserver.ingest.admission import GapError, admit, parse
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.machine.samples import content_hash
@@ -96,6 +112,28 @@ def met(n: int = 0, **options: Any) -> Delivery:
     if n:
         delivery.spool.record(ROWS[:n])
     return delivery
+
+
+HEAD = Head(7, 3, ROWS[:1], lost_before=1, newest=4)  # sample 3 of run 7; 1 is acknowledged, 2 is lost, 4 was recorded
+
+
+@pytest.mark.parametrize(
+    ("reply", "action"),
+    [
+        (Ack(3, 1), Delete(7, 3)),
+        (Ack(5, 1), StartNewRun()),
+        (Refused(Refusal.GAP, "", 1), LowerWatermark(7, 0)),
+        (Refused(Refusal.OUT_OF_RANGE, "bad"), Quarantine(HEAD, "bad")),
+    ],
+)
+def test_each_event_returns_the_next_action(reply: Ack | Refused, action: SpoolAction) -> None:
+    uplink = Uplink("loader-1", SITE.frame, TIMEOUT_S)
+    assert uplink.start_exchange() == ReadHead(Pacing().first_batch)
+    sent = uplink.on_head(HEAD, 7)
+    assert isinstance(sent, Send)
+    assert decode_batch(sent.payload, 1e9).first_seq == 3
+    assert uplink.on_reply(reply, QUICK_S) == action
+    assert uplink.on_stored(action) == Wait(Pacing().gather_s if isinstance(action, Delete) else 0.0)
 
 
 def test_first_payload_of_an_empty_spool_is_a_question() -> None:
@@ -348,6 +386,17 @@ def test_numbers_that_somebody_else_has_used_move_to_a_new_identity() -> None:
     assert (batch.spool_id, batch.first_seq, batch.lost_before) == (d.spool.spool_id, 1, 0)
     assert d.spool.spool_id != old
     assert [content_hash(r) for r in batch.rows] == [content_hash(r) for r in ROWS[5:8]]
+
+
+def test_samples_that_were_recorded_since_the_batch_are_not_deleted_for_another_agent_s() -> None:
+    """An acknowledgement of more than the machine had when it sent is of samples that a copy of it sent."""
+    d = met(5)
+    d.batch()
+    d.spool.record(ROWS[5:8])
+    d.reply(Ack(7, 1))
+    batch = d.batch()
+    assert d.uplink.counters["new_spool_ids"] == 1
+    assert [content_hash(r) for r in batch.rows] == [content_hash(r) for r in ROWS[:8]]
 
 
 def reopened(tmp_path: Path, n: int = 0, acknowledged: int = 0) -> tuple[Delivery, int]:

@@ -18,7 +18,7 @@ from agents.estimation.ground import (
     GroundEstimate,
     GroundEstimator,
 )
-from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Reading, Torque
 from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, Drive, Ground, Leg, drive, machine, noisy
@@ -83,27 +83,6 @@ def test_accelerating_does_not_change_the_resistance(estimator: str) -> None:
     values = [e.c_rr for e in run.between(7, 14) if not e.reason]
     assert len(values) > 60
     assert np.abs(np.array(values) - 0.05).max() < 0.004
-
-
-def test_rotating_mass_counts() -> None:
-    vehicle, wrong = machine(rotating_mass_factor=1.2), machine(rotating_mass_factor=1.0)
-    made = drive([STAND, Leg(10, 0.5)], vehicle)
-    assert last_estimate(vehicle, made).c_rr == pytest.approx(0.04, abs=0.002)
-    assert last_estimate(wrong, made).c_rr == pytest.approx(0.04 + 0.2 * 0.5 / GRAVITY_MPS2, abs=0.002)
-
-
-@pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 90.0), (180.0, 0.0, 0.0), (90.0, 0.0, -90.0), (10.0, -20.0, 30.0)])
-def test_mounting_is_turned_back(rpy_deg: tuple[float, float, float]) -> None:
-    vehicle = machine(Mount((0.4, 0.0, 0.9), rpy_deg))
-    estimate = last_estimate(vehicle, drive(FORWARDS, vehicle, ground=Ground(0.05, SLOPE_RAD, 0.1)))
-    assert estimate.c_rr == pytest.approx(0.05, abs=0.003)
-    assert (estimate.slope_x, estimate.slope_y) == pytest.approx((math.tan(SLOPE_RAD), math.tan(0.1)), abs=0.005)
-
-
-def test_imu_far_ahead_in_a_bend_changes_nothing() -> None:
-    vehicle = machine(Mount((2.5, 0.0, 0.9)))
-    estimate = last_estimate(vehicle, drive([STAND, START, Leg(10, 0.0, 0.4)], vehicle))
-    assert estimate.c_rr == pytest.approx(0.04, abs=0.003)
 
 
 @pytest.mark.parametrize("ahead_rad", [0.0, 0.15])
@@ -429,7 +408,7 @@ def test_calibration_from_before_is_used_at_once() -> None:
 
 def test_what_is_found_is_handed_on() -> None:
     vehicle = machine()
-    run = EstimatorRun(vehicle).feed(off(cycles(vehicle, 3), 0.06))
+    run = EstimatorRun(vehicle).feed(off(cycles(vehicle, 2), 0.06))
     calibration = run.estimator.calibration
     assert calibration.zero == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.001)
     again = EstimatorRun(vehicle, calibration=calibration).feed(drive([STAND], vehicle).readings).estimator
@@ -463,7 +442,7 @@ def test_scale_is_found_on_slopes() -> None:
 
 def test_nothing_is_learnt_of_moments_that_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = machine()
-    readings = off(cycles(vehicle, 2), 0.06)
+    readings = off(cycles(vehicle, 1), 0.06)
     some = EstimatorRun(vehicle).feed(readings)
     monkeypatch.setattr(plausibility, "MIN_SPEED_MPS", 1.9)  # the machine is hardly ever so fast
     few = EstimatorRun(vehicle).feed(readings)
