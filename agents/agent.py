@@ -13,7 +13,7 @@ import zenoh
 
 from agents.config import AgentConfig
 from agents.delivery.audit import AuditLog
-from agents.delivery.link import Link, Sign, linger
+from agents.delivery.link import Sign, UplinkThread, linger
 from agents.delivery.spool import Spool
 from agents.delivery.uplink import Uplink
 from agents.drivers import Driver
@@ -62,7 +62,7 @@ class Agent:
         self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
         self._presence = Presence(session, site.name, machine.name, owner)
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
-        self._link = Link(session, site.name, self._uplink, self._spool, sign)
+        self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign)
         self._unsaved, self._given_up, self._spool_problem = empty(), 0, ""
         self._readings = 0
         self._samples = 0
@@ -114,7 +114,7 @@ class Agent:
 
     def close(self) -> None:
         """End the uplink, leave the network, close the spool."""
-        self._link.close()
+        self._uplink_thread.close()
         self._presence.close()
         self._spool.close()
 
@@ -142,7 +142,7 @@ class Agent:
             return
         self._unsaved, self._spool_problem = empty(), ""
         self._samples += len(waiting)
-        self._link.wake()
+        self._uplink_thread.wake()
 
     def _yield_name(self) -> None:
         """Send nothing while an earlier agent of the same name runs; the samples wait in the spool."""

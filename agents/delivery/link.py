@@ -56,7 +56,7 @@ def perform(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
         return uplink.on_disk_error(error)
 
 
-class Link:
+class UplinkThread:
     """Runs an uplink on a thread of its own."""
 
     def __init__(

@@ -17,7 +17,7 @@ import zenoh
 
 from agents.agent import Agent, Places
 from agents.config import AgentConfig
-from agents.delivery.link import Link
+from agents.delivery.link import UplinkThread
 from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import Uplink, UplinkConfig, Wait
 from agents.localisation.filters.belief import PoseBelief
@@ -235,7 +235,7 @@ def uplink_of(session: zenoh.Session, path: Path, n: int) -> Iterator[Spool]:
     spool = Spool(path, SpoolConfig())
     for first in range(0, n, 50_000):
         spool.record(made_up(n)[first : first + 50_000])
-    link = Link(session, SITE.name, Uplink("loader-1", SITE.frame, UplinkConfig().timeout_s), spool)
+    link = UplinkThread(session, SITE.name, Uplink("loader-1", SITE.frame, UplinkConfig().timeout_s), spool)
     yield spool
     link.close()
     spool.close()
