@@ -9,9 +9,9 @@ Both axles stand on the same ground until the leading one crosses a border; from
 grounds, until the trailing axle has come up. Ground changes with the distance, so the random walk is per square root of
 a metre. With x, P before and x0, P0, x1, P1 at the present step, and T for the transpose,
 
-    predict   P0 = A P A^T + Q
-    correct   K = P0 h^T / (h P0 h^T + r)    x1 = x0 + K (raw - h x0)    P1 = P0 - K h P0
-    smooth    G = P A^T P0^-1                xs = x + G (xs1 - x0)       Ps = P + G (Ps1 - P0) G^T
+    predict   x0 = x, c_trail = c_lead on one ground    P0 = A P A^T + Q
+    correct   K = P0 h^T / (h P0 h^T + r)               x1 = x0 + K (raw - h x0)    P1 = P0 - K h P0
+    smooth    G = P A^T P0^-1                           xs = x + G (xs1 - x0)       Ps = P + G (Ps1 - P0) G^T
 
 (Rauch, Tung and Striebel 1965). A is the identity on one ground; at a border it forgets what was known under the
 leading axle, and at the end of a crossing the trailing axle takes over what is known under the leading one.
@@ -37,16 +37,16 @@ LEAD, TRAIL, SCALE = 0, 1, 2
 KEPT = 100  # steps: 5 s, more than a sample waits for what comes after it
 FIRST_C_RR, FIRST_STD = 0.03, 0.1
 NEAR_NS = 150_000_000  # a stamp this far from a usable step has no estimate
-NOISE = 0.004  # of one raw c_rr, at least, as a density [1/sqrt(Hz)]; more is measured,
-NOISE_S = 20.0  # over so long,
-OUTLIER = 16.0  # and squares beyond so many times the mean are something else
+NOISE = 0.004  # least density of the noise of raw c_rr [1/sqrt(Hz)]; larger noise is measured
+NOISE_S = 20.0  # over which noise is measured
+OUTLIER = 16.0  # squares beyond so many times the mean are no noise, but a border
 WALK = 0.002  # random walk of c_rr [1/sqrt(m)]: ground of one kind is never quite even
 SCALE_WALK = 1e-3  # random walk of the scale error [1/sqrt(s)]
 SCALE_STD = 0.2  # standard deviation of the scale error at first, and when the load has changed: 3.5 t of 17.5 t
-# A border: the jump is so many standard deviations large, so that five minutes on one ground show none; and at least so
-# large, as smaller differences are within one kind of ground. c_rr is then as unknown as at first.
+# A jump is a border from so many standard deviations on: five minutes on one ground show none. It is also at least JUMP
+# large: smaller differences occur within one kind of ground. c_rr is then as unknown as at first.
 JUMP_SIGMA, JUMP, JUMP_STD = 5.5, 0.006, 0.1
-LEAST_BEHIND = 4  # steps behind a border: fewer are an outlier of the noise
+LEAST_BEHIND = 4  # steps before and behind a border: fewer may be an outlier of the noise
 SEARCHED = 40  # steps that are searched for a border: 2 s
 
 IDENTITY = np.eye(3)
