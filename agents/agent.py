@@ -1,4 +1,4 @@
-"""One machine's process: driver -> pipeline -> spool -> uplink, with pose and health on the side."""
+"""One machine's process: driver -> pipeline -> spool -> uplink; it publishes pose and health too."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import zenoh
 
 from agents.config import AgentConfig
 from agents.delivery.audit import AuditLog
+from agents.delivery.link import Sign, UplinkThread, linger
 from agents.delivery.spool import Spool
-from agents.delivery.uplink import Sign, Uplink, UplinkState, linger
+from agents.delivery.uplink import Uplink
 from agents.drivers import Driver
-from agents.estimation import calibration_file
-from agents.estimation.calibration import Calibration
+from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Owner, Presence
@@ -28,12 +28,12 @@ from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
 
 HEALTH_S = 1.0
-MOST_UNSAVED = 100_000  # samples that wait in memory while the disk takes nothing
+MOST_UNSAVED = 100_000  # samples that wait in memory while the disk is full or fails
 
 
 @dataclass(frozen=True)
 class Places:
-    """Files of an agent: its spool, and where asked for an audit file and one that keeps the calibration."""
+    """Files of an agent: its spool, and optionally an audit file and one for the calibration."""
 
     spool: Path
     audit: Path | None = None
@@ -56,15 +56,13 @@ class Agent:
         sign: Sign | None = None,
     ) -> None:
         self._config = config
-        self._machine, self._calibration_file = machine.name, places.calibration
-        self._calibration_problem = ""
-        self._pipeline = Pipeline(site, machine, config.pipeline, self._known())
-        self._kept_ns = self._pipeline.calibration.stamp_ns
+        self._calibration_file = CalibrationFile(places.calibration, machine.name)
+        self._pipeline = Pipeline(site, machine, config.pipeline, self._calibration_file.read())
         self._holdout = Holdout(site, machine, config.holdout) if withhold else None
         self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
         self._presence = Presence(session, site.name, machine.name, owner)
-        state = UplinkState(machine.name, site.frame, self._spool, config.uplink)
-        self._uplink = Uplink(session, site.name, machine.name, state, config.uplink.timeout_s, sign)
+        self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
+        self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign)
         self._unsaved, self._given_up, self._spool_problem = empty(), 0, ""
         self._readings = 0
         self._samples = 0
@@ -86,12 +84,12 @@ class Agent:
             self._step(list(readings))
             if clock() >= health_s:
                 health_s = clock() + HEALTH_S
-                self._keep_calibration()
+                self._calibration_file.write(self._pipeline.calibration)
                 self._yield_name()
                 self._presence.show_health(self._newest_ns, self.report(driver))
         driver.close()
         self._deliver(self._pipeline.finish())
-        self._keep_calibration()
+        self._calibration_file.write(self._pipeline.calibration)
         delivered = linger(self._is_delivered, wait, clock, 0.0 if is_stopped() else self._config.linger_s)
         report = {**self.report(driver), "delivered": delivered}
         self._presence.show_health(self._newest_ns, report)
@@ -99,7 +97,7 @@ class Agent:
 
     def report(self, driver: Driver) -> dict[str, Any]:
         """Health in plain values."""
-        uplink, owner = self._uplink.state, self._presence.owner
+        uplink, owner = self._uplink, self._presence.owner
         return {
             "host": owner.host,
             "pid": owner.pid,
@@ -109,14 +107,14 @@ class Agent:
             "pipeline": self._pipeline.health(),
             "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._given_up},
             "spool_problem": self._spool_problem,
-            "calibration_problem": self._calibration_problem,
+            "calibration_problem": self._calibration_file.problem,
             "uplink": {"problem": uplink.held or uplink.problem, "counters": dict(uplink.counters)},
             "holdout": self._holdout.report() if self._holdout else None,
         }
 
     def close(self) -> None:
         """End the uplink, leave the network, close the spool."""
-        self._uplink.close()
+        self._uplink_thread.close()
         self._presence.close()
         self._spool.close()
 
@@ -132,7 +130,7 @@ class Agent:
             self._presence.show_pose(pose)
 
     def _deliver(self, rows: Table) -> None:
-        """Write samples to the spool; while the disk takes none they wait here, and the machine goes on."""
+        """Write samples to the spool; while the disk is full or fails they wait here, and the machine goes on."""
         waiting = np.concatenate([self._unsaved, rows])
         if not len(waiting):
             return
@@ -144,35 +142,15 @@ class Agent:
             return
         self._unsaved, self._spool_problem = empty(), ""
         self._samples += len(waiting)
-        self._uplink.wake()
+        self._uplink_thread.wake()
 
     def _yield_name(self) -> None:
-        """Send nothing while an earlier agent of the same name is alive; the samples wait in the spool."""
+        """Send nothing while an earlier agent of the same name runs; the samples wait in the spool."""
         rival = self._presence.look_around()
-        self._uplink.state.held = (
+        self._uplink.held = (
             f"another agent of this name runs as {rival}: it sends, this one waits; stop one of them" if rival else ""
         )
 
-    def _known(self) -> Calibration | None:
-        """The calibration from before; one that cannot be read is reported, and found anew."""
-        try:
-            return calibration_file.load(self._calibration_file, self._machine) if self._calibration_file else None
-        except StoreError as error:
-            self._calibration_problem = str(error)
-            return None
-
-    def _keep_calibration(self) -> None:
-        """Write the calibration down when it is a new one; a full disk must not stop the machine."""
-        calibration = self._pipeline.calibration
-        if not self._calibration_file or calibration.stamp_ns <= self._kept_ns:
-            return
-        try:
-            calibration_file.save(self._calibration_file, self._machine, calibration)
-        except StoreError as error:
-            self._calibration_problem = str(error)
-        else:
-            self._kept_ns, self._calibration_problem = calibration.stamp_ns, ""
-
     def _is_delivered(self) -> bool:
-        self._deliver(empty())  # what the disk did not take yet
+        self._deliver(empty())  # samples that are not on disk yet
         return not len(self._unsaved) and self._spool.is_settled()

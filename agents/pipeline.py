@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from agents.drivers.stream_order import Order, Verdict
-from agents.estimation.calibration import Calibration
+from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import SPEED
@@ -214,7 +214,7 @@ class Pipeline:
         if not areas or not pose:
             return None
         std_m = float(np.sqrt(np.linalg.eigvalsh(pose.covariance_m2)[-1]))
-        margin_m = self._config.estimation.calibration.edge_m + 2 * std_m
+        margin_m = EDGE_M + 2 * std_m
         return next((area.c_rr for area in areas if area.inside_m(pose.x_m, pose.y_m) > margin_m), None)
 
     def _start(self, known: Calibration | None) -> None:

@@ -1,9 +1,10 @@
-"""What others see of a machine: live pose, health, a liveliness token, and an answer to who it is.
+"""What other processes see of a machine: live pose, health, a liveliness token, and an answer to who it is.
 
-The token tells that an agent is there, for as long as the router believes so (up to the lease after a broken link). Who
-asks on the same key gets an answer from a live agent only: so a machine that restarts never takes its own dead
-predecessor for another agent. (A router passes nothing between two sessions in peer mode: of two agents that both
-started without a router, neither sees the other. Their samples have different identities all the same, see spool.py.)
+The token shows that an agent is there, for as long as the router believes so (up to the lease after a broken link). A
+query on the same key is answered by a live agent only: so a machine that restarts never mistakes its own
+killed predecessor for another agent. (A router passes nothing between two sessions in peer mode: of two agents that
+both started without a router, neither sees the other. Their samples have different identities all the same, see
+spool.py.)
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ EVERY_OTHER: Any = {
 
 @dataclass(frozen=True, order=True)
 class Owner:
-    """One running agent. Where two have one name, the one that is less (earlier, then by chance) keeps it."""
+    """One running agent. Of two with one name, the lesser one keeps it: the earlier, then by chance."""
 
     started_ns: int
     token: int
@@ -49,7 +50,7 @@ class Owner:
 
 
 def this_process(now_ns: Callable[[], int] = time.time_ns) -> Owner:
-    """Describe an agent that starts now in this process."""
+    """An agent that starts now in this process."""
     return Owner(now_ns(), secrets.randbits(62), socket.gethostname(), os.getpid())
 
 
@@ -60,10 +61,10 @@ def find_namesake(session: zenoh.Session, site: str, machine: str, wait_s: float
 
 
 class Presence:
-    """Publishes pose and health; both may be dropped on the way, the next one replaces them.
+    """Publishes pose and health; a message may be lost, as the next one replaces it.
 
-    While a machine catches up they wait for at most one batch of samples, which uplink.py keeps to about a second:
-    Zenoh's priorities change nothing there, because a batch lies in the socket's buffer already.
+    While a machine catches up they wait for at most one batch of samples, which the uplink keeps to about a second.
+    Zenoh's priorities do not help there, because a batch lies in the socket's buffer already.
     """
 
     def __init__(self, session: zenoh.Session, site: str, machine: str, owner: Owner | None = None) -> None:
@@ -89,7 +90,7 @@ class Presence:
     def look_around(self) -> Owner | None:
         """Return the agent whose name this is, if it is another one; and ask again for the next call.
 
-        Answers come in beside the work, within ANSWER_S.
+        Answers arrive between two calls, within ANSWER_S.
         """
         answers, self._answers = self._answers, set()
         self._session.get(self._key, self._on_reply, timeout=ANSWER_S, **EVERY_OTHER)

@@ -1,1 +1,1 @@
-"""Samples from the machine's own disk to the map server: spool, uplink, and the audit of both."""
+"""Samples from the machine's own disk to the map server: spool, uplink, its link over Zenoh, and an audit."""

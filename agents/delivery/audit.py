@@ -1,9 +1,9 @@
-"""The audit file: what an agent recorded, line by line at recording time, to compare with what the server has.
+"""The audit file: what an agent recorded, line by line at recording time, to compare with the server's journal.
 
 `+ <spool_id> <seq> <hash>` is a recorded sample (a later line for the same sample replaces it), `- <spool_id> <seq>`
-one whose identity is void because it was numbered anew. A line is written after its sample is committed, and what a
-crash kept from being written is added when the spool is opened again: no line claims what was never on disk, and a disk
-that forgets what it committed shows as a loss.
+one whose identity is void because it was numbered anew. A line is written after its sample is committed; lines that a
+crash prevented are added when the spool is opened again. So no line claims a sample that was never on disk, and a disk
+that loses committed samples shows as a loss.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class AuditLog:
         self._file = path.open("a", encoding="ascii")
 
     def recorded(self, spool_id: int, first_seq: int, rows: Table) -> None:
-        """Note samples."""
+        """Note new samples."""
         self._write(f"+ {spool_id:016x} {first_seq + i} {content_hash(row)}" for i, row in enumerate(rows))
 
     def renumbered(self, old_id: int, old_seqs: Iterable[int], new_id: int, rows: Table) -> None:
@@ -35,17 +35,19 @@ class AuditLog:
         self.recorded(new_id, 1, rows)
 
     def complete(self, spooled: Iterable[tuple[int, int, Table]]) -> None:
-        """Add what a crash kept from being noted, and end a line that it cut off.
+        """Add lines that a crash prevented, and end a line that it cut off.
 
         spooled: the samples that are on disk, as (spool_id, seq, row).
         """
         text = self._path.read_text(encoding="ascii")
         if text and not text.endswith("\n"):
             self._write([" # cut off"])
-        known = parse(_whole_lines(text))
-        hashes = ((spool_id, seq, content_hash(row)) for spool_id, seq, row in spooled)
-        missing = (found for found in hashes if known.get(found[:2]) != found[2])
-        self._write(f"+ {spool_id:016x} {seq} {content}" for spool_id, seq, content in missing)
+        noted = parse(_whole_lines(text))
+        self._write(
+            f"+ {spool_id:016x} {seq} {content}"
+            for spool_id, seq, row in spooled
+            if noted.get((spool_id, seq)) != (content := content_hash(row))
+        )
 
     def close(self) -> None:
         """Close the file."""
@@ -62,7 +64,7 @@ def read_audit(path: Path) -> dict[Identity, str]:
 
 
 def parse(lines: Iterable[str]) -> dict[Identity, str]:
-    """Hash by identity, of audit lines; malformed lines are left out."""
+    """Hash by identity, of audit lines; malformed lines are skipped."""
     recorded: dict[Identity, str] = {}
     for sign, spool_id, seq, content in _fields(lines):
         if sign == "+":

@@ -2,8 +2,9 @@
 
 Samples are numbered through in the file. What is recorded between one opening and the next is a **run**, with a random
 `spool_id` of its own; `seq` counts 1, 2, 3... within a run, so that seq = number - base. A file that was copied,
-cloned, restored from a backup or taken back by a lying disk therefore never gives one identity to two samples: what
-copies have in common has the same identity and the same bytes, what they record from then on has another spool_id.
+cloned, restored from a backup or set back by a disk that lies about its syncs therefore never gives one identity to two
+samples: what copies have in common has the same identity and the same bytes, what they record from then on has another
+spool_id.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from agents.delivery.audit import AuditLog
+from agents.delivery.head import Head
 from agents.delivery.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty
 
-KEPT_RUNS = 16  # earlier runs that are declared again: a server restored from a backup learns what it has lost
+KEPT_RUNS = 16  # earlier runs that are declared again: so a server that was restored from a backup learns what it lost
 
 
 @dataclass(frozen=True)
@@ -39,20 +41,7 @@ class SpoolConfig:
 
 
 @dataclass(frozen=True)
-class Head:
-    """The oldest samples that are final. lost_before: how many directly before them will never be sent.
-
-    Without rows it closes an earlier run: nothing more will come of it.
-    """
-
-    spool_id: int
-    first_seq: int
-    rows: Table
-    lost_before: int
-
-
-@dataclass(frozen=True)
-class Run:
+class SpoolRun:
     """What one opening recorded. base: number of the last sample before it; acknowledged: a seq.
 
     closed: the server has once accounted for all of it.
@@ -66,18 +55,14 @@ class Run:
 
 @dataclass(frozen=True)
 class _Meta:
-    """Counts of the file: the last number given out, samples that were dropped, samples that were recorded.
-
-    plain_until: numbers up to this one were given by schema 1, which had no checksums.
-    """
+    """Counts of the file: the last number given out, samples that were dropped, samples that were recorded."""
 
     newest: int
     dropped: int
     recorded: int
-    plain_until: int = 0
 
 
-_Row = tuple[int, bytes, int, int | None]  # number, sample, whether it is final, checksum
+_SampleRow = tuple[int, bytes, int, int]  # number, sample, whether it is final, checksum
 
 
 def random_id() -> int:
@@ -88,7 +73,7 @@ def random_id() -> int:
 class Spool:
     """One machine's samples that are not yet acknowledged. All methods may be called from any thread.
 
-    StoreError if the file is damaged, or if another process has it open.
+    StoreError if the file is damaged, if another process has it open, or if the disk is full or fails.
     """
 
     def __init__(
@@ -137,39 +122,36 @@ class Spool:
             return {
                 "depth": self._depth,
                 "dropped": meta.dropped,
-                "put_aside": self._aside,
+                "put_aside": self._quarantined,
                 "recorded": meta.recorded,
             }
 
     def is_settled(self) -> bool:
         """Whether nothing is left to be sent, and the server has accounted for all earlier runs."""
         with self._lock:
-            return self._depth == 0 and self._at == len(self._runs) - 1
+            return self._depth == 0 and self._sending == len(self._runs) - 1
 
     def record(self, rows: Table, *, final: bool = True) -> int:
-        """Write samples durably; returns the sequence number of the first. StoreError if the disk does not take them.
+        """Write samples durably; returns the sequence number of the first.
 
         Pending ones (not final) are not sent before they are made final.
         """
-        with self._lock:
+        with self._access():
             first = self.newest + 1
-            try:
-                self._insert(rows, final=final)
-            except sqlite3.Error as error:
-                raise StoreError(self._path, f"cannot be written: {error}; look at the machine's disk") from None
+            self._insert(rows, final=final)
             self._note(first, rows)
             return first
 
     def finalise(self, first_seq: int, rows: Table) -> None:
         """Replace pending samples of this run by their final values; those that are final stay as they are."""
-        with self._lock:
+        with self._access():
             base = self._runs[-1].base
-            kept = [i for i in range(len(rows)) if self._is_pending(base + first_seq + i)]
+            pending = [i for i in range(len(rows)) if self._is_pending(base + first_seq + i)]
             with transaction(self._db):
-                data = {base + first_seq + i: rows[i].tobytes() for i in kept}
+                data = {base + first_seq + i: rows[i].tobytes() for i in pending}
                 values = [(row, checksum(number, row), number) for number, row in data.items()]
                 self._db.executemany("UPDATE sample SET row = ?, crc32 = ?, final = 1 WHERE number = ?", values)
-            for i in kept:
+            for i in pending:
                 self._note(first_seq + i, rows[i : i + 1])
 
     def head(self, limit: int) -> Head | None:
@@ -177,75 +159,71 @@ class Spool:
 
         Runs come one after the other; one that has no samples left is closed with an empty head.
         """
-        with self._lock:
-            run, end = self._runs[self._at], self._end(self._at)
-            while damaged := _damaged(found := self._oldest(limit), self._meta.plain_until):
-                self._move_aside(run, damaged, "damaged on the machine's disk")
-            if not found:
-                is_earlier = self._at < len(self._runs) - 1
-                return Head(run.spool_id, end + 1, empty(), end) if is_earlier else None
-            first = found[0][0]
-            n = next((i for i, (number, _, final, _) in enumerate(found) if final == 0 or number != first + i), None)
-            seq, rows = first - run.base, _table(row for _, row, _, _ in found[:n])
-            return Head(run.spool_id, seq, rows, seq - 1 - run.acknowledged) if len(rows) else None
+        with self._access():
+            run, end = self._runs[self._sending], self._end(self._sending)
+            while damaged := _damaged(oldest := self._oldest(limit)):
+                self._move_to_quarantine(run, damaged, "damaged on the machine's disk")
+            newest = None if self._sending < len(self._runs) - 1 else end
+            if not oldest:
+                return Head(run.spool_id, end + 1, empty(), end) if newest is None else None
+            first = oldest[0][0]
+            n = next((i for i, (number, _, final, _) in enumerate(oldest) if final == 0 or number != first + i), None)
+            seq, rows = first - run.base, _table(row for _, row, _, _ in oldest[:n])
+            return Head(run.spool_id, seq, rows, seq - 1 - run.acknowledged, newest) if len(rows) else None
 
     def acknowledge(self, spool_id: int, watermark: int) -> None:
         """Delete what the server has on disk, of one run."""
-        with self._lock:
+        with self._access():
             at = self._index(spool_id)
             run, end = self._runs[at], self._end(at)
             upto = max(run.acknowledged, min(watermark, end))
             is_earlier = at < len(self._runs) - 1
             new = replace(run, acknowledged=upto, closed=run.closed or (is_earlier and watermark >= end))
             with transaction(self._db):
-                span = (run.base, run.base + upto)
-                deleted = self._db.execute("DELETE FROM sample WHERE number > ? AND number <= ?", span).rowcount
+                numbers = (run.base, run.base + upto)
+                deleted = self._db.execute("DELETE FROM sample WHERE number > ? AND number <= ?", numbers).rowcount
                 self._save_run(new)
             self._runs[at] = new
             self._depth -= deleted
-            if at == self._at and is_earlier and watermark >= end:
-                self._at += 1
+            if at == self._sending and is_earlier and watermark >= end:
+                self._sending += 1
 
-    def fall_back(self, spool_id: int, watermark: int) -> bool:
-        """Take in that the server knows less than it acknowledged (restored from a backup); returns whether it does.
+    def lower_watermark(self, spool_id: int, watermark: int) -> None:
+        """Handle a server that knows less than it acknowledged: it was restored from a backup.
 
         What it has lost is gone here as well: it is declared lost, of this run and of the earlier ones.
         """
-        with self._lock:
+        with self._access():
             at = self._index(spool_id)
-            run = self._runs[at]
-            if watermark >= run.acknowledged:
-                return False
-            new = replace(run, acknowledged=watermark)
+            new = replace(self._runs[at], acknowledged=watermark)
             with transaction(self._db):
                 self._save_run(new)
-            self._runs[at], self._at = new, 0
-            return True
+            self._runs[at], self._sending = new, 0
 
-    def fork(self) -> None:
-        """Give what is not acknowledged of this run a new identity: somebody else sends under the present one."""
-        with self._lock:
+    def start_new_run(self) -> None:
+        """Give what is not acknowledged of this run a new identity: another agent sends under the present one."""
+        with self._access():
             old = self._runs[-1]
-            new = Run(old.base + old.acknowledged, self._draw_id())
-            found = self._db.execute("SELECT number, row FROM sample WHERE number > ?", (new.base,)).fetchall()
-            kept = [replace(old, closed=True)] if old.acknowledged else []
+            new = SpoolRun(old.base + old.acknowledged, self._draw_id())
+            waiting = self._db.execute("SELECT number, row FROM sample WHERE number > ?", (new.base,)).fetchall()
+            ended = [replace(old, closed=True)] if old.acknowledged else []
             with transaction(self._db):
                 self._db.execute("DELETE FROM run WHERE base = ?", (old.base,))
-                for run in (*kept, new):
+                for run in (*ended, new):
                     self._save_run(run)
-            self._runs[-1:] = [*kept, new]
-            self._at = len(self._runs) - 1
-            if self._audit and found:
-                seqs = [number - old.base for number, _ in found]
+            self._runs[-1:] = [*ended, new]
+            self._sending = len(self._runs) - 1
+            if self._audit and waiting:
+                seqs = [number - old.base for number, _ in waiting]
                 with contextlib.suppress(OSError):
-                    self._audit.renumbered(old.spool_id, seqs, new.spool_id, _table(row for _, row in found))
+                    self._audit.renumbered(old.spool_id, seqs, new.spool_id, _table(row for _, row in waiting))
 
-    def put_aside(self, head: Head, problem: str) -> None:
-        """Keep samples that the server will never take out of the way, for a person to look at."""
-        with self._lock:
+    def quarantine(self, head: Head, problem: str) -> None:
+        """Keep samples that the server will never accept out of the way, for a person to look at."""
+        with self._access():
             run = self._runs[self._index(head.spool_id)]
             first = run.base + head.first_seq
-            self._move_aside(run, [(first + i, row.tobytes()) for i, row in enumerate(head.rows)], problem)
+            self._move_to_quarantine(run, [(first + i, row.tobytes()) for i, row in enumerate(head.rows)], problem)
 
     def close(self) -> None:
         """Fold the write-ahead log into the file and close."""
@@ -259,6 +237,15 @@ class Spool:
     def _connect(self, path: Path) -> sqlite3.Connection:
         return connect(path)
 
+    @contextlib.contextmanager
+    def _access(self) -> Iterator[None]:
+        """Have the file to oneself; what SQLite cannot do is a StoreError."""
+        with self._lock:
+            try:
+                yield
+            except sqlite3.Error as error:
+                raise StoreError(self._path, f"cannot be used: {error}; look at the machine's disk") from None
+
     def _open(self) -> None:
         """Make or read the file, and start a run."""
         with transaction(self._db):  # all together: a kill leaves all or nothing
@@ -267,20 +254,19 @@ class Spool:
             self._db.execute("UPDATE sample SET final = 1 WHERE final IS NOT 1")
             self._meta = _Meta(**{k: int(v) for k, v in self._db.execute("SELECT key, value FROM meta")})
             self._runs = self._start_run()
-        self._at = 0
+        self._sending = 0  # index of the run that is being sent
         self._depth = int(self._db.execute("SELECT COUNT(*) FROM sample").fetchone()[0])
-        self._aside = int(self._db.execute("SELECT COUNT(*) FROM aside").fetchone()[0])
+        self._quarantined = int(self._db.execute("SELECT COUNT(*) FROM quarantine").fetchone()[0])
         if self._audit:
             self._audit.complete(self._identified())
 
-    def _start_run(self) -> list[Run]:
+    def _start_run(self) -> list[SpoolRun]:
         """Add a run to those that are still of interest: not closed, or among the last. One without samples is not."""
-        plain = self._meta.plain_until
-        found = [_run_of(*row, is_plain=row[0] < plain) for row in self._db.execute("SELECT * FROM run ORDER BY base")]
-        filled = [run for run in found if run.base < self._meta.newest]
+        runs = [_run_from(*row) for row in self._db.execute("SELECT * FROM run ORDER BY base")]
+        filled = [run for run in runs if run.base < self._meta.newest]
         last = filled[-KEPT_RUNS:]
         first = next((i for i, run in enumerate(filled) if not run.closed or run in last), len(filled))
-        runs = [*filled[first:], Run(self._meta.newest, self._draw_id())]
+        runs = [*filled[first:], SpoolRun(self._meta.newest, self._draw_id())]
         self._db.execute("DELETE FROM run")
         for run in runs:
             self._save_run(run)
@@ -288,11 +274,9 @@ class Spool:
 
     def _identified(self) -> Iterator[tuple[int, int, Table]]:
         """All samples of the file as (spool_id, seq, row)."""
+        query = "SELECT number, row FROM sample WHERE number > ? AND number <= ?"
         for i, run in enumerate(self._runs):
-            span = (run.base, run.base + self._end(i))
-            for number, row in self._db.execute(
-                "SELECT number, row FROM sample WHERE number > ? AND number <= ?", span
-            ):
+            for number, row in self._db.execute(query, (run.base, run.base + self._end(i))):
                 yield run.spool_id, number - run.base, _table([row])[0]
 
     def _end(self, at: int) -> int:
@@ -320,58 +304,56 @@ class Spool:
         self._meta = new
         self._depth += n - excess
 
-    def _oldest(self, limit: int) -> list[_Row]:
+    def _oldest(self, limit: int) -> list[_SampleRow]:
         """Rows of the run that is being sent."""
-        base, end = self._runs[self._at].base, self._end(self._at)
+        base, end = self._runs[self._sending].base, self._end(self._sending)
         query = "SELECT * FROM sample WHERE number > ? AND number <= ? ORDER BY number LIMIT ?"
         return self._db.execute(query, (base, base + end, limit)).fetchall()
 
-    def _move_aside(self, run: Run, rows: list[tuple[int, bytes]], why: str) -> None:
-        values = [(f"{run.spool_id:016x}", number - run.base, row, why) for number, row in rows]
+    def _move_to_quarantine(self, run: SpoolRun, rows: list[tuple[int, bytes]], problem: str) -> None:
+        values = [(f"{run.spool_id:016x}", number - run.base, row, problem) for number, row in rows]
         with transaction(self._db):
-            self._db.executemany("INSERT INTO aside VALUES (?, ?, ?, ?)", values)
-            places = [(number,) for number, _ in rows]
-            gone = self._db.executemany("DELETE FROM sample WHERE number = ?", places).rowcount
-            if gone < len(rows):  # it is found where it is not: the file's own structure is damaged
-                raise sqlite3.DatabaseError(f"samples {places[0][0]} and on cannot be removed: the file is damaged")
-        self._aside += len(values)
+            self._db.executemany("INSERT INTO quarantine VALUES (?, ?, ?, ?)", values)
+            numbers = [(number,) for number, _ in rows]
+            deleted = self._db.executemany("DELETE FROM sample WHERE number = ?", numbers).rowcount
+            if deleted < len(rows):  # a row is read where it cannot be deleted: the file's own structure is damaged
+                raise sqlite3.DatabaseError(f"samples {rows[0][0]} and on cannot be removed: the file is damaged")
+        self._quarantined += len(values)
         self._depth -= len(values)
 
     def _note(self, first_seq: int, rows: Table) -> None:
-        """Write the audit, if there is one: what a full disk keeps from it is added at the next opening."""
+        """Write the audit, if there is one: lines that a full disk prevents are added at the next opening."""
         if self._audit:
             with contextlib.suppress(OSError):
                 self._audit.recorded(self.spool_id, first_seq, rows)
 
     def _is_pending(self, number: int) -> bool:
-        found = self._db.execute("SELECT 1 FROM sample WHERE number = ? AND final = 0", (number,)).fetchone()
-        return found is not None
+        query = "SELECT 1 FROM sample WHERE number = ? AND final = 0"
+        return self._db.execute(query, (number,)).fetchone() is not None
 
     def _save(self, meta: _Meta) -> None:
         values = [(key, str(value)) for key, value in asdict(meta).items()]
         self._db.executemany("REPLACE INTO meta VALUES (?, ?)", values)
 
-    def _save_run(self, run: Run) -> None:
+    def _save_run(self, run: SpoolRun) -> None:
         values = (run.base, f"{run.spool_id:016x}", run.acknowledged, int(run.closed))
         self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?, ?)", (*values, checksum_of(*values)))
 
 
-def _damaged(rows: list[_Row], plain_until: int) -> list[tuple[int, bytes]]:
-    """Those that are not what was written; up to plain_until samples have no checksum."""
-    return [(number, row) for number, row, _, crc32 in rows if not _is_sound(number, row, crc32, number <= plain_until)]
+def _damaged(rows: list[_SampleRow]) -> list[tuple[int, bytes]]:
+    """Those that are not what was written."""
+    return [(number, row) for number, row, _, crc32 in rows if not _is_sound(number, row, crc32)]
 
 
-def _is_sound(number: int, row: object, crc32: int | None, is_plain: bool) -> bool:  # noqa: FBT001
-    if not isinstance(row, bytes) or len(row) != SAMPLE_DTYPE.itemsize:
-        return False
-    return crc32 == checksum(number, row) or (is_plain and crc32 is None)
+def _is_sound(number: int, row: object, crc32: int) -> bool:
+    return isinstance(row, bytes) and len(row) == SAMPLE_DTYPE.itemsize and crc32 == checksum(number, row)
 
 
-def _run_of(base: int, spool_id: str, acknowledged: int, closed: int, crc32: int | None, *, is_plain: bool) -> Run:
+def _run_from(base: int, spool_id: str, acknowledged: int, closed: int, crc32: int) -> SpoolRun:
     """A run as the file has it; ValueError where that is not what was written."""
-    if crc32 != checksum_of(base, spool_id, acknowledged, closed) and not (is_plain and crc32 is None):
+    if crc32 != checksum_of(base, spool_id, acknowledged, closed):
         raise ValueError(f"what it knows of samples from {base} on is damaged; move the file away")
-    return Run(base, int(spool_id, 16), acknowledged, bool(closed))
+    return SpoolRun(base, int(spool_id, 16), acknowledged, bool(closed))
 
 
 def _table(rows: Iterable[bytes]) -> Table:

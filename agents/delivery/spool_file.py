@@ -6,25 +6,14 @@ import sqlite3
 import zlib
 from pathlib import Path
 
-SCHEMA = 2
+SCHEMA = 3
 LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
-_RUN = "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INTEGER, closed INTEGER, crc32 INTEGER)"
 _TABLES = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
+    "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INTEGER, closed INTEGER, crc32 INTEGER)",
     "CREATE TABLE sample (number INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL, crc32 INTEGER)",
-    "CREATE TABLE aside (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL)",
+    "CREATE TABLE quarantine (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL)",
     "INSERT INTO meta VALUES ('newest', '0'), ('dropped', '0'), ('recorded', '0')",
-    _RUN,
-    f"PRAGMA user_version={SCHEMA}",
-)
-_FROM_SCHEMA_1 = (
-    _RUN,
-    "INSERT INTO run SELECT 0, value, 0, 0, NULL FROM meta WHERE key = 'spool_id'",
-    "UPDATE run SET acknowledged = (SELECT value FROM meta WHERE key = 'acknowledged')",
-    "DELETE FROM meta WHERE key IN ('spool_id', 'acknowledged')",
-    "ALTER TABLE sample RENAME COLUMN seq TO number",
-    "ALTER TABLE sample ADD COLUMN crc32 INTEGER",
-    "INSERT INTO meta SELECT 'plain_until', value FROM meta WHERE key = 'newest'",  # up to there it is not known
     f"PRAGMA user_version={SCHEMA}",
 )
 
@@ -37,12 +26,12 @@ def connect(path: Path, kind: type[sqlite3.Connection] = sqlite3.Connection) -> 
 
 
 def make_or_check(db: sqlite3.Connection) -> None:
-    """Write the tables of a new file, bring an older one up to date; ValueError for any other schema."""
+    """Write the tables of a new file; ValueError for another schema."""
     if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
-        _run_all(db, _TABLES)
-    elif _schema(db) == 1:
-        _run_all(db, _FROM_SCHEMA_1)
-    if (schema := _schema(db)) != SCHEMA:
+        for statement in _TABLES:
+            db.execute(statement)
+    (schema,) = db.execute("PRAGMA user_version").fetchone()
+    if schema != SCHEMA:
         raise ValueError(f"schema {schema}, this agent knows {SCHEMA}")
 
 
@@ -79,12 +68,3 @@ class transaction:  # noqa: N801 - used like a keyword
         finally:
             if self._db.in_transaction:  # SQLite itself has rolled back after some errors of the disk
                 self._db.execute("ROLLBACK")
-
-
-def _run_all(db: sqlite3.Connection, statements: tuple[str, ...]) -> None:
-    for statement in statements:
-        db.execute(statement)
-
-
-def _schema(db: sqlite3.Connection) -> int:
-    return int(db.execute("PRAGMA user_version").fetchone()[0])

@@ -1,11 +1,11 @@
-"""From readings to balances of force along the machine: what drives it, over its weight, less what its motion takes.
+"""From readings to steps of the force balance: drive force over weight, less what the motion takes.
 
-With F the drive force, f the specific force ahead at `base_link` (the accelerometer's, gravity's share included), a the
-wheels' acceleration, m the mass and lambda the rotating mass factor,
+With F the drive force, f the specific force ahead at `base_link`, a the wheels' acceleration, m the mass and lambda the
+rotating mass factor,
 
     F / (m g) - (f - g squat) / g - (lambda - 1) a / g  =  direction c_rr cos(slope)
 
-The accelerometer feels gravity's share as well, so the grade cancels (DESIGN, "Ground estimation").
+The accelerometer measures gravity's share of the slope as well, so the grade cancels.
 """
 
 from __future__ import annotations
@@ -14,33 +14,35 @@ import math
 from dataclasses import dataclass
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.attitude import AttitudeConfig, LeanFilter
+from agents.estimation.attitude import SlopeFilter
 from agents.estimation.squat import front_share, squat_rad
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Articulation, Encoder, Imu, Odometry, Payload, Reading, Torque
 from protocol.units import GRAVITY_MPS2
 
-NOTHING = (0.0,) * 4
+STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
+MAX_PAUSE_S = 1.0  # of the IMU, or of the wheels' readings, before their last values no longer count
+NO_SUMS = (0.0,) * 4
 
 
 @dataclass(frozen=True, slots=True)
 class Balance:
     """One step of the force balance.
 
-    speed_mps, accel_mps2, way_m: of the wheels; way_m counts up in reverse too. unbalanced: the left side above, share:
-    F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad] with their variance, as
-    the body has them, squat taken off; sine_x: of the one ahead, by the accelerometer alone. pitch_radps: how fast it
-    changes. norm_mps2: of the specific force.
-    on_front: share of the load on the front axle, 0 if not known. body_mps2: acceleration ahead as the accelerometer
-    has it. torque_s, wheels_s: how old their newest reading is.
+    speed_mps, accel_mps2, distance_m: of the wheels; distance_m counts up in reverse too. unbalanced: the left side of
+    the equation, share: F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad] with
+    their variance, as the body has them, without squat; sine_x: of the one ahead, by the accelerometer alone.
+    pitch_radps: rate of the pitch, nose up positive. norm_mps2: of the specific force. on_front: share of the load on
+    the front axle, 0 if not known. body_mps2: acceleration ahead by the accelerometer. torque_s, wheels_s: age of their
+    newest reading.
     """
 
     stamp_ns: int
     dt_s: float
     speed_mps: float
     accel_mps2: float
-    way_m: float
+    distance_m: float
     unbalanced: float
     share: float
     slope_x: float
@@ -61,26 +63,25 @@ class Balance:
 
 
 class Balancer:
-    """Gathers readings into balances of step_s.
+    """Collects readings into balances of STEP_NS.
 
-    weighs: whether payload readings are believed; else the machine is as heavy as it says.
+    weighs: whether payload readings count; else the mass is the machine's own.
     """
 
-    def __init__(self, machine: MachineConfig, step_s: float, attitude: AttitudeConfig, *, weighs: bool) -> None:
+    def __init__(self, machine: MachineConfig, *, weighs: bool) -> None:
         self.payload_kg = 0.0
         self._machine = machine
         self._weighs = weighs
-        self._step_ns = round(step_s * 1e9)
-        self._lean = LeanFilter(attitude)
+        self._slope = SlopeFilter()
         self._bend_rad = 0.0
         self._rotation: dict[str, Floats] = {}
         self._sensor: str | None = None
         self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = 0
-        self._force_sums = NOTHING  # count; force ahead at base_link, norm, rate of nose up, a negative turn about y
+        self._force_sums = NO_SUMS  # count; force ahead at base_link, norm, rate of nose up, a negative turn about y
         self._torque_nm, self._torque_sums = 0.0, (0, 0.0)
 
-    def update(self, reading: Reading, sensor: SensorConfig, dead: DeadReckoning) -> Balance | None:
-        """Take in a reading, after dead reckoning did; returns the balance of the step that it ends."""
+    def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> Balance | None:
+        """Add a reading, after dead reckoning did; returns the balance of the step that it ends."""
         if isinstance(reading, Torque):
             self._torque_ns, self._torque_nm = reading.stamp_ns, reading.torque_nm
             count, total = self._torque_sums
@@ -91,36 +92,36 @@ class Balancer:
             self._bend_rad = reading.angle_rad
         elif isinstance(reading, Payload) and self._weighs:
             self.payload_kg = reading.payload_kg
-        elif isinstance(reading, Imu) and self._is_ours(sensor):
-            return self._feel(reading, sensor, dead)
+        elif isinstance(reading, Imu) and self._is_in_use(sensor):
+            return self._add_imu(reading, sensor, dead_reckoning)
         return None
 
-    def _is_ours(self, sensor: SensorConfig) -> bool:
+    def _is_in_use(self, sensor: SensorConfig) -> bool:
         """Whether it is the first IMU on the rear frame that has an accelerometer."""
         return sensor.frame == BASE and sensor.says("force") and self._sensor in (None, sensor.name)
 
-    def _feel(self, imu: Imu, sensor: SensorConfig, dead: DeadReckoning) -> Balance | None:
+    def _add_imu(self, imu: Imu, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> Balance | None:
         if imu.sensor not in self._rotation:
             self._sensor, self._rotation[imu.sensor] = imu.sensor, sensor.mount.base_from_sensor()
             self._imu_ns = self._begin_ns = imu.stamp_ns
             return None
         dt_s, self._imu_ns = (imu.stamp_ns - self._imu_ns) * 1e-9, imu.stamp_ns
-        if not 0 < dt_s < 1:  # a pause: start from here
-            self._begin_ns, self._force_sums, self._torque_sums = imu.stamp_ns, NOTHING, (0, 0.0)
+        if not 0 < dt_s < MAX_PAUSE_S:  # start from here
+            self._begin_ns, self._force_sums, self._torque_sums = imu.stamp_ns, NO_SUMS, (0, 0.0)
             return None
-        rotation = self._rotation[imu.sensor]
+        rotation, wheels = self._rotation[imu.sensor], dead_reckoning.wheels
         gyro = (rotation @ (imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)).tolist()
         ahead, left, up = (rotation @ (imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)).tolist()
         ahead += (gyro[1] ** 2 + gyro[2] ** 2) * sensor.mount.xyz_m[0]  # what turning adds at the sensor's place
-        accel, speed = (dead.wheels.accel_mps2, dead.wheels.speed_mps) if self._wheels_s() < 1 else (0.0, 0.0)
-        self._lean.update(dt_s, (gyro[0], gyro[1], gyro[2]), (ahead - accel, left - speed * gyro[2]))
+        accel, speed = (wheels.accel_mps2, wheels.speed_mps) if self._wheels_s() < MAX_PAUSE_S else (0.0, 0.0)
+        self._slope.update(dt_s, (gyro[0], gyro[1], gyro[2]), (ahead - accel, left - speed * gyro[2]))
         n, force, norm, rate = self._force_sums
         self._force_sums = n + 1, force + ahead, norm + math.hypot(ahead, left, up), rate - gyro[1]
-        if imu.stamp_ns - self._begin_ns < self._step_ns:
+        if imu.stamp_ns - self._begin_ns < STEP_NS:
             return None
-        return self._balance(dead, speed, accel)
+        return self._balance(dead_reckoning, speed, accel)
 
-    def _balance(self, dead: DeadReckoning, speed: float, accel: float) -> Balance:
+    def _balance(self, dead_reckoning: DeadReckoning, speed: float, accel: float) -> Balance:
         machine, g = self._machine, GRAVITY_MPS2
         (n, *sums), (torques, torque_nm) = self._force_sums, self._torque_sums
         force, norm, rate = (value / n for value in sums)
@@ -129,38 +130,38 @@ class Balancer:
         on_front = front_share(machine, self.payload_kg, force)
         squat = squat_rad(machine, self.payload_kg, force)
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
-        self._force_sums, self._torque_sums = NOTHING, (0, 0.0)
+        self._force_sums, self._torque_sums = NO_SUMS, (0, 0.0)
         return Balance(
             stamp_ns=self._imu_ns,
             dt_s=dt_s,
             speed_mps=speed,
             accel_mps2=accel,
-            way_m=dead.way_m,
+            distance_m=dead_reckoning.way_m,
             unbalanced=share
             - force / g
             + squat
-            - self._bent(on_front, squat)
+            - self._climb_of_bend(on_front, squat)
             - (machine.rotating_mass_factor - 1) * accel / g,
             share=share,
-            slope_x=self._lean.ahead.angle_rad - squat,
-            slope_y=self._lean.left.angle_rad,
-            slope_var=self._lean.ahead.variance,
+            slope_x=self._slope.ahead.angle_rad - squat,
+            slope_y=self._slope.left.angle_rad,
+            slope_var=self._slope.ahead.variance,
             sine_x=(force - accel) / g - squat,
             pitch_radps=rate,
             norm_mps2=norm,
             on_front=on_front,
-            body_mps2=force - g * self._lean.ahead.sine,
+            body_mps2=force - g * self._slope.ahead.sine,
             torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
             wheels_s=self._wheels_s(),
         )
 
-    def _bent(self, on_front: float, squat: float) -> float:
-        """What the front frame of a bent machine climbs more than the rear one, over the way [-].
+    def _climb_of_bend(self, on_front: float, squat: float) -> float:
+        """Sine of the slope of the front frame of a bent machine, less that of the rear one, by the front's load [-].
 
-        Gravity works on each axle's load along that axle's own way, and the accelerometer feels the rear one's.
+        Gravity acts on each axle's load along that axle's own direction; the accelerometer measures the rear one's.
         """
         c, s = math.cos(self._bend_rad), math.sin(self._bend_rad)
-        return on_front * ((self._lean.ahead.sine - squat) * (c - 1) + self._lean.left.sine * s)
+        return on_front * ((self._slope.ahead.sine - squat) * (c - 1) + self._slope.left.sine * s)
 
     def _wheels_s(self) -> float:
         return (self._imu_ns - self._wheels_ns) * 1e-9 if self._wheels_ns else math.inf

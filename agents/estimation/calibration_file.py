@@ -4,27 +4,52 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from agents.estimation.calibration import Calibration
 from protocol.errors import StoreError
+from protocol.files import write_whole
 
 VERSION = 1
 
 
+class CalibrationFile:
+    """Where an agent keeps its calibration; no path: nowhere. problem: why it could not be read or written, or ""."""
+
+    def __init__(self, path: Path | None, machine: str) -> None:
+        self.problem = ""
+        self._path, self._machine = path, machine
+        self._saved_ns = 0  # stamp of the calibration in the file
+
+    def read(self) -> Calibration | None:
+        """The calibration from before; one that cannot be read is a problem, and the agent calibrates anew."""
+        try:
+            calibration = load(self._path, self._machine) if self._path else None
+        except StoreError as error:
+            self.problem = str(error)
+            return None
+        self._saved_ns = calibration.stamp_ns if calibration else 0
+        return calibration
+
+    def write(self, calibration: Calibration) -> None:
+        """Save a calibration that is newer than the file; a full disk must not stop the machine."""
+        if not self._path or calibration.stamp_ns <= self._saved_ns:
+            return
+        try:
+            save(self._path, self._machine, calibration)
+        except StoreError as error:
+            self.problem = str(error)
+        else:
+            self._saved_ns, self.problem = calibration.stamp_ns, ""
+
+
 def save(path: Path, machine: str, calibration: Calibration) -> None:
     """Write whole or not at all; raises StoreError."""
-    part = path.with_name(path.name + ".part")
     text = json.dumps({"version": VERSION, "machine": machine, **asdict(calibration)}, indent=1)
     try:
-        with part.open("w", encoding="utf-8") as file:
-            file.write(text + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        write_whole(path, f"{text}\n".encode())
     except OSError as error:
         raise StoreError(path, f"cannot be written: {error.strerror}") from None
 
@@ -32,23 +57,23 @@ def save(path: Path, machine: str, calibration: Calibration) -> None:
 def load(path: Path, machine: str) -> Calibration | None:
     """Read what `save` wrote; None where there is no file. Raises StoreError on anything else than a calibration."""
     try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
+        table = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, RecursionError) as error:
         raise StoreError(path, f"cannot be read: {error}") from None
-    if not isinstance(kept, dict) or kept.get("version") != VERSION:
+    if not isinstance(table, dict) or table.get("version") != VERSION:
         raise StoreError(path, f"is no calibration of version {VERSION}")
-    if kept.get("machine") != machine:
-        raise StoreError(path, f"is the calibration of {kept.get('machine')!r}, not of {machine!r}")
-    return _parse(path, kept)
+    if table.get("machine") != machine:
+        raise StoreError(path, f"is the calibration of {table.get('machine')!r}, not of {machine!r}")
+    return _parse(path, table)
 
 
-def _parse(path: Path, kept: dict[str, Any]) -> Calibration:
+def _parse(path: Path, table: dict[str, Any]) -> Calibration:
     try:
-        (zz, zs), (sz, ss) = ((float(a), float(b)) for a, b in kept["covariance"])
-        zero, scale = float(kept["zero"]), float(kept["scale"])
-        stamp_ns, passages = int(kept["stamp_ns"]), int(kept["passages"])
+        (zz, zs), (sz, ss) = ((float(a), float(b)) for a, b in table["covariance"])
+        zero, scale = float(table["zero"]), float(table["scale"])
+        stamp_ns, passages = int(table["stamp_ns"]), int(table["passages"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StoreError(path, f"is no calibration: {error}") from None
     sound = math.isfinite(zero + scale + zz + zs + ss) and zz > 0 and ss > 0 and zs * zs <= zz * ss and zs == sz

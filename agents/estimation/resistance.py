@@ -1,4 +1,4 @@
-"""What estimators of the rolling resistance share: what they are given, and what they say."""
+"""What the estimators of the rolling resistance have in common: their input, and their methods."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
-class Push:
-    """One usable step: raw = direction cos(slope) c_rr + scale error * share, by the balance of forces.
+class BalanceStep:
+    """One usable step of the force balance: raw = direction cos(slope) c_rr + scale error * share.
 
-    stamp_ns: of its end; dt_s; way_m: driven since the last step that was usable. raw: with the calibration taken off
-    [-]. regressor: direction cos(slope) [-]. share: drive force over weight, signed ahead [-]. lead_share: of the load,
-    that the leading axle bears; wheelbase_m: how far the trailing one is behind it, lead_m: the load centre. Without a
-    wheelbase, all wheels stand on the same ground.
+    stamp_ns: of its end; dt_s; distance_m: driven since the last usable step. raw: with the calibration applied [-].
+    regressor: direction cos(slope) [-]. share: drive force over weight, signed ahead [-]. lead_share: share of the load
+    that the leading axle carries; wheelbase_m: how far the trailing axle is behind it; lead_m: how far the load centre
+    is. Without a wheelbase, all wheels stand on the same ground.
     """
 
     stamp_ns: int
     dt_s: float
-    way_m: float
+    distance_m: float
     raw: float
     regressor: float
     share: float
@@ -27,15 +27,15 @@ class Push:
     lead_m: float = 0.0
 
 
-class Resistance(Protocol):
+class ResistanceEstimator(Protocol):
     """An estimator of c_rr."""
 
-    def update(self, push: Push) -> None:
-        """Take in a step."""
+    def update(self, step: BalanceStep) -> None:
+        """Add a step."""
         ...
 
-    def rest(self, *, changes_load: bool) -> None:
-        """The machine stands; changes_load: what it carries may be another when it drives on."""
+    def stand(self, *, changes_load: bool) -> None:
+        """The machine stands; changes_load: it may carry another load when it drives on."""
         ...
 
     def at(self, stamp_ns: int) -> tuple[float, float] | None:

@@ -1,8 +1,8 @@
 """How a body sits on its tyres: the pitch that payload and longitudinal force add to that of the ground.
 
 Axle loads of a rigid body in balance, N_f = m (g cos(slope) l_c - f h) / L and N_r = m g cos(slope) - N_f, press tyres
-of stiffness k per axle by N / k; the nose rises by (N_r - N_f) / (k L). A machine stands level when empty, so that
-much is taken off.
+of stiffness k per axle by N / k; the nose rises by (N_r - N_f) / (k L). The empty machine stands level: its own pitch
+is subtracted.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from protocol.units import GRAVITY_MPS2
 
 
 def front_share(machine: MachineConfig, payload_kg: float, force_mps2: float) -> float:
-    """Share of the load on the front axle [-]; 0 where the machine's data are not known.
+    """Share of the load on the front axle [-]; 0 where the machine's data are missing.
 
     force_mps2: specific force ahead, gravity's share included.
     """
@@ -27,7 +27,7 @@ def front_share(machine: MachineConfig, payload_kg: float, force_mps2: float) ->
 
 
 def squat_rad(machine: MachineConfig, payload_kg: float, force_mps2: float) -> float:
-    """Nose-up angle [rad] against the empty machine at rest on the level; 0 where the machine's data are not known."""
+    """Nose-up angle [rad] against the empty machine at rest on the level; 0 where the machine's data are missing."""
     if not (machine.wheelbase_m and machine.axle_stiffness_npm):
         return 0.0
     weight_n = (machine.mass_kg + payload_kg) * _down(force_mps2)

@@ -23,7 +23,7 @@ from sitegrid.security.join import join
 if TYPE_CHECKING:
     from agents.agent import Places
     from agents.config import AgentConfig
-    from agents.delivery.uplink import Sign
+    from agents.delivery.link import Sign
     from agents.drivers import Driver
     from agents.presence import Owner
     from protocol.machine.log_folder import LogFolder

@@ -86,7 +86,7 @@ def _spool_state(path: Path, db: sqlite3.Connection) -> SpoolState:
     (schema,) = db.execute("PRAGMA user_version").fetchone()
     if schema != SPOOL_SCHEMA:
         raise StoreError(path, f"has schema {schema}, this version knows {SPOOL_SCHEMA}")
-    (depth,), (quarantined,) = (db.execute(f"SELECT COUNT(*) FROM {t}").fetchone() for t in ("sample", "aside"))  # noqa: S608
+    (depth,), (quarantined,) = (db.execute(f"SELECT COUNT(*) FROM {t}").fetchone() for t in ("sample", "quarantine"))  # noqa: S608
     (dropped,) = db.execute("SELECT value FROM meta WHERE key = 'dropped'").fetchone() or (0,)
     oldest = db.execute("SELECT row FROM sample ORDER BY number LIMIT 1").fetchone()
     oldest_ns = int(np.frombuffer(oldest[0], SAMPLE_DTYPE)["stamp_ns"][0]) if oldest else 0
@@ -97,14 +97,14 @@ def check_spool(state: SpoolState, now_ns: int) -> Finding:
     """Depth, age of the oldest, and what will never reach the server."""
     age_s = (now_ns - state.oldest_ns) * 1e-9 if state.oldest_ns else 0.0
     message = f"{state.depth} samples wait" + (f", the oldest is of {_ago(age_s)}" if state.oldest_ns else "")
-    message += f"; {state.dropped} were dropped, {state.quarantined} put aside"
+    message += f"; {state.dropped} were dropped, {state.quarantined} quarantined"
     advice = []
     if state.depth and age_s > WAITING_S:
         advice.append("start its agent, and see what it says of its uplink")
     if state.dropped:
         advice.append("it was full: mend the link, or raise max_samples")
     if state.quarantined:
-        advice.append("the map server refused samples: table `aside` has them and the reasons")
+        advice.append("the map server refused samples: table `quarantine` has them and the reasons")
     return Finding(Level.WARN if advice else Level.PASS, "spool", message, "; ".join(advice))
 
 
@@ -112,7 +112,7 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     """A running agent, by the values of its health report: of another version, they may be anything."""
     spool, uplink = (_table_of(values, part) for part in ("spool", "uplink"))
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
-    message = f"{machine} runs: {counts[0]}; {counts[1]}, {spool.get('put_aside', '?')} put aside"
+    message = f"{machine} runs: {counts[0]}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
     problems = [uplink.get("problem"), values.get("spool_problem"), values.get("calibration_problem")]
     advice = "; ".join(str(problem) for problem in problems if problem)
     lost = any(spool.get(key) for key in ("dropped", "put_aside"))

@@ -6,7 +6,6 @@ import random
 import re
 import shutil
 import signal
-import sqlite3
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -119,10 +118,10 @@ def read_spool(path: Path) -> Content:
             spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
         counters = spool.counters()
         return {"contents": found, "named": counters["put_aside"] + declared}
-    except sqlite3.Error as error:
+    except StoreError:  # the uplink reports it, and sends nothing
         if time.monotonic() > end_s:
             raise TimeoutError from None
-        raise StoreError(path, str(error)) from None  # the uplink reports it as the spool's, and sends nothing
+        raise
     finally:
         spool._db.close()
 

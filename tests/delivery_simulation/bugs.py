@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
-from agents.delivery.spool import Run, Spool
-from agents.delivery.uplink import UplinkState
+from agents.delivery import link
+from agents.delivery.link import Ask
+from agents.delivery.spool import Spool, SpoolRun
+from agents.delivery.uplink import Action, Send, Uplink
 from mapserver.ingest import admission
 from mapserver.ingest.admission import Admission
 from protocol.wire.messages import Ack, Refused, SampleBatch
@@ -32,7 +34,7 @@ def ack_before_commit(patch: pytest.MonkeyPatch) -> None:
 
 
 def watermark_one_too_low(patch: pytest.MonkeyPatch) -> None:
-    """The server takes the last committed sample for the next that it expects."""
+    """The server mistakes the last committed sample for the next that it expects."""
     admit = admission.admit
     patch.setattr(admission, "admit", lambda batch, watermark: admit(batch, max(0, watermark - 1)))
 
@@ -44,15 +46,15 @@ def watermark_one_too_high(patch: pytest.MonkeyPatch) -> None:
 
 def delete_before_ack(patch: pytest.MonkeyPatch) -> None:
     """The agent deletes what it has sent, not what has arrived."""
-    next_payload = UplinkState.next_payload
+    perform = link.perform
 
-    def sent_is_done(self: UplinkState) -> bytes | None:
-        payload = next_payload(self)
-        if self._head and len(self._head.rows):
-            self._spool.acknowledge(self._head.spool_id, self._head.first_seq + len(self._head.rows) - 1)
-        return payload
+    def sent_is_done(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
+        head = uplink._head
+        if isinstance(action, Send) and head and len(head.rows):
+            spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
+        return perform(action, uplink, spool, ask)
 
-    patch.setattr(UplinkState, "next_payload", sent_is_done)
+    patch.setattr(link, "perform", sent_is_done)
 
 
 def _plant_admit(patch: pytest.MonkeyPatch, wrong: Callable[[SampleBatch, int], SampleBatch]) -> None:
@@ -66,7 +68,7 @@ def _plant_admit(patch: pytest.MonkeyPatch, wrong: Callable[[SampleBatch, int], 
 
 
 def trim_whole_batch(patch: pytest.MonkeyPatch) -> None:
-    """A batch that begins with known samples is taken for known altogether, and acknowledged."""
+    """A batch that begins with known samples is treated as known altogether, and acknowledged."""
 
     def known(batch: SampleBatch, watermark: int) -> SampleBatch:
         return replace(batch, first_seq=batch.last_seq + 1, rows=batch.rows[:0])
@@ -75,12 +77,12 @@ def trim_whole_batch(patch: pytest.MonkeyPatch) -> None:
 
 
 def trim_nothing(patch: pytest.MonkeyPatch) -> None:
-    """A batch that ends with new samples is taken for new altogether."""
+    """A batch that ends with new samples is treated as new altogether."""
     _plant_admit(patch, lambda batch, watermark: batch)
 
 
-def gap_is_taken(patch: pytest.MonkeyPatch) -> None:
-    """A batch beyond the next expected sample is taken, and what is missing is not counted."""
+def gap_is_accepted(patch: pytest.MonkeyPatch) -> None:
+    """A batch beyond the next expected sample is accepted, and what is missing is not counted."""
     admit = admission.admit
 
     def admit_gap(batch: SampleBatch, watermark: int) -> Admission:
@@ -94,11 +96,11 @@ def one_identity_for_ever(patch: pytest.MonkeyPatch) -> None:
     """A spool keeps its spool_id when it is opened again, also as a copy of another one."""
     start_run = Spool._start_run
 
-    def go_on(self: Spool) -> list[Run]:
-        found = self._db.execute("SELECT spool_id, acknowledged FROM run WHERE base = 0").fetchone()
-        if not found:
+    def go_on(self: Spool) -> list[SpoolRun]:
+        first = self._db.execute("SELECT spool_id, acknowledged FROM run WHERE base = 0").fetchone()
+        if not first:
             return start_run(self)
-        return [Run(0, int(found[0], 16), found[1])]
+        return [SpoolRun(0, int(first[0], 16), first[1])]
 
     patch.setattr(Spool, "_start_run", go_on)
 
@@ -130,7 +132,7 @@ def drops_are_silent(patch: pytest.MonkeyPatch) -> None:
     """A full spool drops without counting."""
     save = Spool._save
     patch.setattr(Spool, "_save", lambda self, meta: save(self, replace(meta, dropped=0)))
-    patch.setattr(Spool, "counters", lambda self: {"depth": self._depth, "dropped": 0, "put_aside": self._aside})
+    patch.setattr(Spool, "counters", lambda self: {"depth": self._depth, "dropped": 0, "put_aside": self._quarantined})
 
 
 BUGS: dict[str, Plant] = {
@@ -142,7 +144,7 @@ BUGS: dict[str, Plant] = {
         delete_before_ack,
         trim_whole_batch,
         trim_nothing,
-        gap_is_taken,
+        gap_is_accepted,
         one_identity_for_ever,
         commit_is_assumed,
         failed_commit_stays_open,

@@ -9,12 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.delivery_simulation.world import Verdict, World
+from tests.delivery_simulation.world import Outcome, World
 
 IN_MEMORY = Path("/dev/shm")
 
 
-def run_one(seed: int, *, real: bool = False, say: Callable[[str], None] | None = None) -> Verdict:
+def run_one(seed: int, *, real: bool = False, say: Callable[[str], None] | None = None) -> Outcome:
     """Run one world; an error in it is a failure of this seed."""
     folder = Path(tempfile.mkdtemp(prefix="sitegrid-", dir=IN_MEMORY if IN_MEMORY.is_dir() else None))
     try:
@@ -26,7 +26,7 @@ def run_one(seed: int, *, real: bool = False, say: Callable[[str], None] | None 
     except Exception as error:
         if say:
             raise
-        return Verdict(seed, problems=[f"{type(error).__name__}: {error}"])
+        return Outcome(seed, problems=[f"{type(error).__name__}: {error}"])
     finally:
         shutil.rmtree(folder)
 
@@ -34,20 +34,23 @@ def run_one(seed: int, *, real: bool = False, say: Callable[[str], None] | None 
 def run_seeds(
     first: int, n: int, *, real: bool = False, say: Callable[[str], None], stop_at_failure: bool = False
 ) -> dict[str, Any]:
-    """Run `n` worlds; the sums over them, and what happened in them. Each that fails is told with how to replay it."""
+    """Run `n` worlds; the sums over them, and what happened in them.
+
+    Each that fails is reported with the command that replays it.
+    """
     sums: Counter[str] = Counter()
     events: Counter[str] = Counter()
     failed: list[int] = []
     for seed in range(first, first + n):
-        verdict = run_one(seed, real=real)
+        outcome = run_one(seed, real=real)
         for name in ("recorded", "journalled", "explained", "lost", "double"):
-            sums[name] += getattr(verdict, name)
-        events.update(verdict.events)
-        if not verdict.is_good:
+            sums[name] += getattr(outcome, name)
+        events.update(outcome.events)
+        if not outcome.is_good:
             failed.append(seed)
-            problem = "; ".join(verdict.problems)
+            problem = "; ".join(outcome.problems)
             replay = f"python -m tests.delivery_simulation --seed {seed} --trace{' --real' if real else ''}"
-            say(f"seed {seed}: lost {verdict.lost}, double {verdict.double} {problem}  replay: {replay}")
+            say(f"seed {seed}: lost {outcome.lost}, double {outcome.double} {problem}  replay: {replay}")
             if stop_at_failure:
                 break
     return {"seeds": n, "failed": len(failed), "failed_seeds": failed[:20], **sums, "events": dict(events)}

@@ -1,4 +1,4 @@
-"""SQLite connections that fail as the disk or the process under them would, at a statement that is chosen before."""
+"""SQLite connections that fail at a chosen statement, as the disk or the process under them would."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ KILLS = (Fault.KILLED_BEFORE, Fault.KILLED_AFTER)
 
 
 @dataclass
-class Plan:
-    """The fault that comes at the `left`-th writing statement from now, if any; and whether the process is dead."""
+class FaultPlan:
+    """The fault that comes at the `left`-th writing statement from now, if any; and whether the process has ended."""
 
     fault: Fault | None = None
     left: int = 0
-    dead: bool = False
+    killed: bool = False
 
     def arm(self, fault: Fault, left: int) -> None:
         """Choose the next fault."""
@@ -46,7 +46,7 @@ class Plan:
 
     def due(self, statement: str) -> Fault | None:
         """Return the fault of this statement."""
-        if self.dead:
+        if self.killed:
             raise Killed
         if self.fault is None or statement.lstrip().startswith(("SELECT", "PRAGMA")):
             return None
@@ -54,28 +54,28 @@ class Plan:
         if self.left > 0:
             return None
         fault, self.fault = self.fault, None
-        self.dead = fault in KILLS
+        self.killed = fault in KILLS
         return fault
 
 
 class FaultyConnection(sqlite3.Connection):
     """Fails by its plan."""
 
-    plan: Plan | None = None
+    plan: FaultPlan | None = None
 
     def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
         """As sqlite3, or the fault."""
         self._before(fault := self._due(statement))
-        found = super().execute(statement, *values)
+        cursor = super().execute(statement, *values)
         self._after(fault)
-        return found
+        return cursor
 
     def executemany(self, statement: str, *values: Any) -> sqlite3.Cursor:
         """As sqlite3, or the fault."""
         self._before(fault := self._due(statement))
-        found = super().executemany(statement, *values)
+        cursor = super().executemany(statement, *values)
         self._after(fault)
-        return found
+        return cursor
 
     def _due(self, statement: str) -> Fault | None:
         return self.plan.due(statement) if self.plan else None
@@ -96,20 +96,20 @@ class FaultyConnection(sqlite3.Connection):
 class FaultySpool(Spool):
     """A spool whose process can be killed, and whose disk can be full, at any statement."""
 
-    plan: Plan
+    plan: FaultPlan
 
-    def __init__(self, path: Path, plan: Plan, **options: Any) -> None:
+    def __init__(self, path: Path, plan: FaultPlan, **options: Any) -> None:
         self.plan = plan
         super().__init__(path, **options)
 
     def kill(self) -> None:
         """End the process that has the file open, as it is."""
-        self.plan.dead = True
+        self.plan.killed = True
         self._db.close()
 
     def _connect(self, path: Path) -> sqlite3.Connection:
-        found = connect(path, FaultyConnection)
-        assert isinstance(found, FaultyConnection)
-        found.execute("PRAGMA wal_autocheckpoint=0")  # files that are copied and thrown away: no need for it
-        found.plan = self.plan
-        return found
+        db = connect(path, FaultyConnection)
+        assert isinstance(db, FaultyConnection)
+        db.execute("PRAGMA wal_autocheckpoint=0")  # files that are copied and thrown away: no need for it
+        db.plan = self.plan
+        return db

@@ -10,19 +10,20 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mapserver.config import ServerConfig
-from mapserver.ingest.admission import Admission, GapError, admit, parse
+from mapserver.ingest import admission as rules
+from mapserver.ingest.admission import Admission, GapError, parse
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import Ack, Refused
-from tests.delivery_simulation.faults import Fault, FaultyConnection, Killed, Plan
+from tests.delivery_simulation.faults import Fault, FaultPlan, FaultyConnection, Killed
 
-Run = tuple[str, int]  # machine, spool_id
+RunKey = tuple[str, int]  # machine, spool_id
 
 
 @dataclass(frozen=True)
-class Taken:
+class JournalledSample:
     """One sample in the journal."""
 
     machine: str
@@ -34,7 +35,7 @@ class Taken:
 class MapServer(Protocol):
     """What the simulation needs of a server. Each method leaves it usable, also after a kill."""
 
-    def take(self, group: list[Incoming], plan: Plan) -> list[Ack | Refused]:
+    def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
         """Answer a group of batches in one commit; Killed if the plan says so."""
 
     def back_up(self) -> None:
@@ -43,10 +44,10 @@ class MapServer(Protocol):
     def restore(self) -> None:
         """Go back to the copy."""
 
-    def samples(self) -> Iterator[Taken]:
+    def samples(self) -> Iterator[JournalledSample]:
         """Everything in the journal."""
 
-    def marks(self) -> dict[Run, tuple[int, int]]:
+    def marks(self) -> dict[RunKey, tuple[int, int]]:
         """Watermark and samples declared lost, by run."""
 
 
@@ -55,7 +56,7 @@ class _Disk:
     """What is committed."""
 
     rows: list[Admission] = field(default_factory=list)
-    marks: dict[Run, tuple[int, int]] = field(default_factory=dict)
+    marks: dict[RunKey, tuple[int, int]] = field(default_factory=dict)
 
     def copy(self) -> _Disk:
         return _Disk(list(self.rows), dict(self.marks))
@@ -70,7 +71,7 @@ class ModelServer:
         self._now_ns = now_ns
         self._backup = _Disk()
 
-    def take(self, group: list[Incoming], plan: Plan) -> list[Ack | Refused]:
+    def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
         """As Store.take."""
         fault = plan.fault
         plan.disarm()
@@ -97,14 +98,14 @@ class ModelServer:
         """Go back to the copy."""
         self.disk = self._backup.copy()
 
-    def samples(self) -> Iterator[Taken]:
+    def samples(self) -> Iterator[JournalledSample]:
         """Everything in the journal."""
         for admission in self.disk.rows:
             batch = admission.batch
             for i, row in enumerate(batch.rows):
-                yield Taken(batch.machine, batch.spool_id, batch.first_seq + i, row.tobytes())
+                yield JournalledSample(batch.machine, batch.spool_id, batch.first_seq + i, row.tobytes())
 
-    def marks(self) -> dict[Run, tuple[int, int]]:
+    def marks(self) -> dict[RunKey, tuple[int, int]]:
         """Watermark and lost, by run."""
         return self.disk.marks
 
@@ -112,7 +113,7 @@ class ModelServer:
         try:
             batch = parse(incoming.payload, incoming.machine, self._site, self._now_ns)
             seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
-            admission = admit(batch, seq)
+            admission = rules.admit(batch, seq)  # by its module, so that a bug can be planted there
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected)
@@ -130,11 +131,11 @@ class RealServer:
         self._folder, self._backup = folder / "store", folder / "store-backup"
         self._site = site
         self._now_ns = now_ns
-        self._plan = Plan()
+        self._plan = FaultPlan()
         self._open()
         self.back_up()
 
-    def take(self, group: list[Incoming], plan: Plan) -> list[Ack | Refused]:
+    def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
         """As Store.take; a killed one is started again."""
         if plan.fault:
             self._plan.arm(plan.fault, plan.left)
@@ -160,13 +161,13 @@ class RealServer:
         shutil.copytree(self._backup, self._folder)
         self._open()
 
-    def samples(self) -> Iterator[Taken]:
+    def samples(self) -> Iterator[JournalledSample]:
         """Everything in the journal."""
         for row in self._journal.read():
             for i, sample in enumerate(row.rows):
-                yield Taken(row.machine, row.spool_id, row.first_seq + i, sample.tobytes())
+                yield JournalledSample(row.machine, row.spool_id, row.first_seq + i, sample.tobytes())
 
-    def marks(self) -> dict[Run, tuple[int, int]]:
+    def marks(self) -> dict[RunKey, tuple[int, int]]:
         """Watermark and lost, by run."""
         return {run: (mark.seq, mark.lost) for run, mark in self._journal.marks().items()}
 
@@ -179,7 +180,7 @@ class RealServer:
         return self._store._journal
 
     def _open(self) -> None:
-        self._plan = Plan()
+        self._plan = FaultPlan()
         self._store = Store(self._folder, self._site, ServerConfig(), self._now_ns)
         path = self._folder / JOURNAL_FILE
         self._journal._db.close()
@@ -190,7 +191,7 @@ class RealServer:
 
     def _close(self) -> None:
         """Let go of the files without a word to SQLite: what was not committed is gone."""
-        self._plan.dead = False
+        self._plan.killed = False
         self._plan.disarm()
         self._journal._db.rollback()
         self._store.close()

@@ -21,10 +21,11 @@ def _quiet() -> Iterator[None]:
     logging.disable(logging.NOTSET)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_or_double_in_any_world() -> None:
-    told: list[str] = []
-    sums = run_seeds(0, 250, say=told.append)
-    assert not told, told[0]
+    lines: list[str] = []
+    sums = run_seeds(0, 250, say=lines.append)
+    assert not lines, lines[0]
     assert sums["recorded"] > 5000
     assert sums["journalled"] > 0.6 * sums["recorded"]
     events = sums["events"]
@@ -32,20 +33,22 @@ def test_nothing_is_lost_or_double_in_any_world() -> None:
         assert events[name] > 0, f"no {name} in these seeds"
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_or_double_with_the_real_store() -> None:
-    told: list[str] = []
-    sums = run_seeds(0, 25, real=True, say=told.append)
-    assert not told, told[0]
+    lines: list[str] = []
+    sums = run_seeds(0, 25, real=True, say=lines.append)
+    assert not lines, lines[0]
     assert sums["recorded"] > 500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BUGS)
 def test_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     BUGS[name](monkeypatch)
-    told: list[str] = []
-    sums = run_seeds(0, 200, say=told.append, stop_at_failure=True)
+    lines: list[str] = []
+    sums = run_seeds(0, 200, say=lines.append, stop_at_failure=True)
     assert sums["failed"] == 1
-    assert f"replay: python -m tests.delivery_simulation --seed {sums['failed_seeds'][0]} --trace" in told[0]
+    assert f"replay: python -m tests.delivery_simulation --seed {sums['failed_seeds'][0]} --trace" in lines[0]
 
 
 def test_same_seed_is_the_same_world() -> None:
@@ -58,6 +61,6 @@ def test_same_seed_is_the_same_world() -> None:
 
 def test_command_prints_one_object_last() -> None:
     command = [sys.executable, "-m", "tests.delivery_simulation", "--seeds", "3", "--json"]
-    found = subprocess.run(command, capture_output=True, text=True, check=True)
-    table = json.loads(found.stdout.splitlines()[-1])
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    table = json.loads(ended.stdout.splitlines()[-1])
     assert (table["seeds"], table["lost"], table["double"], table["failed"]) == (3, 0, 0, 0)

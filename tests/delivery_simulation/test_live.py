@@ -17,8 +17,9 @@ import zenoh
 
 from agents.agent import Agent, Places
 from agents.config import AgentConfig
+from agents.delivery.link import UplinkThread
 from agents.delivery.spool import Spool, SpoolConfig
-from agents.delivery.uplink import Uplink, UplinkConfig, UplinkState
+from agents.delivery.uplink import Uplink, UplinkConfig, Wait
 from agents.localisation.filters.belief import PoseBelief
 from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
 from mapserver.config import ServerConfig
@@ -43,9 +44,9 @@ Opened = Callable[..., zenoh.Session]
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    found = free_endpoint()
-    router: Any = open_session(SessionConfig(found, mode="router"))
-    yield found
+    endpoint = free_endpoint()
+    router: Any = open_session(SessionConfig(endpoint, mode="router"))
+    yield endpoint
     router.close()
 
 
@@ -55,9 +56,9 @@ def opened(endpoint: str) -> Iterator[Opened]:
     with contextlib.ExitStack() as stack:
 
         def session(where: str = endpoint) -> zenoh.Session:
-            found: Any = _open(SessionConfig(where))
-            stack.callback(found.close)
-            return found
+            opened: Any = _open(SessionConfig(where))
+            stack.callback(opened.close)
+            return opened
 
         yield session
 
@@ -91,11 +92,11 @@ def test_agent_without_a_router_starts(opened: Opened) -> None:
     session.close()
 
 
-def test_dead_predecessor_keeps_nobody_from_starting(endpoint: str, opened: Opened) -> None:
+def test_killed_predecessor_keeps_nobody_from_starting(endpoint: str, opened: Opened) -> None:
     """Until its lease ends, a router still shows its token and hands it queries, which nobody answers."""
-    dead, held = opened(), []
-    token = dead.liveliness().declare_token(keys.alive(SITE.name, "loader-1"))
-    queryable = dead.declare_queryable(keys.alive(SITE.name, "loader-1"), held.append)
+    killed, held = opened(), []
+    token = killed.liveliness().declare_token(keys.alive(SITE.name, "loader-1"))
+    queryable = killed.declare_queryable(keys.alive(SITE.name, "loader-1"), held.append)
     start_s = time.monotonic()
     _claim_name(opened(), endpoint, SITE.name, "loader-1")
     assert time.monotonic() - start_s < ANSWER_S + 2
@@ -147,10 +148,10 @@ def test_agent_holds_its_samples_while_another_has_its_name(opened: Opened, tmp_
     first = Presence(opened(), SITE.name, "loader-1")
     agent = Agent(opened(), SITE, MACHINE, AgentConfig(), Places(tmp_path / "spool.db"))
     agent._spool.record(made_up(3))
-    wait_until(lambda: agent._yield_name() or bool(agent._uplink.state.held), WAIT_S, "it yields")
+    wait_until(lambda: agent._yield_name() or bool(agent._uplink.held), WAIT_S, "it yields")
     problem = agent.report(Silent(1))["uplink"]["problem"]
     assert f"runs as {first.owner}: it sends, this one waits" in problem
-    assert agent._uplink.state.next_payload() is None
+    assert isinstance(agent._uplink.start_exchange(), Wait)
     agent.close()
     first.close()
 
@@ -171,18 +172,18 @@ def test_uplink_ends_at_once_while_a_server_does_not_answer(opened: Opened, tmp_
 def test_bug_does_not_end_delivery_silently(
     endpoint: str, opened: Opened, tmp_path: Path, monkeypatch: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    states: list[UplinkState] = []
+    uplinks: list[Uplink] = []
 
-    def fail(self: UplinkState) -> bytes:
-        states.append(self)
+    def fail(self: Uplink, *_: object) -> None:
+        uplinks.append(self)
         raise RuntimeError("nobody thought of this")
 
     with monkeypatch.context() as patch, server_at(endpoint, tmp_path / "store"):
-        patch.setattr(UplinkState, "next_payload", fail)
+        patch.setattr(Uplink, "on_head", fail)
         with uplink_of(opened(), tmp_path / "spool.db", 5) as spool:
-            wait_until(lambda: len(states) > 1, WAIT_S, "it tries again")
-            assert "nobody thought of this" in states[0].problem
-            assert states[0].counters["bugs"] >= 1
+            wait_until(lambda: len(uplinks) > 1, WAIT_S, "it tries again")
+            assert "nobody thought of this" in uplinks[0].problem
+            assert uplinks[0].counters["bugs"] >= 1
             patch.undo()
             wait_until(spool.is_settled, WAIT_S, "everything delivered")
     assert "uplink failed" in caplog.text
@@ -234,10 +235,9 @@ def uplink_of(session: zenoh.Session, path: Path, n: int) -> Iterator[Spool]:
     spool = Spool(path, SpoolConfig())
     for first in range(0, n, 50_000):
         spool.record(made_up(n)[first : first + 50_000])
-    state = UplinkState("loader-1", SITE.frame, spool, UplinkConfig())
-    uplink = Uplink(session, SITE.name, "loader-1", state, UplinkConfig().timeout_s)
+    link = UplinkThread(session, SITE.name, Uplink("loader-1", SITE.frame, UplinkConfig().timeout_s), spool)
     yield spool
-    uplink.close()
+    link.close()
     spool.close()
 
 
@@ -311,14 +311,14 @@ def test_pose_and_health_stay_live_while_a_machine_catches_up(endpoint: str, ope
     link = SlowLink(endpoint, 300e3 / 8)
     delays: dict[str, list[float]] = {"pose": [], "health": []}
 
-    def heard(kind: str, stamp_ns: int) -> None:
+    def received(kind: str, stamp_ns: int) -> None:
         delays[kind].append((time.time_ns() - stamp_ns) * 1e-9)
 
     listener = opened()
     decoders = {"pose": decode_pose, "health": decode_health}
     for kind, decode in decoders.items():
         key = f"sitegrid/{SITE.name}/machine/*/{kind}"
-        listener.declare_subscriber(key, lambda s, k=kind, d=decode: heard(k, d(s.payload.to_bytes()).stamp_ns))
+        listener.declare_subscriber(key, lambda s, k=kind, d=decode: received(k, d(s.payload.to_bytes()).stamp_ns))
     session = opened(link.endpoint)
     presence = Presence(session, SITE.name, "loader-1")
     with server_at(endpoint, tmp_path / "store"), uplink_of(session, tmp_path / "spool.db", 20_000) as spool:

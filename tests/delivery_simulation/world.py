@@ -1,7 +1,8 @@
 """Machines, a link and a map server in one thread, with faults that a seed draws, and what must hold in the end.
 
-The agents are the real `Spool` and `UplinkState`; the server is a model of the journal around the real rules of
-admission, or the real store. Time is a number. Faults stop after a while; then everything must be settled.
+The agents are the real `Spool` and `Uplink`, with the real `perform` between them; the server is a model of the journal
+around the real rules of admission, or the real store. Time is a number. Faults stop after a while; then everything must
+be settled.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+from agents.delivery import link
 from agents.delivery.spool import SpoolConfig
-from agents.delivery.uplink import UplinkConfig, UplinkState
+from agents.delivery.uplink import Action, Pacing, Uplink, UplinkConfig, Wait
 from mapserver.ingest.store import Incoming
 from protocol.arrays import Table
 from protocol.errors import StoreError
@@ -26,13 +28,14 @@ from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_reply, encode_reply
 from protocol.wire.messages import Ack, Refused
-from tests.delivery_simulation.faults import Fault, FaultySpool, Killed, Plan
+from tests.delivery_simulation.faults import Fault, FaultPlan, FaultySpool, Killed
 from tests.delivery_simulation.rates import draw_rates
 from tests.delivery_simulation.servers import MapServer, ModelServer, RealServer
 
 START_NS = 1_767_225_600_000_000_000
 HOUR_NS = 3_600_000_000_000
-UPLINK = UplinkConfig(batch_samples=4, max_batch_samples=16)
+TIMEOUT_S = UplinkConfig().timeout_s
+PACING = Pacing(first_batch=4, max_batch=16)
 MOST_ROUNDS = 3000  # to settle everything, without faults
 _WEIGHTS = {
     "record": 30,
@@ -47,14 +50,14 @@ _WEIGHTS = {
 }
 
 
-class Agent:
+class SimulatedAgent:
     """One process of a machine, its file, and what happened to it."""
 
     def __init__(self, name: str, machine: str, path: Path) -> None:
         self.name, self.machine, self.path = name, machine, path
         self.spool: FaultySpool | None = None
-        self.state: UplinkState | None = None
-        self.plan = Plan()
+        self.uplink: Uplink | None = None
+        self.plan = FaultPlan()
         self.unsaved: list[bytes] = []  # the disk was full; the agent keeps them and tries again
         self.in_doubt: list[bytes] = []  # it was killed while it wrote them
         self.before_drop: set[int] = set()
@@ -63,8 +66,8 @@ class Agent:
 
 
 @dataclass
-class Verdict:
-    """What became of all samples. lost, double: must be 0; explained: dropped, put aside or gone with a disk."""
+class Outcome:
+    """What became of all samples. lost, double: must be 0; explained: dropped, quarantined or gone with a disk."""
 
     seed: int
     recorded: int = 0
@@ -89,7 +92,7 @@ class World:
     ) -> None:
         self.rng = random.Random(seed)
         self.rates = draw_rates(self.rng)
-        self.verdict = Verdict(seed)
+        self.outcome = Outcome(seed)
         self._say = say
         self._folder = folder
         self._now_ns = START_NS
@@ -99,7 +102,9 @@ class World:
         self._server: MapServer = RealServer(folder, site, self._now) if real else ModelServer(site, self._now)
         self._server_up = True
         self._late: list[Incoming] = []
-        self._agents = [Agent(f"agent-{i}", f"loader-{i}", folder / f"{i}.db") for i in range(self.rates.machines)]
+        self._agents = [
+            SimulatedAgent(f"agent-{i}", f"loader-{i}", folder / f"{i}.db") for i in range(self.rates.machines)
+        ]
         self._copies: dict[str, Path] = {}
         self._contents: dict[int, set[bytes]] = {}  # of every recorded sample, by stamp; coarse and final
         self._explained: set[int] = set()
@@ -109,7 +114,7 @@ class World:
         for agent in self._agents:
             self._start(agent)
 
-    def run(self) -> Verdict:
+    def run(self) -> Outcome:
         """Let things happen, then let them settle, then judge."""
         for _ in range(self.rates.steps):
             self._now_ns += self.rng.randint(1, 2_000_000_000)
@@ -119,7 +124,7 @@ class World:
         for agent in self._agents:
             if agent.spool:
                 agent.spool.kill()
-        return self.verdict
+        return self.outcome
 
     def note(self, text: str) -> None:
         """Trace what happens."""
@@ -152,7 +157,7 @@ class World:
                 "copy": self._copy_or_restore,
             }[what](agent)
 
-    def _record(self, agent: Agent) -> None:
+    def _record(self, agent: SimulatedAgent) -> None:
         if not agent.spool:
             return
         rows = agent.unsaved + [self._sample(agent) for _ in range(self.rng.randint(1, 6))]
@@ -171,7 +176,7 @@ class World:
             agent.unsaved, agent.in_doubt = agent.in_doubt, []
         agent.before_drop = before if agent.in_doubt else set()
 
-    def _finalise(self, agent: Agent) -> None:
+    def _finalise(self, agent: SimulatedAgent) -> None:
         first, rows = agent.pending
         if not agent.spool or not rows:
             return
@@ -184,21 +189,29 @@ class World:
             agent.pending = (0, [])
             self.note(f"{agent.name} finalised {first}..{first + len(rows) - 1}")
 
-    def _exchange(self, agent: Agent) -> float:
-        """One round of the uplink; returns the pause that the agent wants [s]."""
-        if not agent.spool or not agent.state:
+    def _exchange(self, agent: SimulatedAgent) -> float:
+        """One exchange of the uplink; returns the pause that it wants [s]."""
+        if not agent.spool or not agent.uplink:
             return 0.0
-        with self._spool_faults(agent):
-            payload = agent.state.next_payload()
-            if payload is None:
-                return 0.0
+
+        def ask(payload: bytes) -> tuple[Ack | Refused | None, float]:
             reply, took_s = self._send(Incoming(agent.machine, payload))
-            self.note(f"{agent.name} heard {reply}")
-            return agent.state.on_reply(reply, took_s)
+            self.note(f"{agent.name} received {reply}")
+            return reply, took_s
+
+        with self._spool_faults(agent):
+            errors = agent.uplink.counters["disk_errors"]
+            action: Action = agent.uplink.start_exchange()
+            while not isinstance(action, Wait):
+                action = link.perform(action, agent.uplink, agent.spool, ask)
+            if agent.uplink.counters["disk_errors"] > errors:
+                self.outcome.events["disk_full"] += 1
+                self.note(f"{agent.name}: {agent.uplink.problem}")
+            return 0.0 if action.for_samples else action.seconds
         return 0.0
 
     def _send(self, incoming: Incoming) -> tuple[Ack | Refused | None, float]:
-        timeout_s = UPLINK.timeout_s
+        timeout_s = TIMEOUT_S
         if self._happens(self.rates.lost):
             return None, timeout_s
         if self._happens(self.rates.late):
@@ -218,14 +231,14 @@ class World:
         group = [incoming]
         while self._late and self._faults and self.rng.random() < 0.3:
             group.insert(self.rng.randint(0, len(group)), self._late.pop(self.rng.randrange(len(self._late))))
-        plan = Plan()
+        plan = FaultPlan()
         if self._happens(self.rates.server_fault):
             plan.arm(self.rng.choice(list(Fault)), self.rng.randint(1, 6))
             self.note(f"server {plan.fault} at {plan.left}")
         try:
             answers = self._server.take(group, plan)
         except Killed:
-            self.verdict.events["server_kills"] += 1
+            self.outcome.events["server_kills"] += 1
             return None
         return next(answer for one, answer in zip(group, answers, strict=True) if one is incoming)
 
@@ -233,13 +246,13 @@ class World:
         if self._late and self._server_up:
             incoming = self._late.pop(self.rng.randrange(len(self._late)))
             answer = self._take(incoming)
-            self.note(f"late request of {incoming.machine} answered {answer}, heard by nobody")
-            self.verdict.events["late"] += 1
+            self.note(f"late request of {incoming.machine} answered {answer}, received by nobody")
+            self.outcome.events["late"] += 1
 
-    def _start(self, agent: Agent) -> None:
+    def _start(self, agent: SimulatedAgent) -> None:
         if agent.spool:
             return
-        agent.plan = Plan()
+        agent.plan = FaultPlan()
         config = SpoolConfig(self.rates.max_samples)
         try:
             with self._spool_faults(agent):
@@ -251,28 +264,28 @@ class World:
         if not agent.spool:
             return
         rng = np.random.default_rng(0)
-        agent.state = UplinkState(agent.machine, self._frame, agent.spool, UPLINK, rng)
+        agent.uplink = Uplink(agent.machine, self._frame, TIMEOUT_S, PACING, rng)
         present = self._present(agent)
         self._end_doubt(agent, present)
         agent.pending = (0, [])
         self.note(f"{agent.name} started with {len(present)} samples, spool_id={agent.spool.spool_id:x}")
 
-    def _end_doubt(self, agent: Agent, present: set[int]) -> None:
+    def _end_doubt(self, agent: SimulatedAgent, present: set[int]) -> None:
         """See whether the transaction in which a process was killed had been done."""
         if _stamp_set(agent.in_doubt) & present:
             self._is_recorded(agent.in_doubt)
             self._explained |= agent.before_drop - present
         agent.in_doubt, agent.before_drop = [], set()
 
-    def _end(self, agent: Agent, orderly: bool | None = None) -> None:
+    def _end(self, agent: SimulatedAgent, orderly: bool | None = None) -> None:
         if agent.spool:
             orderly = self.rng.random() < 0.5 if orderly is None else orderly
             self.note(f"{agent.name} ends orderly={orderly}")
-            self.verdict.events["agent_ends"] += 1
+            self.outcome.events["agent_ends"] += 1
             agent.spool.close() if orderly else agent.spool.kill()
-            agent.spool, agent.state, agent.unsaved = None, None, []
+            agent.spool, agent.uplink, agent.unsaved = None, None, []
 
-    def _copy_or_restore(self, agent: Agent) -> None:
+    def _copy_or_restore(self, agent: SimulatedAgent) -> None:
         """Keep a copy of the spool; put it back later; or start a second process of the machine from it."""
         if not self.rates.copies:
             return
@@ -281,22 +294,24 @@ class World:
             self._copies[agent.machine] = self._copy(agent.path, self._folder / f"copy-{next(self._numbers)}.db")
             self.note(f"{agent.name} copied")
         elif self.rng.random() < 0.5:
-            # Gone with the disk that is thrown away; what was put aside there is declared lost, the copy's too.
-            self._explained |= self._held(agent.path) - self._held(copy) | self._put_aside(agent.path)
+            # Gone with the disk that is thrown away; what was quarantined there is declared lost, the copy's too.
+            self._explained |= self._held(agent.path) - self._held(copy) | self._quarantined(agent.path)
             self._end(agent, orderly=False)
             self._end_doubt(agent, self._held(agent.path))
             self._copy(copy, agent.path)
-            self.verdict.events["spool_restores"] += 1
+            self.outcome.events["spool_restores"] += 1
             self.note(f"{agent.name} restored from a copy")
         elif len(self._agents) < 4:
             number = next(self._numbers)
-            clone = Agent(f"clone-{number}", agent.machine, self._copy(copy, self._folder / f"clone-{number}.db"))
+            clone = SimulatedAgent(
+                f"clone-{number}", agent.machine, self._copy(copy, self._folder / f"clone-{number}.db")
+            )
             self._agents.append(clone)
-            self.verdict.events["clones"] += 1
+            self.outcome.events["clones"] += 1
             self.note(f"{clone.name} is a clone of a copy of {agent.machine}")
             self._start(clone)
 
-    def _step_clock(self, agent: Agent) -> None:
+    def _step_clock(self, agent: SimulatedAgent) -> None:
         agent.clock_ns = self.rng.choice((-HOUR_NS, 0, HOUR_NS))
         self.note(f"{agent.name} clock off by {agent.clock_ns / HOUR_NS:+.0f} h")
 
@@ -311,10 +326,10 @@ class World:
             self._server.back_up()
             self.note("server backed up")
             return
-        before = {_stamp(taken.row) for taken in self._server.samples()}
+        before = {_stamp(one.row) for one in self._server.samples()}
         self._server.restore()
-        self._explained |= before - {_stamp(taken.row) for taken in self._server.samples()}
-        self.verdict.events["server_restores"] += 1
+        self._explained |= before - {_stamp(one.row) for one in self._server.samples()}
+        self.outcome.events["server_restores"] += 1
         self.note("server restored")
 
     # --- the end -----------------------------------------------------------------------------------------------------
@@ -330,7 +345,7 @@ class World:
             self._start(agent)
             self._finalise(agent)
         self._deliver_all()
-        for agent in self._agents:  # the next start declares what was put aside or dropped at the end of a run
+        for agent in self._agents:  # the next start declares what was quarantined or dropped at the end of a run
             self._end(agent, orderly=True)
             self._start(agent)
         self._deliver_all()
@@ -344,9 +359,9 @@ class World:
             if self._ends_pending(agent):
                 continue
             self._now_ns += int(self._exchange(agent) * 1e9)
-        self.verdict.problems.append(f"not settled after {MOST_ROUNDS} rounds")
+        self.outcome.problems.append(f"not settled after {MOST_ROUNDS} rounds")
 
-    def _ends_pending(self, agent: Agent) -> bool:
+    def _ends_pending(self, agent: SimulatedAgent) -> bool:
         """Nothing finalises what an earlier call left pending: a restart sends it as it is."""
         assert agent.spool
         if agent.spool.head(1) is None and agent.spool.counters()["depth"]:
@@ -356,23 +371,23 @@ class World:
         return False
 
     def _judge(self) -> None:
-        verdict = self.verdict
-        taken = list(self._server.samples())
-        by_stamp = Counter(_stamp(one.row) for one in taken)
-        by_identity = Counter((one.machine, one.spool_id, one.seq) for one in taken)
-        verdict.double = max(sum(n - 1 for n in found.values()) for found in (by_stamp, by_identity))
+        outcome = self.outcome
+        samples = list(self._server.samples())
+        by_stamp = Counter(_stamp(one.row) for one in samples)
+        by_identity = Counter((one.machine, one.spool_id, one.seq) for one in samples)
+        outcome.double = max(sum(n - 1 for n in counts.values()) for counts in (by_stamp, by_identity))
         for agent in self._agents:
-            self._explained |= self._put_aside(agent.path)
-        right = {_stamp(one.row) for one in taken if one.row in self._contents.get(_stamp(one.row), ())}
+            self._explained |= self._quarantined(agent.path)
+        right = {_stamp(one.row) for one in samples if one.row in self._contents.get(_stamp(one.row), ())}
         missing = self._contents.keys() - right
-        verdict.recorded, verdict.journalled = len(self._contents), len(right)
-        verdict.explained = len(missing & self._explained)
-        verdict.lost = len(missing - self._explained)
+        outcome.recorded, outcome.journalled = len(self._contents), len(right)
+        outcome.explained = len(missing & self._explained)
+        outcome.lost = len(missing - self._explained)
         for stamp in sorted(missing - self._explained):
             self.note(f"lost: stamp {stamp}")
         if foreign := by_stamp.keys() - self._contents.keys():
-            verdict.problems.append(f"{len(foreign)} samples that nobody recorded")
-        self._judge_marks([(one.machine, one.spool_id) for one in taken])
+            outcome.problems.append(f"{len(foreign)} samples that nobody recorded")
+        self._judge_marks([(one.machine, one.spool_id) for one in samples])
         self._judge_counters()
 
     def _judge_marks(self, runs: list[tuple[str, int]]) -> None:
@@ -380,29 +395,29 @@ class World:
         present = Counter(runs)
         for run, (seq, lost) in self._server.marks().items():
             if present[run] + lost != seq:
-                self.verdict.problems.append(f"run {run[1]:x}: {present[run]} there + {lost} lost is not {seq}")
+                self.outcome.problems.append(f"run {run[1]:x}: {present[run]} there + {lost} lost is not {seq}")
 
     def _judge_counters(self) -> None:
         """Where no file was copied or thrown away, the agents have counted all that never arrived."""
-        events = self.verdict.events
+        events = self.outcome.events
         if events["spool_restores"] or events["clones"] or events["server_restores"]:
             return
         counted = sum(
-            found[name]
+            counters[name]
             for a in self._agents
-            if a.spool and (found := a.spool.counters())
+            if a.spool and (counters := a.spool.counters())
             for name in ("dropped", "put_aside")
         )
-        never = self.verdict.explained
+        never = self.outcome.explained
         if counted < never:
-            self.verdict.problems.append(f"{never} never arrived, {counted} are counted")
+            self.outcome.problems.append(f"{never} never arrived, {counted} are counted")
         if (declared := sum(lost for _, lost in self._server.marks().values())) != never:
-            self.verdict.problems.append(f"{never} never arrived, {declared} were declared lost")
+            self.outcome.problems.append(f"{never} never arrived, {declared} were declared lost")
 
     # --- helpers -----------------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def _spool_faults(self, agent: Agent):
+    def _spool_faults(self, agent: SimulatedAgent):
         """Perhaps a fault at one of the next statements of an agent's file."""
         if self._happens(self.rates.spool_fault):
             agent.plan.arm(self.rng.choice(list(Fault)), self.rng.randint(1, 9))
@@ -410,18 +425,13 @@ class World:
             yield
         except Killed:
             self.note(f"{agent.name} was killed")
-            self.verdict.events["agent_kills"] += 1
+            self.outcome.events["agent_kills"] += 1
             if agent.spool:
                 agent.spool.kill()
-            agent.spool, agent.state = None, None
+            agent.spool, agent.uplink = None, None
         except StoreError as error:
             self.note(f"{agent.name}: {error}")
-            self.verdict.events["disk_full"] += 1
-        except sqlite3.Error as error:
-            self.verdict.events["disk_full"] += 1
-            self.note(f"{agent.name}: {error}")
-            if agent.state:
-                agent.state.on_disk_error(error)
+            self.outcome.events["disk_full"] += 1
         finally:
             agent.plan.disarm()
 
@@ -431,7 +441,7 @@ class World:
     def _now(self) -> int:
         return self._now_ns
 
-    def _sample(self, agent: Agent) -> bytes:
+    def _sample(self, agent: SimulatedAgent) -> bytes:
         row = np.zeros(1, SAMPLE_DTYPE)
         row["stamp_ns"] = self._now_ns + agent.clock_ns + next(self._numbers)
         row["cov_xx_m2"] = row["cov_yy_m2"] = 1.0
@@ -442,7 +452,7 @@ class World:
         for row in rows:
             self._contents[_stamp(row)] = {row}
 
-    def _present(self, agent: Agent) -> set[int]:
+    def _present(self, agent: SimulatedAgent) -> set[int]:
         assert agent.spool
         with agent.spool._lock:
             return _stamp_set(row for (row,) in agent.spool._db.execute("SELECT row FROM sample"))
@@ -450,8 +460,8 @@ class World:
     def _held(self, path: Path) -> set[int]:
         return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM sample"))
 
-    def _put_aside(self, path: Path) -> set[int]:
-        return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM aside"))
+    def _quarantined(self, path: Path) -> set[int]:
+        return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM quarantine"))
 
     def _query(self, path: Path, statement: str) -> list[tuple[bytes]]:
         """Read a file, whoever has it open: a copy of it."""

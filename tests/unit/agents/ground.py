@@ -1,4 +1,4 @@
-"""Balances, pushes and estimates for the tests of ground estimation."""
+"""Balances, steps and estimates for the tests of ground estimation."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.attitude import AttitudeConfig
 from agents.estimation.balance import Balance, Balancer
+from agents.estimation.calibration import Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEstimator
-from agents.estimation.resistance import Push, Resistance
+from agents.estimation.resistance import BalanceStep, ResistanceEstimator
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
@@ -28,7 +28,7 @@ STEADY = Balance(
     dt_s=STEP_S,
     speed_mps=2.0,
     accel_mps2=0.0,
-    way_m=0.0,
+    distance_m=0.0,
     unbalanced=0.04,
     share=0.04,
     slope_x=0.0,
@@ -46,79 +46,77 @@ STEADY = Balance(
 
 def after(steps: int, **options: Any) -> Balance:
     """The steady balance, changed, so many steps after the start."""
-    return replace(STEADY, stamp_ns=START_NS + steps * round(STEP_S * 1e9), way_m=0.1 * steps, **options)
+    return replace(STEADY, stamp_ns=START_NS + steps * round(STEP_S * 1e9), distance_m=0.1 * steps, **options)
 
 
-def balances(
-    of: MachineConfig, readings: Iterable[Reading], *, weighs: bool = True, step_s: float = 0.05
-) -> list[Balance]:
-    """What readings make."""
-    balancer, dead = Balancer(of, step_s, AttitudeConfig(), weighs=weighs), DeadReckoning(of, 0.0)
-    found = []
+def balances(machine: MachineConfig, readings: Iterable[Reading], *, weighs: bool = True) -> list[Balance]:
+    """The balances of these readings."""
+    balancer, dead_reckoning = Balancer(machine, weighs=weighs), DeadReckoning(machine, 0.0)
+    made = []
     for reading in readings:
-        sensor = of.sensor(reading.sensor)
+        sensor = machine.sensor(reading.sensor)
         assert sensor
-        dead.update(reading, sensor)
-        if balance := balancer.update(reading, sensor, dead):
-            found.append(balance)
-    return found
+        dead_reckoning.update(reading, sensor)
+        if balance := balancer.update(reading, sensor, dead_reckoning):
+            made.append(balance)
+    return made
 
 
-class Run:
-    """A ground estimator that is fed with readings, and asked for every so many of them a moment later."""
+class EstimatorRun:
+    """A ground estimator that gets readings, and is asked ten times a second for an estimate of a moment ago."""
 
     def __init__(
         self,
-        of: MachineConfig,
+        machine: MachineConfig,
         config: EstimationConfig | None = None,
         *,
         lag_s: float = 1.5,
-        known: Any = None,
+        calibration: Calibration | None = None,
         known_c_rr: float | None = None,
     ) -> None:
-        self.estimator = GroundEstimator(of, config or EstimationConfig(), known)
-        self.dead = DeadReckoning(of, 0.0)
-        self.found: list[tuple[int, GroundEstimate]] = []
-        self._of, self._lag_ns, self._known_c_rr = of, round(lag_s * 1e9), known_c_rr
+        self.estimator = GroundEstimator(machine, config or EstimationConfig(), calibration)
+        self.dead_reckoning = DeadReckoning(machine, 0.0)
+        self.estimates: list[tuple[int, GroundEstimate]] = []
+        self._machine, self._lag_ns, self._known_c_rr = machine, round(lag_s * 1e9), known_c_rr
         self._asked_ns = 0
 
-    def feed(self, readings: Iterable[Reading]) -> Run:
+    def feed(self, readings: Iterable[Reading]) -> EstimatorRun:
         for reading in readings:
-            sensor = self._of.sensor(reading.sensor)
+            sensor = self._machine.sensor(reading.sensor)
             assert sensor
-            self.dead.update(reading, sensor)
-            self.estimator.update(reading, sensor, self.dead, self._known_c_rr)
-            if reading.stamp_ns - self._asked_ns >= 100_000_000:  # ten times a second
+            self.dead_reckoning.update(reading, sensor)
+            self.estimator.update(reading, sensor, self.dead_reckoning, self._known_c_rr)
+            if reading.stamp_ns - self._asked_ns >= 100_000_000:
                 self._asked_ns = reading.stamp_ns
-                asked = reading.stamp_ns - self._lag_ns
-                self.found.append((asked, self.estimator.at(asked)))
+                stamp_ns = reading.stamp_ns - self._lag_ns
+                self.estimates.append((stamp_ns, self.estimator.at(stamp_ns)))
         return self
 
     @property
     def last(self) -> GroundEstimate:
         """The estimate that was asked for last."""
-        return self.found[-1][1]
+        return self.estimates[-1][1]
 
     def between(self, start_s: float, end_s: float) -> list[GroundEstimate]:
         """Estimates for these seconds of the drive."""
-        return [e for ns, e in self.found if start_s <= (ns - START_NS) * 1e-9 < end_s]
+        return [e for ns, e in self.estimates if start_s <= (ns - START_NS) * 1e-9 < end_s]
 
 
-def pushes(raw: Iterable[float], *, share: Iterable[float] | float = 0.04, speed_mps: float = 2.0) -> list[Push]:
-    """Steps of a machine that drives forwards on level ground."""
+def level_steps(raw: Iterable[float], *, share: Iterable[float] | float = 0.04) -> list[BalanceStep]:
+    """Steps of a machine that drives forwards on level ground at 2 m/s."""
     raw = list(raw)
     shares = np.broadcast_to(np.array(share, float), len(raw))
     return [
-        Push(START_NS + i * round(STEP_S * 1e9), STEP_S, speed_mps * STEP_S, float(z), 1.0, float(s))
+        BalanceStep(START_NS + i * round(STEP_S * 1e9), STEP_S, 2.0 * STEP_S, float(z), 1.0, float(s))
         for i, (z, s) in enumerate(zip(raw, shares, strict=True))
     ]
 
 
-def pushed(of: Resistance, steps: Iterable[Push]) -> None:
-    for push in steps:
-        of.update(push)
+def feed(estimator: ResistanceEstimator, steps: Iterable[BalanceStep]) -> None:
+    for step in steps:
+        estimator.update(step)
 
 
-def noise_of(density: float, n: int, rng: np.random.Generator) -> Floats:
+def white_noise(density: float, n: int, rng: np.random.Generator) -> Floats:
     """White noise of n steps."""
     return density / math.sqrt(STEP_S) * np.asarray(rng.standard_normal(n))

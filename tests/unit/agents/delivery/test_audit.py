@@ -89,7 +89,7 @@ def test_void_line_that_was_cut_off_voids_no_other_sample(path: Path) -> None:
     assert len(read_audit(path)) == 12
 
 
-def test_other_lines_are_left_out() -> None:
+def test_other_lines_are_skipped() -> None:
     assert parse(["", "+", "# a remark", "+ 07 1", "- 07", "* 07 1 aa", "+ 07 1 aa", "+ 07 2 bb # cut off"]) == {
         (7, 1): "aa"
     }
@@ -103,7 +103,7 @@ def test_spool_notes_what_it_records_finalises_and_numbers_anew(tmp_path: Path, 
     spool.finalise(1, ROWS[15:16])  # is final already
     assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14]])
     spool.acknowledge(5, 1)
-    spool.fork()
+    spool.start_new_run()
     assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14]])
     spool.close()
 

@@ -1,9 +1,11 @@
+import contextlib
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +28,19 @@ def opened(path: Path, max_samples: int = 1000, audit: AuditLog | None = None) -
 def kill(spool: Spool) -> None:
     """End the process that has it open."""
     spool._db.close()
+
+
+def changed(path: Path, statement: str) -> Path:
+    """The folder of a spool at rest, in whose file a statement was carried out."""
+    with contextlib.closing(sqlite3.connect(path / "spool.db")) as db, db:
+        db.execute(statement)
+    return path
+
+
+def quarantined(path: Path) -> list[tuple[int, bytes, str]]:
+    """Number, sample and problem of what a spool at rest has in quarantine."""
+    with contextlib.closing(sqlite3.connect(path / "spool.db")) as db:
+        return db.execute("SELECT seq, row, problem FROM quarantine ORDER BY seq").fetchall()
 
 
 def hashes(rows: np.ndarray) -> list[str]:
@@ -83,7 +98,6 @@ def test_openings_that_record_nothing_leave_nothing(tmp_path: Path) -> None:
         spool = opened(tmp_path)
         assert spool.head(9) is None
         assert spool.is_settled()
-        assert len(spool._runs) == 1
         spool.close()
 
 
@@ -95,11 +109,11 @@ def test_runs_come_out_one_after_the_other_and_are_closed(tmp_path: Path) -> Non
         ids.append(spool.spool_id)
         if i < 2:
             kill(spool)
-    found = []
+    heads = []
     while head := spool.head(3):
-        found.append((ids.index(head.spool_id), head.first_seq, len(head.rows), head.lost_before))
+        heads.append((ids.index(head.spool_id), head.first_seq, len(head.rows), head.lost_before))
         spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
-    assert found == [(i, *part) for i in range(3) for part in ((1, 3, 0), (4, 1, 0))]
+    assert heads == [(i, *part) for i in range(3) for part in ((1, 3, 0), (4, 1, 0))]
     assert spool.is_settled()
     spool.close()
 
@@ -140,8 +154,8 @@ def test_spool_that_another_process_has_open_is_refused(tmp_path: Path) -> None:
         "Spool(Path(sys.argv[1]), SpoolConfig())"
     )
     command = [sys.executable, "-c", script, str(tmp_path / "spool.db")]
-    found = subprocess.run(command, capture_output=True, text=True, env={"PYTHONPATH": str(ROOT)}, check=False)
-    assert "another agent is using this spool" in found.stderr
+    ended = subprocess.run(command, capture_output=True, text=True, env={"PYTHONPATH": str(ROOT)}, check=False)
+    assert "another agent is using this spool" in ended.stderr
     kill(spool)
     opened(tmp_path).close()
 
@@ -165,19 +179,19 @@ def test_spool_survives_kill_in_the_middle_of_writing(tmp_path: Path) -> None:
     command = [sys.executable, "-c", WRITER, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": str(ROOT)}) as writer:
         assert writer.stdout
-        told = 0
+        printed = 0
         for line in writer.stdout:
-            told = int(line)
-            if told >= 300:
+            printed = int(line)
+            if printed >= 300:
                 writer.send_signal(signal.SIGKILL)
                 break
-        told = max([told, *map(int, writer.stdout.read().split())])
+        printed = max([printed, *map(int, writer.stdout.read().split())])
     assert writer.returncode == -signal.SIGKILL
     audit = AuditLog(tmp_path / "audit.txt")
     spool = opened(tmp_path, 10**6, audit)
     head = spool.head(10**6)
     assert head
-    assert len(head.rows) >= told
+    assert len(head.rows) >= printed
     assert head.first_seq == 1
     assert hashes(head.rows) == hashes(made_up_samples(100_000)[: len(head.rows)])
     assert len(head.rows) == spool.counters()["recorded"]
@@ -259,7 +273,7 @@ def test_head_ends_before_a_hole(tmp_path: Path) -> None:
     bad = spool.head(99)
     assert bad
     spool.acknowledge(spool.spool_id, 3)
-    spool.put_aside(type(bad)(bad.spool_id, 6, ROWS[5:6], 0), "too bad")
+    spool.quarantine(type(bad)(bad.spool_id, 6, ROWS[5:6], 0), "too bad")
     first = spool.head(99)
     assert first
     assert (first.first_seq, len(first.rows), first.lost_before) == (4, 2, 0)
@@ -268,9 +282,8 @@ def test_head_ends_before_a_hole(tmp_path: Path) -> None:
     assert rest
     assert (rest.first_seq, len(rest.rows), rest.lost_before) == (7, 4, 1)
     assert spool.counters()["put_aside"] == 1
-    aside = spool._db.execute("SELECT seq, row, problem FROM aside").fetchall()
-    assert aside == [(6, ROWS[5].tobytes(), "too bad")]
     spool.close()
+    assert quarantined(tmp_path) == [(6, ROWS[5].tobytes(), "too bad")]
 
 
 @pytest.mark.parametrize("limit", [1, 10])
@@ -290,24 +303,24 @@ def test_full_spool_drops_the_oldest_counts_them_and_declares_them_lost(tmp_path
     again.close()
 
 
-def test_damaged_samples_are_put_aside_and_never_sent(tmp_path: Path) -> None:
+def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
-    for number in (1, 2, 3, 6):
-        spool._db.execute("UPDATE sample SET row = zeroblob(68) WHERE number = ?", (number,))
+    spool.close()
+    spool = opened(changed(tmp_path, "UPDATE sample SET row = zeroblob(68) WHERE number IN (1, 2, 3, 6)"))
     first = spool.head(2)
     assert first
     assert (first.first_seq, first.lost_before) == (4, 3)
     assert hashes(first.rows) == hashes(ROWS[3:5])
-    spool.acknowledge(spool.spool_id, 5)
+    spool.acknowledge(first.spool_id, 5)
     rest = spool.head(99)
     assert rest
     assert (rest.first_seq, rest.lost_before) == (7, 1)
     assert hashes(rest.rows) == hashes(ROWS[6:10])
     assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10}
-    aside = spool._db.execute("SELECT seq, problem FROM aside ORDER BY seq").fetchall()
-    assert aside == [(seq, "damaged on the machine's disk") for seq in (1, 2, 3, 6)]
     spool.close()
+    problem = "damaged on the machine's disk"
+    assert [(seq, why) for seq, _, why in quarantined(tmp_path)] == [(seq, problem) for seq in (1, 2, 3, 6)]
 
 
 # --- servers and files that are set back ------------------------------------------------------------------------------
@@ -317,8 +330,7 @@ def test_server_that_knows_less_than_it_acknowledged_is_told_what_is_lost(tmp_pa
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
     spool.acknowledge(spool.spool_id, 8)
-    assert spool.fall_back(spool.spool_id, 5)
-    assert not spool.fall_back(spool.spool_id, 5)
+    spool.lower_watermark(spool.spool_id, 5)
     head = spool.head(99)
     assert head
     assert (head.first_seq, head.lost_before) == (9, 3)
@@ -335,7 +347,7 @@ def test_earlier_runs_are_declared_again_to_a_server_that_was_set_back(tmp_path:
     spool.acknowledge(earlier, 3)
     spool.record(ROWS[3:5])
     spool.acknowledge(spool.spool_id, 1)
-    assert spool.fall_back(spool.spool_id, 0)
+    spool.lower_watermark(spool.spool_id, 0)
     head = spool.head(9)
     assert head
     assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 4, 0, 3)
@@ -408,28 +420,6 @@ def test_two_clones_that_both_send_lose_and_double_nothing(tmp_path: Path) -> No
     assert sorted(journal.values()) == sorted(hashes(ROWS[:8]) + hashes(ROWS[10:30]))
 
 
-def test_spool_of_schema_1_goes_on(tmp_path: Path) -> None:
-    """Its samples keep their identity; what is recorded from now on is a new run."""
-    db = sqlite3.connect(tmp_path / "spool.db", isolation_level=None)
-    db.execute("CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID")
-    db.execute("CREATE TABLE sample (seq INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL)")
-    db.execute("CREATE TABLE aside (spool_id TEXT, seq INTEGER, row BLOB, problem TEXT)")
-    meta = {"spool_id": f"{77:016x}", "newest": "5", "acknowledged": "2", "dropped": "1", "recorded": "5"}
-    db.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
-    db.executemany("INSERT INTO sample VALUES (?, ?, 1)", [(i + 1, ROWS[i].tobytes()) for i in range(3, 5)])
-    db.execute("PRAGMA user_version=1")
-    db.close()
-    spool = opened(tmp_path)
-    head = spool.head(9)
-    assert head
-    assert (head.spool_id, head.first_seq, head.lost_before) == (77, 4, 1)
-    assert hashes(head.rows) == hashes(ROWS[3:5])
-    assert spool.counters() == {"depth": 2, "dropped": 1, "put_aside": 0, "recorded": 5}
-    assert spool.record(ROWS[5:6]) == 1
-    spool.close()
-    opened(tmp_path).close()
-
-
 # --- errors ----------------------------------------------------------------------------------------------------------
 
 
@@ -444,79 +434,84 @@ def test_damaged_file_is_a_store_error(tmp_path: Path, damage: bytes) -> None:
 
 def test_spool_of_another_schema_is_a_store_error(tmp_path: Path) -> None:
     opened(tmp_path).close()
-    db = sqlite3.connect(tmp_path / "spool.db")
-    db.execute("PRAGMA user_version=99")
-    db.close()
     with pytest.raises(StoreError, match="schema 99"):
-        opened(tmp_path)
+        opened(changed(tmp_path, "PRAGMA user_version=99"))
 
 
 def test_spool_that_has_lost_its_numbers_is_a_store_error(tmp_path: Path) -> None:
     opened(tmp_path).close()
-    db = sqlite3.connect(tmp_path / "spool.db", isolation_level=None)
-    db.execute("DELETE FROM meta WHERE key = 'newest'")
-    db.close()
     with pytest.raises(StoreError):
-        opened(tmp_path)
+        opened(changed(tmp_path, "DELETE FROM meta WHERE key = 'newest'"))
 
 
-def test_failed_record_changes_nothing(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+class FullDisk(sqlite3.Connection):
+    """A disk that is full when it comes to some statement; SQLite rolls back by itself, or does not."""
+
+    rolls_back = False
+    full_at = "never"
+
+    def execute(self, statement: str, *values: object) -> sqlite3.Cursor:
+        self._fail(statement)
+        return super().execute(statement, *values)
+
+    def executemany(self, statement: str, values: Any) -> sqlite3.Cursor:
+        self._fail(statement)
+        return super().executemany(statement, values)
+
+    def _fail(self, statement: str) -> None:
+        if statement.startswith(self.full_at):
+            if self.rolls_back:
+                super().execute("ROLLBACK")
+            raise sqlite3.OperationalError("database or disk is full")
+
+
+class SpoolOnFullDisk(Spool):
+    def _connect(self, path: Path) -> sqlite3.Connection:
+        return connect(path, FullDisk)
+
+
+@pytest.mark.parametrize("statement", ["INSERT INTO sample", "REPLACE INTO meta", "COMMIT"])
+def test_failed_record_changes_nothing_and_names_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, statement: str
+) -> None:
+    spool = SpoolOnFullDisk(tmp_path / "spool.db", SpoolConfig())
     spool.record(ROWS[:2])
-    spool._db.execute("INSERT INTO sample VALUES (4, x'00', 1, NULL)")  # in the way
-    with pytest.raises(StoreError, match="UNIQUE"):
-        spool.record(ROWS[2:5])
-    spool._db.execute("DELETE FROM sample WHERE number = 4")
+    with monkeypatch.context() as patch:
+        patch.setattr(FullDisk, "full_at", statement)
+        with pytest.raises(StoreError, match=r"spool\.db: cannot be used: .* full; look at the machine's disk"):
+            spool.record(ROWS[2:5])
     assert spool.newest == 2
     assert spool.record(ROWS[2:5]) == 3
     assert spool.counters()["recorded"] == 5
     spool.close()
 
 
-class Full(sqlite3.Connection):
-    """A disk that is full when it comes to a commit; SQLite rolls back by itself, or does not."""
-
-    rolls_back = False
-    full = False
-
-    def execute(self, statement: str, *values: object) -> sqlite3.Cursor:
-        if self.full and statement == "COMMIT":
-            if self.rolls_back:
-                super().execute("ROLLBACK")
-            raise sqlite3.OperationalError("database or disk is full")
-        return super().execute(statement, *values)
-
-
 @pytest.mark.parametrize("rolls_back", [False, True])
 def test_failed_commit_leaves_no_transaction_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rolls_back: bool
 ) -> None:
-    class OnFull(Spool):
-        def _connect(self, path: Path) -> sqlite3.Connection:
-            return connect(path, Full)
-
-    monkeypatch.setattr(Full, "rolls_back", rolls_back)
-    spool = OnFull(tmp_path / "spool.db", SpoolConfig())
+    monkeypatch.setattr(FullDisk, "rolls_back", rolls_back)
+    spool = SpoolOnFullDisk(tmp_path / "spool.db", SpoolConfig())
     spool.record(ROWS[:4])
-    monkeypatch.setattr(Full, "full", True)
+    monkeypatch.setattr(FullDisk, "full_at", "COMMIT")
     with pytest.raises(StoreError, match="disk is full"):
         spool.record(ROWS[4:6])
     head = spool.head(9)
     assert head
     attempts = (
         lambda: spool.acknowledge(spool.spool_id, 2),
-        lambda: spool.put_aside(head, "bad"),
+        lambda: spool.quarantine(head, "bad"),
         lambda: spool.finalise(1, ROWS[:1]),
-        lambda: spool.fall_back(spool.spool_id, -1),
-        spool.fork,
+        lambda: spool.lower_watermark(spool.spool_id, -1),
+        spool.start_new_run,
     )
     identity = spool.spool_id
     for attempt in attempts:
-        with pytest.raises(sqlite3.OperationalError, match="disk is full"):
+        with pytest.raises(StoreError, match="disk is full; look at the machine's disk"):
             attempt()
         assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 0, "recorded": 4}
         assert (spool.spool_id, spool.newest, spool.acknowledged) == (identity, 4, 0)
-    monkeypatch.setattr(Full, "full", False)
+    monkeypatch.setattr(FullDisk, "full_at", "never")
     assert spool.record(ROWS[4:6]) == 5
     spool.close()
 
@@ -526,26 +521,7 @@ def test_bad_spool_option_is_refused_by_name() -> None:
         SpoolConfig(max_samples=0)
 
 
-def test_disk_that_takes_nothing_is_named(tmp_path: Path) -> None:
-    spool = Spool(tmp_path / "spool.db", SpoolConfig())
-    spool._db.execute("PRAGMA query_only = ON")
-    with pytest.raises(StoreError, match=r"spool\.db: cannot be written: .*; look at the machine's disk"):
-        spool.record(made_up_samples(2))
-    assert spool.newest == 0
-    spool._db.execute("PRAGMA query_only = OFF")
-    assert spool.record(made_up_samples(2)) == 1
-    spool.close()
-
-
 # --- damage that SQLite does not see ---------------------------------------------------------------------------------
-
-
-def changed(path: Path, statement: str) -> Path:
-    db = sqlite3.connect(path / "spool.db")
-    db.execute(statement)
-    db.commit()
-    db.close()
-    return path
 
 
 @pytest.mark.parametrize("column", ["spool_id = '00000000000000ff'", "acknowledged = 2", "closed = 1", "crc32 = 5"])
@@ -560,7 +536,7 @@ def test_a_run_that_is_not_what_was_written_is_no_reason_to_send_under_another_i
 
 
 @pytest.mark.parametrize("row", ["x''", "x'0102'", "5", "'text'"])
-def test_a_sample_that_is_none_is_put_aside_and_the_others_are_sent(tmp_path: Path, row: str) -> None:
+def test_a_sample_that_is_none_is_quarantined_and_the_others_are_sent(tmp_path: Path, row: str) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:3])
     spool.close()
@@ -574,9 +550,11 @@ def test_a_sample_that_is_none_is_put_aside_and_the_others_are_sent(tmp_path: Pa
 def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:3])
-    spool._db.execute("UPDATE sample SET crc32 = 1 WHERE number = 2")
-    spool._db.execute("CREATE TRIGGER stays BEFORE DELETE ON sample BEGIN SELECT RAISE(IGNORE); END")
-    with pytest.raises(sqlite3.DatabaseError, match="the file is damaged"):
+    spool.close()
+    changed(tmp_path, "UPDATE sample SET crc32 = 1 WHERE number = 2")
+    changed(tmp_path, "CREATE TRIGGER stays BEFORE DELETE ON sample BEGIN SELECT RAISE(IGNORE); END")
+    spool = opened(tmp_path)
+    with pytest.raises(StoreError, match="the file is damaged"):
         spool.head(10)
     assert spool.counters()["put_aside"] == 0
     spool.close()

@@ -307,7 +307,7 @@ def test_uplink_waits_timeout_s_for_an_acknowledgement(sessions: tuple[Any, Any]
     agent = Agent(client, SITE, OF, AgentConfig(uplink=UplinkConfig(timeout_s=0.3)), Places(tmp_path / "spool.db"))
     deadline_s = began_s + 20
     uplink = agent._uplink
-    while not uplink.state.counters["timeouts"]:
+    while not uplink.counters["timeouts"]:
         assert time.monotonic() < deadline_s
     took_s = time.monotonic() - began_s
     for query in held:

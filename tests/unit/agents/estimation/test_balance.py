@@ -25,17 +25,17 @@ BODY = {
 
 def loader(mount: Mount | None = None, **options: float) -> MachineConfig:
     """A machine that bends, weighs what it carries, and sits on tyres."""
-    of = machine(mount, **{**BODY, **options})  # type: ignore[arg-type]
+    vehicle = machine(mount, **{**BODY, **options})  # type: ignore[arg-type]
     more = SensorConfig("joint", "articulation"), SensorConfig("scale", "payload")
-    return replace(of, sensors=(*of.sensors, *more))
+    return replace(vehicle, sensors=(*vehicle.sensors, *more))
 
 
 @pytest.mark.parametrize("legs", [FORWARDS, REVERSE], ids=["forwards", "reverse"])
 @pytest.mark.parametrize("c_rr", [0.008, 0.25])
 @pytest.mark.parametrize("ahead_deg", [0.0, 15.0, -15.0])
 def test_what_is_left_is_the_rolling_resistance(legs: list[Leg], c_rr: float, ahead_deg: float) -> None:
-    of = machine()
-    last = balances(of, drive(legs, of, ground=Ground(c_rr, math.radians(ahead_deg))).readings)[-1]
+    vehicle = machine()
+    last = balances(vehicle, drive(legs, vehicle, ground=Ground(c_rr, math.radians(ahead_deg))).readings)[-1]
     direction = 1.0 if legs is FORWARDS else -1.0
     assert last.direction == direction
     assert last.unbalanced == pytest.approx(direction * c_rr * math.cos(math.radians(ahead_deg)), abs=1e-4)
@@ -45,63 +45,63 @@ def test_what_is_left_is_the_rolling_resistance(legs: list[Leg], c_rr: float, ah
     assert last.speed_mps == pytest.approx(direction * 2.0, abs=0.02)
 
 
-def test_way_counts_up_in_reverse_too() -> None:
-    of = machine()
-    found = balances(of, drive([*FORWARDS, Leg(8, -0.5), Leg(5)], of).readings)
-    assert (np.diff([b.way_m for b in found]) >= 0).all()
-    assert found[-1].way_m == pytest.approx(4 + 20 + 4 + 4 + 10, abs=0.3)
+def test_distance_counts_up_in_reverse_too() -> None:
+    vehicle = machine()
+    steps = balances(vehicle, drive([*FORWARDS, Leg(8, -0.5), Leg(5)], vehicle).readings)
+    assert (np.diff([b.distance_m for b in steps]) >= 0).all()
+    assert steps[-1].distance_m == pytest.approx(4 + 20 + 4 + 4 + 10, abs=0.3)
 
 
-def test_a_step_ends_every_step_s() -> None:
-    of = machine()
-    found = balances(of, drive(FORWARDS, of).readings, step_s=0.1)
-    assert [b.dt_s for b in found] == pytest.approx([0.1] * 159)
-    assert np.diff([b.stamp_ns for b in found]).tolist() == [100_000_000] * 158
+def test_a_step_ends_every_50_ms() -> None:
+    vehicle = machine()
+    steps = balances(vehicle, drive(FORWARDS, vehicle).readings)
+    assert [b.dt_s for b in steps] == pytest.approx([0.05] * 319)
+    assert np.diff([b.stamp_ns for b in steps]).tolist() == [50_000_000] * 318
 
 
 def test_rotating_mass_is_taken_off() -> None:
     """What the machine does not know of its wheels' inertia looks like ground."""
-    of, wrong = machine(rotating_mass_factor=1.2), machine(rotating_mass_factor=1.0)
-    made = drive([Leg(10, 0.5)], of).readings
-    assert balances(of, made)[-1].unbalanced == pytest.approx(0.04, abs=1e-3)
+    vehicle, wrong = machine(rotating_mass_factor=1.2), machine(rotating_mass_factor=1.0)
+    made = drive([Leg(10, 0.5)], vehicle).readings
+    assert balances(vehicle, made)[-1].unbalanced == pytest.approx(0.04, abs=1e-3)
     assert balances(wrong, made)[-1].unbalanced == pytest.approx(0.04 + 0.2 * 0.5 / GRAVITY_MPS2, abs=1e-3)
 
 
 @pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 90.0), (180.0, 0.0, 0.0), (90.0, 0.0, -90.0), (10.0, -20.0, 30.0)])
 def test_mounting_is_turned_back(rpy_deg: tuple[float, float, float]) -> None:
-    of = machine(Mount((0.4, 0.0, 0.9), rpy_deg))
-    last = balances(of, drive(FORWARDS, of, ground=Ground(0.05, 0.2, 0.1)).readings)[-1]
+    vehicle = machine(Mount((0.4, 0.0, 0.9), rpy_deg))
+    last = balances(vehicle, drive(FORWARDS, vehicle, ground=Ground(0.05, 0.2, 0.1)).readings)[-1]
     assert last.unbalanced == pytest.approx(0.05 * math.cos(0.2), abs=1e-4)
     assert (last.slope_x, last.slope_y) == pytest.approx((0.2, 0.1), abs=3e-3)
 
 
 def test_lever_arm_of_the_accelerometer_in_a_bend_is_taken_off() -> None:
     """2.5 m ahead of the rear axle a turn of 0.4 rad/s pulls 0.4 m/s2 backwards: 0.04 of c_rr."""
-    of = machine(Mount((2.5, 0.0, 0.9)))
+    vehicle = machine(Mount((2.5, 0.0, 0.9)))
     legs = [Leg(2), Leg(4, 0.5), Leg(6, 0.0, 0.4)]
-    made = drive(legs, of)
-    felt = [r for r in made.readings if isinstance(r, Imu)][-1]
-    assert felt.force_x_mps2 == pytest.approx(-0.4)
-    last = balances(of, made.readings)[-1]
+    made = drive(legs, vehicle)
+    measured = [r for r in made.readings if isinstance(r, Imu)][-1]
+    assert measured.force_x_mps2 == pytest.approx(-0.4)
+    last = balances(vehicle, made.readings)[-1]
     assert last.unbalanced == pytest.approx(0.04, abs=1e-3)
     assert last.slope_x == pytest.approx(0.0, abs=2e-3)
-    moved = balances(changed_sensor(of, "imu", mount=Mount()), made.readings)[-1]
+    moved = balances(changed_sensor(vehicle, "imu", mount=Mount()), made.readings)[-1]
     assert moved.unbalanced == pytest.approx(0.04 + 0.4 / GRAVITY_MPS2, abs=1e-3)
 
 
 def test_centripetal_acceleration_of_a_bend_is_no_slope() -> None:
-    of = machine()
-    last = balances(of, drive([Leg(2), Leg(4, 0.5), Leg(10, 0.0, 0.3)], of).readings)[-1]
+    vehicle = machine()
+    last = balances(vehicle, drive([Leg(2), Leg(4, 0.5), Leg(10, 0.0, 0.3)], vehicle).readings)[-1]
     assert last.slope_y == pytest.approx(0.0, abs=2e-3)
     assert last.slope_x == pytest.approx(0.0, abs=2e-3)
 
 
 def test_turning_across_a_slope_keeps_slopes_and_resistance_right() -> None:
     """The wheels' share of the force is off by up to g sin(15 deg) if the slope does not turn with the machine."""
-    of = machine()
+    vehicle = machine()
     ground = Ground(0.04, left_rad=math.radians(15))
     legs = [Leg(2), Leg(4, 0.5), Leg(4), Leg(12, 0.0, 0.25)]
-    for at in balances(of, drive(legs, of, ground=ground).readings)[160:]:
+    for at in balances(vehicle, drive(legs, vehicle, ground=ground).readings)[160:]:
         turned = max((at.stamp_ns - START_NS) * 1e-9 - 10, 0) * 0.25
         here = ground.turned(turned)
         assert (at.slope_x, at.slope_y) == pytest.approx((here.ahead_rad, here.left_rad), abs=0.01)
@@ -111,39 +111,39 @@ def test_turning_across_a_slope_keeps_slopes_and_resistance_right() -> None:
 @pytest.mark.parametrize("bend_rad", [0.5, -0.5])
 def test_bent_machine_on_a_side_slope_climbs_with_its_front_axle(bend_rad: float) -> None:
     """By hand: 1.5 / 3.3 of the weight stand on the front axle, whose way rises by sin(0.2) sin(bend)."""
-    of = loader(axle_stiffness_npm=0.0, cog_height_m=0.0)
+    vehicle = loader(axle_stiffness_npm=0.0, cog_height_m=0.0)
     legs = [Leg(2), Leg(4, 0.5, bend_rad=bend_rad), Leg(6, bend_rad=bend_rad)]
-    made = drive(legs, of, ground=Ground(0.04, 0.0, 0.2)).readings
+    made = drive(legs, vehicle, ground=Ground(0.04, 0.0, 0.2)).readings
     extra = 1.5 / 3.3 * math.sin(0.2) * math.sin(bend_rad)
-    last = balances(of, made)[-1]
+    last = balances(vehicle, made)[-1]
     assert last.share == pytest.approx(0.04 + extra, abs=1e-4)
     assert last.unbalanced == pytest.approx(0.04, abs=1e-3)
-    straight = balances(of, [r for r in made if r.sensor != "joint"])[-1]  # nobody says that it is bent
+    straight = balances(vehicle, [r for r in made if r.sensor != "joint"])[-1]  # nobody says that it is bent
     assert straight.unbalanced == pytest.approx(0.04 + extra, abs=1e-3)
 
 
 def test_bent_machine_uphill_climbs_less() -> None:
-    of = loader(axle_stiffness_npm=0.0, cog_height_m=0.0)
+    vehicle = loader(axle_stiffness_npm=0.0, cog_height_m=0.0)
     legs = [Leg(2), Leg(4, 0.5, bend_rad=0.6), Leg(6, bend_rad=0.6)]
-    last = balances(of, drive(legs, of, ground=Ground(0.04, 0.2)).readings)[-1]
+    last = balances(vehicle, drive(legs, vehicle, ground=Ground(0.04, 0.2)).readings)[-1]
     assert last.share == pytest.approx(
         0.04 * math.cos(0.2) + math.sin(0.2) * (1 - 1.5 / 3.3 * (1 - math.cos(0.6))), abs=1e-4
     )
     assert last.unbalanced == pytest.approx(0.04 * math.cos(0.2), abs=1e-3)
 
 
-def test_share_of_the_load_on_the_front_axle_is_told() -> None:
-    of = loader(cog_height_m=0.0)
-    assert balances(of, drive(FORWARDS, of).readings)[-1].on_front == pytest.approx(1.5 / 3.3, abs=1e-3)
+def test_share_of_the_load_on_the_front_axle() -> None:
+    vehicle = loader(cog_height_m=0.0)
+    assert balances(vehicle, drive(FORWARDS, vehicle).readings)[-1].on_front == pytest.approx(1.5 / 3.3, abs=1e-3)
     bare = machine()
     assert balances(bare, drive(FORWARDS, bare).readings)[-1].on_front == 0.0
 
 
 def test_payload_counts_as_mass_and_moves_weight_to_the_front() -> None:
-    of = loader()
+    vehicle = loader()
     legs = [Leg(2), Leg(4, 0.5, payload_kg=4000, bend_rad=0.4), Leg(6, payload_kg=4000, bend_rad=0.4)]
-    made = drive(legs, of, ground=Ground(0.04, 0.0, 0.15)).readings
-    weighed, not_weighed = (balances(of, made, weighs=weighs)[-1] for weighs in (True, False))
+    made = drive(legs, vehicle, ground=Ground(0.04, 0.0, 0.15)).readings
+    weighed, not_weighed = (balances(vehicle, made, weighs=weighs)[-1] for weighs in (True, False))
     assert weighed.unbalanced == pytest.approx(0.04, abs=2e-3)
     assert not_weighed.share == pytest.approx(weighed.share * 21.5 / 17.5)
     assert abs(not_weighed.unbalanced - 0.04) > 0.01
@@ -153,115 +153,117 @@ def test_payload_counts_as_mass_and_moves_weight_to_the_front() -> None:
 @pytest.mark.parametrize("payload_kg", [0.0, 4000.0])
 def test_squat_is_no_slope_and_no_resistance(accel_mps2: float, payload_kg: float) -> None:
     """A full bucket lowers the nose by 0.9 degrees, which would be 0.015 of c_rr and of slope."""
-    of = loader()
+    vehicle = loader()
     legs = [Leg(2), Leg(4, 0.5, payload_kg=payload_kg), Leg(12, accel_mps2, payload_kg=payload_kg)]
-    made = drive(legs, of, ground=Ground(0.04, 0.1)).readings
-    last = balances(of, made)[-1]
+    made = drive(legs, vehicle, ground=Ground(0.04, 0.1)).readings
+    last = balances(vehicle, made)[-1]
     assert last.unbalanced == pytest.approx(0.04 * math.cos(0.1), abs=1e-3)
     assert last.slope_x == pytest.approx(0.1, abs=3e-3)
     assert last.sine_x == pytest.approx(math.sin(0.1), abs=3e-3)
-    rigid = balances(replace(of, axle_stiffness_npm=0.0), made)[-1]
+    rigid = balances(replace(vehicle, axle_stiffness_npm=0.0), made)[-1]
     assert (abs(rigid.slope_x - 0.1) > 5e-3) == bool(payload_kg)
 
 
 def test_nose_that_rises_is_a_positive_pitch_rate() -> None:
-    of = machine()
-    made = drive(FORWARDS, of, without=("imu",)).readings
+    vehicle = machine()
+    made = drive(FORWARDS, vehicle, without=("imu",)).readings
     turning = [Imu("imu", r.stamp_ns, 0.0, -0.1, 0.02, 0.0, 0.0, 9.81) for r in made if isinstance(r, Torque)]
-    last = balances(of, sorted([*made, *turning], key=lambda r: r.stamp_ns))[-1]
+    last = balances(vehicle, sorted([*made, *turning], key=lambda r: r.stamp_ns))[-1]
     assert last.pitch_radps == pytest.approx(0.1)
     assert last.norm_mps2 == pytest.approx(9.81)
 
 
 def test_body_s_acceleration_is_the_accelerometer_s_without_the_slope() -> None:
-    of = machine()
-    last = balances(of, drive([Leg(2), Leg(4, 0.5), Leg(4, 0.4)], of, ground=Ground(0.04, 0.1)).readings)[-1]
+    vehicle = machine()
+    last = balances(vehicle, drive([Leg(2), Leg(4, 0.5), Leg(4, 0.4)], vehicle, ground=Ground(0.04, 0.1)).readings)[-1]
     assert last.body_mps2 == pytest.approx(0.4, abs=0.03)
     assert last.accel_mps2 == pytest.approx(0.4, abs=0.03)
 
 
 def test_torque_between_two_steps_is_averaged_and_the_last_one_kept() -> None:
-    of = machine()
-    made = [r for r in drive(FORWARDS, of).readings if not isinstance(r, Torque)]
-    wheel_nm = of.mass_kg * GRAVITY_MPS2 * of.wheel_radius_m
+    vehicle = machine()
+    made = [r for r in drive(FORWARDS, vehicle).readings if not isinstance(r, Torque)]
+    wheel_nm = vehicle.mass_kg * GRAVITY_MPS2 * vehicle.wheel_radius_m
     stamps = [r.stamp_ns for r in made if isinstance(r, Imu)]
-    said = {stamps[500 + i]: wheel_nm * 0.01 * i for i in range(1, 6)}
-    torques = [Torque("torque", stamp, nm) for stamp, nm in said.items()]
-    found = balances(of, sorted([*torques, *made], key=lambda r: r.stamp_ns))
-    share = {b.stamp_ns: b for b in found}
-    first = next(b for b in found if b.torque_s < math.inf)
+    stated = {stamps[500 + i]: wheel_nm * 0.01 * i for i in range(1, 6)}
+    torques = [Torque("torque", stamp, nm) for stamp, nm in stated.items()]
+    steps = balances(vehicle, sorted([*torques, *made], key=lambda r: r.stamp_ns))
+    share = {b.stamp_ns: b for b in steps}
+    first = next(b for b in steps if b.torque_s < math.inf)
     assert first.stamp_ns <= stamps[505]
-    shares = [b.share for b in found if b.torque_s < math.inf]
+    shares = [b.share for b in steps if b.torque_s < math.inf]
     assert 0.01 <= shares[0] <= 0.05
     assert shares[-1] == pytest.approx(0.05)  # the last one, kept
-    assert share[found[-1].stamp_ns].torque_s == pytest.approx((found[-1].stamp_ns - stamps[505]) * 1e-9)
-    assert found[0].torque_s == math.inf
+    assert share[steps[-1].stamp_ns].torque_s == pytest.approx((steps[-1].stamp_ns - stamps[505]) * 1e-9)
+    assert steps[0].torque_s == math.inf
 
 
-def test_ages_of_wheels_and_torque_are_told_and_silent_wheels_stand() -> None:
-    of = machine()
-    made = drive(FORWARDS, of)
+def test_ages_of_wheels_and_torque_and_silent_wheels_that_stand() -> None:
+    vehicle = machine()
+    made = drive(FORWARDS, vehicle)
     cut = made.stamps_ns[700]
     silent = [r for r in made.readings if not isinstance(r, Encoder | Torque) or r.stamp_ns <= cut]
-    found = balances(of, silent)
-    last = found[-1]
+    steps = balances(vehicle, silent)
+    last = steps[-1]
     assert last.wheels_s == pytest.approx((last.stamp_ns - cut) * 1e-9, abs=0.06)
     assert last.torque_s == pytest.approx((last.stamp_ns - cut) * 1e-9, abs=0.02)
     assert (last.speed_mps, last.accel_mps2) == (0.0, 0.0)
-    never = balances(of, [r for r in made.readings if isinstance(r, Imu)])[-1]
+    never = balances(vehicle, [r for r in made.readings if isinstance(r, Imu)])[-1]
     assert (never.wheels_s, never.torque_s) == (math.inf, math.inf)
 
 
 def test_odometry_counts_as_wheels() -> None:
-    of = replace(machine(), sensors=(*machine().sensors[:2], SensorConfig("wheels", "odometry")))
+    vehicle = replace(machine(), sensors=(*machine().sensors[:2], SensorConfig("wheels", "odometry")))
     made = drive(FORWARDS, machine(), without=("wheels",))
     speeds = [Odometry("wheels", t, float(v), 0.0, 0.0) for t, v in zip(made.stamps_ns, made.speed_mps, strict=True)]
     both = sorted([*(r for r in made.readings if r.sensor != "gps-1"), *speeds], key=lambda r: r.stamp_ns)
-    last = balances(of, both)[-1]
+    last = balances(vehicle, both)[-1]
     assert last.wheels_s < 0.02
     assert last.unbalanced == pytest.approx(0.04, abs=1e-3)
 
 
 @pytest.mark.parametrize("options", [{"frame": FRONT}, {"gives": ("rate",)}], ids=["front frame", "no accelerometer"])
-def test_only_an_accelerometer_on_the_rear_frame_is_felt(options: dict[str, object]) -> None:
-    of = machine()
-    made: Drive = drive(FORWARDS, of)
-    assert balances(changed_sensor(of, "imu", **options), made.readings) == []
-    assert balances(of, made.readings)
+def test_only_an_accelerometer_on_the_rear_frame_counts(options: dict[str, object]) -> None:
+    vehicle = machine()
+    made: Drive = drive(FORWARDS, vehicle)
+    assert balances(changed_sensor(vehicle, "imu", **options), made.readings) == []
+    assert balances(vehicle, made.readings)
 
 
 def test_the_first_accelerometer_is_used_alone() -> None:
-    of = machine()
-    both = replace(of, sensors=(*of.sensors, SensorConfig("imu-b", "imu")))
-    made = drive(FORWARDS, of).readings
+    vehicle = machine()
+    both = replace(vehicle, sensors=(*vehicle.sensors, SensorConfig("imu-b", "imu")))
+    made = drive(FORWARDS, vehicle).readings
     bad = [Imu("imu-b", r.stamp_ns, 0.0, 0.0, 0.0, 3.0, 3.0, 3.0) for r in made if isinstance(r, Imu)]
     stream = sorted([*made, *bad], key=lambda r: r.stamp_ns)
-    assert balances(both, stream) == balances(of, made)
+    assert balances(both, stream) == balances(vehicle, made)
 
 
 def test_pause_of_the_imu_spoils_no_step() -> None:
-    of = machine()
-    made = drive(FORWARDS, of)
+    vehicle = machine()
+    made = drive(FORWARDS, vehicle)
     silent = (made.stamps_ns[600], made.stamps_ns[750])
-    found = balances(of, [r for r in made.readings if not (isinstance(r, Imu) and silent[0] < r.stamp_ns < silent[1])])
-    assert max(b.dt_s for b in found) < 0.07
-    assert not [b for b in found if silent[0] < b.stamp_ns < silent[1]]
-    assert found[-1].unbalanced == pytest.approx(0.04, abs=1e-3)
+    steps = balances(
+        vehicle, [r for r in made.readings if not (isinstance(r, Imu) and silent[0] < r.stamp_ns < silent[1])]
+    )
+    assert max(b.dt_s for b in steps) < 0.07
+    assert not [b for b in steps if silent[0] < b.stamp_ns < silent[1]]
+    assert steps[-1].unbalanced == pytest.approx(0.04, abs=1e-3)
 
 
 def test_noise_of_the_readings_averages_out_over_steps() -> None:
     """The raw balance has the density that the estimators are told of, or less."""
-    of = machine()
-    made = drive([Leg(2), Leg(4, 0.5), Leg(60)], of)
-    raw = np.array([b.unbalanced for b in balances(of, noisy(made.readings, 1))][100:])
+    vehicle = machine()
+    made = drive([Leg(2), Leg(4, 0.5), Leg(60)], vehicle)
+    raw = np.array([b.unbalanced for b in balances(vehicle, noisy(made.readings, 1))][100:])
     assert raw.mean() == pytest.approx(0.04, abs=2e-3)
     assert raw.std() * math.sqrt(0.05) < 0.005
 
 
 def test_payload_reading_is_kept_until_the_next() -> None:
-    of = loader()
-    made = [r for r in drive(FORWARDS, of).readings if not isinstance(r, Payload)]
-    said = [Payload("scale", made[0].stamp_ns, 4000.0)]
-    shares = [b.share for b in balances(of, [*said, *made])]
-    empty = [b.share for b in balances(of, made)]
+    vehicle = loader()
+    made = [r for r in drive(FORWARDS, vehicle).readings if not isinstance(r, Payload)]
+    stated = [Payload("scale", made[0].stamp_ns, 4000.0)]
+    shares = [b.share for b in balances(vehicle, [*stated, *made])]
+    empty = [b.share for b in balances(vehicle, made)]
     assert shares == pytest.approx([share * 17.5 / 21.5 for share in empty])

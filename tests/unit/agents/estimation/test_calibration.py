@@ -1,7 +1,7 @@
-"""Zero and scale of the balance, found by driving the same ground there and back, and on known ground."""
+"""Zero and scale of the balance, calibration by driving the same ground there and back, and on known ground."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -9,8 +9,18 @@ import numpy as np
 import pytest
 
 from agents.dead_reckoning import Dead, DeadReckoning
+from agents.estimation import calibration as module
 from agents.estimation.balance import Balance
-from agents.estimation.calibration import RELOCK, Calibration, CalibrationConfig, Calibrator, unknown
+from agents.estimation.calibration import (
+    FLOOR,
+    RELOCK,
+    SCALE_STD,
+    STRETCH_STD,
+    UNCALIBRATED,
+    ZERO_STD,
+    Calibration,
+    Calibrator,
+)
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
 from tests.unit.agents.ground import STEADY, STEP_S
@@ -50,7 +60,7 @@ class Course:
         self._zero, self._scale, self._c_rr, self._slope = zero, scale, c_rr, slope
         self._noise, self._rng = noise, np.random.default_rng(seed)
         self._steps = 0
-        self._way_m = 0.0
+        self._distance_m = 0.0
 
     def drive(
         self, metres: float, direction: float = 1.0, *, known_c_rr: float | None = None, speed_mps: float = 2.0
@@ -58,7 +68,7 @@ class Course:
         """Straight on, or back, in 0.05 s steps."""
         for _ in range(round(metres / (speed_mps * STEP_S))):
             self._steps += 1
-            self._way_m += speed_mps * STEP_S
+            self._distance_m += speed_mps * STEP_S
             self.place.x_m += direction * speed_mps * STEP_S * math.cos(self.place.angle_rad)
             self.place.y_m += direction * speed_mps * STEP_S * math.sin(self.place.angle_rad)
             balance = self._balance(direction, speed_mps)
@@ -84,15 +94,15 @@ class Course:
             STEADY,
             stamp_ns=START_NS + self._steps * round(STEP_S * 1e9),
             speed_mps=direction * speed_mps,
-            way_m=self._way_m,
+            distance_m=self._distance_m,
             slope_x=slope,
             share=share,
             unbalanced=true + self._scale * share + self._zero + noise,
         )
 
 
-def course(config: CalibrationConfig | None = None, known: Calibration | None = None, **options: object) -> Course:
-    return Course(Calibrator(config or CalibrationConfig(), known), **options)  # type: ignore[arg-type]
+def course(calibration: Calibration | None = None, **options: object) -> Course:
+    return Course(Calibrator(calibration), **options)  # type: ignore[arg-type]
 
 
 # --- there and back --------------------------------------------------------------------------------------------------
@@ -103,13 +113,13 @@ def course(config: CalibrationConfig | None = None, known: Calibration | None = 
 def test_flat_ground_there_and_back_shows_the_zero(zero: float, c_rr: float) -> None:
     on = course(zero=zero, c_rr=lambda _: c_rr, noise=NOISE, seed=1)
     on.there_and_back(40, 6)
-    found = on.calibrator.calibration
-    assert found.zero == pytest.approx(zero, abs=0.0012)
-    assert found.scale == pytest.approx(0.0, abs=0.045)
-    assert math.sqrt(found.covariance[0][0]) < 0.0012
-    assert math.sqrt(found.covariance[1][1]) > 0.02  # which flat ground does not show
+    calibration = on.calibrator.calibration
+    assert calibration.zero == pytest.approx(zero, abs=0.0012)
+    assert calibration.scale == pytest.approx(0.0, abs=0.045)
+    assert math.sqrt(calibration.covariance[0][0]) < 0.0012
+    assert math.sqrt(calibration.covariance[1][1]) > 0.02  # which flat ground does not show
     assert on.calibrator.counters["pairs"] > 6 * 70
-    assert found.passages > 6 * 70
+    assert calibration.passages > 6 * 70
 
 
 @pytest.mark.parametrize("scale", [0.05, -0.05])
@@ -117,14 +127,14 @@ def test_a_slope_shows_the_scale_too(scale: float) -> None:
     """40 m of flat ground, then a ramp of 12 degrees."""
     on = course(zero=0.004, scale=scale, slope=lambda x: math.radians(12) if x > 20 else 0.0, noise=NOISE, seed=2)
     on.there_and_back(40, 8)
-    found = on.calibrator.calibration
-    assert found.zero == pytest.approx(0.004, abs=0.0015)
-    assert found.scale == pytest.approx(scale, abs=0.012)
-    corrected = [found.corrected(on._balance(d, 2.0)) * d for d in (1.0, -1.0)]
+    calibration = on.calibrator.calibration
+    assert calibration.zero == pytest.approx(0.004, abs=0.0015)
+    assert calibration.scale == pytest.approx(scale, abs=0.012)
+    corrected = [calibration.corrected(on._balance(d, 2.0)) * d for d in (1.0, -1.0)]
     assert np.mean(corrected) == pytest.approx(0.04, abs=0.02)
 
 
-def test_ground_of_many_kinds_matters_not() -> None:
+def test_changes_of_the_ground_do_not_matter() -> None:
     """Each place against itself; c_rr changes every 4 m."""
     on = course(zero=0.005, c_rr=lambda x: 0.02 + 0.06 * (int(x / 4) % 2), noise=NOISE, seed=3)
     on.there_and_back(40, 6)
@@ -137,7 +147,7 @@ def test_one_direction_alone_shows_nothing() -> None:
         on.drive(40)
         on.place.x_m = 0.0
         on.wait(1)
-    assert on.calibrator.calibration == unknown(CalibrationConfig())
+    assert on.calibrator.calibration == UNCALIBRATED
     assert not on.calibrator.counters
 
 
@@ -157,7 +167,7 @@ def test_a_passage_counts_once() -> None:
     assert 2 * pairs - 6 <= on.calibrator.counters["pairs"] <= 2 * pairs + 6
 
 
-def test_one_way_there_pairs_with_one_way_back() -> None:
+def test_each_passage_there_pairs_with_one_back() -> None:
     on = course(zero=0.004)
     on.drive(20)
     on.wait(1)
@@ -192,21 +202,7 @@ def test_what_is_the_same_ground(change: dict[str, float], pairs: bool) -> None:
     assert bool(on.calibrator.counters["pairs"]) is pairs
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "change"),
-    [("pair_m", 0.4, {"y_m": 0.5}), ("pair_rad", 0.05, {"angle_rad": 0.1}), ("pair_s", 60.0, {"wait_s": 90.0})],
-)
-def test_options_say_what_is_the_same_ground(option: str, value: float, change: dict[str, float]) -> None:
-    on = course(CalibrationConfig(**{option: value}), zero=0.004)
-    on.drive(6)
-    on.wait(change.pop("wait_s", 1.0))
-    for name, place in change.items():
-        setattr(on.place, name, place)
-    on.drive(3, -1.0)
-    assert not on.calibrator.counters["pairs"]
-
-
-def test_turning_round_is_no_way_back() -> None:
+def test_turning_round_makes_no_pair() -> None:
     """Driving home forwards: the gravity of the slope is not seen from the other side, so nothing is learnt."""
     on = course(zero=0.004)
     on.drive(20)
@@ -226,7 +222,7 @@ def test_full_turns_of_dead_reckoning_are_no_turn() -> None:
 
 
 @pytest.mark.parametrize("speed_mps", [0.5, 1.0, 3.0])
-def test_speed_of_the_way_back_matters_not(speed_mps: float) -> None:
+def test_speed_on_the_return_does_not_matter(speed_mps: float) -> None:
     on = course(zero=0.004)
     on.drive(20)
     on.wait(1)
@@ -235,7 +231,7 @@ def test_speed_of_the_way_back_matters_not(speed_mps: float) -> None:
     assert on.calibrator.calibration.zero == pytest.approx(0.004, abs=3e-4)
 
 
-def test_pairs_across_a_border_are_left_out() -> None:
+def test_pairs_across_a_border_are_excluded() -> None:
     """Ground that became sand in between: half the difference is no zero."""
     on = course(zero=0.004)
     on.there_and_back(20, 2)
@@ -249,14 +245,12 @@ def test_pairs_across_a_border_are_left_out() -> None:
     assert on.calibrator.calibration.passages == before.passages
 
 
-def test_gate_sigma_and_noise_say_what_is_off() -> None:
-    for config, off in ((CalibrationConfig(), True), (CalibrationConfig(gate_sigma=30.0), False)):
-        on = course(config, zero=0.05)
-        on.there_and_back(3)
-        assert bool(on.calibrator.counters["off"]) is off
-    on = course(CalibrationConfig(noise=0.1), zero=0.05)
-    on.there_and_back(3)
-    assert not on.calibrator.counters["off"]
+def test_pairs_beyond_three_standard_deviations_are_excluded() -> None:
+    """Those of the zero are 0.0045, of the mean of two stretches 0.008 / sqrt(2)."""
+    for sigmas, excluded in ((3.3, True), (2.7, False)):
+        on = course(zero=sigmas * math.hypot(ZERO_STD, STRETCH_STD / math.sqrt(2)))
+        on.there_and_back(1)
+        assert bool(on.calibrator.counters["off"]) is excluded
 
 
 def test_a_zero_far_beyond_its_class_is_found_in_the_end() -> None:
@@ -277,11 +271,10 @@ def test_interrupted_stretches_are_not_used() -> None:
     assert not on.calibrator.counters["pairs"]
 
 
-def test_stretch_m_is_the_way_of_a_stretch() -> None:
-    for stretch_m, pairs in ((0.5, 37), (2.0, 10)):
-        on = course(CalibrationConfig(stretch_m=stretch_m), zero=0.004)
-        on.there_and_back(20)
-        assert on.calibrator.counters["pairs"] == pytest.approx(pairs, abs=3)
+def test_a_stretch_is_half_a_metre() -> None:
+    on = course(zero=0.004)
+    on.there_and_back(20)
+    assert on.calibrator.counters["pairs"] == pytest.approx(37, abs=3)
 
 
 # --- known ground ----------------------------------------------------------------------------------------------------
@@ -291,8 +284,8 @@ def test_stretch_m_is_the_way_of_a_stretch() -> None:
 def test_known_ground_alone_shows_the_zero(direction: float) -> None:
     on = course(zero=0.006, noise=NOISE, seed=6)
     on.drive(120, direction, known_c_rr=0.04)
-    found = on.calibrator.calibration
-    assert found.zero == pytest.approx(0.006, abs=0.003)
+    calibration = on.calibrator.calibration
+    assert calibration.zero == pytest.approx(0.006, abs=0.003)
     assert on.calibrator.counters["known_ground"] >= 200
     assert not on.calibrator.counters["pairs"]
 
@@ -304,7 +297,7 @@ def test_known_ground_on_a_slope_counts_with_its_cosine() -> None:
     assert on.calibrator.calibration.zero == pytest.approx(0.006, abs=3e-4)
 
 
-def test_known_ground_that_is_not_what_it_is_said_to_be_is_off() -> None:
+def test_known_ground_that_is_not_as_stated_is_excluded() -> None:
     on = course()
     on.drive(4, known_c_rr=0.2)
     assert on.calibrator.counters["off"] >= 6
@@ -314,46 +307,42 @@ def test_known_ground_that_is_not_what_it_is_said_to_be_is_off() -> None:
 # --- how sure it is --------------------------------------------------------------------------------------------------
 
 
-def normalised(seeds: Iterable[int], error: Callable[[Calibration, float, float], float]) -> float:
-    """Rms over drives with zero and scale drawn from what is assumed of them."""
-    config, found = CalibrationConfig(floor=1e-9), []
-    for seed in seeds:
-        rng = np.random.default_rng(1000 + seed)
-        zero, scale = config.zero * rng.standard_normal(), config.scale * rng.standard_normal()
-        on = course(config, zero=zero, scale=scale, slope=lambda x: 0.2 if x > 10 else 0.0, noise=NOISE, seed=seed)
-        on.there_and_back(20, 2)
-        found.append(error(on.calibrator.calibration, zero, scale))
-    return float(np.sqrt(np.mean(np.square(found))))
+@pytest.fixture
+def no_floor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "FLOOR", 1e-12)
 
 
+@pytest.mark.usefixtures("no_floor")
 def test_covariance_is_honest() -> None:
-    def of_zero(c: Calibration, zero: float, _: float) -> float:
-        return (c.zero - zero) / math.sqrt(c.covariance[0][0])
-
-    def of_scale(c: Calibration, _: float, scale: float) -> float:
-        return (c.scale - scale) / math.sqrt(c.covariance[1][1])
-
-    def of_balance(c: Calibration, zero: float, scale: float) -> float:
-        return (c.zero - zero + 0.25 * (c.scale - scale)) / math.sqrt(c.variance(0.25))
-
-    for error in (of_zero, of_scale, of_balance):
-        rms = normalised(range(50), error)
-        assert 0.6 < rms < 1.5, f"{error.__name__} {rms=}"
+    """Rms of normalised errors over drives with zero and scale as they are assumed to be."""
+    errors = []
+    for seed in range(50):
+        rng = np.random.default_rng(1000 + seed)
+        zero, scale = ZERO_STD * rng.standard_normal(), SCALE_STD * rng.standard_normal()
+        on = course(zero=zero, scale=scale, slope=lambda x: 0.2 if x > 10 else 0.0, noise=NOISE, seed=seed)
+        on.there_and_back(20, 2)
+        c = on.calibrator.calibration
+        off_zero, off_scale = c.zero - zero, c.scale - scale
+        (zz, _), (_, ss) = c.covariance
+        balance = (off_zero + 0.25 * off_scale) / math.sqrt(c.variance(0.25))
+        errors.append((off_zero / math.sqrt(zz), off_scale / math.sqrt(ss), balance))
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert ((rms > 0.6) & (rms < 1.5)).all(), f"{rms=}"
 
 
 def test_no_number_of_pairs_gets_below_the_floor() -> None:
-    config = CalibrationConfig(floor=0.002)
-    on = course(config, slope=lambda x: 0.2 if x > 10 else 0.0)
-    assert on.calibrator.calibration.covariance == unknown(config).covariance
-    on.there_and_back(20, 20)
+    on = course(slope=lambda x: 0.2 if x > 10 else 0.0)
+    on.there_and_back(20, 40)
     (zz, _), (_, ss) = on.calibrator.calibration.covariance
-    assert math.sqrt(zz) == pytest.approx(0.002)
-    assert math.sqrt(ss) == pytest.approx(0.02)
+    assert math.sqrt(zz) == pytest.approx(FLOOR)
+    assert math.sqrt(ss) == pytest.approx(10 * FLOOR)
 
 
-def test_known_stretch_counts_as_one_and_a_pair_as_two() -> None:
-    config = CalibrationConfig(zero=1.0, scale=1e-9, floor=1e-12, zero_walk=1e-12)
-    on, known = course(config), course(config)
+@pytest.mark.usefixtures("no_floor")
+def test_known_stretch_counts_as_one_and_a_pair_as_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "ZERO_WALK", 0.0)
+    vague = Calibration(0.0, 0.0, ((1.0, 0.0), (0.0, 1e-18)))
+    on, known = course(vague), course(vague)
     on.there_and_back(20)
     known.drive(20, known_c_rr=0.04)
     for course_, stretches in (
@@ -361,7 +350,7 @@ def test_known_stretch_counts_as_one_and_a_pair_as_two() -> None:
         (known, known.calibrator.counters["known_ground"]),
     ):
         zz = course_.calibrator.calibration.covariance[0][0]
-        assert zz == pytest.approx(config.noise**2 / stretches, rel=1e-3)
+        assert zz == pytest.approx(STRETCH_STD**2 / stretches, rel=1e-3)
 
 
 def test_variance_of_a_balance_is_that_of_zero_and_scale_together() -> None:
@@ -380,48 +369,29 @@ def given(age_s: float = 0.0) -> Calibration:
     return Calibration(0.005, 0.01, ((1e-6, 0.0), (0.0, 1e-4)), START_NS - round(age_s * 1e9), 50)
 
 
-def test_calibration_from_before_is_what_is_known_first() -> None:
-    found = Calibrator(CalibrationConfig(), given()).calibration
-    assert (found.zero, found.scale, found.passages, found.stamp_ns) == (0.005, 0.01, 50, START_NS)
+def test_calibration_from_before_is_the_first() -> None:
+    first = Calibrator(given()).calibration
+    assert (first.zero, first.scale, first.passages, first.stamp_ns) == (0.005, 0.01, 50, START_NS)
 
 
+@pytest.mark.usefixtures("no_floor")
 @pytest.mark.parametrize(("age_s", "std"), [(0.0, 1e-3), (400.0, math.hypot(1e-3, 1.6e-3)), (1e7, 4.5e-3)])
 def test_zero_grows_unsure_as_time_passes_but_never_more_than_at_first(age_s: float, std: float) -> None:
     """Its random walk is 8e-5 per root of a second; the scale stays."""
-    config = CalibrationConfig(floor=1e-9, noise=1.0, gate_sigma=100.0)  # passages tell next to nothing
-    on = course(config, given(age_s))
-    on.there_and_back(1)
-    (zz, _), (_, ss) = on.calibrator.calibration.covariance
-    assert on.calibrator.counters["pairs"]
-    assert math.sqrt(zz) == pytest.approx(std, rel=0.02)
-    assert math.sqrt(ss) == pytest.approx(1e-2, rel=0.01)
-
-
-def test_zero_walk_says_how_fast() -> None:
-    config = CalibrationConfig(floor=1e-9, noise=1.0, gate_sigma=100.0, zero_walk=1e-9)
-    on = course(config, given(400.0))
-    on.there_and_back(1)
-    assert math.sqrt(on.calibrator.calibration.covariance[0][0]) == pytest.approx(1e-3, rel=0.02)
+    calibrator = Calibrator(given(age_s))
+    calibrator.age(START_NS)
+    (zz, _), (_, ss) = calibrator.calibration.covariance
+    assert math.sqrt(zz) == pytest.approx(std, rel=1e-3)
+    assert math.sqrt(ss) == pytest.approx(1e-2)
 
 
 def test_old_zero_that_moved_is_found_again() -> None:
-    on = course(zero=0.009, known=given(3600.0), noise=NOISE, seed=8)
+    on = course(zero=0.009, calibration=given(3600.0), noise=NOISE, seed=8)
     on.there_and_back(40, 4)
     assert on.calibrator.calibration.zero == pytest.approx(0.009, abs=0.0015)
     assert on.calibrator.calibration.stamp_ns > START_NS
 
 
-# --- options ---------------------------------------------------------------------------------------------------------
-
-
-def test_nothing_known_is_how_large_errors_usually_are() -> None:
-    found = unknown(CalibrationConfig(zero=0.01, scale=0.1))
-    assert (found.zero, found.scale, found.stamp_ns, found.passages) == (0.0, 0.0, 0, 0)
-    assert np.array(found.covariance) == pytest.approx(np.diag([1e-4, 1e-2]))
-
-
-@pytest.mark.parametrize("name", list(CalibrationConfig.__dataclass_fields__))
-@pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
-def test_bad_calibration_option_is_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
-        CalibrationConfig(**{name: value})
+def test_uncalibrated_is_how_large_errors_usually_are() -> None:
+    assert (UNCALIBRATED.zero, UNCALIBRATED.scale, UNCALIBRATED.stamp_ns, UNCALIBRATED.passages) == (0.0, 0.0, 0, 0)
+    assert np.array(UNCALIBRATED.covariance) == pytest.approx(np.diag([0.0045**2, 0.045**2]))

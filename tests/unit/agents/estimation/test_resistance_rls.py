@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from agents.estimation.resistance_rls import MultipleForgetting, RecursiveConfig, RecursiveGrade, RecursiveResistance
+from agents.estimation.resistance_rls import MultipleForgetting, RecursiveGrade, RecursiveResistance
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
-from tests.unit.agents.ground import STEP_S, noise_of, pushed, pushes
+from tests.unit.agents.ground import STEP_S, feed, level_steps, white_noise
 
 
 def by_the_paper(
@@ -75,13 +75,13 @@ def test_with_equal_factors_and_separate_excitation_it_is_ordinary_least_squares
 
 
 def test_factors_mean_the_same_at_any_rate() -> None:
-    found = []
+    estimates = []
     for dt_s in (0.02, 0.1):
         squares = MultipleForgetting(np.zeros(1), np.ones(1), np.array([0.5]), np.full(1, 1e9))
         for i in range(round(8 / dt_s)):
             squares.update(dt_s, 0.0 if i * dt_s < 7 else 1.0, np.ones(1))
-        found.append(float(squares.parameters[0]))
-    assert found == pytest.approx([0.5, 0.5], abs=0.03)  # half of the past is forgotten in the last second
+        estimates.append(float(squares.parameters[0]))
+    assert estimates == pytest.approx([0.5, 0.5], abs=0.03)  # half of the past is forgotten in the last second
 
 
 def test_variance_stays_below_its_bound_without_excitation() -> None:
@@ -98,7 +98,7 @@ def test_a_mass_that_stays_and_a_ground_that_jumps_are_both_followed() -> None:
     n = round(400 / STEP_S)
     hs = np.column_stack([0.1 + 0.15 * np.sin(0.3 * np.arange(n)), np.ones(n)])
     truth = np.where(np.arange(n) // 800 % 2, 0.08, 0.03)  # every 40 s
-    ys = scale * hs[:, 0] + truth + noise_of(0.002, n, rng)
+    ys = scale * hs[:, 0] + truth + white_noise(0.002, n, rng)
     squares = MultipleForgetting(np.zeros(2), np.ones(2), np.array([0.999, 0.6]), np.full(2, 1e9))
     errors = []
     for i in range(n):
@@ -113,96 +113,84 @@ def test_a_mass_that_stays_and_a_ground_that_jumps_are_both_followed() -> None:
 def test_wrong_mass_is_found_where_forces_vary_faster_than_the_ground() -> None:
     n = round(600 / STEP_S)
     share = 0.05 + 0.2 * np.sin(0.3 * np.arange(n))
-    of = RecursiveResistance(RecursiveConfig(), estimates_mass=True)
-    pushed(of, pushes(0.05 + 0.1 * share, share=share))
-    assert 0.05 < of._squares.parameters[0] < 0.11  # slowly: ten minutes
-    found = of.at(START_NS + (n - 1) * 50_000_000)
-    assert found
-    assert found[0] == pytest.approx(0.05, abs=0.01)
+    rls = RecursiveResistance(estimates_mass=True)
+    feed(rls, level_steps(0.05 + 0.1 * share, share=share))
+    assert 0.05 < rls._squares.parameters[0] < 0.11  # slowly: ten minutes
+    estimate = rls.at(START_NS + (n - 1) * 50_000_000)
+    assert estimate
+    assert estimate[0] == pytest.approx(0.05, abs=0.01)
 
 
 def test_ground_that_jumps_is_followed_within_seconds() -> None:
-    of = RecursiveResistance(RecursiveConfig())
+    rls = RecursiveResistance()
     raw = np.where(np.arange(400) < 200, 0.02, 0.06)
-    for i, push in enumerate(pushes(raw)):
-        of.update(push)
+    for i, step in enumerate(level_steps(raw)):
+        rls.update(step)
         if i == 199 + round(1.36 / STEP_S):  # ln 2 / -ln 0.6 s: half of it
-            half = of.at(push.stamp_ns)
+            half = rls.at(step.stamp_ns)
     assert half
     assert half[0] == pytest.approx(0.04, abs=2e-3)
-    last = of.at(START_NS + 399 * 50_000_000)
+    last = rls.at(START_NS + 399 * 50_000_000)
     assert last
     assert last[0] == pytest.approx(0.06, abs=1e-3)
 
 
 def test_variance_is_that_of_white_noise() -> None:
-    seed, found = 5, []
+    seed, errors = 5, []
     rng = np.random.default_rng(seed)
     for _ in range(60):
-        of = RecursiveResistance(RecursiveConfig())
-        pushed(of, pushes(0.05 + noise_of(0.004, 300, rng)))
-        estimate = of.at(START_NS + 299 * 50_000_000)
+        rls = RecursiveResistance()
+        feed(rls, level_steps(0.05 + white_noise(0.004, 300, rng)))
+        estimate = rls.at(START_NS + 299 * 50_000_000)
         assert estimate
-        found.append((estimate[0] - 0.05) / math.sqrt(estimate[1]))
-    rms = float(np.sqrt(np.mean(np.square(found))))
+        errors.append((estimate[0] - 0.05) / math.sqrt(estimate[1]))
+    rms = float(np.sqrt(np.mean(np.square(errors))))
     assert 0.8 < rms < 1.25, f"{seed=} {rms=}"
 
 
 def test_a_load_that_changes_at_a_stop_is_found_again_sooner() -> None:
     n = round(600 / STEP_S)
     share = 0.05 + 0.2 * np.sin(0.3 * np.arange(n))
-    found = []
+    estimates = []
     for loads in (True, False):
-        of = RecursiveResistance(RecursiveConfig(), estimates_mass=True)
-        pushed(of, pushes(0.05 + 0 * share, share=share))
-        of.rest(changes_load=loads)
-        pushed(of, pushes(0.05 + 0.15 * share[:400], share=share[:400]))
-        found.append(abs(of._squares.parameters[0] - 0.15))
-    assert found[0] < found[1] - 1e-3
+        rls = RecursiveResistance(estimates_mass=True)
+        feed(rls, level_steps(0.05 + 0 * share, share=share))
+        rls.stand(changes_load=loads)
+        feed(rls, level_steps(0.05 + 0.15 * share[:400], share=share[:400]))
+        estimates.append(abs(rls._squares.parameters[0] - 0.15))
+    assert estimates[0] < estimates[1] - 1e-3
 
 
 def test_mass_that_is_known_stays_known() -> None:
-    of = RecursiveResistance(RecursiveConfig())
+    rls = RecursiveResistance()
     share = 0.1 + 0.15 * np.sin(0.05 * np.arange(400))
-    pushed(of, pushes(0.05 + 0.2 * share, share=share))
-    of.rest(changes_load=True)
-    pushed(of, pushes(0.05 + 0.2 * share, share=share))
-    assert of._squares.parameters[0] == 0.0
-    assert of._squares.variance[0] == 0.0
+    feed(rls, level_steps(0.05 + 0.2 * share, share=share))
+    rls.stand(changes_load=True)
+    feed(rls, level_steps(0.05 + 0.2 * share, share=share))
+    assert rls._squares.parameters[0] == 0.0
+    assert rls._squares.variance[0] == 0.0
 
 
 def test_only_the_recent_past_has_an_estimate() -> None:
-    of = RecursiveResistance(RecursiveConfig())
-    assert of.at(START_NS) is None
-    pushed(of, pushes(np.full(20, 0.05)))
+    rls = RecursiveResistance()
+    assert rls.at(START_NS) is None
+    feed(rls, level_steps(np.full(20, 0.05)))
     end = START_NS + 19 * 50_000_000
-    assert of.at(end - 10**9)
-    assert of.at(end + 490_000_000)
-    assert of.at(end + 510_000_000) is None
+    assert rls.at(end - 10**9)
+    assert rls.at(end + 490_000_000)
+    assert rls.at(end + 510_000_000) is None
 
 
 @pytest.mark.parametrize("slope_rad", [0.2, -0.3])
 def test_grade_is_the_slope_of_the_mean_sine(slope_rad: float) -> None:
-    seed, grade = 6, RecursiveGrade(RecursiveConfig())
+    seed, grade = 6, RecursiveGrade()
     rng = np.random.default_rng(seed)
-    found = [grade.update(STEP_S, math.sin(slope_rad) + 0.02 * rng.standard_normal()) for _ in range(400)]
-    assert np.mean(found[200:]) == pytest.approx(slope_rad, abs=3e-3), f"{seed=}"
-    assert np.std(found[200:]) < 0.02
+    estimates = [grade.update(STEP_S, math.sin(slope_rad) + 0.02 * rng.standard_normal()) for _ in range(400)]
+    assert np.mean(estimates[200:]) == pytest.approx(slope_rad, abs=3e-3), f"{seed=}"
+    assert np.std(estimates[200:]) < 0.02
     later = [grade.update(STEP_S, 0.0) for _ in range(round(2 / STEP_S))]
     assert later[-1] == pytest.approx(0.2**2 * slope_rad, abs=0.01)
 
 
 def test_grade_survives_nonsense() -> None:
-    assert math.isfinite(RecursiveGrade(RecursiveConfig()).update(STEP_S, 40.0))
-
-
-@pytest.mark.parametrize("name", ["forget", "forget_mass", "forget_grade"])
-@pytest.mark.parametrize("value", [0.0, 1.0, math.nan])
-def test_bad_factor_is_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
-        RecursiveConfig(**{name: value})
-
-
-def test_bad_noise_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="noise"):
-        RecursiveConfig(noise=0.0)
+    assert math.isfinite(RecursiveGrade().update(STEP_S, 40.0))

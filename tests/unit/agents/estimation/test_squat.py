@@ -24,8 +24,12 @@ LOADER = MachineConfig(
     [
         (0.0, 0.0, 0.5),  # the load centre lies in the middle
         (4000.0, 0.0, (17_500 * 1.5 + 4000 * 4.7) / (21_500 * 3.0)),
-        (0.0, 2.0, 0.5 - 2.0 / math.sqrt(9.81**2 - 4) / 3.0),  # uphill, or faster: to the rear, by 1 m of height
-        (0.0, -2.0, 0.5 + 2.0 / math.sqrt(9.81**2 - 4) / 3.0),
+        (
+            0.0,
+            2.0,
+            0.5 - 2.0 / math.sqrt(GRAVITY_MPS2**2 - 4) / 3.0,
+        ),  # uphill, or faster: to the rear
+        (0.0, -2.0, 0.5 + 2.0 / math.sqrt(GRAVITY_MPS2**2 - 4) / 3.0),
     ],
 )
 def test_share_on_the_front_axle(payload_kg: float, force_mps2: float, share: float) -> None:
@@ -39,10 +43,10 @@ def test_empty_machine_at_rest_stands_level() -> None:
 
 def test_payload_ahead_of_the_front_axle_lowers_the_nose() -> None:
     """By hand: 4000 kg at 4.7 m put 61.5 kN on the front axle and take 22.2 kN off the rear one."""
-    front_n, rear_n = 4000 * 9.81 * 4.7 / 3.0, 4000 * 9.81 * (1 - 4.7 / 3.0)
-    assert (front_n, rear_n) == pytest.approx((61_476, -22_236), abs=1)
+    front_n, rear_n = 4000 * GRAVITY_MPS2 * 4.7 / 3.0, 4000 * GRAVITY_MPS2 * (1 - 4.7 / 3.0)
+    assert (front_n, rear_n) == pytest.approx((61_455, -22_228), abs=1)
     assert squat_rad(LOADER, 4000, 0.0) == pytest.approx((rear_n - front_n) / (1.8e6 * 3.0))
-    assert squat_rad(LOADER, 4000, 0.0) == pytest.approx(-0.015502, abs=1e-6)
+    assert squat_rad(LOADER, 4000, 0.0) == pytest.approx(-0.015497, abs=1e-6)
 
 
 def test_acceleration_raises_the_nose() -> None:
@@ -57,12 +61,12 @@ def test_payload_s_height_counts_with_acceleration() -> None:
 
 
 def test_on_a_slope_less_weight_presses_the_tyres() -> None:
-    """A machine with its weight at the rear: what it stands on when level is taken off, what it loses uphill is not."""
+    """A machine with its weight at the rear: its squat on level ground is subtracted, what it loses uphill is not."""
     rear_heavy = replace(LOADER, load_centre_m=1.0, cog_height_m=0.0)
     slope_rad = math.radians(20)
-    found = squat_rad(rear_heavy, 0.0, GRAVITY_MPS2 * math.sin(slope_rad))
+    squat = squat_rad(rear_heavy, 0.0, GRAVITY_MPS2 * math.sin(slope_rad))
     weight_n = 17_500 * GRAVITY_MPS2
-    assert found == pytest.approx(weight_n * (2 / 3 - 1 / 3) * (math.cos(slope_rad) - 1) / (1.8e6 * 3.0))
+    assert squat == pytest.approx(weight_n * (2 / 3 - 1 / 3) * (math.cos(slope_rad) - 1) / (1.8e6 * 3.0))
 
 
 @pytest.mark.parametrize("unknown", ["wheelbase_m", "axle_stiffness_npm"])

@@ -270,7 +270,7 @@ def test_free_space(tmp_path: Path):
         (SpoolState(5, 0, 0, NOW_NS), 600, Level.PASS, "the oldest is of 10 min ago"),
         (SpoolState(5, 0, 0, NOW_NS), 4 * 3600, Level.WARN, "4 h ago; 0 were dropped, 0 put aside; start its agent"),
         (SpoolState(0, 3, 0, 0), 0, Level.WARN, "raise max_samples"),
-        (SpoolState(0, 0, 2, 0), 0, Level.WARN, "table `aside`"),
+        (SpoolState(0, 0, 2, 0), 0, Level.WARN, "table `quarantine`"),
     ],
 )
 def test_spool(state: SpoolState, age_s: int, level: Level, words: str):
@@ -317,7 +317,7 @@ def test_a_spool_is_read_without_a_trace(tmp_path: Path):
         spool.record(samples(6))
         head = spool.head(1)
         assert head
-        spool.put_aside(head, "bad")
+        spool.quarantine(head, "bad")
         with pytest.raises(disk.InUseError, match="an agent has it open"):
             disk.read_spool(tmp_path / "spool.db")
     before = sorted(tmp_path.iterdir())
