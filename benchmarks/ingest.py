@@ -61,7 +61,7 @@ def _variant(folder: Path, name: str, rows: Table, size: int, group: int) -> Cal
 
 def _take(store: Store, groups: list[list[Incoming]]) -> None:
     for group in groups:
-        if not all(isinstance(answer, Ack) for answer in store.take(group)):
+        if not all(isinstance(answer, Ack) for answer in store.commit(group)):
             raise RuntimeError("the store refused a batch")
 
 

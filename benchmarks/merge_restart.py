@@ -21,6 +21,7 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import Admission
 from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.writer import SNAPSHOT_ROWS
 from mapserver.journal.journal import Journal
 from protocol.arrays import Table
 from protocol.site.site_config import SiteConfig
@@ -28,7 +29,7 @@ from protocol.wire.messages import SampleBatch
 
 SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()
 GOAL_S = 5.0
-TAIL_ROWS = CONFIG.store.snapshot_rows  # as many as a crash can leave without a snapshot
+TAIL_ROWS = SNAPSHOT_ROWS  # as many as a crash can leave without a snapshot
 IN_ONE_COMMIT = 10_000  # journal rows: what is measured is the opening, not the writing
 MB = 1e6
 

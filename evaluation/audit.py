@@ -25,7 +25,7 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import JournalRow
 from mapserver.trust.decisions import KIND as TRUST
-from mapserver.trust.decisions import Decisions
+from mapserver.trust.decisions import TrustDecisions
 from protocol.arrays import Ints
 from protocol.machine.samples import content_hash
 from protocol.site.site_config import SiteConfig
@@ -63,7 +63,7 @@ def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, conf
     """Compare audit files with the store of a server that has ended."""
     with JournalReader(folder / JOURNAL_FILE) as journal:
         rows = list(history_rows(History.of(journal)))
-        left_out = Decisions(journal.events(TRUST)).distrusted
+        left_out = TrustDecisions(journal.events(TRUST)).distrusted
     last = rows[-1].row if rows else 0
     _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, left_out)
     return compare(read_audits(audits), rows, grid, site, config, left_out)

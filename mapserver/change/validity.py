@@ -19,15 +19,15 @@ def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block
 
     Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted.
     """
-    found = {block: cuts(of_block, config) for block, of_block in pages.items()}
-    first = {block: cut.first for block, cut in found.items()}
-    changed = [block for block, cut in found.items() if cut.first.any()]
+    last = {block: cuts(block_pages, config) for block, block_pages in pages.items()}
+    first = {block: last[block].first for block in pages}
+    changed = [block for block in first if first[block].any()]
     if not changed:
         return first
     reach = reach_blocks(cell_m, config)
-    near = {block for one in changed for block in around(one, reach) if block in found}
+    near = {block for one in changed for block in around(one, reach) if block in pages}
     image, corner = image_of({block: first[block] > 0 for block in near}, False)
-    kind, _ = image_of({block: found[block].kind for block in near}, np.nan)
+    kind, _ = image_of({block: last[block].kind for block in near}, np.nan)
     now, _ = image_of({block: kinds(pages[block]) for block in near}, np.nan)
     holds = credible(image, kind, now, cell_m, config)
     for block in changed:

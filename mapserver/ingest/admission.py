@@ -1,4 +1,4 @@
-"""What may enter the journal: the rules of identity, as a pure function (DESIGN, "Samples, identity")."""
+"""What may enter the journal: the rules of identity, as a pure function."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ class View:
 
 
 @dataclass(frozen=True)
-class Past:
-    """The past of one store. Every call opens the journal anew, so that any thread may ask."""
+class PastMaps:
+    """Maps of one store as of any time. Every call opens the journal anew, so that any thread may ask."""
 
     journal: Path
     cell_m: float
@@ -88,8 +88,8 @@ def read_cells(
     shape = (window.rows, window.columns)
     out: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in names}
     for some in chunks([block for block in view.pages if _touches(block, window)]):
-        found = evidence([view.pages[block] for block in some], [first[block] for block in some])
-        for name, values in cell_layers.read(found, names, config.read, view.stamp_ns).items():
+        sums = evidence([view.pages[block] for block in some], [first[block] for block in some])
+        for name, values in cell_layers.read(sums, names, config.read, view.stamp_ns).items():
             _place(out[name], window, some, values)
     return out
 

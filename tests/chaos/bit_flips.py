@@ -88,16 +88,16 @@ def read_store(folder: Path, definition: Any) -> Content:
     try:
         rows = {
             row.row: (row.machine, row.spool_id, row.first_seq, row.received_ns, row.rows.tobytes())
-            for row in history_rows(History.of(store._journal))
+            for row in history_rows(History.of(store.journal))
         }
         grid = store.grid.state()
         votes = [(at.x, at.y, at.rung, at.index, at.page.votes.tobytes()) for at in grid.pages]
-        marks = {key: (mark.seq, mark.lost) for key, mark in store._journal.marks().items()}
-        placed = [(row.row, int(row.rows["stamp_ns"].min())) for row in store._journal.read(wanted=Wanted(from_ns=1))]
+        marks = {key: (mark.seq, mark.lost) for key, mark in store.journal.marks().items()}
+        placed = [(row.row, int(row.rows["stamp_ns"].min())) for row in store.journal.read(wanted=Wanted(from_ns=1))]
         return {
             "rows": rows,
             "placed": placed,  # what is found by time and place
-            "events": store._journal.events(),
+            "events": store.journal.events(),
             "marks": marks,
             "grid": (grid.folded, sorted(votes)),
             "last": store.journalled,

@@ -139,16 +139,16 @@ def _look_at_store(folder: Path) -> Found:
     except StoreError as error:
         return Found({}, f"store does not open: {error}")
     refolded = Grid(work.SITE.cell_m, config.fold)
-    for row in history_rows(History.of(store._journal)):
+    for row in history_rows(History.of(store.journal)):
         refolded.fold(row.rows, row.machine)
         for i, sample in enumerate(row.rows):
             contents.setdefault((row.spool_id, row.first_seq + i), []).append(content_hash(sample))
     problem = "" if refolded.folded == store.grid.folded else "grid and journal differ"
-    watermark = store._journal.mark(work.MACHINE, work.SPOOL_ID).seq
+    watermark = store.journal.mark(work.MACHINE, work.SPOOL_ID).seq
     rows = empty(1)
     rows["stamp_ns"] = 1
     payload = encode_batch(SampleBatch(work.MACHINE, work.SPOOL_ID, watermark + 1, rows, work.SITE.frame, 0))
-    if not isinstance(store.take([Incoming(work.MACHINE, payload)])[0], Ack):
+    if not isinstance(store.commit([Incoming(work.MACHINE, payload)])[0], Ack):
         problem = "store takes nothing more"
     store.close()
     return Found(contents, problem)

@@ -11,13 +11,12 @@ from tests.chaos.chaos_site import Site
 from tests.chaos.outcome import Told
 from tests.chaos.recordings import Recordings
 
-# Snapshots every few seconds, so that they are written under faults too; audits of trust would leave machines out.
+# Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
 SERVER_TOML = """
 [store]
-snapshot_rows = 50
 snapshot_s = 2.0
-[keep]
-distrusts = false
+[trust]
+exclude = false
 """
 
 

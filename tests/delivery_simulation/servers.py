@@ -140,7 +140,7 @@ class RealServer:
             self._plan.arm(plan.fault, plan.left)
         plan.disarm()
         try:
-            return self._store.take(group)
+            return self._store.commit(group)
         except Killed:
             self._close()
             self._open()
@@ -176,7 +176,7 @@ class RealServer:
 
     @property
     def _journal(self) -> Journal:
-        return self._store._journal
+        return self._store.journal
 
     def _open(self) -> None:
         self._plan = Plan()

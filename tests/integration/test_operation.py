@@ -121,13 +121,13 @@ def old_rows(store: Path, site: SiteConfig) -> None:
     with closing(Store(store, site, ServerConfig(), lambda: NOW_NS)) as opened:
         for i in range(50):
             batch = SampleBatch("old", 7, 1 + 1000 * i, drive(1000, seed=i, first_s=100 * i), site.frame)
-            assert isinstance(opened.take([Incoming("old", encode_batch(batch))])[0], Ack)
+            assert isinstance(opened.commit([Incoming("old", encode_batch(batch))])[0], Ack)
         opened.save_snapshot()
 
 
 def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committed(site: SiteRun):
     options = site.folder / "server.toml"
-    options.write_text("[keep]\nturn_s = 0.1\narchive_after_h = 0.01\n[store]\nsnapshot_rows = 50\n")
+    options.write_text("[store]\narchive_after_h = 0.01\nsnapshot_s = 0.5\n")
     config = load_site(site.site_file)
     old_rows(site.folder / "store", config)
     site.start_router()
@@ -387,7 +387,7 @@ def test_a_backup_as_the_operators_page_has_it_is_a_whole_store(tmp_path: Path, 
     first, second = code.split("if os.path")
     with closing(Store(store, site, ServerConfig(), lambda: NOW_NS)) as opened:
         late = SampleBatch("late", 7, 1, drive(10, seed=1), site.frame)
-        assert isinstance(opened.take([Incoming("late", encode_batch(late))])[0], Ack)
+        assert isinstance(opened.commit([Incoming("late", encode_batch(late))])[0], Ack)
         names: dict[str, Any] = {}
         exec(compile(first, "docs/operation.md", "exec"), names)
         with JournalReader(store / JOURNAL_FILE) as reader:  # rows move just in between

@@ -15,7 +15,7 @@ from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.journal import Journal, JournalReader
 from mapserver.journal.rows import JournalRow, checksum, pack
-from mapserver.trust.decisions import KIND, PERSON, Decision
+from mapserver.trust.decisions import KIND, PERSON, TrustDecision
 from protocol.arrays import Table
 from protocol.machine.samples import content_hash, empty
 from protocol.site.site_config import SiteConfig
@@ -52,7 +52,7 @@ def clean(tmp_path_factory) -> tuple[Path, dict[str, Path]]:
             # every batch begins with what was sent before: trimmed, not counted twice
             start = max(0, first - 3)
             batch = SampleBatch(machine, spool, start + 1, rows[start : first + BATCH], SITE.frame)
-            assert isinstance(store.take([Incoming(machine, encode_batch(batch))])[0], Ack)
+            assert isinstance(store.commit([Incoming(machine, encode_batch(batch))])[0], Ack)
     store.save_snapshot()
     store.close()
     return folder / "store", audits
@@ -233,10 +233,10 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
 def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, tmp_path):
     shutil.copytree(clean[0], tmp_path / "store")
     store = Store(tmp_path / "store", SITE, CONFIG, lambda: 1)
-    store.remember(KIND, 1, Decision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1).body)
+    store.journal.append_event(KIND, 1, TrustDecision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1).body)
     store.close()
     store = Store(tmp_path / "store", SITE, CONFIG, lambda: 1)
-    assert store.left_out == {"b"}
+    assert store.excluded == {"b"}
     store.save_snapshot()
     store.close()
     result = audit_store(clean[1], tmp_path / "store", SITE, CONFIG)

@@ -182,7 +182,7 @@ def held(writer: Writer) -> Iterator[None]:
         entered.set()
         release.wait(WAIT_S)
 
-    reader = Thread(target=writer.read, args=(hold,))
+    reader = Thread(target=writer.run, args=(hold,))
     reader.start()
     assert entered.wait(WAIT_S)
     try:

@@ -35,7 +35,7 @@ def test_snapshot_and_tail_are_the_fold_of_everything(tmp_path, after):
     for i, part in enumerate(parts):
         if i == after:
             running.save_snapshot()
-        assert isinstance(running.take([incoming(part, 1 + 20 * i)])[0], Ack)
+        assert isinstance(running.commit([incoming(part, 1 + 20 * i)])[0], Ack)
     if after == 10:
         running.save_snapshot()
     shutil.copytree(tmp_path / "store", copy)  # as after a power cut: the log is not folded into the journal
@@ -292,18 +292,18 @@ def test_snapshots_that_a_restored_journal_does_not_reach_never_come_back(tmp_pa
     """A backup of the journal is put back; later it grows past the snapshots of the history that is gone."""
     store, backup = open_store(tmp_path / "store"), tmp_path / "backup.db"
     parts = np.split(random_samples(120, 8), 6)
-    store.take([incoming(parts[0], 1)])
+    store.commit([incoming(parts[0], 1)])
     store.close()
     shutil.copy(tmp_path / "store" / "journal.db", backup)
     store = open_store(tmp_path / "store")
     for i in (1, 2):
-        store.take([incoming(parts[i], 1 + 20 * i)])
+        store.commit([incoming(parts[i], 1 + 20 * i)])
     store.save_snapshot()  # of row 3
     store.close()
     shutil.copy(backup, tmp_path / "store" / "journal.db")
     store = open_store(tmp_path / "store")
     for i in (3, 4, 5):
-        store.take([incoming(parts[i], 21 + 20 * (i - 3))])
+        store.commit([incoming(parts[i], 21 + 20 * (i - 3))])
     assert store.journalled == 4
     store.close()  # without a snapshot, as a kill would
     store = open_store(tmp_path / "store")
@@ -313,7 +313,7 @@ def test_snapshots_that_a_restored_journal_does_not_reach_never_come_back(tmp_pa
 
 def test_parameters_of_a_store_reach_its_snapshot(tmp_path):
     store = open_store(tmp_path)
-    store.take([incoming(samples(5))])
+    store.commit([incoming(samples(5))])
     store.save_snapshot()
     store.close()
     changed = replace(CONFIG, fold=replace(CONFIG.fold, std_cap_m=0.35))

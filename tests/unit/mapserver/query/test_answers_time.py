@@ -8,7 +8,7 @@ import pytest
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
-from mapserver.query.answers import Answers, Nobody, reads_past
+from mapserver.query.answers import Answers, reads_past
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
 from protocol.queries.commands import TrustCommand, encode_command
@@ -47,6 +47,7 @@ from tests.unit.mapserver.data import (
     samples,
     send,
 )
+from tests.unit.mapserver.query.fake_follower import FakeFollower
 
 S, HOUR_NS = 10**9, 3600 * 10**9
 BOX = Bounds(-40, -40, 40, 40)
@@ -56,36 +57,12 @@ NEWEST_NS = int(ROWS["b"]["stamp_ns"].max())
 NAMES = (*LAYERS, "resistance_filled", "grade_filled_std")
 
 
-class Watching(Nobody):
-    """A keeper with an answer to everything."""
-
-    def __init__(self, *distrusted: str) -> None:
-        self.asked: list[object] = []
-        self._distrusted = frozenset(distrusted)
-
-    def machines(self):
-        return [{"name": "a", "trusted": True}, {"name": "b", "trusted": False}]
-
-    def changes(self, after):
-        self.asked.append(after)
-        return [{"id": after + 1}]
-
-    def trust(self, machine, trusted, reason, wait_s):
-        self.asked.append((machine, trusted, reason, wait_s))
-        if machine not in "ab":
-            return super().trust(machine, trusted, reason, wait_s)
-        return {"name": machine, "trusted": trusted is not False}
-
-    def distrusted(self):
-        return self._distrusted
-
-
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     """Function that starts a writer with the samples of each machine in two rows, in a folder of its own."""
     opened = []
 
-    def start(rows=None, keeper=None) -> Answers:
+    def start(rows=None, follower=None) -> Answers:
         folder = tmp_path_factory.mktemp("store")
         writer = Writer(folder, SITE, CONFIG, now_ns)
         opened.append(writer)
@@ -93,7 +70,7 @@ def served(tmp_path_factory):
             half = len(table) // 2
             send(writer, [incoming(part, machine=machine) for part in (table[:half],) if len(part)])
             send(writer, [incoming(table[half:], 1 + half, machine)])
-        return Answers(writer, SITE, CONFIG, keeper, folder / JOURNAL_FILE)
+        return Answers(writer, follower or FakeFollower(), SITE, CONFIG, folder / JOURNAL_FILE)
 
     yield start
     for writer in opened:
@@ -167,8 +144,8 @@ def test_what_changed_later_has_not_changed_yet(served):
     assert now["resistance"] == after["resistance"]
 
 
-def test_machines_that_are_left_out_are_left_out_of_the_past(answers, served):
-    without = served(keeper=Watching("b"))
+def test_excluded_machines_are_excluded_from_the_past(answers, served):
+    without = served(follower=FakeFollower("b"))
     only_a = served({"a": ROWS["a"]})
     when = When(as_of_ns=NEWEST_NS)
     here, there = (of.region(RegionQuery(BOX, ("resistance",), when=when)) for of in (without, only_a))
@@ -276,7 +253,7 @@ def test_without_a_first_time_the_newest_spans_are_answered(served):
 
 def test_a_history_leaves_out_machines_and_filled_layers(served):
     rows = hours(0.02, 0.05)
-    assert served(rows, Watching("a")).history(HistoryQuery(8.5, 8.5)).spans == ()
+    assert served(rows, FakeFollower("a")).history(HistoryQuery(8.5, 8.5)).spans == ()
     with pytest.raises(QueryError, match="`resistance_filled` is made from a cell's neighbours") as caught:
         served(rows).history(HistoryQuery(8.5, 8.5, ("visits", "resistance_filled")))
     assert caught.value.reason == Refusal.UNKNOWN_LAYER
@@ -295,10 +272,9 @@ def test_a_site_without_samples_has_no_history(served):
 @pytest.mark.parametrize("query", [PointQuery(0, 0, when=When(1)), HistoryQuery(0, 0)])
 def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
     writer = Writer(tmp_path, SITE, CONFIG, now_ns)
-    for journal, words in ((None, "keeps no journal"), (tmp_path / "none.db", "no usable journal")):
-        with pytest.raises(QueryError, match=words) as caught:
-            getattr(Answers(writer, SITE, CONFIG, None, journal), query.name)(query)
-        assert caught.value.reason == Refusal.STORE
+    with pytest.raises(QueryError, match="no usable journal") as caught:
+        getattr(Answers(writer, FakeFollower(), SITE, CONFIG, tmp_path / "none.db"), query.name)(query)
+    assert caught.value.reason == Refusal.STORE
     writer.close()
 
 
@@ -331,15 +307,15 @@ def test_answers_about_the_past_travel_as_bytes(answers):
 # --- machines, changes, commands -------------------------------------------------------------------------------------
 
 
-def test_the_keeper_is_asked(served):
-    keeper = Watching()
-    answers = served(keeper=keeper)
-    assert decode_machines(answers.answer("machines", {"after": "1"})) == keeper.machines()
+def test_the_follower_is_asked(served):
+    follower = FakeFollower()
+    answers = served(follower=follower)
+    assert decode_machines(answers.answer("machines", {"after": "1"})) == follower.machines()
     assert decode_changes(answers.answer("changes", {"after": "41"})) == [{"id": 42}]
     row = decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
     assert row == {"name": "b", "trusted": False, "merged": 4}
     answers.obey("trust", {"machine": "b", "trusted": "auto"})
-    assert keeper.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
+    assert follower.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
     with pytest.raises(QueryError, match="`c` is not known") as caught:
         answers.obey("trust", {"machine": "c", "trusted": "yes"})
     assert caught.value.reason == Refusal.UNKNOWN_MACHINE
@@ -347,22 +323,21 @@ def test_the_keeper_is_asked(served):
         answers.answer("machines", {"after": "9", "wait": "0.01"})
 
 
-def test_where_nobody_watches_nothing_is_known(answers):
-    assert decode_machines(answers.answer("machines", {})) == []
-    assert decode_changes(answers.answer("changes", {})) == []
-    with pytest.raises(QueryError, match="nobody watches"):
-        answers.obey("trust", {"machine": "a", "trusted": "yes"})
-
-
 # --- over Zenoh ------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def sessions():
+    with routed() as pair:
+        yield pair
+
+
 @pytest.fixture
-def online(tmp_path):
-    with routed() as (router, client):
-        server = Server(router, tmp_path, SITE, CONFIG, now_ns)
-        yield server, client
-        server.close()
+def online(sessions, tmp_path):
+    router, client = sessions
+    server = Server(router, tmp_path, SITE, CONFIG, now_ns)
+    yield server, client
+    server.close()
 
 
 def get(client, key: str, parameters: dict[str, str], payload: bytes | None = None):
@@ -373,20 +348,20 @@ def get(client, key: str, parameters: dict[str, str], payload: bytes | None = No
 
 def test_events_and_queries_below_the_map_do_not_meet(online):
     server, client = online
-    heard, here = [], threading.Event()
+    received, here = [], threading.Event()
     subscriber = client.declare_subscriber(
-        keys.changed("pit"), lambda s: (heard.append(s.payload.to_bytes()), here.set())
+        keys.changed("pit"), lambda s: (received.append(s.payload.to_bytes()), here.set())
     )
     error = decode_error(get(client, keys.changed("pit"), {}).err.payload.to_bytes())
     assert error.reason == Refusal.UNKNOWN_QUERY
     get(client, keys.map_query("pit", "info"), {})  # the subscription has reached the server with this answer
     server._publish({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})
     assert here.wait(WAIT_S)
-    assert heard == [encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
+    assert received == [encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
     subscriber.undeclare()
 
 
-def test_a_command_reaches_the_keeper_with_its_reason(online):
+def test_a_command_reaches_the_follower_with_its_reason(online):
     _, client = online
     get(client, keys.ingest("pit", "a"), {}, encode_batch(batch(samples(5))))
     command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")

@@ -73,10 +73,10 @@ def make_store(
             if changed is not None and first <= changed < first + batch:
                 rows["c_rr"][changed - first] += 0.01
             sent = encode_batch(SampleBatch(name, spool_id, first + 1, rows, site.frame))
-            assert isinstance(store.take([Incoming(name, sent)])[0], Ack)
+            assert isinstance(store.commit([Incoming(name, sent)])[0], Ack)
         clock[0] += HOUR_NS
     with JournalReader(folder / JOURNAL_FILE) as reader:
-        list(archive(folder / FOLDER, reader, site, int(T0 + archived * HOUR_NS), store._journal.forget))
+        list(archive(folder / FOLDER, reader, site, int(T0 + archived * HOUR_NS), store.journal.forget))
     store.close()
     (folder / "site.toml").write_text("\n".join(fold._site_lines(site)))
     return folder
@@ -134,7 +134,7 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert same(again.grid, folded())
     assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
     with JournalReader(store / JOURNAL_FILE) as reader:
-        assert again._journal.marks() == reader.marks()
+        assert again.journal.marks() == reader.marks()
     assert (again.site, again.newest_ns) == (SITE, T0 + 1190 * S)
     again.close()
 
@@ -144,7 +144,7 @@ def test_the_machines_go_on_sending_to_the_new_store(store: Path, tmp_path: Path
     again = opened(tmp_path / "new")
     for name in "abc":
         more = encode_batch(SampleBatch(name, 7, 121, track(9, 5), SITE.frame))
-        assert isinstance(again.take([Incoming(name, more)])[0], Ack)
+        assert isinstance(again.commit([Incoming(name, more)])[0], Ack)
     again.close()
 
 
@@ -157,7 +157,7 @@ def test_the_size_of_cells_can_be_changed(store: Path, tmp_path: Path):
 
 
 def test_options_are_taken_and_written_beside_the_store(store: Path, tmp_path: Path):
-    text = "# mine\n[fold]\nstd_cap_m = 1.2\n[store]\ngroup_batches = 3\n"
+    text = "# mine\n[fold]\nstd_cap_m = 1.2\n[store]\nsnapshot_s = 30.0\n"
     (tmp_path / "other.toml").write_text(text)
     assert run(store, "--out", tmp_path / "new", "--config", tmp_path / "other.toml") == 0
     assert (tmp_path / "new" / "server.toml").read_text() == text
@@ -179,7 +179,7 @@ def test_machines_are_left_out_and_their_progress_is_kept(
     assert summary["machines"] == {"b": 120}
     again = opened(tmp_path / "new")
     assert same(again.grid, folded("b"))
-    marks = {name: (mark.seq, mark.lost) for (name, _), mark in again._journal.marks().items()}
+    marks = {name: (mark.seq, mark.lost) for (name, _), mark in again.journal.marks().items()}
     assert marks == {"a": (120, 120), "b": (120, 0), "c": (120, 120)}
     assert again.info()["machines"]["a"]["samples"] == 0
     again.close()
@@ -194,7 +194,7 @@ def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsy
     assert {(r.machine, r.first_seq, len(r.rows)) for r in rows} == {(n, f, 10) for n in "abc" for f in (11, 21)}
     again = opened(tmp_path / "new")
     assert same(again.grid, folded(keep=slice(10, 30)))
-    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(120, 100)}
+    assert {(mark.seq, mark.lost) for mark in again.journal.marks().values()} == {(120, 100)}
     again.close()
 
 
@@ -203,7 +203,7 @@ def test_samples_out_of_time_in_the_middle_of_a_batch_cut_it_in_two(tmp_path: Pa
     rows = TRACKS["a"][:6].copy()
     rows["stamp_ns"] = T0 + S * np.array([5, 6, 900, 7, 8, 901])
     store = Store(folder, SITE, ServerConfig(), lambda: T0)
-    store.take([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
+    store.commit([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
     store.close()
     assert run(folder, "--out", tmp_path / "new", "--until", "2026-01-01T00:00:10") == 0
     found = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
@@ -223,7 +223,7 @@ def test_files_folders_and_stores_are_folded(store: Path, tmp_path: Path):
     assert identities(tmp_path / "file") == identities(store)[3:6]
     again = opened(tmp_path / "folder")  # the files say which site they are of
     assert again.site == SITE
-    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(40, 0)}
+    assert {(mark.seq, mark.lost) for mark in again.journal.marks().values()} == {(40, 0)}
     again.close()
 
 
@@ -237,7 +237,7 @@ def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, cap
     assert (summary["samples"], summary["archives"]) == (360, 4)
     again = opened(tmp_path / "new")
     assert same(again.grid, folded())
-    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(120, 0)}
+    assert {(mark.seq, mark.lost) for mark in again.journal.marks().values()} == {(120, 0)}
     again.close()
 
 

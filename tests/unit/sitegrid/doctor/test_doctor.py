@@ -357,10 +357,10 @@ def test_a_spool_that_cannot_be_used_is_a_finding(tmp_path: Path, broken: str, c
 def filled_store(folder: Path) -> None:
     with closing(Store(folder, SITE, ServerConfig(), time.time_ns)) as store:
         payload = encode_batch(SampleBatch("loader-1", 5, 1, samples(4), SITE.frame))
-        assert isinstance(store.take([Incoming("loader-1", payload)])[0], Ack)
+        assert isinstance(store.commit([Incoming("loader-1", payload)])[0], Ack)
         store.save_snapshot()
         payload = encode_batch(SampleBatch("loader-1", 5, 5, samples(4), SITE.frame))
-        store.take([Incoming("loader-1", payload)])
+        store.commit([Incoming("loader-1", payload)])
 
 
 def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
