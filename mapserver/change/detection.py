@@ -1,4 +1,4 @@
-"""Change of the ground: where recent evidence contradicts older evidence, the older is left out when the map is read.
+"""Change of the ground: where recent evidence contradicts older evidence, the older does not count when the map is read.
 
 For every cell, evidence is cut in two between two of its pages by time. The cut that explains it best (two kinds of
 ground are more likely than one, by the log-likelihood ratio of their histograms) is a change if the two histograms have
@@ -149,7 +149,7 @@ def _may_differ(pages: Sequence[TimedPage], part: slice) -> Bools:
 def _best_cut(votes: Floats, first: Ints) -> tuple[Ints, Floats]:
     """Index of the page (cells,) at which the ground changed, the given first page where it did not.
 
-    votes: (pages, bins, cells); pages before `first` are left out. Also returns the median (cells,) after it.
+    votes: (pages, bins, cells); pages before `first` do not count. Also returns the median (cells,) after it.
     """
     pages = np.arange(len(votes))
     kept = np.where(pages[:, None, None] >= first, votes, 0)

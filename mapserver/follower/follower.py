@@ -44,10 +44,8 @@ class Follower:
         self._reader = reader = JournalReader(folder / JOURNAL_FILE)
         self._wake, self._ending = threading.Event(), threading.Event()
         self._exclusion = Exclusion(writer, reader, site.cell_m, config.fold, self._ending)
-        auditor, report = (
-            Auditor(site.cell_m, config.fold),
-            self._exclusion.judge if config.trust.exclude else _only_named,
-        )
+        auditor = Auditor(site.cell_m, config.fold)
+        report = self._exclusion.judge if config.trust.exclude else _only_named
         self._audit = Audit(writer, reader, auditor, config.trust.judge_s, report, self._interrupted)
         self._changes = ChangeSearch(writer, reader, site.cell_m, config, publish, self._ending)
         archiving = Archiving(writer, reader, site, config.store.archive_after_h, now_ns, self._ending)

@@ -23,7 +23,7 @@ Reply = Callable[[Ack | Refused], None]
 log = logging.getLogger("mapserver.ingest.writer")
 
 
-QUEUE_BATCHES = 256  # so many batches may wait before machines are told to send again later; a few MB at most
+QUEUE_BATCHES = 256  # so many batches may wait before machines have to send again later; some MB
 GROUP_BATCHES = 64  # committed together at most: one sync to disk for all of them
 SNAPSHOT_ROWS = 2000  # a burst of so many rows brings the next snapshot forward: the next start would have to fold them
 

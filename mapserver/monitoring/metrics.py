@@ -22,7 +22,7 @@ Values = float | Mapping[str, float]  # of one metric, or by the value of its la
 
 
 class ServerCollector(Collector):
-    """Everything that a server tells of itself.
+    """All metrics of a server, except those of its process.
 
     info: answers as `map/info` does, and asks the thread that owns the store. agents: their health by machine.
     """

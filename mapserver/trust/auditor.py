@@ -73,7 +73,7 @@ class Auditor:
         """Add samples of one machine, as they lie in a journal row; rows in the order of the journal.
 
         The maps depend on no order. The clocks do: compared is what the machines sent at about the same time, and the
-        order of the journal tells that better than the time of receipt, which steps where the server's clock is set.
+        order of the journal shows that better than the time of receipt, which steps where the server's clock is set.
         """
         if not len(rows):
             return

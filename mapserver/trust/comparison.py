@@ -43,7 +43,7 @@ class Gain:
 class Difference:
     """How one map differs from another.
 
-    cells: compared, of the same period; shift: None where no border tells; agreement: share of the cells whose levels
+    cells: compared, of the same period; shift: None where no border shows it; agreement: share of the cells whose levels
     agree within the tolerance once gain and shift are taken out; spreads: standard deviations of both levels on them.
     """
 

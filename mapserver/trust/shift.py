@@ -17,7 +17,7 @@ _MOST_CELLS = 4000  # more make it slower, not surer
 _FEWEST_CELLS = 50
 _BORDER_BITS, _BORDER_LEVELS = 3, 0.25  # a square of 16 m in which levels differ by so much holds a border
 _CLIP = 1.0  # levels: beyond, a difference counts as this one; else the borders of sand alone would decide
-# Where borders run one way only, nothing tells the shift along them: a shift by one cell must improve the cost by 1 %.
+# Where borders run one way only, nothing shows the shift along them: a shift by one cell must improve the cost by 1 %.
 _PRICE = 0.01
 _GROUPS = 8  # of squares of 32 m, left out in turn (jackknife)
 _GROUP_BITS = 4

@@ -148,7 +148,7 @@ def test_excluded_machines_are_excluded_from_the_past(answers, served):
     without = served(follower=FakeFollower("b"))
     only_a = served({"a": ROWS["a"]})
     when = When(as_of_ns=NEWEST_NS)
-    here, there = (of.region(RegionQuery(BOX, ("resistance",), when=when)) for of in (without, only_a))
+    here, there = (asked.region(RegionQuery(BOX, ("resistance",), when=when)) for asked in (without, only_a))
     assert equal(here, there, ["resistance"])
     assert not equal(here, answers.region(RegionQuery(BOX, ("resistance",), when=when)), ["resistance"])
 
@@ -278,7 +278,7 @@ def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
     writer.close()
 
 
-def test_questions_about_the_past_are_told_apart():
+def test_questions_about_the_past_are_recognised():
     assert reads_past("history", {})
     assert reads_past("point", {"as_of": "1"})
     assert reads_past("region", {"minus": "1"})

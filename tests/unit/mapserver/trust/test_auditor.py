@@ -177,7 +177,7 @@ def test_a_parked_machine_says_nothing_about_the_ground() -> None:
     assert audit([*fleet(0, GOOD, GOOD, GOOD), rows])["d"].evidence["cells"] == 0
 
 
-def test_samples_unsure_of_their_place_are_left_out() -> None:
+def test_samples_unsure_of_their_place_do_not_count() -> None:
     rows = drive(3, gain=1.6)
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = 4.0
     auditor = Auditor(1.0, FoldConfig(std_cap_m=1.9))
