@@ -1,4 +1,4 @@
-"""Change of the ground: where recent evidence contradicts older evidence, the older does not count when the map is read.
+"""Change of the ground: where recent evidence contradicts older evidence, a read of the map skips the older.
 
 For every cell, evidence is cut in two between two of its pages by time. The cut that explains it best (two kinds of
 ground are more likely than one, by the log-likelihood ratio of their histograms) is a change if the two histograms have

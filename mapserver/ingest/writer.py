@@ -98,7 +98,7 @@ class Writer:
         return info
 
     def close(self) -> None:
-        """Finish what is waiting, snapshot, close."""
+        """Finish what is waiting, snapshot, close; once more does nothing."""
         self._batches.put(None)
         self._thread.join()
 

@@ -43,8 +43,9 @@ class Gain:
 class Difference:
     """How one map differs from another.
 
-    cells: compared, of the same period; shift: None where no border shows it; agreement: share of the cells whose levels
-    agree within the tolerance once gain and shift are taken out; spreads: standard deviations of both levels on them.
+    cells: compared, of the same period; shift: None where no border shows it; agreement: share of the cells whose
+    levels agree within TOLERANCE once gain and shift are taken out; spreads: standard deviations of the levels, own and
+    other, on these cells.
     """
 
     cells: int

@@ -392,13 +392,13 @@ def test_a_backup_as_the_operators_page_has_it_is_a_whole_store(tmp_path: Path, 
         names: dict[str, Any] = {}
         exec(compile(first, "docs/operation.md", "exec"), names)
         with JournalReader(store / JOURNAL_FILE) as reader:  # rows move just in between
-            assert list(archive(store / "archive", reader, site, NOW_NS + 3 * HOUR_NS, opened.forget))
+            assert list(archive(store / "archive", reader, site, NOW_NS + 3 * HOUR_NS, opened.journal.forget))
         exec(compile(f"if os.path{second}", "docs/operation.md", "exec"), names)
         folded = opened.grid.folded
     with closing(Store(backup, site, ServerConfig(), lambda: NOW_NS)) as restored:
         assert restored.machines()["late"]["samples"] == 10
         assert restored.grid.folded == folded == 50_010
         with JournalReader(backup / JOURNAL_FILE) as reader:
-            assert list(archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.forget))
+            assert list(archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.journal.forget))
             rows = [row.row for row in history_rows(History.of(reader))]
     assert rows == list(range(1, 52))

@@ -297,6 +297,16 @@ def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(
     assert [(list(verdicts), stamp_ns) for verdicts, stamp_ns in reports] == [(["a"], NOW_NS + 4 * 10**9)] * 2
 
 
+@pytest.mark.parametrize(("judge_s", "times"), [(1e-9, 3), (60.0, 1)])
+def test_machines_are_judged_so_often(store, judge_s, times):
+    writer, reader = store
+    reports: list[Any] = []
+    audit = Audit(writer, reader, Auditor(SITE.cell_m), judge_s, lambda *report: reports.append(report), lambda: False)
+    for _ in range(3):
+        audit.run()
+    assert len(reports) == times
+
+
 def test_other_work_interrupts_the_audit_which_goes_on_where_it_was(store):
     writer, reader = store
     send(writer, [incoming(samples(5), machine=name) for name in "abc"])
