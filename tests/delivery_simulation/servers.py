@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mapserver.config import ServerConfig
-from mapserver.ingest import admission as rules  # as a module: planted bugs replace what is in it
-from mapserver.ingest.admission import Admission, GapError
+from mapserver.ingest.admission import Admission, GapError, admit, parse
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
 from protocol.errors import MessageError, Refusal
@@ -72,7 +71,7 @@ class ModelServer:
         self._backup = _Disk()
 
     def take(self, group: list[Incoming], plan: Plan) -> list[Ack | Refused]:
-        """As Store.take."""
+        """As Store.commit."""
         fault = plan.fault
         plan.disarm()
         new = self.disk.copy()
@@ -111,9 +110,9 @@ class ModelServer:
 
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
         try:
-            batch = rules.parse(incoming.payload, incoming.machine, self._site, self._now_ns)
+            batch = parse(incoming.payload, incoming.machine, self._site, self._now_ns)
             seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
-            admission = rules.admit(batch, seq)
+            admission = admit(batch, seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected)
@@ -136,7 +135,7 @@ class RealServer:
         self.back_up()
 
     def take(self, group: list[Incoming], plan: Plan) -> list[Ack | Refused]:
-        """As Store.take; a killed one is started again."""
+        """As Store.commit; a killed one is started again."""
         if plan.fault:
             self._plan.arm(plan.fault, plan.left)
         plan.disarm()

@@ -136,12 +136,8 @@ def test_the_least_size_is_obeyed(size_m, seen):
 def test_detection_off_leaves_everything():
     now = read(repaved(-5, 4, 10), replace(CONFIG, detect=False))
     assert not now.changed_ns.any()
-    everything = grid_of_blocks(repaved(-5, 4, 10))
+    everything = repaved(-5, 4, 10).evidence([(x, y) for x in range(-2, 2) for y in range(-2, 2)])
     assert now.counts.sum() == everything.counts.sum()
-
-
-def grid_of_blocks(grid: Grid) -> ev.Evidence:
-    return grid.evidence([(x, y) for x in range(-2, 2) for y in range(-2, 2)])
 
 
 @pytest.mark.parametrize("grounds", [[OLD, NEW, OLD], [OLD, OLD, OLD, NEW, OLD], [OLD, OLD, NEW, NEW, OLD]])

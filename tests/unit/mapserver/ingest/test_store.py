@@ -26,8 +26,14 @@ from tests.unit.mapserver.data import (
 )
 
 
-def test_a_group_is_answered_in_order(tmp_path):
-    store = open_store(tmp_path)
+@pytest.fixture
+def store(tmp_path):
+    opened = open_store(tmp_path)
+    yield opened
+    opened.close()
+
+
+def test_a_group_is_answered_in_order(store):
     group = [
         incoming(samples(3), 1),
         incoming(samples(2), 9),
@@ -44,23 +50,19 @@ def test_a_group_is_answered_in_order(tmp_path):
     assert answers[4] == Ack(6, 3, trimmed=2)
     assert answers[5] == Ack(6, 3)
     assert (store.merged, store.journalled, store.grid.folded) == (3, 3, 10)
-    store.close()
 
 
-def test_a_refused_batch_leaves_no_trace(tmp_path):
-    store = open_store(tmp_path)
+def test_a_refused_batch_leaves_no_trace(store):
     bad = samples(3, speed_mps=[1.0, 1e6, 1.0])
     answer = store.commit([incoming(bad)])[0]
     assert answer == Refused(Refusal.OUT_OF_RANGE, "speed_mps[1]: 1e+06: not between -100 and 100", 0)
     assert store.journalled == store.grid.folded == 0
     assert store.commit([incoming(samples(3))])[0] == Ack(3, 1)
-    store.close()
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sent_at_least_once_is_merged_exactly_once(tmp_path, seed):
+def test_sent_at_least_once_is_merged_exactly_once(store, seed):
     rows, draw = random_samples(120, seed), np.random.default_rng(seed)
-    store = open_store(tmp_path)
     watermark = 0
     while watermark < len(rows):
         first = max(1, watermark + 1 - int(draw.integers(0, 15)))
@@ -69,11 +71,9 @@ def test_sent_at_least_once_is_merged_exactly_once(tmp_path, seed):
         watermark = max([watermark, *(a.watermark for a in answers if isinstance(a, Ack))])
     assert same(store.grid, folded(rows))
     assert store.counters["samples_trimmed"] > 0
-    store.close()
 
 
-def test_a_failed_commit_refuses_all_and_folds_nothing(tmp_path, monkeypatch):
-    store = open_store(tmp_path)
+def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
     store.commit([incoming(samples(2))])
 
     def full():
@@ -91,12 +91,10 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(tmp_path, monkeypatch):
     assert [(a.watermark, a.trimmed) for a in again] == [(5, 0), (4, 0)]
     assert store.grid.folded == 9
     assert store.info()["machines"]["b"] == {"spools": 1, "samples": 4, "lost": 0, "newest_ns": NOW_NS + 3 * 10**9}
-    store.close()
 
 
 @pytest.mark.parametrize("method", ["begin", "append"])
-def test_a_journal_that_cannot_be_written_refuses(tmp_path, monkeypatch, method):
-    store = open_store(tmp_path)
+def test_a_journal_that_cannot_be_written_refuses(store, monkeypatch, method):
 
     def locked(*_):
         raise sqlite3.OperationalError("database is locked")
@@ -105,19 +103,15 @@ def test_a_journal_that_cannot_be_written_refuses(tmp_path, monkeypatch, method)
         patched.setattr(store.journal, method, locked)
         assert store.commit([incoming(samples(3))])[0].reason == Refusal.STORE
     assert store.commit([incoming(samples(3))])[0] == Ack(3, 1)
-    store.close()
 
 
-def test_losses_and_repeats_are_counted(tmp_path):
-    store = open_store(tmp_path)
+def test_losses_and_repeats_are_counted(store):
     store.commit([incoming(samples(3)), incoming(samples(2), 2), incoming(samples(1), 10, lost_before=6)])
     assert store.counters == {"batches": 2, "samples_trimmed": 2, "samples_lost": 6}
     assert store.info()["machines"] == {"a": {"spools": 1, "samples": 4, "lost": 6, "newest_ns": NOW_NS + 2 * 10**9}}
-    store.close()
 
 
-def test_info_tells_the_state_in_plain_values(tmp_path):
-    store = open_store(tmp_path)
+def test_info_tells_the_state_in_plain_values(store):
     store.commit([
         incoming(samples(3)),
         incoming(samples(2), spool_id=8),
@@ -133,7 +127,6 @@ def test_info_tells_the_state_in_plain_values(tmp_path):
     assert info["bounds"] == (0, 0, 16, 16)
     assert info["stamp_ns"] == NOW_NS + 10**12
     assert info["machines"]["a"] == {"spools": 2, "samples": 5, "lost": 0, "newest_ns": NOW_NS + 2 * 10**9}
-    store.close()
 
 
 def test_now_is_the_newest_accepted_stamp_also_after_a_restart(tmp_path):
@@ -197,8 +190,7 @@ def test_a_grid_adopted_while_a_snapshot_is_written_gets_one_of_its_own(tmp_path
 
 
 @pytest.mark.parametrize("row", [0, 1])
-def test_an_adopted_grid_gets_what_came_since_without_those_excluded(tmp_path, row):
-    store = open_store(tmp_path)
+def test_an_adopted_grid_gets_what_came_since_without_those_excluded(store, row):
     store.commit([incoming(samples(3)), incoming(samples(3), machine="b"), incoming(samples(5), 4)])
     store.adopt(folded(samples(3 * row)), row, frozenset({"b"}))
     expected = folded(samples(3))
@@ -208,7 +200,6 @@ def test_an_adopted_grid_gets_what_came_since_without_those_excluded(tmp_path, r
     expected.fold(samples(2), "a")
     assert same(store.grid, expected)
     assert (store.merged, store.journalled) == (5, 5)
-    store.close()
 
 
 # --- kill and replay -------------------------------------------------------------------------------------------------

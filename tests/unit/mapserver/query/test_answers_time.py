@@ -1,7 +1,5 @@
 """Maps as of any time, their differences, the history of a point; machines, changes and commands."""
 
-import threading
-
 import numpy as np
 import pytest
 
@@ -9,41 +7,29 @@ from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answers import Answers, reads_past
-from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
 from protocol.queries.commands import TrustCommand, encode_command
-from protocol.queries.parameters import selector_of
 from protocol.queries.requests import (
     MAX_SPANS,
     HistoryQuery,
-    InfoQuery,
     PointQuery,
     RegionQuery,
     When,
     decode_changes,
-    decode_error,
     decode_history,
-    decode_info,
     decode_machine,
     decode_machines,
     decode_point,
     decode_region,
-    encode_change,
-    encode_query,
 )
 from protocol.site.geometry import Bounds
-from protocol.wire import keys
-from protocol.wire.codec import encode_batch
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
     SITE,
-    WAIT_S,
-    batch,
     incoming,
     now_ns,
     random_samples,
-    routed,
     samples,
     send,
 )
@@ -321,99 +307,3 @@ def test_the_follower_is_asked(served):
     assert caught.value.reason == Refusal.UNKNOWN_MACHINE
     with pytest.raises(QueryError, match="row 9 is not merged"):
         answers.answer("machines", {"after": "9", "wait": "0.01"})
-
-
-# --- over Zenoh ------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def sessions():
-    with routed() as pair:
-        yield pair
-
-
-@pytest.fixture
-def online(sessions, tmp_path):
-    router, client = sessions
-    server = Server(router, tmp_path, SITE, CONFIG, now_ns)
-    yield server, client
-    server.close()
-
-
-def get(client, key: str, parameters: dict[str, str], payload: bytes | None = None):
-    selector = f"{key}?{selector_of(parameters)}" if parameters else key
-    [reply] = client.get(selector, payload=payload, timeout=WAIT_S)
-    return reply
-
-
-def test_events_and_queries_below_the_map_do_not_meet(online):
-    server, client = online
-    received, here = [], threading.Event()
-    subscriber = client.declare_subscriber(
-        keys.changed("pit"), lambda s: (received.append(s.payload.to_bytes()), here.set())
-    )
-    error = decode_error(get(client, keys.changed("pit"), {}).err.payload.to_bytes())
-    assert error.reason == Refusal.UNKNOWN_QUERY
-    get(client, keys.map_query("pit", "info"), {})  # the subscription has reached the server with this answer
-    server._publish({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})
-    assert here.wait(WAIT_S)
-    assert received == [encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
-    subscriber.undeclare()
-
-
-def test_a_command_reaches_the_follower_with_its_reason(online):
-    _, client = online
-    get(client, keys.ingest("pit", "a"), {}, encode_batch(batch(samples(5))))
-    command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")
-    row = decode_machine(get(client, keys.admin("pit", "trust"), encode_command(command)).ok.payload.to_bytes())
-    assert (row["name"], row["trusted"], row["merged"]) == ("a", False, 1)
-    assert row["reason"] == command.reason
-    gone = {"x": "8.5", "y": "8.5", "layers": "weight"}
-    for more in ({}, {"as_of": str(NOW_NS + HOUR_NS)}):
-        point = decode_point(get(client, keys.map_query("pit", "point"), gone | more).ok.payload.to_bytes())
-        assert np.isnan(point.values["weight"])
-    [machine] = decode_machines(get(client, keys.map_query("pit", "machines"), {}).ok.payload.to_bytes())
-    assert machine["name"] == "a"
-    assert not machine["trusted"]
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "reason"),
-    [
-        ("trust", {"machine": "c", "trusted": "yes"}, Refusal.UNKNOWN_MACHINE),
-        ("trust", {"machine": "c"}, Refusal.MISSING_FIELD),
-        ("shutdown", {}, Refusal.UNKNOWN_QUERY),
-    ],
-)
-def test_a_refused_command_gets_its_reason_and_is_counted(online, name, parameters, reason):
-    _, client = online
-    assert decode_error(get(client, keys.admin("pit", name), parameters).err.payload.to_bytes()).reason == reason
-    info = decode_info(get(client, keys.map_query("pit", "info"), {}).ok.payload.to_bytes())
-    assert info["counters"] == {f"refused_query_{reason}": 1}
-
-
-@pytest.mark.parametrize("slow", ["past", "command"])
-def test_the_map_as_it_is_does_not_wait_for_what_is_slow(online, monkeypatch, slow):
-    server, client = online
-    release, entered = threading.Event(), threading.Event()
-
-    def hold(*_):
-        entered.set()
-        assert release.wait(WAIT_S)
-        raise QueryError(Refusal.STORE, "held")
-
-    monkeypatch.setattr(server.answers, "history", hold)
-    monkeypatch.setattr(server.answers, "trust", hold)
-    key, asked = {
-        "past": (keys.map_query("pit", "history"), encode_query(HistoryQuery(0, 0))),
-        "command": (keys.admin("pit", "trust"), encode_command(TrustCommand("a", True))),
-    }[slow]
-    askers = [threading.Thread(target=get, args=(client, key, asked)) for _ in range(3)]
-    for asker in askers:
-        asker.start()
-    assert entered.wait(WAIT_S)
-    for _ in range(3):
-        assert get(client, keys.map_query("pit", "info"), encode_query(InfoQuery())).ok
-    release.set()
-    for asker in askers:
-        asker.join()
