@@ -1,4 +1,4 @@
-"""The follower: a thread beside the writer that runs four jobs in turn, and the door to their results."""
+"""The follower: a thread beside the writer that runs four jobs in turn; other threads ask it for their results."""
 
 from __future__ import annotations
 
