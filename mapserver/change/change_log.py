@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 
 from mapserver.change.detection import ChangeConfig, cuts
-from mapserver.change.validity import evidence, image_of, valid_pages
+from mapserver.change.validity import image_of, valid_pages
 from mapserver.evidence import cells as ev
+from mapserver.evidence.sums import evidence
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.layers import cell_layers
 from protocol.arrays import Bools, Floats32, Ints

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.change.validity import evidence
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import kernel
 from mapserver.evidence.open_blocks import Hot, NoRoom, of_code
 from mapserver.evidence.pages import Page
+from mapserver.evidence.sums import evidence
 from mapserver.evidence.timeline import Block, Ladder, TimedPage, rungs
 from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Table

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Pages, evidence, valid_pages
+from mapserver.change.validity import Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
+from mapserver.evidence.sums import evidence
 from mapserver.evidence.timeline import Block
 from mapserver.ingest.store import Store
 from mapserver.journal.history import History, Moment, grid_as_of, point_history

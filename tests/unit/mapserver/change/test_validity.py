@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mapserver.change.detection import ChangeConfig
-from mapserver.change.validity import around, evidence, valid_pages
+from mapserver.change.validity import around, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
+from mapserver.evidence.sums import evidence
 from mapserver.evidence.votes import FoldConfig
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import ReadConfig
