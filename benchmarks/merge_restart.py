@@ -43,10 +43,11 @@ def run(samples: int) -> Result:
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
         build_s = timed(lambda: build(folder, rows))
-        found: Result = {}
-        process_s = timed(lambda: found.update(in_child("benchmarks.merge_restart", path)))
-        if found["journalled"] != rows or found["merged"] != rows:
-            raise RuntimeError(f"the store has {found['merged']} of {rows} rows in its grid: nothing was measured")
+        opened_store: Result = {}
+        process_s = timed(lambda: opened_store.update(in_child("benchmarks.merge_restart", path)))
+        if opened_store["journalled"] != rows or opened_store["merged"] != rows:
+            merged = opened_store["merged"]
+            raise RuntimeError(f"the store has {merged} of {rows} rows in its grid: nothing was measured")
         sizes = {
             "journal_mb": round((folder / JOURNAL_FILE).stat().st_size / MB, 1),
             "snapshot_mb": round(sum(file.stat().st_size for file in folder.glob("snapshot-*")) / MB, 1),
@@ -54,11 +55,11 @@ def run(samples: int) -> Result:
     row = {
         "samples": rows * BATCH,
         "journal_rows": rows,
-        "tail_rows": rows - found["snapshot_row"],
+        "tail_rows": rows - opened_store["snapshot_row"],
         **sizes,
         "build_s": round(build_s, 1),
-        "open_s": round(found["open_s"], 3),
-        "open_cpu_s": round(found["open_cpu_s"], 3),
+        "open_s": round(opened_store["open_s"], 3),
+        "open_cpu_s": round(opened_store["open_cpu_s"], 3),
         "process_s": round(process_s, 3),
     }
     return {"benchmark": "restart", "samples": rows * BATCH, **machine(), "goal_s": GOAL_S, "rows": [row]}
@@ -83,8 +84,8 @@ def build(folder: Path, rows: int) -> None:
     journal.close()
 
 
-def opened(folder: Path) -> Result:
-    """Open the store, and say how long that took."""
+def open_timed(folder: Path) -> Result:
+    """Open the store; returns how long that took."""
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
     store = Store(folder, SITE, CONFIG, lambda: START_NS)
     open_s, open_cpu_s = time.perf_counter() - start_s, time.process_time() - start_cpu_s
@@ -100,4 +101,4 @@ def _admission(name: str, first_seq: int, rows: Table) -> Admission:
 if __name__ == "__main__":
     from mapserver import server  # noqa: F401 # a server's imports count in the time of the process
 
-    print(json.dumps(opened(Path(sys.argv[1]))))
+    print(json.dumps(open_timed(Path(sys.argv[1]))))

@@ -17,7 +17,7 @@ import numpy as np
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.votes import FoldConfig
+from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
 from mapserver.ingest.admission import Admission
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.journal import LAST, ArchivedError, Journal, JournalReads
@@ -139,7 +139,7 @@ def _cell_evidence(
 
 def _reaching(window: CellWindow, cell_m: float, config: FoldConfig) -> Bounds:
     """Where samples that vote in a window can lie: 3 sigma of the least sure that may vote, and a cell for rounding."""
-    reach_m = 3 * math.hypot(config.std_cap_m, config.std_floor_m) + cell_m
+    reach_m = 3 * math.hypot(config.std_cap_m, STD_FLOOR_M) + cell_m
     inner = GridGeometry(cell_m).bounds(window)
     return Bounds(inner.west_m - reach_m, inner.south_m - reach_m, inner.east_m + reach_m, inner.north_m + reach_m)
 

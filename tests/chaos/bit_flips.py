@@ -91,7 +91,7 @@ def read_store(folder: Path, definition: Any) -> Content:
             for row in history_rows(History.of(store._journal))
         }
         grid = store.grid.state()
-        votes = [(at.x, at.y, at.rung, at.index, at.page.votes.tobytes()) for at in grid.pages]
+        votes = [(at.x, at.y, at.tier, at.index, at.page.votes.tobytes()) for at in grid.pages]
         marks = {key: (mark.seq, mark.lost) for key, mark in store._journal.marks().items()}
         placed = [(row.row, int(row.rows["stamp_ns"].min())) for row in store._journal.read(wanted=Wanted(from_ns=1))]
         return {

@@ -147,13 +147,15 @@ def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committe
 
 
 def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: SiteRun, children: Children):
-    store, options = site.folder / "store", site.folder / "server.toml"
-    old_rows(store, load_site(site.site_file))
+    store, old = site.folder / "store", load_site(site.site_file)
+    old_rows(store, old)
     for cache in store.glob("snapshot-*"):
         cache.unlink()
-    options.write_text('[fold]\nkernel = "numpy"\nstd_floor_m = 2.9\n')  # slow: many cells for each sample
+    text = site.site_file.read_text()
+    site.site_file.write_text(text.replace(f"cell_m = {old.cell_m}", "cell_m = 0.05"))  # slow: many for each sample
+    assert load_site(site.site_file).cell_m == 0.05
     site.start_router()
-    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store, "--config", options)
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store)
     server = children.start("server", "server", *words)
     wait_until(lambda: (store / "journal.db-wal").exists(), READY_S, "the store is opened")
     end(server)

@@ -225,7 +225,7 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
         rows["stamp_ns"] += i * 5 * 3600 * 10**9
         aged.append(replace(row, rows=rows))
     whole, less = grid_of(aged).state(), grid_of(aged[1:]).state()
-    assert {at.rung for at in whole.pages} >= {0, 1}
+    assert {at.tier for at in whole.pages} >= {0, 1}
     assert grid_difference(whole, whole) == (0, 0)
     assert grid_difference(whole, less) == (pytest.approx(BATCH, abs=5), 0)
 
