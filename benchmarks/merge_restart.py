@@ -19,9 +19,9 @@ from benchmarks.merge_work import BATCH, batches
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import Admission
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.journal import Journal
+from mapserver.journal.rows import Admission
 from protocol.arrays import Table
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch

@@ -22,7 +22,7 @@ from mapserver.evidence.grid import Grid, GridState, PlacedPage
 from mapserver.evidence.pages import Page
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import Decisions
@@ -62,7 +62,7 @@ def read_audits(audits: Mapping[str, Path]) -> dict[Identity, str]:
 def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, config: ServerConfig) -> AuditResult:
     """Compare audit files with the store of a server that has ended."""
     with JournalReader(folder / JOURNAL_FILE) as journal:
-        rows = list(history_rows(History.of(journal)))
+        rows = list(history_rows(History.beside(journal)))
         excluded = Decisions(journal.events(TRUST)).distrusted
     last = rows[-1].row if rows else 0
     _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, excluded)

@@ -23,8 +23,8 @@ from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
-from mapserver.journal.rows import Wanted
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Selection
 from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.decisions import AUDIT, KIND, PERSON, Decision, Decisions
 from protocol.errors import QueryError, Refusal, SitegridError
@@ -54,7 +54,7 @@ class Keeper:
         self._writer, self._folder, self._site, self._config = writer, folder, site, config
         self._publish, self._now_ns = publish, now_ns
         self._reader = JournalReader(folder / JOURNAL_FILE)
-        self._history = History.of(self._reader)
+        self._history = History.beside(self._reader)
         self._auditor = Auditor(config.trust, site.cell_m, config.fold)
         self._verdicts: dict[str, Verdict] = {}
         self._decisions = Decisions(self._reader.events(KIND))
@@ -193,7 +193,7 @@ class Keeper:
         """Fold the whole history without some machines, and have the writer go on with that."""
         until = self._reader.last_row
         grid = Grid(self._site.cell_m, self._config.fold)
-        for row in history_rows(self._history, until=until, wanted=Wanted(without=left_out)):
+        for row in history_rows(self._history, until=until, selection=Selection(without=left_out)):
             grid.fold(row.rows, row.machine)
             if self._ending:
                 return

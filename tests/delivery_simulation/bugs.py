@@ -11,7 +11,7 @@ import pytest
 from agents.delivery.spool import Run, Spool
 from agents.delivery.uplink import UplinkState
 from mapserver.ingest import admission
-from mapserver.ingest.admission import Admission
+from mapserver.journal.rows import Admission
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from tests.delivery_simulation.faults import KILLS, Fault
 from tests.delivery_simulation.servers import ModelServer

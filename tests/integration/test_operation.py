@@ -20,9 +20,10 @@ import zenoh
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.journal.archive import HOUR_NS, archive
+from mapserver.journal.archive import archive
+from mapserver.journal.archive_writer import HOUR_NS
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig, load_site
 from protocol.wire import keys
@@ -98,7 +99,7 @@ class Sender:
 
 def committed(store: Path) -> dict[str, int]:
     with JournalReader(store / JOURNAL_FILE) as journal:
-        return {machine: mark.seq for (machine, _), mark in journal.marks().items()}
+        return {machine: mark.seq for (machine, _), mark in journal.watermarks().items()}
 
 
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
@@ -401,5 +402,5 @@ def test_a_backup_as_the_operators_page_has_it_is_a_whole_store(tmp_path: Path, 
         assert restored.grid.folded == folded == 50_010
         with JournalReader(backup / JOURNAL_FILE) as reader:
             assert list(archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.forget))
-            rows = [row.row for row in history_rows(History.of(reader))]
+            rows = [row.row for row in history_rows(History.beside(reader))]
     assert rows == list(range(1, 52))

@@ -13,7 +13,8 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import FOLDER, archive
-from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow, checksum, pack
 from mapserver.trust.decisions import KIND, PERSON, Decision
 from protocol.arrays import Table
