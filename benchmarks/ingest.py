@@ -1,4 +1,4 @@
-"""Samples per second from a machine's bytes to the grid: decode, judge, commit to disk (FULL), fold."""
+"""Samples per second from a machine's bytes to the grid: decode, check, commit to disk (FULL), fold."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run(samples: int, runs: int) -> Result:
     def commits(size: int, group: int) -> int:
         return math.ceil(math.ceil(samples / size) / group)
 
-    found = [
+    figures = [
         {
             "batch": size,
             "batches_per_commit": group,
@@ -41,7 +41,7 @@ def run(samples: int, runs: int) -> Result:
         }
         for name, (size, group) in cases.items()
     ]
-    return {"benchmark": "ingest", "samples": samples, "runs": runs, **machine(), "rows": found}
+    return {"benchmark": "ingest", "samples": samples, "runs": runs, **machine(), "rows": figures}
 
 
 def _variant(folder: Path, name: str, rows: Table, size: int, group: int) -> Callable[[], float]:

@@ -84,8 +84,8 @@ def in_child(module: str, *words: str) -> Result:
     """What a module prints as one JSON object when it runs in a process of its own."""
     command = [sys.executable, "-m", module, *words]
     root = Path(__file__).parent.parent
-    found: Result = json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603
-    return found
+    result: Result = json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603
+    return result
 
 
 def machine() -> dict[str, Any]:

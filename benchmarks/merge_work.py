@@ -50,9 +50,9 @@ def samples_of(hours: float) -> int:
 def batches(seed: int = 0) -> Iterator[tuple[str, Table]]:
     """Names of machines and batches of samples, in the order in which they would come in, day after day."""
     draws = np.random.default_rng(seed).spawn(MACHINES)
-    ways = [_legs(draw) for draw in draws]
+    drives = [_legs(draw) for draw in draws]
     while True:
-        driven = [_drive(next(way), draw) for way, draw in zip(ways, draws, strict=True)]
+        driven = [_drive(next(legs), draw) for legs, draw in zip(drives, draws, strict=True)]
         for first in range(0, LEG_SAMPLES, BATCH):
             for number, rows in enumerate(driven, start=1):
                 yield f"loader-{number}", rows[first : first + BATCH]
@@ -63,11 +63,11 @@ def _legs(draw: np.random.Generator) -> Iterator[Leg]:
     column, row, heading = int(draw.integers(ROADS)), int(draw.integers(ROADS)), int(draw.integers(4))
     a_day = samples_of(HOURS) // (MACHINES * LEG_SAMPLES)
     for number in count():
-        # a heading two further is the way back
-        ways = [h for h in range(4) if (h - heading) % 4 != 2 and _on_site(column, row, h)]
-        heading = int(draw.choice(ways))
-        day, of_day = divmod(number, a_day)
-        yield Leg(START_NS + day * DAY_NS + of_day * LEG_SAMPLES * SAMPLE_NS, column, row, heading)
+        # a heading two further leads back
+        headings = [h for h in range(4) if (h - heading) % 4 != 2 and _on_site(column, row, h)]
+        heading = int(draw.choice(headings))
+        day, leg = divmod(number, a_day)
+        yield Leg(START_NS + day * DAY_NS + leg * LEG_SAMPLES * SAMPLE_NS, column, row, heading)
         column, row = column + HEADINGS[heading][0], row + HEADINGS[heading][1]
 
 
@@ -97,5 +97,5 @@ def _drive(leg: Leg, draw: np.random.Generator) -> Table:
 
 def _resistance(x: AnyArray, y: AnyArray) -> Floats:
     patch = (np.floor(x / PATCH_M) + 3 * np.floor(y / PATCH_M)).astype(np.int64)
-    found: Floats = RESISTANCES[patch % len(RESISTANCES)]
-    return found
+    resistance: Floats = RESISTANCES[patch % len(RESISTANCES)]
+    return resistance

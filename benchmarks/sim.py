@@ -44,7 +44,7 @@ def run(seconds: float, runs: int) -> Result:
     for _ in range(runs):  # in turn, so that all meet the same disturbances
         for case in CASES:
             measured[case].append(_measure(case, seconds))
-    rows = [_row(case, found) for case, found in measured.items()]
+    rows = [_row(case, figures) for case, figures in measured.items()]
     return {"benchmark": "sim", "seconds": seconds, "runs": runs, **machine(), "rows": rows}
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from protocol.site.site_config import SiteConfig
 
 LOOK_S = 60.0  # between two looks for rows that are old enough: files are of whole hours

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from mapserver.ingest.writer import Writer
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
 
 Report = Callable[[Mapping[str, Verdict], int], None]

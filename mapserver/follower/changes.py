@@ -14,7 +14,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 
 LOOK_BLOCKS = 256  # at a time: the writer copies their pages, and batches wait meanwhile
 Publish = Callable[[dict[str, Any]], None]

@@ -14,8 +14,8 @@ from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest.writer import Writer
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
-from mapserver.journal.rows import Wanted
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Selection
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import KIND, TrustDecision, TrustDecisions
 
@@ -30,7 +30,7 @@ class Exclusion:
     def __init__(
         self, writer: Writer, reader: JournalReader, cell_m: float, fold: FoldConfig, ending: threading.Event
     ) -> None:
-        self._writer, self._reader, self._history = writer, reader, History.of(reader)
+        self._writer, self._reader, self._history = writer, reader, History.beside(reader)
         self._cell_m, self._fold, self._ending = cell_m, fold, ending
         self._decisions = TrustDecisions(reader.events(KIND))
         self._pending: list[TrustDecision] = []
@@ -89,7 +89,7 @@ class Exclusion:
     def _fold_again(self, excluded: frozenset[str]) -> None:
         until = self._reader.last_row
         grid = Grid(self._cell_m, self._fold)
-        for row in history_rows(self._history, until=until, wanted=Wanted(without=excluded)):
+        for row in history_rows(self._history, until=until, selection=Selection(without=excluded)):
             grid.fold(row.rows, row.machine)
             if self._ending.is_set():
                 return

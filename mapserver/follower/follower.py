@@ -15,7 +15,7 @@ from mapserver.follower.changes import ChangeSearch, Publish
 from mapserver.follower.exclusion import Exclusion
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError

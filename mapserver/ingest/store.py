@@ -15,11 +15,11 @@ from typing import Any
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import Admission, GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, parse
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import Journal
-from mapserver.journal.rows import Wanted
+from mapserver.journal.rows import Admission, Selection
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecisions
 from protocol.errors import MessageError, Refusal, StoreError
@@ -160,7 +160,7 @@ class Store:
     def machines(self) -> dict[str, dict[str, int]]:
         """What each machine sent: spools, samples, samples that it declared lost, newest stamp."""
         machines: dict[str, dict[str, int]] = {}
-        for (machine, _), mark in self.journal.marks().items():
+        for (machine, _), mark in self.journal.watermarks().items():
             entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0})
             entry["spools"] += 1
             entry["samples"] += mark.seq - mark.lost
@@ -173,7 +173,7 @@ class Store:
             if self._verify:
                 self._check_signature(self._verify, incoming)
             batch = parse(incoming.payload, incoming.machine, self.site, self._now_ns)
-            admission = admit(batch, self.journal.mark(batch.machine, batch.spool_id).seq)
+            admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
@@ -207,7 +207,7 @@ class Store:
     def _fold_tail(self, grid: Grid, merged: int, excluded: frozenset[str]) -> None:
         """Fold what a grid does not hold yet."""
         history = History(self.journal, Archive(self._folder / FOLDER))
-        for row in history_rows(history, after=merged, wanted=Wanted(without=excluded)):
+        for row in history_rows(history, after=merged, selection=Selection(without=excluded)):
             grid.fold(row.rows, row.machine)
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from mapserver.config import ServerConfig
 from mapserver.follower.follower import Follower
 from mapserver.ingest.writer import Writer
-from mapserver.journal.history import Moment
-from mapserver.journal.rows import Wanted
+from mapserver.journal.history import SpanEvidence
+from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
@@ -104,8 +104,8 @@ class Answers:
         span_s = query.span_s or self._config.fold.bucket_s
         from_ns, to_ns = _time_of(query, now_ns, span_s)
         cell = self._cell(query.x_m, query.y_m)
-        wanted = Wanted(from_ns, to_ns, without=self._follower.excluded())
-        moments, merged = self._past.moments((cell.column, cell.row), wanted, span_s)
+        selection = Selection(from_ns, to_ns, without=self._follower.excluded())
+        moments, merged = self._past.moments((cell.column, cell.row), selection, span_s)
         x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
         return HistoryAnswer(x_m, y_m, tuple(self._span(moment, names) for moment in moments), merged, now_ns)
 
@@ -147,7 +147,7 @@ class Answers:
             return self._writer.run(lambda store: view_now(store, window))
         return self._past.view(window, as_of_ns, self._follower.excluded())
 
-    def _span(self, moment: Moment, names: tuple[str, ...]) -> Span:
+    def _span(self, moment: SpanEvidence, names: tuple[str, ...]) -> Span:
         values = cell_layers.read(moment.evidence, names, self._config.read, moment.last_ns)
         return Span(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
 

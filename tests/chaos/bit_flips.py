@@ -18,7 +18,7 @@ from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.rows import Wanted
+from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
 from protocol.site.site_config import load_site
@@ -88,12 +88,14 @@ def read_store(folder: Path, definition: Any) -> Content:
     try:
         rows = {
             row.row: (row.machine, row.spool_id, row.first_seq, row.received_ns, row.rows.tobytes())
-            for row in history_rows(History.of(store.journal))
+            for row in history_rows(History.beside(store.journal))
         }
         grid = store.grid.state()
-        votes = [(at.x, at.y, at.rung, at.index, at.page.votes.tobytes()) for at in grid.pages]
-        marks = {key: (mark.seq, mark.lost) for key, mark in store.journal.marks().items()}
-        placed = [(row.row, int(row.rows["stamp_ns"].min())) for row in store.journal.read(wanted=Wanted(from_ns=1))]
+        votes = [(at.x, at.y, at.tier, at.index, at.page.votes.tobytes()) for at in grid.pages]
+        marks = {key: (mark.seq, mark.lost) for key, mark in store.journal.watermarks().items()}
+        placed = [
+            (row.row, int(row.rows["stamp_ns"].min())) for row in store.journal.read(selection=Selection(from_ns=1))
+        ]
         return {
             "rows": rows,
             "placed": placed,  # what is found by time and place

@@ -14,7 +14,7 @@ from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from protocol.errors import StoreError
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import plain_lines
@@ -193,7 +193,7 @@ class Site:
         found: dict[str, int] = {}
         try:
             with JournalReader(self.folder / "store" / JOURNAL_FILE) as reader:
-                for (machine, _), mark in reader.marks().items():
+                for (machine, _), mark in reader.watermarks().items():
                     found[machine] = found.get(machine, 0) + mark.seq
         except StoreError:  # being made, or recovered
             return {}
@@ -214,8 +214,8 @@ class Site:
         store, site = self.folder / "store", load_site(self.folder / "site.toml")
         result = audit_store(audits, store, site, ServerConfig())
         with JournalReader(store / JOURNAL_FILE) as reader:
-            rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(History.of(reader))]
-            declared = sum(mark.lost for mark in reader.marks().values())
+            rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(History.beside(reader))]
+            declared = sum(mark.lost for mark in reader.watermarks().values())
         out = self.outcome
         out.recorded, out.merged, out.double = result.recorded, result.merged, result.double
         out.lost = result.lost - min(declared, result.lost)

@@ -139,12 +139,12 @@ def _look_at_store(folder: Path) -> Found:
     except StoreError as error:
         return Found({}, f"store does not open: {error}")
     refolded = Grid(work.SITE.cell_m, config.fold)
-    for row in history_rows(History.of(store.journal)):
+    for row in history_rows(History.beside(store.journal)):
         refolded.fold(row.rows, row.machine)
         for i, sample in enumerate(row.rows):
             contents.setdefault((row.spool_id, row.first_seq + i), []).append(content_hash(sample))
     problem = "" if refolded.folded == store.grid.folded else "grid and journal differ"
-    watermark = store.journal.mark(work.MACHINE, work.SPOOL_ID).seq
+    watermark = store.journal.watermark(work.MACHINE, work.SPOOL_ID).seq
     rows = empty(1)
     rows["stamp_ns"] = 1
     payload = encode_batch(SampleBatch(work.MACHINE, work.SPOOL_ID, watermark + 1, rows, work.SITE.frame, 0))

@@ -1,4 +1,4 @@
-"""`python -m tests.simulation`: many worlds, or one that is traced.
+"""`python -m tests.delivery_simulation`: many worlds, or one that is traced.
 
 --seeds N [--first F] [--real] [--json]: run so many, print each that fails with the command that replays it, and the
 sums. --seed N --trace: run one and tell what happens. Exit code 1 if anything is lost, double or stuck.
@@ -17,7 +17,7 @@ from tests.delivery_simulation.campaign import run_one, run_seeds
 
 def main() -> int:
     """Run."""
-    parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.delivery_simulation", description=__doc__)
     parser.add_argument("--seeds", type=int, default=1000, help="how many")
     parser.add_argument("--first", type=int, default=0, help="the first one")
     parser.add_argument("--seed", type=int, help="only this one")

@@ -46,7 +46,7 @@ def run_seeds(
         if not verdict.is_good:
             failed.append(seed)
             problem = "; ".join(verdict.problems)
-            replay = f"python -m tests.simulation --seed {seed} --trace{' --real' if real else ''}"
+            replay = f"python -m tests.delivery_simulation --seed {seed} --trace{' --real' if real else ''}"
             say(f"seed {seed}: lost {verdict.lost}, double {verdict.double} {problem}  replay: {replay}")
             if stop_at_failure:
                 break

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mapserver.config import ServerConfig
-from mapserver.ingest.admission import Admission, GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, parse
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
+from mapserver.journal.rows import Admission
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import Ack, Refused
@@ -168,7 +169,7 @@ class RealServer:
 
     def marks(self) -> dict[Run, tuple[int, int]]:
         """Watermark and lost, by run."""
-        return {run: (mark.seq, mark.lost) for run, mark in self._journal.marks().items()}
+        return {run: (mark.seq, mark.lost) for run, mark in self._journal.watermarks().items()}
 
     def close(self) -> None:
         """End the server."""

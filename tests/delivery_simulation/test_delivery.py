@@ -45,7 +45,7 @@ def test_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
     told: list[str] = []
     sums = run_seeds(0, 200, say=told.append, stop_at_failure=True)
     assert sums["failed"] == 1
-    assert f"replay: python -m tests.simulation --seed {sums['failed_seeds'][0]} --trace" in told[0]
+    assert f"replay: python -m tests.delivery_simulation --seed {sums['failed_seeds'][0]} --trace" in told[0]
 
 
 def test_same_seed_is_the_same_world() -> None:
@@ -57,7 +57,7 @@ def test_same_seed_is_the_same_world() -> None:
 
 
 def test_command_prints_one_object_last() -> None:
-    command = [sys.executable, "-m", "tests.simulation", "--seeds", "3", "--json"]
+    command = [sys.executable, "-m", "tests.delivery_simulation", "--seeds", "3", "--json"]
     found = subprocess.run(command, capture_output=True, text=True, check=True)
     table = json.loads(found.stdout.splitlines()[-1])
     assert (table["seeds"], table["lost"], table["double"], table["failed"]) == (3, 0, 0, 0)

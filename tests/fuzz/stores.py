@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver.ingest.admission import Admission
-from mapserver.journal.archive import FOLDER, ArchiveFile, next_file
-from mapserver.journal.journal import Journal, JournalReader
-from mapserver.journal.rows import JournalRow
+from mapserver.journal.archive import FOLDER, next_file
+from mapserver.journal.archive_file import ArchiveFile
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Admission, JournalRow
 from protocol.errors import StoreError
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch

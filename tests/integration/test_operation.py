@@ -21,9 +21,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.journal.archive import HOUR_NS, archive
+from mapserver.journal.archive import archive
+from mapserver.journal.archive_writer import HOUR_NS
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig, load_site
 from protocol.wire import keys
@@ -99,7 +100,7 @@ class Sender:
 
 def committed(store: Path) -> dict[str, int]:
     with JournalReader(store / JOURNAL_FILE) as journal:
-        return {machine: mark.seq for (machine, _), mark in journal.marks().items()}
+        return {machine: mark.seq for (machine, _), mark in journal.watermarks().items()}
 
 
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
@@ -148,13 +149,15 @@ def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committe
 
 
 def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: SiteRun, children: Children):
-    store, options = site.folder / "store", site.folder / "server.toml"
-    old_rows(store, load_site(site.site_file))
+    store, old = site.folder / "store", load_site(site.site_file)
+    old_rows(store, old)
     for cache in store.glob("snapshot-*"):
         cache.unlink()
-    options.write_text('[fold]\nkernel = "numpy"\nstd_floor_m = 2.9\n')  # slow: many cells for each sample
+    text = site.site_file.read_text()
+    site.site_file.write_text(text.replace(f"cell_m = {old.cell_m}", "cell_m = 0.05"))  # slow: many for each sample
+    assert load_site(site.site_file).cell_m == 0.05
     site.start_router()
-    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store, "--config", options)
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store)
     server = children.start("server", "server", *words)
     wait_until(lambda: (store / "journal.db-wal").exists(), READY_S, "the store is opened")
     end(server)
@@ -400,5 +403,5 @@ def test_a_backup_as_the_operators_page_has_it_is_a_whole_store(tmp_path: Path, 
         assert restored.grid.folded == folded == 50_010
         with JournalReader(backup / JOURNAL_FILE) as reader:
             assert list(archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.journal.forget))
-            rows = [row.row for row in history_rows(History.of(reader))]
+            rows = [row.row for row in history_rows(History.beside(reader))]
     assert rows == list(range(1, 52))

@@ -13,7 +13,8 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import FOLDER, archive
-from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow, checksum, pack
 from mapserver.trust.decisions import KIND, PERSON, TrustDecision
 from protocol.arrays import Table
@@ -225,7 +226,7 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
         rows["stamp_ns"] += i * 5 * 3600 * 10**9
         aged.append(replace(row, rows=rows))
     whole, less = grid_of(aged).state(), grid_of(aged[1:]).state()
-    assert {at.rung for at in whole.pages} >= {0, 1}
+    assert {at.tier for at in whole.pages} >= {0, 1}
     assert grid_difference(whole, whole) == (0, 0)
     assert grid_difference(whole, less) == (pytest.approx(BATCH, abs=5), 0)
 

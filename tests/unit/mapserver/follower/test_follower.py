@@ -18,7 +18,7 @@ from mapserver.follower.follower import Follower
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Auditor
 from protocol.errors import QueryError, StoreError
 from protocol.site.ground_classes import ZONES

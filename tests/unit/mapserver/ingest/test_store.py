@@ -204,26 +204,27 @@ def test_an_adopted_grid_gets_what_came_since_without_those_excluded(store, row)
 
 # --- kill and replay -------------------------------------------------------------------------------------------------
 
-# Takes batches of 20 samples; in the fold of number `stuck`, half of it lies in the hot blocks, and nothing goes on.
+# Takes batches of 20 samples; in the fold of number `stuck`, half of it lies in the open blocks, and nothing goes on.
 TAKES = """
 import signal
 import sys
 from pathlib import Path
 import numpy as np
+from mapserver.evidence import grid
 from tests.unit.mapserver.data import incoming, open_store
 
 folder, stuck, saved = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 store = open_store(folder / "store")
-kernel = store.grid._kernel
+fold = grid.fold
 
-def half(rows, machine, cell_m, config, hot):
+def half(rows, *rest):
     if store.merged < stuck - 1:
-        return kernel(rows, machine, cell_m, config, hot)
-    kernel(rows[: len(rows) // 2], machine, cell_m, config, hot)
+        return fold(rows, *rest)
+    fold(rows[: len(rows) // 2], *rest)
     print("folding", flush=True)
     signal.pause()
 
-store.grid._kernel = half
+grid.fold = half
 for i, part in enumerate(np.split(np.load(folder / "rows.npy"), 10)):
     if i == saved:
         store.save_snapshot()

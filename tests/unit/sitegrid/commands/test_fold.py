@@ -14,9 +14,10 @@ import pytest
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.journal.archive import FOLDER, HOUR_NS, archive
+from mapserver.journal.archive import FOLDER, archive
+from mapserver.journal.archive_writer import HOUR_NS
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow
 from protocol.arrays import Table
 from protocol.config import from_table, load_toml
@@ -94,7 +95,7 @@ def opened(folder: Path) -> Store:
 
 def rows_of(folder: Path) -> list[JournalRow]:
     with JournalReader(folder / JOURNAL_FILE) as reader:
-        return list(history_rows(History.of(reader)))
+        return list(history_rows(History.beside(reader)))
 
 
 def identities(folder: Path) -> list[tuple[object, ...]]:
@@ -134,7 +135,7 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert same(again.grid, folded())
     assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
     with JournalReader(store / JOURNAL_FILE) as reader:
-        assert again.journal.marks() == reader.marks()
+        assert again.journal.watermarks() == reader.watermarks()
     assert (again.site, again.newest_ns) == (SITE, T0 + 1190 * S)
     again.close()
 
@@ -175,11 +176,11 @@ def test_machines_are_left_out_and_their_progress_is_kept(
 ):
     assert run(store, "--out", tmp_path / "new", "--without", "a", "--without", "c", "--json") == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["left_out"] == {"machine": 240, "time": 0, "twice": 0}
+    assert summary["excluded"] == {"machine": 240, "time": 0, "twice": 0}
     assert summary["machines"] == {"b": 120}
     again = opened(tmp_path / "new")
     assert same(again.grid, folded("b"))
-    marks = {name: (mark.seq, mark.lost) for (name, _), mark in again.journal.marks().items()}
+    marks = {name: (mark.seq, mark.lost) for (name, _), mark in again.journal.watermarks().items()}
     assert marks == {"a": (120, 120), "b": (120, 0), "c": (120, 120)}
     assert again.info()["machines"]["a"]["samples"] == 0
     again.close()
@@ -189,12 +190,12 @@ def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsy
     span = ("--from", "2026-01-01T00:01:40", "--until", "2026-01-01T01:05+01:00")  # samples 10 to 29
     assert run(store, "--out", tmp_path / "new", *span, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
-    assert (summary["samples"], summary["left_out"]["time"]) == (60, 300)
+    assert (summary["samples"], summary["excluded"]["time"]) == (60, 300)
     rows = rows_of(tmp_path / "new")
     assert {(r.machine, r.first_seq, len(r.rows)) for r in rows} == {(n, f, 10) for n in "abc" for f in (11, 21)}
     again = opened(tmp_path / "new")
     assert same(again.grid, folded(keep=slice(10, 30)))
-    assert {(mark.seq, mark.lost) for mark in again.journal.marks().values()} == {(120, 100)}
+    assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(120, 100)}
     again.close()
 
 
@@ -223,7 +224,7 @@ def test_files_folders_and_stores_are_folded(store: Path, tmp_path: Path):
     assert identities(tmp_path / "file") == identities(store)[3:6]
     again = opened(tmp_path / "folder")  # the files say which site they are of
     assert again.site == SITE
-    assert {(mark.seq, mark.lost) for mark in again.journal.marks().values()} == {(40, 0)}
+    assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(40, 0)}
     again.close()
 
 
@@ -233,11 +234,11 @@ def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, cap
     file = min((store / FOLDER).glob("*.parquet"))
     assert run(store, other, file, file, "--out", tmp_path / "new", "--json") == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["left_out"] == {"machine": 0, "time": 0, "twice": 240 + 120}
+    assert summary["excluded"] == {"machine": 0, "time": 0, "twice": 240 + 120}
     assert (summary["samples"], summary["archives"]) == (360, 4)
     again = opened(tmp_path / "new")
     assert same(again.grid, folded())
-    assert {(mark.seq, mark.lost) for mark in again.journal.marks().values()} == {(120, 0)}
+    assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(120, 0)}
     again.close()
 
 
@@ -363,12 +364,12 @@ def test_times_are_utc_where_no_zone_is_given():
 
 def test_people_read_what_became_of_the_samples(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run(store, "--out", tmp_path / "new", "--without", "b") == 0
-    said = capsys.readouterr()
-    assert "240 samples in 12 journal rows" in said.out
-    assert "  a: 120 samples" in said.out
-    assert "left out: 120 of machines, 0 by time, 0 that came twice" in said.out
-    assert f"sitegrid server --store {tmp_path}/new --site-file {tmp_path}/new/site.toml" in said.out
-    assert said.err == ""
+    printed = capsys.readouterr()
+    assert "240 samples in 12 journal rows" in printed.out
+    assert "  a: 120 samples" in printed.out
+    assert "excluded: 120 of machines, 0 by time, 0 duplicates" in printed.out
+    assert f"sitegrid server --store {tmp_path}/new --site-file {tmp_path}/new/site.toml" in printed.out
+    assert printed.err == ""
 
 
 @pytest.mark.parametrize(
