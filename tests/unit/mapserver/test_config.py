@@ -38,6 +38,7 @@ def test_the_file_names_every_option_with_its_default_and_a_comment():
         ("[fold]\nbucket_s = 1", "bucket_s: 1"),
         ("[fold]\nbucket_s = 7200", "bucket_s: 7200"),
         ("[fold]\nbucket_s = 700", "bucket_s: 700"),
+        ("[fold]\nkeep_buckets = 0", "keep_buckets: 0"),
         ("[change]\nsize_m = 0.0", "size_m"),
         ("[change]\nsize_m = nan", "size_m"),
         ("[read]\nmin_weight_m = -1", "min_weight_m"),
