@@ -121,7 +121,7 @@ def fold_of(sent: dict[str, list[Any]], config: ServerConfig, without: str = "")
 
 
 def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
-    sent = fleet({})
+    sent = fleet({}, size=16)
     with opened() as site:
         deliver(site, sent)
         row = site.follower.trust("b", False, "its scale is broken", 20.0)
@@ -133,7 +133,7 @@ def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
 
 
 def test_rows_of_an_excluded_machine_are_kept_and_stay_out(opened):
-    sent = fleet({})
+    sent = fleet({}, size=16)
     with opened() as site:
         for name in sent:
             send(site.writer, [incoming(sent[name][0], 1, name)])
@@ -148,7 +148,7 @@ def test_rows_of_an_excluded_machine_are_kept_and_stay_out(opened):
 
 @pytest.mark.parametrize("snapshot", [True, False])
 def test_a_decision_outlives_the_server(opened, tmp_path, snapshot):
-    sent = fleet({})
+    sent = fleet({}, size=16)
     with opened() as site:
         deliver(site, sent)
         site.follower.trust("b", False, "why", 20.0)
