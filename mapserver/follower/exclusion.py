@@ -33,13 +33,14 @@ class Exclusion:
         self._writer, self._reader, self._history = writer, reader, History.beside(reader)
         self._cell_m, self._fold, self._ending = cell_m, fold, ending
         self._decisions = TrustDecisions(reader.events(KIND))
-        self._pending: list[TrustDecision] = []
+        self._requested: list[TrustDecision] = []
+        self._unfolded: list[TrustDecision] = []  # kept with the journal, but not in the map yet
         self._changed = threading.Condition()
 
     @property
-    def pending(self) -> bool:
-        """Whether a decision waits for the map to be folded."""
-        return bool(self._pending)
+    def requested(self) -> bool:
+        """Whether a decision waits for the next run."""
+        return bool(self._requested)
 
     def excluded(self) -> frozenset[str]:
         """Machines whose rows are not in the map."""
@@ -53,30 +54,28 @@ class Exclusion:
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
         """Have decided what the audit may decide."""
         with self._changed:
-            self._pending += self._decisions.judge(verdicts, stamp_ns)
+            self._requested += self._decisions.judge(verdicts, stamp_ns)
 
     def request(self, decision: TrustDecision) -> None:
         """Have a decision made."""
         with self._changed:
-            self._pending.append(decision)
+            self._requested.append(decision)
 
     def wait(self, decision: TrustDecision, wait_s: float) -> bool:
         """Whether a decision counts in the map, after waiting for it."""
         with self._changed:
-            return self._changed.wait_for(lambda: decision not in self._pending, wait_s)
+            return self._changed.wait_for(lambda: decision not in self._requested + self._unfolded, wait_s)
 
     def run(self) -> None:
         """Keep what was decided, fold the map again where that changes who is excluded, tell who waits."""
-        with self._changed:
-            decided = list(self._pending)
-        if not decided:
-            return
-        for decision in decided:
+        for decision in list(self._requested):
             self._keep(decision)
+        if not self._unfolded:
+            return
         if self._decisions.distrusted != self.excluded():
             self._fold_again(self._decisions.distrusted)
         with self._changed:
-            self._pending = [decision for decision in self._pending if decision not in decided]
+            self._unfolded.clear()
             self._changed.notify_all()
 
     def _keep(self, decision: TrustDecision) -> None:
@@ -85,6 +84,8 @@ class Exclusion:
         log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
         with self._changed:
             self._decisions.add(decision)
+            self._requested.remove(decision)
+            self._unfolded.append(decision)
 
     def _fold_again(self, excluded: frozenset[str]) -> None:
         until = self._reader.last_row

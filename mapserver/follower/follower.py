@@ -113,7 +113,7 @@ class Follower:
         return TrustDecision(machine, trusted, PERSON, reason, stamp_ns)
 
     def _interrupted(self) -> bool:
-        return self._ending.is_set() or self._exclusion.pending
+        return self._ending.is_set() or self._exclusion.requested
 
     def _run(self) -> None:
         while not self._ending.is_set():
