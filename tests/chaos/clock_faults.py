@@ -35,8 +35,8 @@ def clocks(scenario: Scenario) -> Outcome:
         site.start_all()
         while left_s > 0:
             steps_s, pause_s, lasts_s = rng.choice(STEPS_S), rng.uniform(0.5, 1.5), rng.uniform(1.0, 4.0)
-            told = ", ".join(f"{name} {step_s:+d} s" for name, step_s in steps_s.items())
-            scenario.say(f"clock of {told} for {lasts_s:.1f} s")
+            steps = ", ".join(f"{name} {step_s:+d} s" for name, step_s in steps_s.items())
+            scenario.say(f"clock of {steps} for {lasts_s:.1f} s")
             site.linger(pause_s)
             with site.fault():
                 for name, step_s in steps_s.items():

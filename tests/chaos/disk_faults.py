@@ -27,20 +27,20 @@ def disks(scenario: Scenario) -> Outcome:
         if not (library := build(site.folder)):
             return Outcome(scenario.fault, skipped="no C compiler for the shim")
         top = site.folder
-        found = {name: FailingDisk(library, top / name, top / f"{name}.bin") for name in ("store", "spool")}
-        site.env = {SERVER: found["store"].env, **dict.fromkeys(site.machines, found["spool"].env)}
+        disks_by_name = {name: FailingDisk(library, top / name, top / f"{name}.bin") for name in ("store", "spool")}
+        site.env = {SERVER: disks_by_name["store"].env, **dict.fromkeys(site.machines, disks_by_name["spool"].env)}
         site.start_all()
         site.excuses = EXCUSES
         while left_s > 0:
-            name, error, is_killed = rng.choice(tuple(found)), rng.choice(tuple(DiskError)), rng.random() < 0.3
+            name, error, is_killed = rng.choice(tuple(disks_by_name)), rng.choice(tuple(DiskError)), rng.random() < 0.3
             pause_s, lasts_s = rng.uniform(0.5, 1.5), rng.uniform(0.5, 4.0)
             victim = SERVER if name == "store" else rng.choice(site.machines)
             scenario.say(f"{name} {error.name.lower()} for {lasts_s:.1f} s{f', {victim} killed' if is_killed else ''}")
             site.linger(pause_s)
             with site.fault(), ExitStack() as broken:
-                broken.enter_context(found[name].failing(error))
+                broken.enter_context(disks_by_name[name].failing(error))
                 site.linger(lasts_s)
-                count += found[name].failed
+                count += disks_by_name[name].failed
                 if is_killed:
                     site.send(victim, signal.SIGKILL)
             if is_killed:

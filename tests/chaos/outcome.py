@@ -50,8 +50,8 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Told:
-    """How a scenario speaks, and how it is told to end."""
+class Console:
+    """Where scenarios print, and the signal that ends them."""
 
     line: Any = print
     stop: threading.Event = field(default_factory=threading.Event)
@@ -79,13 +79,13 @@ def longest_pause(commits: Sequence[float], faults: Iterable[Span], end_s: float
 
 
 def _united(spans: Iterable[Span]) -> list[Span]:
-    found: list[Span] = []
+    united: list[Span] = []
     for begin, end in sorted(spans):
-        if found and begin <= found[-1][1]:
-            found[-1] = (found[-1][0], max(end, found[-1][1]))
+        if united and begin <= united[-1][1]:
+            united[-1] = (united[-1][0], max(end, united[-1][1]))
         else:
-            found.append((begin, end))
-    return found
+            united.append((begin, end))
+    return united
 
 
 def _covered(gap: Span, spans: Iterable[Span]) -> float:

@@ -34,7 +34,7 @@ Identity = tuple[int, int]  # spool_id, seq
 
 
 @dataclass(frozen=True)
-class Found:
+class Remains:
     """What is there after a cut. contents: of each identity, as often as it is found."""
 
     contents: dict[Identity, list[str]]
@@ -50,7 +50,7 @@ def power(scenario: Scenario) -> Outcome:
     for what in ("spool", "store"):
         operations = trace(library, scenario.folder / what, what, scenario.seed)
         cuts = (scenario.strikes or round(CUTS * scenario.scale)) // 2
-        add(total, cut(operations, what, cuts, scenario.rng, scenario.told.wait))
+        add(total, cut(operations, what, cuts, scenario.rng, scenario.console.wait))
     return total
 
 
@@ -92,16 +92,16 @@ def cut(
     return outcome
 
 
-def judge(outcome: Outcome, promises: str, found: Found) -> None:
+def judge(outcome: Outcome, promises: str, left: Remains) -> None:
     """Compare what is there with what was promised, and add to the counts."""
     promised = _promised(promises)
     outcome.recorded += len(promised)
-    kept = sum(content in found.contents.get(identity, ()) for identity, content in promised.items())
+    kept = sum(content in left.contents.get(identity, ()) for identity, content in promised.items())
     outcome.merged += kept
     outcome.lost += len(promised) - kept
-    outcome.double += sum(len(contents) - 1 for contents in found.contents.values())
-    if found.problem and len(outcome.problems) < 5:
-        outcome.problems.append(found.problem)
+    outcome.double += sum(len(contents) - 1 for contents in left.contents.values())
+    if left.problem and len(outcome.problems) < 5:
+        outcome.problems.append(left.problem)
 
 
 def _promised(promises: str) -> dict[Identity, str]:
@@ -114,30 +114,30 @@ def _promised(promises: str) -> dict[Identity, str]:
     return promised
 
 
-def _look_at_spool(folder: Path) -> Found:
+def _look_at_spool(folder: Path) -> Remains:
     """Open what is left, and take everything out of it."""
     contents: dict[Identity, list[str]] = {}
     try:
         spool = Spool(folder / work.SPOOL_FILE, SpoolConfig())
     except StoreError as error:
-        return Found({}, f"spool does not open: {error}")
+        return Remains({}, f"spool does not open: {error}")
     while head := spool.head(1000):
         for i, row in enumerate(head.rows):
             contents.setdefault((head.spool_id, head.first_seq + i), []).append(content_hash(row))
         spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
     is_settled = spool.is_settled()
     spool.close()
-    return Found(contents, "" if is_settled else "spool does not settle")
+    return Remains(contents, "" if is_settled else "spool does not settle")
 
 
-def _look_at_store(folder: Path) -> Found:
+def _look_at_store(folder: Path) -> Remains:
     """Open what is left, read it, fold it anew, and send one more batch."""
     contents: dict[Identity, list[str]] = {}
     config = ServerConfig()
     try:
         store = Store(folder / work.STORE_FOLDER, work.SITE, config, lambda: 10**18)
     except StoreError as error:
-        return Found({}, f"store does not open: {error}")
+        return Remains({}, f"store does not open: {error}")
     refolded = Grid(work.SITE.cell_m, config.fold)
     for row in history_rows(History.beside(store._journal)):
         refolded.fold(row.rows, row.machine)
@@ -151,7 +151,7 @@ def _look_at_store(folder: Path) -> Found:
     if not isinstance(store.take([Incoming(work.MACHINE, payload)])[0], Ack):
         problem = "store takes nothing more"
     store.close()
-    return Found(contents, problem)
+    return Remains(contents, problem)
 
 
 LOOK = {"spool": _look_at_spool, "store": _look_at_store}

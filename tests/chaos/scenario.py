@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.chaos.chaos_site import Site
-from tests.chaos.outcome import Told
+from tests.chaos.outcome import Console
 from tests.chaos.recordings import Recordings
 
 # Snapshots every few seconds, so that they are written under faults too; audits of trust would leave machines out.
@@ -32,7 +32,7 @@ class Scenario:
     fault: str
     folder: Path
     recordings: Recordings
-    told: Told
+    console: Console
     seed: int
     seconds: float
     scale: float = 1.0
@@ -45,8 +45,8 @@ class Scenario:
 
     def site(self, **options: Any) -> Site:
         """Return a site, not yet started."""
-        return Site(self.folder, self.recordings, self.told, server_toml=SERVER_TOML, **options)
+        return Site(self.folder, self.recordings, self.console, server_toml=SERVER_TOML, **options)
 
     def say(self, text: str) -> None:
         """Print a line."""
-        self.told.say(f"{self.fault}: {text}")
+        self.console.say(f"{self.fault}: {text}")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.chaos import bit_flips, clock_faults, disk_faults, link_faults, power_cuts, process_faults, write_faults
-from tests.chaos.outcome import InterruptError, Outcome, Told
+from tests.chaos.outcome import Console, InterruptError, Outcome
 from tests.chaos.recordings import make
 from tests.chaos.scenario import Scenario
 
@@ -42,15 +42,13 @@ FAULTS = (
 )
 
 
-def run_suite(faults: Iterable[Fault], folder: Path, told: Told, seed: int, seconds: float) -> list[Outcome]:
-    """Run faults, a few at a time; InterruptError if the suite was told to end."""
+def run_suite(faults: Iterable[Fault], folder: Path, console: Console, seed: int, seconds: float) -> list[Outcome]:
+    """Run faults, a few at a time; InterruptError if the suite was stopped."""
     logging.disable()  # what the parts under test log of their misfortunes
-    recordings = make(folder / "recordings", MACHINES, seed, stop=told.stop)
+    recordings = make(folder / "recordings", MACHINES, seed, stop=console.stop)
+    scale = seconds / WHOLE_S
     scenarios = [
-        (
-            fault,
-            Scenario(fault.name, folder / fault.name, recordings, told, seed, seconds * fault.share, seconds / WHOLE_S),
-        )
+        (fault, Scenario(fault.name, folder / fault.name, recordings, console, seed, seconds * fault.share, scale))
         for fault in faults
     ]
     with ThreadPoolExecutor(LANES) as lanes:
@@ -58,14 +56,14 @@ def run_suite(faults: Iterable[Fault], folder: Path, told: Told, seed: int, seco
         while wait(runs, timeout=0.5).not_done:  # with a time-out, or a signal that another thread got is not heard
             pass
         outcomes = [run.result() for run in runs]
-    if told.stop.is_set():
+    if console.stop.is_set():
         raise InterruptError
     return outcomes
 
 
 def _run(fault: Fault, scenario: Scenario) -> Outcome:
     """Run one; what goes wrong in it is a result, and the others go on."""
-    if scenario.told.stop.is_set():
+    if scenario.console.stop.is_set():
         return Outcome(fault.name)
     try:
         outcome = fault.run(scenario)

@@ -37,7 +37,7 @@ def writes(scenario: Scenario) -> Outcome:
         total.pids.append(child.pid)
         try:
             while child.poll() is None:
-                scenario.told.wait(0.1)
+                scenario.console.wait(0.1)
             text = child.communicate()[0]
         finally:
             child.kill()

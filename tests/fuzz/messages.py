@@ -82,30 +82,30 @@ def _header(short: int, long: bytes, n: int) -> bytes:
 
 def _tree(value: Any) -> Any:
     if isinstance(value, dict):
-        return Map([key, _tree(of)] for key, of in value.items())
-    return [_tree(of) for of in value] if isinstance(value, list) else value
+        return Map([key, _tree(inner)] for key, inner in value.items())
+    return [_tree(inner) for inner in value] if isinstance(value, list) else value
 
 
 def _places(node: Any) -> list[tuple[list[Any], int]]:
     """Every value of a tree, as the list that holds it and the place there."""
-    found: list[tuple[list[Any], int]] = []
+    places: list[tuple[list[Any], int]] = []
     if isinstance(node, list) and not isinstance(node, Map):
-        found += [(node, i) for i in range(len(node))]
+        places += [(node, i) for i in range(len(node))]
     for pair in node if isinstance(node, Map) else ():
-        found.append((pair, 1))
-    below = (holder[i] for holder, i in list(found))
-    return found + [place for part in below if isinstance(part, list) for place in _places(part)]
+        places.append((pair, 1))
+    below = (holder[i] for holder, i in list(places))
+    return places + [place for part in below if isinstance(part, list) for place in _places(part)]
 
 
 def _maps(node: Any) -> list[Map]:
     parts = node if isinstance(node, list) else []
-    below = [found for part in parts for found in _maps(part)]
+    below = [inner for part in parts for inner in _maps(part)]
     return [node, *below] if isinstance(node, Map) else below
 
 
 def _edit(draw: DrawFn, root: list[Any]) -> None:
     """Change one thing of a tree, in place."""
-    maps = [found for found in _maps(root) if found]
+    maps = [each for each in _maps(root) if each]
     if maps and draw(st.booleans()):
         _edit_map(draw, draw(st.sampled_from(maps)))
         return

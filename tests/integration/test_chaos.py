@@ -21,7 +21,7 @@ from tests.chaos import __main__ as command
 from tests.chaos import bit_flips, power_cuts, process_faults, stepped_clock, write_faults
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
-from tests.chaos.outcome import Outcome, Told, longest_pause, table
+from tests.chaos.outcome import Console, Outcome, longest_pause, table
 from tests.chaos.recordings import make
 from tests.chaos.scenario import Scenario
 from tests.chaos.suite import FAULTS, Fault, run_suite, totals
@@ -37,7 +37,7 @@ def library(tmp_path: Path) -> Path:
 
 def scenario(folder: Path, **options) -> Scenario:
     values = {"fault": "short", "recordings": None, "seconds": 4.0, "scale": 0.02} | options
-    return Scenario(folder=folder, told=Told(line=lambda *_, **__: None), seed=3, **values)
+    return Scenario(folder=folder, console=Console(line=lambda *_, **__: None), seed=3, **values)
 
 
 @pytest.mark.processes

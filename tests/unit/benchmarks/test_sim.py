@@ -15,6 +15,7 @@ def test_goals_stand_beside_their_fleets() -> None:
     assert goals == slow | {("fast", 100): 40.0, ("fast", 1000): 12.0}
 
 
+@pytest.mark.slow
 def test_sim_prints_one_json_object_with_a_row_for_every_fleet(monkeypatch, capsys) -> None:
     monkeypatch.setattr(sim, "CASES", SMALL)
     assert main(["sim", "--json", "--seconds", "0.5", "--runs", "2"]) == 0

@@ -171,7 +171,7 @@ def test_options_are_taken_and_written_beside_the_store(store: Path, tmp_path: P
     assert (tmp_path / "newer" / "server.toml").read_text() == text
 
 
-def test_machines_are_left_out_and_their_progress_is_kept(
+def test_machines_are_excluded_and_their_progress_is_kept(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert run(store, "--out", tmp_path / "new", "--without", "a", "--without", "c", "--json") == 0
@@ -207,8 +207,8 @@ def test_samples_out_of_time_in_the_middle_of_a_batch_cut_it_in_two(tmp_path: Pa
     store.take([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
     store.close()
     assert run(folder, "--out", tmp_path / "new", "--until", "2026-01-01T00:00:10") == 0
-    found = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
-    assert found == [(1, 2), (4, 2)]
+    pieces = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
+    assert pieces == [(1, 2), (4, 2)]
 
 
 # --- several archives ------------------------------------------------------------------------------------------------
@@ -248,9 +248,9 @@ def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tm
     orders = [(store, one, two), (two, store, one), (one, two / FOLDER, two, store)]
     for i, order in enumerate(orders):
         assert run(*order, "--out", tmp_path / f"new{i}") == 0
-    found = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
-    assert found[0] == found[1] == found[2]
-    received = [row[3] for row in found[0]]
+    made = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
+    assert made[0] == made[1] == made[2]
+    received = [row[3] for row in made[0]]
     assert received == sorted(received)
 
 
