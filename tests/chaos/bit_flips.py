@@ -22,14 +22,14 @@ from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
 from protocol.site.site_config import load_site
-from tests.chaos.chaos_site import ROUTER, SERVER, Site
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.chaos_site import ROUTER, SERVER, ChaosSite
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 STUCK_S = 2.0  # reading a spool of the suite takes milliseconds
 
 
-class Verdict(StrEnum):
+class FlipVerdict(StrEnum):
     """What became of a bit."""
 
     DETECTED = "detected"
@@ -42,7 +42,7 @@ FLIPS = 400  # of each file, in the whole suite
 Content = dict[Any, Any]
 
 
-def flips(scenario: Scenario) -> Outcome:
+def flips(scenario: FaultRun) -> FaultOutcome:
     """Stop a site, flip bits in copies of its files; then damage the files themselves, and restore them."""
     with scenario.site() as site:
         site.start_all()
@@ -54,12 +54,12 @@ def flips(scenario: Scenario) -> Outcome:
         for path, look in _files(site):
             counts = _flip_all(path, look, scenario.rng, n, site.folder / "flipped")
             scenario.say(f"{path.name} " + ", ".join(f"{what} {k}" for what, k in sorted(counts.items())))
-            if served := counts[Verdict.SERVED]:
+            if served := counts[FlipVerdict.SERVED]:
                 site.problem(f"{served} of {n} flips in {path.name} are served as data")
-            if unnamed := counts[Verdict.UNNAMED]:
-                kinds = ", ".join(sorted(set(counts) - set(Verdict)))
+            if unnamed := counts[FlipVerdict.UNNAMED]:
+                kinds = ", ".join(sorted(set(counts) - set(FlipVerdict)))
                 site.problem(f"{unnamed} of {n} flips in {path.name} end in {kinds}, which does not name the file")
-            for verdict in Verdict:
+            for verdict in FlipVerdict:
                 verdicts[verdict] += counts[verdict]
         _damage_and_restore(site)
         site.start_all()
@@ -69,7 +69,7 @@ def flips(scenario: Scenario) -> Outcome:
         return outcome
 
 
-def _files(site: Site) -> list[tuple[Path, Callable[[Path], Content]]]:
+def _files(site: ChaosSite) -> list[tuple[Path, Callable[[Path], Content]]]:
     """Files, and how to read what they say."""
     store = site.folder / "store"
     definition = load_site(site.folder / "site.toml")
@@ -144,19 +144,19 @@ def _flip_all(path: Path, look: Callable[[Path], Content], rng: random.Random, n
     return verdicts
 
 
-def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[Verdict, str]:
+def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[FlipVerdict, str]:
     """Return what became of a damaged file, and the kind of an error that is not what a person should see."""
     try:
         content = look(path)
     except StoreError as error:
-        return (Verdict.DETECTED, "") if str(path) in str(error) else (Verdict.UNNAMED, str(error))
+        return (FlipVerdict.DETECTED, "") if str(path) in str(error) else (FlipVerdict.UNNAMED, str(error))
     except Exception as error:  # whatever damage can raise
-        return Verdict.UNNAMED, type(error).__name__
+        return FlipVerdict.UNNAMED, type(error).__name__
     if content == truth:
-        return Verdict.HARMLESS, ""
+        return FlipVerdict.HARMLESS, ""
     if content.get("named", 0) > truth.get("named", 0) and content["contents"].items() <= truth["contents"].items():
-        return Verdict.DETECTED, ""  # the damaged samples are named or declared lost, the others sent
-    return Verdict.SERVED, ""
+        return FlipVerdict.DETECTED, ""  # the damaged samples are named or declared lost, the others sent
+    return FlipVerdict.SERVED, ""
 
 
 def _near_identities(content: bytes, truth: Content) -> list[int]:
@@ -181,7 +181,7 @@ def _copy(path: Path, folder: Path) -> Path:
     return folder / path.name
 
 
-def _damage_and_restore(site: Site) -> None:
+def _damage_and_restore(site: ChaosSite) -> None:
     """With files that are damaged for sure, server and agent must not start, and say which file it is."""
     machine = site.machines[0]
     site.start(ROUTER)

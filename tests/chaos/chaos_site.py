@@ -21,7 +21,7 @@ from protocol.machine.machine_config import plain_lines
 from protocol.site.site_config import load_site
 from protocol.wire.session import free_endpoint
 from tests.chaos.leashed import Process
-from tests.chaos.outcome import Console, Outcome, Span, longest_pause
+from tests.chaos.outcome import Console, FaultOutcome, TimeSpan, longest_pause
 from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings
 
 READY_S = 40.0
@@ -36,7 +36,7 @@ class StartError(Exception):
     """The site did not come to life, before any fault."""
 
 
-class Site:
+class ChaosSite:
     """Router, map server and agents. Leaving the block ends them all.
 
     clock: the site's clock. server_toml: options of the map server. first_ns: when the first drives begin.
@@ -62,8 +62,8 @@ class Site:
         self.options: dict[str, tuple[str, ...]] = {}
         self.modules: dict[str, tuple[str, ...]] = {}
         self.excuses: tuple[str, ...] = ()  # last words with which a process may end, to be started again
-        self.outcome = Outcome("")
-        self.faults: list[Span] = []
+        self.outcome = FaultOutcome("")
+        self.faults: list[TimeSpan] = []
         self._recordings, self._first_ns = recordings, first_ns
         self._running: dict[str, Process] = {}
         self._starts = 0
@@ -71,7 +71,7 @@ class Site:
         (folder / "site.toml").write_text("\n".join(plain_lines(site)) + "\n", encoding="utf-8")
         (folder / "server.toml").write_text(server_toml, encoding="utf-8")
 
-    def __enter__(self) -> Site:
+    def __enter__(self) -> ChaosSite:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -165,7 +165,7 @@ class Site:
 
     # --- the end -----------------------------------------------------------------------------------------------------
 
-    def finish(self, fault: str, count: int) -> Outcome:
+    def finish(self, fault: str, count: int) -> FaultOutcome:
         """Wait until every machine is served again, have everything delivered, end it, and count."""
         self.outcome.fault, self.outcome.count = fault, count
         ended_s = time.time()

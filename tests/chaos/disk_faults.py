@@ -7,8 +7,8 @@ from contextlib import ExitStack
 
 from tests.chaos.chaos_site import SERVER
 from tests.chaos.disk_shim import DiskError, FailingDisk, build
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 # What SQLite and the system say; a process that starts on such a disk has to end, and is started again.
 EXCUSES = (
@@ -20,12 +20,12 @@ EXCUSES = (
 )
 
 
-def disks(scenario: Scenario) -> Outcome:
+def disks(scenario: FaultRun) -> FaultOutcome:
     """Every write of the store, or of all spools, fails for some seconds; sometimes the process is killed in it."""
     rng, left_s, count = scenario.rng, scenario.seconds, 0
     with scenario.site() as site:
         if not (library := build(site.folder)):
-            return Outcome(scenario.fault, skipped="no C compiler for the shim")
+            return FaultOutcome(scenario.fault, skipped="no C compiler for the shim")
         top = site.folder
         disks_by_name = {name: FailingDisk(library, top / name, top / f"{name}.bin") for name in ("store", "spool")}
         site.env = {SERVER: disks_by_name["store"].env, **dict.fromkeys(site.machines, disks_by_name["spool"].env)}

@@ -24,29 +24,29 @@ from protocol.wire.messages import Ack, SampleBatch
 from tests.chaos import power_worker as work
 from tests.chaos.disk_model import Disk, Kind, Operation, read_trace
 from tests.chaos.disk_shim import FailingDisk, build
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 CUTS = 2000  # of the whole suite, half of them of the spool
 STEPS = {"spool": 400, "store": 200}
 IN_MEMORY = Path("/dev/shm")
-Identity = tuple[int, int]  # spool_id, seq
+SampleNumber = tuple[int, int]  # spool_id, seq
 
 
 @dataclass(frozen=True)
 class Remains:
     """What is there after a cut. contents: of each identity, as often as it is found."""
 
-    contents: dict[Identity, list[str]]
+    contents: dict[SampleNumber, list[str]]
     problem: str = ""
 
 
-def power(scenario: Scenario) -> Outcome:
+def power(scenario: FaultRun) -> FaultOutcome:
     """Cut the power of a spool and of a store at random moments of their work, and open them again."""
-    total = Outcome(scenario.fault)
+    total = FaultOutcome(scenario.fault)
     scenario.folder.mkdir(parents=True)
     if not (library := build(scenario.folder)):
-        return Outcome(scenario.fault, skipped="no C compiler for the shim")
+        return FaultOutcome(scenario.fault, skipped="no C compiler for the shim")
     for what in ("spool", "store"):
         operations = trace(library, scenario.folder / what, what, scenario.seed)
         cuts = (scenario.strikes or round(CUTS * scenario.scale)) // 2
@@ -71,10 +71,10 @@ def cut(
     cuts: int,
     rng: random.Random,
     wait: Callable[[float], None] = lambda _: None,
-) -> Outcome:
+) -> FaultOutcome:
     """Cut at random points; every cut is judged against what was promised before it."""
     points = sorted(rng.choices(range(1, len(operations)), k=cuts))
-    outcome, disk, promises, done = Outcome("power", count=cuts), Disk(), "", 0
+    outcome, disk, promises, done = FaultOutcome("power", count=cuts), Disk(), "", 0
     for point in points:
         for operation in operations[done:point]:
             if operation.name == work.PROMISES:
@@ -92,7 +92,7 @@ def cut(
     return outcome
 
 
-def judge(outcome: Outcome, promises: str, left: Remains) -> None:
+def judge(outcome: FaultOutcome, promises: str, left: Remains) -> None:
     """Compare what is there with what was promised, and add to the counts."""
     promised = _promised(promises)
     outcome.recorded += len(promised)
@@ -104,8 +104,8 @@ def judge(outcome: Outcome, promises: str, left: Remains) -> None:
         outcome.problems.append(left.problem)
 
 
-def _promised(promises: str) -> dict[Identity, str]:
-    promised: dict[Identity, str] = {}
+def _promised(promises: str) -> dict[SampleNumber, str]:
+    promised: dict[SampleNumber, str] = {}
     for sign, spool_id, seq, *content in (line.split() for line in promises.splitlines()):
         if sign == "+":
             promised[int(spool_id, 16), int(seq)] = content[0]
@@ -116,7 +116,7 @@ def _promised(promises: str) -> dict[Identity, str]:
 
 def _look_at_spool(folder: Path) -> Remains:
     """Open what is left, and take everything out of it."""
-    contents: dict[Identity, list[str]] = {}
+    contents: dict[SampleNumber, list[str]] = {}
     try:
         spool = Spool(folder / work.SPOOL_FILE, SpoolConfig())
     except StoreError as error:
@@ -132,7 +132,7 @@ def _look_at_spool(folder: Path) -> Remains:
 
 def _look_at_store(folder: Path) -> Remains:
     """Open what is left, read it, fold it anew, and send one more batch."""
-    contents: dict[Identity, list[str]] = {}
+    contents: dict[SampleNumber, list[str]] = {}
     config = ServerConfig()
     try:
         store = Store(folder / work.STORE_FOLDER, work.SITE, config, lambda: 10**18)
@@ -157,7 +157,7 @@ def _look_at_store(folder: Path) -> Remains:
 LOOK = {"spool": _look_at_spool, "store": _look_at_store}
 
 
-def add(total: Outcome, part: Outcome) -> None:
+def add(total: FaultOutcome, part: FaultOutcome) -> None:
     for name in ("count", "recorded", "merged", "lost", "double"):
         setattr(total, name, getattr(total, name) + getattr(part, name))
     total.problems += part.problems

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.chaos.chaos_site import Site
+from tests.chaos.chaos_site import ChaosSite
 from tests.chaos.outcome import Console
 from tests.chaos.recordings import Recordings
 
@@ -22,7 +22,7 @@ distrusts = false
 
 
 @dataclass(frozen=True)
-class Scenario:
+class FaultRun:
     """One fault's run.
 
     folder: its own. seconds: how long faults strike. scale: how much of the whole suite, 0 to 1. strikes: how often to
@@ -43,9 +43,9 @@ class Scenario:
         """Random numbers of this fault alone: the same whatever else runs."""
         return random.Random(f"{self.seed} {self.fault}")
 
-    def site(self, **options: Any) -> Site:
+    def site(self, **options: Any) -> ChaosSite:
         """Return a site, not yet started."""
-        return Site(self.folder, self.recordings, self.console, server_toml=SERVER_TOML, **options)
+        return ChaosSite(self.folder, self.recordings, self.console, server_toml=SERVER_TOML, **options)
 
     def say(self, text: str) -> None:
         """Print a line."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.fuzz.campaign import CORPUS, Result, fuzz, replay
+from tests.fuzz.campaign import CORPUS, DecoderResult, fuzz, replay
 from tests.fuzz.decoders import decoders
 from tests.fuzz.mutations import files
 from tests.fuzz.verdict import Decoder, FaultError, judge, watched
@@ -70,7 +70,7 @@ def test_a_failing_input_is_made_shorter():
         if b"\xff" in data:
             raise KeyError
 
-    planted, result = Decoder("planted", (b"seed" * 20,), decode, (ValueError,), files), Result("planted")
+    planted, result = Decoder("planted", (b"seed" * 20,), decode, (ValueError,), files), DecoderResult("planted")
     fuzz(planted, result, 500, 1)
     ((_, data),) = result.faults.values()
     assert len(data) < 80

@@ -6,7 +6,7 @@ import pytest
 from benchmarks import sim
 from benchmarks.__main__ import main
 
-SMALL = (sim.Case("paper_site", "pybullet", 2, 20.0), sim.Case("busy_site", "fast", 3, 40.0))
+SMALL = (sim.FleetCase("paper_site", "pybullet", 2, 20.0), sim.FleetCase("busy_site", "fast", 3, 40.0))
 
 
 def test_goals_stand_beside_their_fleets() -> None:
