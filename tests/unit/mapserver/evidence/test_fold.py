@@ -189,12 +189,6 @@ def test_any_split_over_grids_put_together_is_the_grid_of_all(seed, cuts, keep, 
     assert same(merged(parts, **keeps), folded(rows, **keeps))
 
 
-@pytest.mark.parametrize("cut", [0, 1, 100, 300])
-def test_two_grids_added_are_the_grid_of_all(cut):
-    rows = random_samples(300, 2)
-    assert same(merged([folded(rows[:cut], **APART), folded(rows[cut:], **APART)]), folded(rows))
-
-
 def test_machines_mix_in_any_order():
     one, two = random_samples(100, 3), random_samples(100, 4)
     there, back = Grid(1.0, FoldConfig()), Grid(1.0, FoldConfig())

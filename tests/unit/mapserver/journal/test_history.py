@@ -17,7 +17,7 @@ from mapserver.journal.rows import Admission, JournalRow, Selection
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds, CellWindow
-from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, folded, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, folded, random_samples, same_evidence, samples
 
 pytest.importorskip("pyarrow.parquet")
 FOLD = FoldConfig()
@@ -31,17 +31,6 @@ def everything(names: str = "ab", keep: Selection | None = None) -> Grid:
         rows = np.concatenate(PARTS[name])
         grid.fold(rows if keep is None else samples_of(JournalRow(1, name, 7, 1, rows), keep), name)
     return grid
-
-
-def same(one: Grid, other: Grid) -> bool:
-    """Equal evidence, to the bit, in all blocks."""
-    if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
-        return False
-    column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
-    blocks = [grid.blocks_in(CellWindow(column, row, end_column - column, end_row - row)) for grid in (one, other)]
-    a, b = (grid.evidence(blocks[0]) for grid in (one, other))
-    arrays = ("counts", "bitmaps", "newest_ns")
-    return blocks[0] == blocks[1] and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in arrays)
 
 
 def add(journal: Journal, rows: Table, first_seq: int, machine: str = "a", received_ns: int = NOW_NS) -> None:
@@ -144,7 +133,7 @@ def test_a_missing_file_is_no_silent_gap(tmp_path):
 def test_a_grid_as_of_a_time_is_the_fold_of_what_was_stamped_until_then(store, after_s):
     to_ns = NOW_NS + after_s * S
     grid = grid_as_of(store, to_ns, 1.0, FOLD)
-    assert same(grid, everything(keep=Selection(to_ns=to_ns)))
+    assert same_evidence(grid, everything(keep=Selection(to_ns=to_ns)))
     assert (grid.folded > 0) == (after_s >= 0)
 
 
@@ -156,7 +145,7 @@ def test_the_stamp_itself_belongs_to_the_past(tmp_path):
 
 
 def test_a_grid_without_a_machine_is_that_of_the_others(store):
-    assert same(grid_as_of(store, NOW_NS + 10**13, 1.0, FOLD, without=frozenset("b")), everything("a"))
+    assert same_evidence(grid_as_of(store, NOW_NS + 10**13, 1.0, FOLD, without=frozenset("b")), everything("a"))
 
 
 @pytest.mark.parametrize("cell_m", [0.25, 1.0, 3.0])

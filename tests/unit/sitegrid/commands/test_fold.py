@@ -22,13 +22,13 @@ from mapserver.journal.rows import JournalRow
 from protocol.arrays import Table
 from protocol.config import from_table, load_toml
 from protocol.machine.samples import COLUMNS, empty
-from protocol.site.geometry import CellWindow
 from protocol.site.site_config import KnownGround, SiteConfig, load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main
 from sitegrid.commands import fold
 from sitegrid.commands.times import parse_stamp
+from tests.unit.mapserver.data import same_evidence
 
 pytest.importorskip("pyarrow.parquet")
 SITE = SiteConfig("pit", 48.0, 11.0)
@@ -111,16 +111,6 @@ def folded(
     return grid
 
 
-def same(one: Grid, other: Grid) -> bool:
-    """Equal evidence, to the bit, in all blocks."""
-    if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
-        return False
-    column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
-    blocks = one.blocks_in(CellWindow(column, row, end_column - column, end_row - row))
-    a, b = one.evidence(blocks), other.evidence(blocks)
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("counts", "bitmaps", "newest_ns"))
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three machines, two hours archived, four in the journal. Nothing writes to it."""
@@ -132,7 +122,7 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
     assert identities(tmp_path / "new") == identities(store)
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded())
+    assert same_evidence(again.grid, folded())
     assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
     with JournalReader(store / JOURNAL_FILE) as reader:
         assert again._journal.watermarks() == reader.watermarks()
@@ -153,7 +143,7 @@ def test_the_size_of_cells_can_be_changed(store: Path, tmp_path: Path):
     assert run(store, "--out", tmp_path / "new", "--cell", 2.5) == 0
     again = opened(tmp_path / "new")
     assert again.site == replace(SITE, cell_m=2.5)
-    assert same(again.grid, folded(cell_m=2.5))
+    assert same_evidence(again.grid, folded(cell_m=2.5))
     again.close()
 
 
@@ -164,7 +154,7 @@ def test_options_are_taken_and_written_beside_the_store(store: Path, tmp_path: P
     assert (tmp_path / "new" / "server.toml").read_text() == text
     again = opened(tmp_path / "new")
     config = from_table(ServerConfig, load_toml(tmp_path / "other.toml"), "")
-    assert same(again.grid, folded(config=config))
+    assert same_evidence(again.grid, folded(config=config))
     assert again.grid.skipped > 0
     again.close()
     assert run(tmp_path / "new", "--out", tmp_path / "newer") == 0  # a store's own options stay
@@ -179,7 +169,7 @@ def test_machines_are_excluded_and_their_progress_is_kept(
     assert summary["excluded"] == {"machine": 240, "time": 0, "twice": 0}
     assert summary["machines"] == {"b": 120}
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded("b"))
+    assert same_evidence(again.grid, folded("b"))
     marks = {name: (mark.seq, mark.lost) for (name, _), mark in again._journal.watermarks().items()}
     assert marks == {"a": (120, 120), "b": (120, 0), "c": (120, 120)}
     assert again.info()["machines"]["a"]["samples"] == 0
@@ -194,7 +184,7 @@ def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsy
     rows = rows_of(tmp_path / "new")
     assert {(r.machine, r.first_seq, len(r.rows)) for r in rows} == {(n, f, 10) for n in "abc" for f in (11, 21)}
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded(keep=slice(10, 30)))
+    assert same_evidence(again.grid, folded(keep=slice(10, 30)))
     assert {(mark.seq, mark.lost) for mark in again._journal.watermarks().values()} == {(120, 100)}
     again.close()
 
@@ -237,7 +227,7 @@ def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, cap
     assert summary["excluded"] == {"machine": 0, "time": 0, "twice": 240 + 120}
     assert (summary["samples"], summary["archives"]) == (360, 4)
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded())
+    assert same_evidence(again.grid, folded())
     assert {(mark.seq, mark.lost) for mark in again._journal.watermarks().values()} == {(120, 0)}
     again.close()
 
