@@ -109,7 +109,7 @@ def read_store(folder: Path, definition: Any) -> Content:
 
 
 def read_spool(path: Path) -> Content:
-    """All that an agent would send: contents by identity, and what it says is lost."""
+    """All that an agent would send: contents by identity, and what it declares lost."""
     spool, contents, end_s = Spool(path, SpoolConfig()), {}, time.monotonic() + STUCK_S
     declared = 0  # lost, to the server, which counts them
     spool._db.set_progress_handler(lambda: time.monotonic() > end_s, 20)

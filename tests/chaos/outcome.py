@@ -22,8 +22,8 @@ class InterruptError(Exception):
 class FaultOutcome:
     """Result of one fault.
 
-    count: how often it struck; recorded: samples in the audit files; declared: those of the lost that the server was
-    told are lost. longest_pause_s: between two commits of one machine, without the time that faults lasted; None where
+    count: how often it struck; recorded: samples in the audit files; declared: those of the lost that were declared
+    to the server. longest_pause_s: between two commits of one machine, without the time that faults lasted; None where
     nothing runs meanwhile. skipped: why it did not run.
     """
 
