@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.measure import START_NS, Result, machine, medians, timed, track
+from benchmarks.measure import START_NS, Report, machine, medians, timed, track
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table
@@ -20,7 +20,7 @@ BATCHES = (100, 1000)
 GROUPS = (1, 16)  # batches in one commit: a single machine waiting for its answer, and many at once
 
 
-def run(samples: int, runs: int) -> Result:
+def run(samples: int, runs: int) -> Report:
     """Measure every size of batch and group, each run on a new store."""
     rows = track(samples)
     with tempfile.TemporaryDirectory() as folder:

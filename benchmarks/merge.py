@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from benchmarks.measure import SIDE_M, Result, machine, medians, scattered, timed, track
+from benchmarks.measure import SIDE_M, Report, machine, medians, scattered, timed, track
 from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, Polars, Sums
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
@@ -56,7 +56,7 @@ VARIANTS = {
 }
 
 
-def run(samples: int, runs: int) -> Result:
+def run(samples: int, runs: int) -> Report:
     """Measure every variant whose library is there on every pattern.
 
     Rows: variant, pattern, samples of a whole run, million samples per second of whole runs, their ratio to the

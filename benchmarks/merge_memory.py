@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measure import Result, in_child, machine, memory_mb, timed
+from benchmarks.measure import Report, in_child, machine, memory_mb, timed
 from benchmarks.merge_work import BATCH, batches, samples_of
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid, PlacedPage
@@ -24,7 +24,7 @@ GOALS = {"bytes_per_cell_and_bucket": 500, "resident_mb": 400}
 MB = 1e6
 
 
-def run(hours: float) -> Result:
+def run(hours: float) -> Report:
     """Fold so many hours of work; a row of what it took.
 
     bytes_per_cell_and_bucket: of pages that still hold one bucket. evidence_mb: of all pages. resident_mb, peak_mb: of

@@ -14,7 +14,7 @@ from collections import Counter
 from itertools import islice
 from pathlib import Path
 
-from benchmarks.measure import START_NS, Result, in_child, machine, timed
+from benchmarks.measure import START_NS, Report, in_child, machine, timed
 from benchmarks.merge_work import BATCH, batches
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
@@ -34,7 +34,7 @@ IN_ONE_COMMIT = 10_000  # journal rows: what is measured is the opening, not the
 MB = 1e6
 
 
-def run(samples: int) -> Result:
+def run(samples: int) -> Report:
     """Write a store of so many samples, in batches of BATCH, and open it; every one is folded into its snapshot.
 
     The row: open_s of the store alone, open_cpu_s on the CPU (less, where others work as well), process_s with the
@@ -44,7 +44,7 @@ def run(samples: int) -> Result:
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
         build_s = timed(lambda: build(folder, rows))
-        opened_store: Result = {}
+        opened_store: Report = {}
         process_s = timed(lambda: opened_store.update(in_child("benchmarks.merge_restart", path)))
         if opened_store["journalled"] != rows or opened_store["merged"] != rows:
             merged = opened_store["merged"]
@@ -85,7 +85,7 @@ def build(folder: Path, rows: int) -> None:
     journal.close()
 
 
-def open_timed(folder: Path) -> Result:
+def open_timed(folder: Path) -> Report:
     """Open the store; returns how long that took."""
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
     store = Store(folder, SITE, CONFIG, lambda: START_NS)

@@ -118,8 +118,8 @@ class Polars:
         cell, value = _columns(rows, self._side)
         c = self._pl.col("value")
         frame = self._pl.DataFrame({"cell": cell, "value": value})
-        found = frame.group_by("cell").agg(self._pl.len(), c.sum().alias("s"), (c * c).sum().alias("q"))
-        self._sums[found["cell"].to_numpy()] += found.select("len", "s", "q").to_numpy()
+        groups = frame.group_by("cell").agg(self._pl.len(), c.sum().alias("s"), (c * c).sum().alias("q"))
+        self._sums[groups["cell"].to_numpy()] += groups.select("len", "s", "q").to_numpy()
 
     def sums(self) -> Floats:
         """See Sums."""

@@ -30,7 +30,7 @@ from protocol.arrays import Ints
 from protocol.machine.samples import content_hash
 from protocol.site.site_config import SiteConfig
 
-Identity = tuple[str, int, int]  # machine, spool_id, seq
+SampleKey = tuple[str, int, int]  # machine, spool_id, seq
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class AuditResult:
     unrecorded: int
 
 
-def read_audits(audits: Mapping[str, Path]) -> dict[Identity, str]:
+def read_audits(audits: Mapping[str, Path]) -> dict[SampleKey, str]:
     """Content hash of every recorded sample; audits: machine -> file."""
     return {
         (machine, spool, seq): content
@@ -70,7 +70,7 @@ def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, conf
 
 
 def compare(
-    recorded: Mapping[Identity, str],
+    recorded: Mapping[SampleKey, str],
     rows: Iterable[JournalRow],
     grid: Grid,
     site: SiteConfig,
@@ -80,7 +80,7 @@ def compare(
     """Compare recorded samples with journal rows, and those, folded again, with a grid; excluded: of the grid."""
     withheld = 0
     refolded = Grid(site.cell_m, config.fold)
-    hashes: dict[Identity, list[str]] = {}
+    hashes: dict[SampleKey, list[str]] = {}
     contents: Counter[tuple[str, str]] = Counter()
     for row in rows:
         if row.machine in excluded:

@@ -40,7 +40,7 @@ def robust_spread(votes: Floats) -> Floats:
     Votes further from the median than the quartiles allow do not count. A vote at fraction f between two bins is split
     between them, which adds f (1 - f) to the variance of votes that agree, and 1/6, the mean of it, to that of votes
     that spread over bins; in between the difference decays as exp(-2 pi^2 variance), the first term of its Fourier
-    series. That is taken off, so votes that agree give 0; a spread below a third of a bin cannot be distinguished from none.
+    series. That is taken off, so votes that agree give 0; a spread below a third of a bin looks like none.
     """
     summed = votes.cumsum(axis=-1)
     first, median, third = ((4 * summed >= k * summed[..., -1:]).argmax(axis=-1) for k in (1, 2, 3))

@@ -238,6 +238,6 @@ def _lines(summary: Mapping[str, Any]) -> list[str]:
         f"{store}: {summary['samples']} samples in {size}",
         *(f"  {machine}: {samples} samples" for machine, samples in summary["machines"].items()),
         f"  excluded: {excluded['machine']} of machines, {excluded['time']} by time, {excluded['twice']} duplicates",
-        f"  too unsure of their place to vote: {summary['too_unsure']}",
+        f"  too uncertain of their position to vote: {summary['too_unsure']}",
         f"sitegrid server --store {store} --site-file {store}/{SITE_FILE} --config {store}/{CONFIG_FILE}",
     ]

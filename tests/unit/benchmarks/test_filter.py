@@ -12,6 +12,7 @@ from benchmarks.__main__ import main
 STEPS = ("predict", "update position", "update rate")
 
 
+@pytest.mark.slow
 def test_filter_prints_one_json_object_with_every_step_of_every_filter(monkeypatch, capsys) -> None:
     monkeypatch.setattr(agent, "SECONDS", 20)
     assert main(["filter", "--json", "--steps", "3", "--runs", "1"]) == 0

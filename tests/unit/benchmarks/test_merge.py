@@ -105,6 +105,7 @@ def test_work_is_a_function_of_its_seed():
     assert one.tobytes() == same.tobytes() != other.tobytes()
 
 
+@pytest.mark.slow
 def test_memory_prints_what_a_day_takes(capsys):
     assert main(["memory", "--json", "--hours", "0.05"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -125,6 +126,7 @@ def test_more_hours_are_more_samples():
     assert merge_memory.measured(0.02)["samples"] < merge_memory.measured(0.05)["samples"]
 
 
+@pytest.mark.slow
 def test_restart_opens_a_store_with_snapshot_and_tail(monkeypatch, capsys):
     monkeypatch.setattr(merge_restart, "TAIL_ROWS", 7)
     assert main(["restart", "--json", "--samples", "1950"]) == 0

@@ -34,7 +34,7 @@ def recorded_rows(seed: int) -> Table:
     rows["stamp_ns"] = 1_767_225_600_000_000_000 + np.arange(N) * 10**9
     rows["x_m"], rows["y_m"] = draw.uniform(-40, 40, (2, N))
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = draw.uniform(0.1, 2.0, N)
-    rows["cov_xx_m2"][::20] = 25.0  # too unsure of their place to vote
+    rows["cov_xx_m2"][::20] = 25.0  # too uncertain of their position to vote
     rows["distance_m"], rows["c_rr"] = draw.uniform(0.5, 1.5, N), draw.uniform(0.005, 0.3, N)
     return rows
 

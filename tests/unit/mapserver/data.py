@@ -20,6 +20,7 @@ from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from protocol.arrays import Table
 from protocol.machine.samples import empty
+from protocol.site.geometry import CellWindow
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
@@ -115,6 +116,16 @@ def same(one: Grid, other: Grid) -> bool:
     a, b = one.state(), other.state()
     totals = [(state.folded, state.skipped, state.newest_ns) for state in (a, b)]
     return totals[0] == totals[1] and [*map(_bits, a.pages)] == [*map(_bits, b.pages)]
+
+
+def same_evidence(one: Grid, other: Grid) -> bool:
+    """Equal evidence, to the bit, in all blocks, however it is spread over pages."""
+    if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
+        return False
+    column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
+    window = CellWindow(column, row, end_column - column, end_row - row)
+    a, b = (grid.evidence(grid.blocks_in(window)) for grid in (one, other))
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("counts", "bitmaps", "newest_ns"))
 
 
 def same_page(one: Page, other: Page) -> bool:

@@ -81,7 +81,7 @@ def test_draining_gives_what_was_written_and_forgets_it():
     blocks.planes[slot, 5] = True
     blocks.counts[slot, 5, 7], blocks.newest[slot, 7], blocks.bitmaps[slot, 1, 7], blocks.load = 9, 1000, 3, 9
     (code, page), *more = blocks.drain()
-    assert (code, more) == (22, [])  # blocks in which nothing was written are left out
+    assert (code, more) == (22, [])  # blocks in which nothing was written are not in it
     assert page.votes.tolist() == [(5 * ev.CELLS + 7, 9)]
     assert page.cells["newest_ns"].tolist() == [1000]
     assert page.cells[["visits", "machines"]].tolist() == [(0, 3)]

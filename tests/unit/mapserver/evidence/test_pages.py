@@ -66,13 +66,13 @@ def test_a_page_cannot_be_written_to():
             assert not array.flags.writeable
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(votes, cells)
 def test_kernel_and_reference_pack_the_same_bits(places, stamps):
     assert same_page(pack(*written(places, stamps)), reference.pack(*written(places, stamps)))
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(pages, pages)
 def test_kernel_and_reference_merge_to_the_same_bits(one, other):
     assert same_page(merge(one, other), reference.merge(one, other))
@@ -116,7 +116,7 @@ def test_a_cell_takes_25_bytes_and_its_votes_four_each():
     assert page({0: 1, 256: 2}, {0: (1, 5)}).nbytes == CELL.itemsize + 2 * NARROW.itemsize == 25 + 8
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.lists(pages, min_size=3, max_size=3))
 def test_pages_merge_in_any_order_to_the_same_bits(three):
     results = [merge(merge(a, b), c) for a, b, c in permutations(three)]
@@ -124,6 +124,7 @@ def test_pages_merge_in_any_order_to_the_same_bits(three):
     assert all(same_page(result, results[0]) for result in results)
 
 
+@settings(max_examples=40)
 @given(pages, pages)
 def test_a_merged_page_is_the_sum_of_both_and_saturates(one, other):
     counts, bitmaps, newest_ns = unpacked(one)
@@ -149,6 +150,7 @@ def test_nothing_merged_with_a_page_is_the_page():
     assert same_page(merge(page({}), one), one)
 
 
+@settings(max_examples=40)
 @given(pages, st.sets(st.integers(0, 255)))
 def test_a_part_of_the_cells_and_the_rest_are_the_page(one, chosen):
     inside = np.zeros(ev.CELLS, np.bool_)
@@ -169,6 +171,7 @@ def test_sums_add_many_full_pages_without_wrapping():
     assert counts[2] == 4 * int(ev.COUNT_MAX)
 
 
+@settings(max_examples=40)
 @given(pages, st.sampled_from([ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH, ev.HEADING]))
 def test_moments_are_those_of_the_histograms(one, part):
     counts = unpacked(one)[0].reshape(ev.COUNTS, ev.CELLS)[part].astype(float)

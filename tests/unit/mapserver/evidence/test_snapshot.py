@@ -65,6 +65,7 @@ def test_a_snapshot_reads_back_to_the_bit(tmp_path):
     assert same(again, grid)
 
 
+@pytest.mark.slow
 def test_damage_anywhere_is_passed_over_or_harmless(tmp_path):
     grid = folded(samples(3))
     data = save(tmp_path, 1, grid).read_bytes()
@@ -228,6 +229,7 @@ snapshot.save(folder, 1, grid.state(), 1.0, config)
 """
 
 
+@pytest.mark.slow
 def test_parts_folded_in_processes_of_their_own_are_the_fold_of_everything(tmp_path):
     """Three processes, which hash strings in three ways, with different space."""
     rows = {machine: random_samples(90, seed, half_m=3.0) for seed, machine in enumerate("ab")}

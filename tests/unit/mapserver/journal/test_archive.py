@@ -248,6 +248,7 @@ def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
             assert (len(decoded), len(checked)) == (groups, files), selection
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(data=st.data())
 def test_rows_come_back_whatever_the_cuts(data):
@@ -480,6 +481,7 @@ for _ in archive(folder / "archive", JournalReader(folder / "journal.db"), site,
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("step", "calls"),
     [

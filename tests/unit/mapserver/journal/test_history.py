@@ -17,7 +17,7 @@ from mapserver.journal.rows import Admission, JournalRow, Selection
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds, CellWindow
-from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, folded, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, folded, random_samples, same_evidence, samples
 
 pytest.importorskip("pyarrow.parquet")
 FOLD = FoldConfig()
@@ -31,17 +31,6 @@ def everything(names: str = "ab", keep: Selection | None = None) -> Grid:
         rows = np.concatenate(PARTS[name])
         grid.fold(rows if keep is None else samples_of(JournalRow(1, name, 7, 1, rows), keep), name)
     return grid
-
-
-def same(one: Grid, other: Grid) -> bool:
-    """Equal evidence, to the bit, in all blocks."""
-    if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
-        return False
-    column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
-    blocks = [grid.blocks_in(CellWindow(column, row, end_column - column, end_row - row)) for grid in (one, other)]
-    a, b = (grid.evidence(blocks[0]) for grid in (one, other))
-    arrays = ("counts", "bitmaps", "newest_ns")
-    return blocks[0] == blocks[1] and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in arrays)
 
 
 def add(journal: Journal, rows: Table, first_seq: int, machine: str = "a", received_ns: int = NOW_NS) -> None:
@@ -89,14 +78,15 @@ def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
         journal.append(Admission(batch(samples(1), i + 1), 0, 0), NOW_NS + i // 100 * HOUR_NS)
     journal.commit()
     reader, other = JournalReader(journal.path), JournalReader(journal.path)
-    rows, found = history_rows(History.beside(reader)), []
+    rows, read = history_rows(History.beside(reader)), []
     for i in range(2):
-        found += [next(rows).row for _ in range(10 * where + 5 * i)]
+        read += [next(rows).row for _ in range(10 * where + 5 * i)]
         list(archive(tmp_path / FOLDER, other, SITE, NOW_NS + 3 * (i + 1) * HOUR_NS, journal.forget))
-    assert found + numbers(rows) == list(range(1, 601))
+    assert read + numbers(rows) == list(range(1, 601))
     reader.close(), other.close(), journal.close()
 
 
+@pytest.mark.slow
 def test_rows_come_once_while_another_thread_archives_and_the_owner_writes(tmp_path):
     journal = Journal(tmp_path / "journal.db", SITE.name, SITE.frame)
     for i in range(120):
@@ -143,7 +133,7 @@ def test_a_missing_file_is_no_silent_gap(tmp_path):
 def test_a_grid_as_of_a_time_is_the_fold_of_what_was_stamped_until_then(store, after_s):
     to_ns = NOW_NS + after_s * S
     grid = grid_as_of(store, to_ns, 1.0, FOLD)
-    assert same(grid, everything(keep=Selection(to_ns=to_ns)))
+    assert same_evidence(grid, everything(keep=Selection(to_ns=to_ns)))
     assert (grid.folded > 0) == (after_s >= 0)
 
 
@@ -155,7 +145,7 @@ def test_the_stamp_itself_belongs_to_the_past(tmp_path):
 
 
 def test_a_grid_without_a_machine_is_that_of_the_others(store):
-    assert same(grid_as_of(store, NOW_NS + 10**13, 1.0, FOLD, without=frozenset("b")), everything("a"))
+    assert same_evidence(grid_as_of(store, NOW_NS + 10**13, 1.0, FOLD, without=frozenset("b")), everything("a"))
 
 
 @pytest.mark.parametrize("cell_m", [0.25, 1.0, 3.0])
@@ -192,20 +182,20 @@ def test_samples_are_chosen_by_stamp_and_place():
 
 def test_the_history_of_a_cell_is_its_evidence_bucket_by_bucket(store):
     cell, span_ns = (-3, 7), 300 * S
-    found = point_history(store, cell, 1.0, FOLD)
-    assert len(found) > 2
-    assert found == sorted(found, key=lambda moment: moment.first_ns)
-    for moment in found:
-        assert moment.first_ns % span_ns == 0
-        assert moment.last_ns == moment.first_ns + span_ns - 1
-        grid = everything(keep=Selection(from_ns=moment.first_ns, to_ns=moment.last_ns))
+    spans = point_history(store, cell, 1.0, FOLD)
+    assert len(spans) > 2
+    assert spans == sorted(spans, key=lambda span: span.first_ns)
+    for span in spans:
+        assert span.first_ns % span_ns == 0
+        assert span.last_ns == span.first_ns + span_ns - 1
+        grid = everything(keep=Selection(from_ns=span.first_ns, to_ns=span.last_ns))
         expected = grid.evidence([(-1, 0)])
-        assert moment.evidence.counts.shape == (1, 1, ev.COUNTS)
-        assert np.array_equal(moment.evidence.counts[0, 0], expected.counts[0, 16 * 7 + 13])
-        assert np.array_equal(moment.evidence.bitmaps[0, 0], expected.bitmaps[0, 16 * 7 + 13])
-        assert moment.evidence.newest_ns[0, 0] == expected.newest_ns[0, 16 * 7 + 13]
+        assert span.evidence.counts.shape == (1, 1, ev.COUNTS)
+        assert np.array_equal(span.evidence.counts[0, 0], expected.counts[0, 16 * 7 + 13])
+        assert np.array_equal(span.evidence.bitmaps[0, 0], expected.bitmaps[0, 16 * 7 + 13])
+        assert span.evidence.newest_ns[0, 0] == expected.newest_ns[0, 16 * 7 + 13]
     whole = everything().evidence([(-1, 0)]).counts[0, 16 * 7 + 13]
-    assert np.array_equal(sum(moment.evidence.counts[0, 0] for moment in found), whole)
+    assert np.array_equal(sum(span.evidence.counts[0, 0] for span in spans), whole)
 
 
 def test_spans_machines_and_times_of_a_history_can_be_chosen(store):

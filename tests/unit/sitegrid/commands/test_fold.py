@@ -22,13 +22,13 @@ from mapserver.journal.rows import JournalRow
 from protocol.arrays import Table
 from protocol.config import from_table, load_toml
 from protocol.machine.samples import COLUMNS, empty
-from protocol.site.geometry import CellWindow
 from protocol.site.site_config import KnownGround, SiteConfig, load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main
 from sitegrid.commands import fold
 from sitegrid.commands.times import parse_stamp
+from tests.unit.mapserver.data import same_evidence
 
 pytest.importorskip("pyarrow.parquet")
 SITE = SiteConfig("pit", 48.0, 11.0)
@@ -111,16 +111,6 @@ def folded(
     return grid
 
 
-def same(one: Grid, other: Grid) -> bool:
-    """Equal evidence, to the bit, in all blocks."""
-    if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
-        return False
-    column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
-    blocks = one.blocks_in(CellWindow(column, row, end_column - column, end_row - row))
-    a, b = one.evidence(blocks), other.evidence(blocks)
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("counts", "bitmaps", "newest_ns"))
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three machines, two hours archived, four in the journal. Nothing writes to it."""
@@ -132,7 +122,7 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
     assert identities(tmp_path / "new") == identities(store)
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded())
+    assert same_evidence(again.grid, folded())
     assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
     with JournalReader(store / JOURNAL_FILE) as reader:
         assert again.journal.watermarks() == reader.watermarks()
@@ -153,7 +143,7 @@ def test_the_size_of_cells_can_be_changed(store: Path, tmp_path: Path):
     assert run(store, "--out", tmp_path / "new", "--cell", 2.5) == 0
     again = opened(tmp_path / "new")
     assert again.site == replace(SITE, cell_m=2.5)
-    assert same(again.grid, folded(cell_m=2.5))
+    assert same_evidence(again.grid, folded(cell_m=2.5))
     again.close()
 
 
@@ -164,14 +154,14 @@ def test_options_are_taken_and_written_beside_the_store(store: Path, tmp_path: P
     assert (tmp_path / "new" / "server.toml").read_text() == text
     again = opened(tmp_path / "new")
     config = from_table(ServerConfig, load_toml(tmp_path / "other.toml"), "")
-    assert same(again.grid, folded(config=config))
+    assert same_evidence(again.grid, folded(config=config))
     assert again.grid.skipped > 0
     again.close()
     assert run(tmp_path / "new", "--out", tmp_path / "newer") == 0  # a store's own options stay
     assert (tmp_path / "newer" / "server.toml").read_text() == text
 
 
-def test_machines_are_left_out_and_their_progress_is_kept(
+def test_machines_are_excluded_and_their_progress_is_kept(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert run(store, "--out", tmp_path / "new", "--without", "a", "--without", "c", "--json") == 0
@@ -179,7 +169,7 @@ def test_machines_are_left_out_and_their_progress_is_kept(
     assert summary["excluded"] == {"machine": 240, "time": 0, "twice": 0}
     assert summary["machines"] == {"b": 120}
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded("b"))
+    assert same_evidence(again.grid, folded("b"))
     marks = {name: (mark.seq, mark.lost) for (name, _), mark in again.journal.watermarks().items()}
     assert marks == {"a": (120, 120), "b": (120, 0), "c": (120, 120)}
     assert again.info()["machines"]["a"]["samples"] == 0
@@ -194,7 +184,7 @@ def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsy
     rows = rows_of(tmp_path / "new")
     assert {(r.machine, r.first_seq, len(r.rows)) for r in rows} == {(n, f, 10) for n in "abc" for f in (11, 21)}
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded(keep=slice(10, 30)))
+    assert same_evidence(again.grid, folded(keep=slice(10, 30)))
     assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(120, 100)}
     again.close()
 
@@ -207,8 +197,8 @@ def test_samples_out_of_time_in_the_middle_of_a_batch_cut_it_in_two(tmp_path: Pa
     store.commit([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
     store.close()
     assert run(folder, "--out", tmp_path / "new", "--until", "2026-01-01T00:00:10") == 0
-    found = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
-    assert found == [(1, 2), (4, 2)]
+    pieces = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
+    assert pieces == [(1, 2), (4, 2)]
 
 
 # --- several archives ------------------------------------------------------------------------------------------------
@@ -237,7 +227,7 @@ def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, cap
     assert summary["excluded"] == {"machine": 0, "time": 0, "twice": 240 + 120}
     assert (summary["samples"], summary["archives"]) == (360, 4)
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded())
+    assert same_evidence(again.grid, folded())
     assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(120, 0)}
     again.close()
 
@@ -248,9 +238,9 @@ def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tm
     orders = [(store, one, two), (two, store, one), (one, two / FOLDER, two, store)]
     for i, order in enumerate(orders):
         assert run(*order, "--out", tmp_path / f"new{i}") == 0
-    found = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
-    assert found[0] == found[1] == found[2]
-    received = [row[3] for row in found[0]]
+    made = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
+    assert made[0] == made[1] == made[2]
+    received = [row[3] for row in made[0]]
     assert received == sorted(received)
 
 
