@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from benchmarks import filter as filters
 from benchmarks import ingest, merge, merge_memory, merge_restart, sim
-from benchmarks.measure import Result, table
+from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 
 SAMPLES, SECONDS, STEPS, RUNS = 20_000, 20.0, 1000, 5
@@ -21,7 +21,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run one benchmark and print what it found."""
     arguments = vars(_parser().parse_args(words))
     run, as_json = arguments.pop("run"), arguments.pop("json")
-    result: Result = run(**arguments)
+    result: Report = run(**arguments)
     tables = [result[name] for name in ("rows", "agent") if name in result]
     print(json.dumps(result) if as_json else "\n\n".join(map(table, tables)))
     for variant, remedy in result.get("missing", {}).items():

@@ -33,11 +33,11 @@ def measured(runs: int) -> dict[str, float | int]:
     """Run the agent's core in processes of its own; the median of the runs counts."""
     command = [sys.executable, "-m", "benchmarks.agent", str(SECONDS)]
     root = Path(__file__).parent.parent
-    found = [
+    runs_figures = [
         json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603 # itself
         for _ in range(runs)
     ]
-    cpu, memory = (statistics.median(each[name] for each in found) for name in ("cpu_percent", "memory_mb"))
+    cpu, memory = (statistics.median(each[name] for each in runs_figures) for name in ("cpu_percent", "memory_mb"))
     return {"seconds": SECONDS, "cpu_percent": round(cpu, 2), "memory_mb": round(memory, 1)}
 
 
@@ -49,34 +49,34 @@ def machine() -> MachineConfig:
     )
 
 
-def way(seconds: float) -> tuple[float, float, float]:
-    """Way [m], speed [m/s] and acceleration [m/s2] of a machine that sets off."""
+def progress(seconds: float) -> tuple[float, float, float]:
+    """Distance [m], speed [m/s] and acceleration [m/s2] of a machine that sets off."""
     ramp_s = SPEED_MPS / ACCEL_MPS2
     if seconds < ramp_s:
         return ACCEL_MPS2 * seconds**2 / 2, ACCEL_MPS2 * seconds, ACCEL_MPS2
     return SPEED_MPS * (seconds - ramp_s / 2), SPEED_MPS, 0.0
 
 
-def place(way_m: float) -> tuple[float, float, float]:
+def place(distance_m: float) -> tuple[float, float, float]:
     """Position [m] and heading [rad] on a circle."""
-    heading = way_m / RADIUS_M
+    heading = distance_m / RADIUS_M
     return 50 + RADIUS_M * math.sin(heading), 50 - RADIUS_M * math.cos(heading), heading
 
 
 def bundles(seconds: int) -> Iterator[list[Reading]]:
     """Readings of a drive, a second at a time; fixes waver by FIX_M."""
-    of, projection = machine(), Projection(SITE)
-    ticks_per_m = of.sensors[1].ticks_per_rev / (2 * math.pi * of.wheel_radius_m)
+    driven, projection = machine(), Projection(SITE)
+    ticks_per_m = driven.sensors[1].ticks_per_rev / (2 * math.pi * driven.wheel_radius_m)
     for first in range(0, 100 * seconds, 100):
         readings: list[Reading] = []
         for step in range(first + 1, first + 101):
-            stamp, (way_m, speed, accel) = START_NS + step * STEP_NS, way(step / 100)
+            stamp, (distance_m, speed, accel) = START_NS + step * STEP_NS, progress(step / 100)
             turn = speed / RADIUS_M
             readings.append(Imu("imu", stamp, 0.0, 0.0, turn, accel, speed * turn, GRAVITY_MPS2))
             if step % WHEELS_EVERY == 0:
-                readings.append(Encoder("wheels", stamp, way_m * ticks_per_m, way_m * ticks_per_m))
+                readings.append(Encoder("wheels", stamp, distance_m * ticks_per_m, distance_m * ticks_per_m))
             if step % FIX_EVERY == 0:
-                readings += [_fix(name, stamp, place(way_m), projection) for name in LEVERS_M]
+                readings += [_fix(name, stamp, place(distance_m), projection) for name in LEVERS_M]
         yield readings
 
 

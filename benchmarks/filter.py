@@ -18,17 +18,17 @@ from agents.localisation.filters.motion import MotionConfig, motion
 from agents.localisation.filters.state import ATTITUDE, POSITION, RATE, VELOCITY, Layout
 from agents.localisation.filters.ukf import Ukf
 from benchmarks import agent
-from benchmarks.measure import Result, machine, medians, timed
+from benchmarks.measure import Report, machine, medians, timed
 from protocol.arrays import Floats
 
 LAYOUT, CONFIG = Layout(), MotionConfig()  # the 15 states
 DT_S = 0.01
 MEASURED = {"update position": slice(POSITION.start, POSITION.start + 2), "update rate": RATE}
 STOCK, ANGULAR = "stock ukf", "stock ukf, angles"
-Step = Callable[[], object]
+FilterStep = Callable[[], object]
 
 
-def run(steps: int, runs: int) -> Result:
+def run(steps: int, runs: int) -> Report:
     """Measure each step of each filter; a run does it so many times, and the median of the runs counts."""
     variants = {STOCK: _stock({}), ANGULAR: _stock(ANGLE_SAFE), "ukf": _own(Ukf()), "ekf": _own(Ekf())}
     works = {(name, step): work for name, made in variants.items() for step, work in made.items()}
@@ -41,11 +41,11 @@ def run(steps: int, runs: int) -> Result:
         stock, angular = (round(seconds[f"{other}/{step}"] / took_s, 1) for other in (STOCK, ANGULAR))
         us = round(took_s / steps * 1e6, 1)
         rows.append({"filter": name, "step": step, "us": us, "x_stock": stock, "x_stock_angles": angular})
-    found = {"benchmark": "filter", "steps": steps, "runs": runs, **machine(), "rows": rows}
-    return {**found, "agent": [agent.measured(runs)]}
+    result = {"benchmark": "filter", "steps": steps, "runs": runs, **machine(), "rows": rows}
+    return {**result, "agent": [agent.measured(runs)]}
 
 
-def _timer(work: Step, steps: int) -> Callable[[], float]:
+def _timer(work: FilterStep, steps: int) -> Callable[[], float]:
     def repeat() -> None:
         for _ in range(steps):
             work()
@@ -60,19 +60,21 @@ def _start() -> Belief:
     return Belief(0, x, np.diag(np.linspace(0.02, 0.5, LAYOUT.n)))
 
 
-def _own(kind: Filter) -> dict[str, Step]:
+def _own(kind: Filter) -> dict[str, FilterStep]:
     """What an agent does for each step, the making of the motion and of the measurement included.
 
     As in a drive a step finds the factor of its belief's covariance, and computes that of the belief it makes.
     """
     belief = _start()
-    steps: dict[str, Step] = {"predict": lambda: kind.predict(belief, motion(LAYOUT, CONFIG, belief, DT_S), 10_000_000)}
+    steps: dict[str, FilterStep] = {
+        "predict": lambda: kind.predict(belief, motion(LAYOUT, CONFIG, belief, DT_S), 10_000_000)
+    }
     for name, states in MEASURED.items():
         steps[name] = _conditioned(kind, belief, states)
     return steps
 
 
-def _conditioned(kind: Filter, belief: Belief, states: slice) -> Step:
+def _conditioned(kind: Filter, belief: Belief, states: slice) -> FilterStep:
     z, H = belief.x[states] + 0.01, np.eye(LAYOUT.n)[states]
     R = np.eye(len(z)) * 0.1
 
@@ -83,7 +85,7 @@ def _conditioned(kind: Filter, belief: Belief, states: slice) -> Step:
     return work
 
 
-def _stock(options: dict[str, Any]) -> dict[str, Step]:
+def _stock(options: dict[str, Any]) -> dict[str, FilterStep]:
     """The filter as its documentation shows it: functions of one state, in Python."""
     points = MerweScaledSigmaPoints(LAYOUT.n, alpha=0.5, beta=2.0, kappa=0.0)
     start = _start()
@@ -97,7 +99,7 @@ def _stock(options: dict[str, Any]) -> dict[str, Step]:
         ukf.Q = motion(LAYOUT, CONFIG, start, DT_S).Q
         ukf.predict()
 
-    def updated(states: slice) -> Step:
+    def updated(states: slice) -> FilterStep:
         z = start.x[states] + 0.01
         R = np.eye(len(z)) * 0.1
 

@@ -1,4 +1,4 @@
-"""Samples per second from a machine's bytes to the grid: decode, judge, commit to disk (FULL), fold."""
+"""Samples per second from a machine's bytes to the grid: decode, check, commit to disk (FULL), fold."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.measure import START_NS, Result, machine, medians, timed, track
+from benchmarks.measure import START_NS, Report, machine, medians, timed, track
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from protocol.arrays import Table
@@ -20,7 +20,7 @@ BATCHES = (100, 1000)
 GROUPS = (1, 16)  # batches in one commit: a single machine waiting for its answer, and many at once
 
 
-def run(samples: int, runs: int) -> Result:
+def run(samples: int, runs: int) -> Report:
     """Measure every size of batch and group, each run on a new store."""
     rows = track(samples)
     with tempfile.TemporaryDirectory() as folder:
@@ -32,7 +32,7 @@ def run(samples: int, runs: int) -> Result:
     def commits(size: int, group: int) -> int:
         return math.ceil(math.ceil(samples / size) / group)
 
-    found = [
+    figures = [
         {
             "batch": size,
             "batches_per_commit": group,
@@ -41,7 +41,7 @@ def run(samples: int, runs: int) -> Result:
         }
         for name, (size, group) in cases.items()
     ]
-    return {"benchmark": "ingest", "samples": samples, "runs": runs, **machine(), "rows": found}
+    return {"benchmark": "ingest", "samples": samples, "runs": runs, **machine(), "rows": figures}
 
 
 def _variant(folder: Path, name: str, rows: Table, size: int, group: int) -> Callable[[], float]:
@@ -61,7 +61,7 @@ def _variant(folder: Path, name: str, rows: Table, size: int, group: int) -> Cal
 
 def _take(store: Store, groups: list[list[Incoming]]) -> None:
     for group in groups:
-        if not all(isinstance(answer, Ack) for answer in store.take(group)):
+        if not all(isinstance(answer, Ack) for answer in store.commit(group)):
             raise RuntimeError("the store refused a batch")
 
 

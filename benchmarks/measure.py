@@ -18,7 +18,7 @@ import numpy as np
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 
-Result = dict[str, Any]
+Report = dict[str, Any]
 START_NS = 1_767_225_600_000_000_000
 SIDE_M = 1024.0  # of the site; three sums for each of its cells of 1 m take 25 MB, more than a cache holds
 
@@ -80,12 +80,12 @@ def memory_mb(name: str = "VmRSS") -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith(name)) * 1024 / 1e6
 
 
-def in_child(module: str, *words: str) -> Result:
+def in_child(module: str, *words: str) -> Report:
     """What a module prints as one JSON object when it runs in a process of its own."""
     command = [sys.executable, "-m", module, *words]
     root = Path(__file__).parent.parent
-    found: Result = json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603
-    return found
+    result: Report = json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603
+    return result
 
 
 def machine() -> dict[str, Any]:

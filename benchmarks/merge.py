@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from benchmarks.measure import SIDE_M, Result, machine, medians, scattered, timed, track
+from benchmarks.measure import SIDE_M, Report, machine, medians, scattered, timed, track
 from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, Polars, Sums
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
@@ -18,7 +18,7 @@ from protocol.arrays import Table
 
 PATTERNS = {"track": track, "random": scattered}
 BATCH = 100  # what a machine sends every few seconds
-PIECE = 5000  # whole runs in pieces of this size; the numpy fallback holds all stencil cells of a piece in memory
+PIECE = 5000  # whole runs in pieces of this size
 BATCHED_SHARE = 10  # batches are measured on a tenth of the samples: calls of data frames take milliseconds
 YARDSTICK = "np.add.at"
 Fold = Callable[[Table], None]
@@ -37,19 +37,18 @@ class Variant:
     shares: Mapping[str, int] = field(default_factory=dict)
 
 
-def _soft(kernel: str) -> Fold:
-    return partial(Grid(1.0, FoldConfig(kernel=kernel)).fold, machine="loader-1")
+def _soft() -> Fold:
+    return partial(Grid(1.0, FoldConfig()).fold, machine="loader-1")
 
 
 def _plain(kind: Callable[[int], Sums]) -> Fold:
     return kind(int(SIDE_M)).fold
 
 
-NUMBA, BENCH = "pip install 'sitegrid[server]'", "pip install 'sitegrid[bench]'"
+BENCH = "pip install 'sitegrid[bench]'"
 VARIANTS = {
-    "soft_votes": Variant(partial(_soft, "numba"), NUMBA, {"track": 10, "random": 100}),
-    "soft_votes numpy": Variant(partial(_soft, "numpy"), shares={"track": 100, "random": 200}),
-    "hard_votes": Variant(partial(_plain, HardVotes), NUMBA),
+    "soft_votes": Variant(_soft, shares={"track": 10, "random": 100}),
+    "hard_votes": Variant(partial(_plain, HardVotes)),
     YARDSTICK: Variant(partial(_plain, AddAt)),
     "boost_histogram": Variant(partial(_plain, BoostHistogram), BENCH),
     "polars group-by": Variant(partial(_plain, Polars), BENCH),
@@ -57,11 +56,12 @@ VARIANTS = {
 }
 
 
-def run(samples: int, runs: int) -> Result:
+def run(samples: int, runs: int) -> Report:
     """Measure every variant whose library is there on every pattern.
 
-    Rows: variant, pattern, samples of a whole run, million samples per second of whole runs, that over the yardstick's,
-    and microseconds for a batch of 100. missing: variants that were not measured, and what to install for each.
+    Rows: variant, pattern, samples of a whole run, million samples per second of whole runs, their ratio to the
+    yardstick's, and microseconds for a batch of 100. missing: variants that were not measured, and what to install for
+    each.
     """
     rows: list[dict[str, str | float]] = []
     missing: dict[str, str] = {}

@@ -14,17 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measure import Result, in_child, machine, memory_mb, timed
+from benchmarks.measure import Report, in_child, machine, memory_mb, timed
 from benchmarks.merge_work import BATCH, batches, samples_of
 from mapserver.evidence import snapshot
-from mapserver.evidence.grid import Grid, Placed
+from mapserver.evidence.grid import Grid, PlacedPage
 from mapserver.evidence.votes import FoldConfig
 
 GOALS = {"bytes_per_cell_and_bucket": 500, "resident_mb": 400}
 MB = 1e6
 
 
-def run(hours: float) -> Result:
+def run(hours: float) -> Report:
     """Fold so many hours of work; a row of what it took.
 
     bytes_per_cell_and_bucket: of pages that still hold one bucket. evidence_mb: of all pages. resident_mb, peak_mb: of
@@ -47,14 +47,14 @@ def measured(hours: float) -> dict[str, float]:
         "samples": grid.folded,
         "pages": len(pages),
         "cells": grid.known_cells(),
-        "bytes_per_cell_and_bucket": round(_bytes_per_cell([at for at in pages if at.rung == 0]), 1),
+        "bytes_per_cell_and_bucket": round(_bytes_per_cell([at for at in pages if at.tier == 0]), 1),
         "evidence_mb": round(sum(at.page.nbytes for at in pages) / MB, 1),
-        "resident_mb": round(max(resident_mb, memory_mb()), 1),  # with all pages packed, or with what was hot
+        "resident_mb": round(max(resident_mb, memory_mb()), 1),  # with all pages packed, or with blocks open
     }
     return row | _snapshot(grid)
 
 
-def _bytes_per_cell(pages: Sequence[Placed]) -> float:
+def _bytes_per_cell(pages: Sequence[PlacedPage]) -> float:
     """Bytes of pages, with their Python objects, per cell that has evidence in them."""
     overhead = sum(map(sys.getsizeof, (pages[0].page, np.empty(0), np.empty(0)))) if pages else 0
     size = sum(at.page.nbytes + overhead for at in pages)
@@ -66,9 +66,9 @@ def _snapshot(grid: Grid) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         save_s = timed(lambda: snapshot.save(Path(folder), 1, grid.state(), grid.cell_m, grid.config))
         path, peak_mb = Path(folder) / "snapshot-1.npz", memory_mb("VmHWM")
-        found: list[object] = []
-        load_s = timed(lambda: found.append(snapshot.load(path, grid.cell_m, grid.config)))
-        if found == [None]:
+        loaded: list[object] = []
+        load_s = timed(lambda: loaded.append(snapshot.load(path, grid.cell_m, grid.config)))
+        if loaded == [None]:
             raise RuntimeError("the snapshot cannot be read: nothing was measured")
         size_mb = path.stat().st_size / MB
     return {

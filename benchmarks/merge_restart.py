@@ -14,26 +14,27 @@ from collections import Counter
 from itertools import islice
 from pathlib import Path
 
-from benchmarks.measure import START_NS, Result, in_child, machine, timed
+from benchmarks.measure import START_NS, Report, in_child, machine, timed
 from benchmarks.merge_work import BATCH, batches
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import Admission
 from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.writer import SNAPSHOT_ROWS
 from mapserver.journal.journal import Journal
+from mapserver.journal.rows import Admission
 from protocol.arrays import Table
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch
 
 SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()
 GOAL_S = 5.0
-TAIL_ROWS = CONFIG.store.snapshot_rows  # as many as a crash can leave without a snapshot
+TAIL_ROWS = SNAPSHOT_ROWS  # as many as a crash can leave without a snapshot
 IN_ONE_COMMIT = 10_000  # journal rows: what is measured is the opening, not the writing
 MB = 1e6
 
 
-def run(samples: int) -> Result:
+def run(samples: int) -> Report:
     """Write a store of so many samples, in batches of BATCH, and open it; every one is folded into its snapshot.
 
     The row: open_s of the store alone, open_cpu_s on the CPU (less, where others work as well), process_s with the
@@ -43,10 +44,11 @@ def run(samples: int) -> Result:
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
         build_s = timed(lambda: build(folder, rows))
-        found: Result = {}
-        process_s = timed(lambda: found.update(in_child("benchmarks.merge_restart", path)))
-        if found["journalled"] != rows or found["merged"] != rows:
-            raise RuntimeError(f"the store has {found['merged']} of {rows} rows in its grid: nothing was measured")
+        opened_store: Report = {}
+        process_s = timed(lambda: opened_store.update(in_child("benchmarks.merge_restart", path)))
+        if opened_store["journalled"] != rows or opened_store["merged"] != rows:
+            merged = opened_store["merged"]
+            raise RuntimeError(f"the store has {merged} of {rows} rows in its grid: nothing was measured")
         sizes = {
             "journal_mb": round((folder / JOURNAL_FILE).stat().st_size / MB, 1),
             "snapshot_mb": round(sum(file.stat().st_size for file in folder.glob("snapshot-*")) / MB, 1),
@@ -54,11 +56,11 @@ def run(samples: int) -> Result:
     row = {
         "samples": rows * BATCH,
         "journal_rows": rows,
-        "tail_rows": rows - found["snapshot_row"],
+        "tail_rows": rows - opened_store["snapshot_row"],
         **sizes,
         "build_s": round(build_s, 1),
-        "open_s": round(found["open_s"], 3),
-        "open_cpu_s": round(found["open_cpu_s"], 3),
+        "open_s": round(opened_store["open_s"], 3),
+        "open_cpu_s": round(opened_store["open_cpu_s"], 3),
         "process_s": round(process_s, 3),
     }
     return {"benchmark": "restart", "samples": rows * BATCH, **machine(), "goal_s": GOAL_S, "rows": [row]}
@@ -83,8 +85,8 @@ def build(folder: Path, rows: int) -> None:
     journal.close()
 
 
-def opened(folder: Path) -> Result:
-    """Open the store, and say how long that took."""
+def open_timed(folder: Path) -> Report:
+    """Open the store; returns how long that took."""
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
     store = Store(folder, SITE, CONFIG, lambda: START_NS)
     open_s, open_cpu_s = time.perf_counter() - start_s, time.process_time() - start_cpu_s
@@ -100,4 +102,4 @@ def _admission(name: str, first_seq: int, rows: Table) -> Admission:
 if __name__ == "__main__":
     from mapserver import server  # noqa: F401 # a server's imports count in the time of the process
 
-    print(json.dumps(opened(Path(sys.argv[1]))))
+    print(json.dumps(open_timed(Path(sys.argv[1]))))

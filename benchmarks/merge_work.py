@@ -33,7 +33,7 @@ HEADINGS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # of the roads: columns and rows 
 
 
 @dataclass(frozen=True)
-class Leg:
+class RoadLeg:
     """A drive from one crossing to the next. first_ns: stamp of its first sample; heading: index of HEADINGS."""
 
     first_ns: int
@@ -50,24 +50,24 @@ def samples_of(hours: float) -> int:
 def batches(seed: int = 0) -> Iterator[tuple[str, Table]]:
     """Names of machines and batches of samples, in the order in which they would come in, day after day."""
     draws = np.random.default_rng(seed).spawn(MACHINES)
-    ways = [_legs(draw) for draw in draws]
+    drives = [_legs(draw) for draw in draws]
     while True:
-        driven = [_drive(next(way), draw) for way, draw in zip(ways, draws, strict=True)]
+        driven = [_drive(next(legs), draw) for legs, draw in zip(drives, draws, strict=True)]
         for first in range(0, LEG_SAMPLES, BATCH):
             for number, rows in enumerate(driven, start=1):
                 yield f"loader-{number}", rows[first : first + BATCH]
 
 
-def _legs(draw: np.random.Generator) -> Iterator[Leg]:
+def _legs(draw: np.random.Generator) -> Iterator[RoadLeg]:
     """Legs of one machine, end to end; the night is between two days."""
     column, row, heading = int(draw.integers(ROADS)), int(draw.integers(ROADS)), int(draw.integers(4))
     a_day = samples_of(HOURS) // (MACHINES * LEG_SAMPLES)
     for number in count():
-        # a heading two further is the way back
-        ways = [h for h in range(4) if (h - heading) % 4 != 2 and _on_site(column, row, h)]
-        heading = int(draw.choice(ways))
-        day, of_day = divmod(number, a_day)
-        yield Leg(START_NS + day * DAY_NS + of_day * LEG_SAMPLES * SAMPLE_NS, column, row, heading)
+        # a heading two further leads back
+        headings = [h for h in range(4) if (h - heading) % 4 != 2 and _on_site(column, row, h)]
+        heading = int(draw.choice(headings))
+        day, leg = divmod(number, a_day)
+        yield RoadLeg(START_NS + day * DAY_NS + leg * LEG_SAMPLES * SAMPLE_NS, column, row, heading)
         column, row = column + HEADINGS[heading][0], row + HEADINGS[heading][1]
 
 
@@ -75,7 +75,7 @@ def _on_site(column: int, row: int, heading: int) -> bool:
     return 0 <= column + HEADINGS[heading][0] < ROADS and 0 <= row + HEADINGS[heading][1] < ROADS
 
 
-def _drive(leg: Leg, draw: np.random.Generator) -> Table:
+def _drive(leg: RoadLeg, draw: np.random.Generator) -> Table:
     """Samples of one leg."""
     n, (east, north) = LEG_SAMPLES, HEADINGS[leg.heading]
     along = np.arange(n) * SPACING_M
@@ -97,5 +97,5 @@ def _drive(leg: Leg, draw: np.random.Generator) -> Table:
 
 def _resistance(x: AnyArray, y: AnyArray) -> Floats:
     patch = (np.floor(x / PATCH_M) + 3 * np.floor(y / PATCH_M)).astype(np.int64)
-    found: Floats = RESISTANCES[patch % len(RESISTANCES)]
-    return found
+    resistance: Floats = RESISTANCES[patch % len(RESISTANCES)]
+    return resistance

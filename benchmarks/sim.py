@@ -6,7 +6,7 @@ import statistics
 import time
 from dataclasses import dataclass
 
-from benchmarks.measure import Result, machine
+from benchmarks.measure import Report, machine
 from sim.config import SimConfig, resolve
 from sim.simulator import Simulator
 
@@ -14,7 +14,7 @@ WARM_UP_S = 1.0  # simulated: compiles, and lets the machines set off
 
 
 @dataclass(frozen=True)
-class Case:
+class FleetCase:
     """A fleet to simulate. goal: simulated seconds per CPU second that are asked for."""
 
     scenario: str
@@ -29,26 +29,26 @@ class Case:
 
 
 CASES = (
-    Case("paper_site", "pybullet", 1, 25.0),
-    Case("paper_site", "pybullet", 4, 20.0),
-    Case("paper_site", "pybullet", 8, 15.0),
-    Case("paper_site", "pybullet", 32, 8.0),
-    Case("busy_site", "fast", 100, 40.0),
-    Case("busy_site", "fast", 1000, 12.0),
+    FleetCase("paper_site", "pybullet", 1, 25.0),
+    FleetCase("paper_site", "pybullet", 4, 20.0),
+    FleetCase("paper_site", "pybullet", 8, 15.0),
+    FleetCase("paper_site", "pybullet", 32, 8.0),
+    FleetCase("busy_site", "fast", 100, 40.0),
+    FleetCase("busy_site", "fast", 1000, 12.0),
 )
 
 
-def run(seconds: float, runs: int) -> Result:
+def run(seconds: float, runs: int) -> Report:
     """Simulate every fleet for so long, each run in a new world; the median of the runs counts."""
-    measured: dict[Case, list[tuple[float, float]]] = {case: [] for case in CASES}
+    measured: dict[FleetCase, list[tuple[float, float]]] = {case: [] for case in CASES}
     for _ in range(runs):  # in turn, so that all meet the same disturbances
         for case in CASES:
             measured[case].append(_measure(case, seconds))
-    rows = [_row(case, found) for case, found in measured.items()]
+    rows = [_row(case, figures) for case, figures in measured.items()]
     return {"benchmark": "sim", "seconds": seconds, "runs": runs, **machine(), "rows": rows}
 
 
-def _measure(case: Case, seconds: float) -> tuple[float, float]:
+def _measure(case: FleetCase, seconds: float) -> tuple[float, float]:
     """CPU seconds for starting a simulator, and simulated seconds per CPU second after its warm-up."""
     start_s = time.process_time()
     simulator = Simulator(case.config)
@@ -68,7 +68,7 @@ def _drive(simulator: Simulator, until_s: float) -> None:
         simulator.sense()
 
 
-def _row(case: Case, measured: list[tuple[float, float]]) -> dict[str, str | int | float]:
+def _row(case: FleetCase, measured: list[tuple[float, float]]) -> dict[str, str | int | float]:
     start_up_s, pace = (statistics.median(column) for column in zip(*measured, strict=True))
     return {
         "world": case.world,

@@ -18,28 +18,28 @@ from agents.delivery.audit import read_audit
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot
-from mapserver.evidence.grid import Grid, GridState, Placed
+from mapserver.evidence.grid import Grid, GridState, PlacedPage
 from mapserver.evidence.pages import Page
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow
 from mapserver.trust.decisions import KIND as TRUST
-from mapserver.trust.decisions import Decisions
+from mapserver.trust.decisions import TrustDecisions
 from protocol.arrays import Ints
 from protocol.machine.samples import content_hash
 from protocol.site.site_config import SiteConfig
 
-Identity = tuple[str, int, int]  # machine, spool_id, seq
+SampleKey = tuple[str, int, int]  # machine, spool_id, seq
 
 
 @dataclass(frozen=True)
 class AuditResult:
     """What became of the recorded samples.
 
-    recorded: in the audit files; merged: voted in the grid, or journalled but too unsure of their place to vote, or of
-    a machine that is not trusted. lost: recorded, but not in the journal with the same content, or missing in the grid;
-    double: more than once in the journal, by identity or by content, or too often in the grid. unrecorded: in the
+    recorded: in the audit files; merged: voted in the grid, or journalled but too uncertain of their position to vote,
+    or of a machine that is not trusted. lost: recorded, but not in the journal with the same content, or missing in the
+    grid; double: more than once in the journal, by identity or by content, or too often in the grid. unrecorded: in the
     journal, but in no audit file.
     """
 
@@ -50,7 +50,7 @@ class AuditResult:
     unrecorded: int
 
 
-def read_audits(audits: Mapping[str, Path]) -> dict[Identity, str]:
+def read_audits(audits: Mapping[str, Path]) -> dict[SampleKey, str]:
     """Content hash of every recorded sample; audits: machine -> file."""
     return {
         (machine, spool, seq): content
@@ -62,37 +62,37 @@ def read_audits(audits: Mapping[str, Path]) -> dict[Identity, str]:
 def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, config: ServerConfig) -> AuditResult:
     """Compare audit files with the store of a server that has ended."""
     with JournalReader(folder / JOURNAL_FILE) as journal:
-        rows = list(history_rows(History.of(journal)))
-        left_out = Decisions(journal.events(TRUST)).distrusted
+        rows = list(history_rows(History.beside(journal)))
+        excluded = TrustDecisions(journal.events(TRUST)).distrusted
     last = rows[-1].row if rows else 0
-    _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, left_out)
-    return compare(read_audits(audits), rows, grid, site, config, left_out)
+    _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, excluded)
+    return compare(read_audits(audits), rows, grid, site, config, excluded)
 
 
 def compare(
-    recorded: Mapping[Identity, str],
+    recorded: Mapping[SampleKey, str],
     rows: Iterable[JournalRow],
     grid: Grid,
     site: SiteConfig,
     config: ServerConfig,
-    left_out: Collection[str] = (),
+    excluded: Collection[str] = (),
 ) -> AuditResult:
-    """Compare recorded samples with journal rows, and those, folded again, with a grid; left_out: of the grid."""
+    """Compare recorded samples with journal rows, and those, folded again, with a grid; excluded: of the grid."""
     withheld = 0
     refolded = Grid(site.cell_m, config.fold)
-    found: dict[Identity, list[str]] = {}
+    hashes: dict[SampleKey, list[str]] = {}
     contents: Counter[tuple[str, str]] = Counter()
     for row in rows:
-        if row.machine in left_out:
+        if row.machine in excluded:
             withheld += len(row.rows)
         else:
             refolded.fold(row.rows, row.machine)
         for i, sample in enumerate(row.rows):
             content = content_hash(sample)
-            found.setdefault((row.machine, row.spool_id, row.first_seq + i), []).append(content)
+            hashes.setdefault((row.machine, row.spool_id, row.first_seq + i), []).append(content)
             contents[row.machine, content] += 1
-    lost = sum(content not in found.get(identity, ()) for identity, content in recorded.items())
-    by_identity = sum(len(hashes) - 1 for hashes in found.values())
+    lost = sum(content not in hashes.get(identity, ()) for identity, content in recorded.items())
+    by_identity = sum(len(each) - 1 for each in hashes.values())
     by_content = sum(n - 1 for n in contents.values())
     short, over = grid_difference(refolded.state(), grid.state())
     return AuditResult(
@@ -100,22 +100,22 @@ def compare(
         merged=grid.folded + grid.skipped + withheld,
         lost=lost + short,
         double=max(by_identity, by_content) + over,
-        unrecorded=sum(identity not in recorded for identity in found),
+        unrecorded=sum(identity not in recorded for identity in hashes),
     )
 
 
-def grid_difference(expected: GridState, found: GridState) -> tuple[int, int]:
+def grid_difference(expected: GridState, actual: GridState) -> tuple[int, int]:
     """About how many samples are missing in a grid, and how many are too many: 0, 0 only where all counts agree.
 
     Counts are compared cell by cell; their difference is turned into samples by the counts of a mean sample, rounded
     up.
     """
     per_sample = max(1.0, sum(map(_votes, expected.pages)) / max(1, expected.folded))
-    there = {(at.x, at.y, at.rung, at.index): at.page for at in found.pages}
+    there = {(at.x, at.y, at.tier, at.index): at.page for at in actual.pages}
     missing = surplus = 0
     for at in expected.pages:
         difference = _dense(at.page)
-        if page := there.pop((at.x, at.y, at.rung, at.index), None):
+        if page := there.pop((at.x, at.y, at.tier, at.index), None):
             difference -= _dense(page)
         missing += int(difference[difference > 0].sum())
         surplus -= int(difference[difference < 0].sum())
@@ -123,7 +123,7 @@ def grid_difference(expected: GridState, found: GridState) -> tuple[int, int]:
     return math.ceil(missing / per_sample), math.ceil(surplus / per_sample)
 
 
-def _votes(at: Placed) -> int:
+def _votes(at: PlacedPage) -> int:
     return int(at.page.votes["count"].sum(dtype=np.int64))
 
 

@@ -1,6 +1,6 @@
 """The map server's edge to Zenoh: a queryable for batches, one for map queries, one for commands; events of changes.
 
-Callbacks only move bytes to the writer's queue or to other threads (EVIDENCE: work in a callback stalls it).
+Callbacks only move bytes to the writer's queue or to other threads: a callback that works stalls the session.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from mapserver.config import ServerConfig
-from mapserver.follower.follower import Keeper
+from mapserver.follower.follower import Follower
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Verify
 from mapserver.ingest.writer import Writer
 from mapserver.query.answers import Answers, reads_past
@@ -46,8 +46,8 @@ class Server:
         self._changed = session.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
-        self._keeper = Keeper(self._writer, folder, site, config, self._publish, now_ns)
-        self._answers = Answers(self._writer, site, config, self._keeper, folder / JOURNAL_FILE)
+        self._follower = Follower(self._writer, folder, site, config, self._publish, now_ns)
+        self._answers = Answers(self._writer, self._follower, site, config, folder / JOURNAL_FILE)
         self._threads = ThreadPoolExecutor(config.query_threads, thread_name_prefix="query")
         # One each: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
         self._past_thread = ThreadPoolExecutor(1, thread_name_prefix="past")
@@ -74,7 +74,7 @@ class Server:
             queryable.undeclare()  # type: ignore[no-untyped-call]
         for threads in (self._threads, self._past_thread, self._command_thread):
             threads.shutdown(wait=False, cancel_futures=True)  # nobody waits for an answer longer than for the end
-        self._keeper.close()
+        self._follower.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()
 

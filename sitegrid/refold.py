@@ -17,10 +17,13 @@ from typing import Any
 
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Store
-from mapserver.journal.archive import FOLDER, Archive, ArchiveFile
-from mapserver.journal.history import Copier, History, Spool, history_rows, merged
-from mapserver.journal.journal import Journal, JournalReader
-from mapserver.journal.rows import JournalRow, Mark, Wanted
+from mapserver.journal.archive import FOLDER, Archive
+from mapserver.journal.archive_file import ArchiveFile
+from mapserver.journal.copier import Copier, SpoolKey, merged
+from mapserver.journal.history import History, history_rows
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import JournalRow, Selection, Watermark
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
@@ -33,8 +36,8 @@ COMMIT_ROWS = 500
 
 
 @dataclass(frozen=True)
-class Source:
-    """Rows of a file or a store. site: where it says so; first_ns: when its first row was received."""
+class SampleSource:
+    """Rows of a file or a store. site: where it is known; first_ns: when its first row was received."""
 
     path: Path
     name: str
@@ -44,34 +47,39 @@ class Source:
     samples: int
     first_ns: int
     rows: Iterator[JournalRow]
-    marks: Mapping[Spool, Mark] = field(default_factory=dict)
+    watermarks: Mapping[SpoolKey, Watermark] = field(default_factory=dict)
 
 
 def run(arguments: Namespace) -> int:
     """Fold once and print what became of the samples."""
-    wanted = Wanted(
+    selection = Selection(
         from_ns=arguments.from_ns or 0,
         to_ns=MAX_STAMP_NS if arguments.until_ns is None else arguments.until_ns - 1,
         without=frozenset(arguments.without),
     )
-    if wanted.to_ns < wanted.from_ns:
+    if selection.to_ns < selection.from_ns:
         raise ConfigError("--until", "is not after --from, so no time is left between them")
     if arguments.out.exists() and (not arguments.out.is_dir() or any(arguments.out.iterdir())):
         raise ConfigError(arguments.out, "exists and is not empty; choose another --out")
     with ExitStack() as opened:
-        sources = [source for path in arguments.archives for source in _sources(path, wanted, opened)]
+        sources = [source for path in arguments.archives for source in _sources(path, selection, opened)]
         site = _site(sources, arguments)
         config, config_text = _config(arguments)
-        if unknown := sorted(wanted.without - {name for source in sources for name in source.machines}):
+        if unknown := sorted(selection.without - {name for source in sources for name in source.machines}):
             known = ", ".join(sorted({name for source in sources for name in source.machines}))
             raise ConfigError("--without", f"{unknown[0]!r} is no machine of these archives; they are: {known}")
-        summary = _build(arguments, sources, site, config, config_text, wanted)
+        summary = _build(arguments, sources, site, config, config_text, selection)
     say(summary) if arguments.json else print("\n".join(_lines(summary)))
     return 0
 
 
 def _build(
-    arguments: Namespace, sources: list[Source], site: SiteConfig, config: ServerConfig, text: str, wanted: Wanted
+    arguments: Namespace,
+    sources: list[SampleSource],
+    site: SiteConfig,
+    config: ServerConfig,
+    text: str,
+    selection: Selection,
 ) -> dict[str, Any]:
     """Make the store beside its place, and put it there when it is complete."""
     part = arguments.out.with_name(f"{arguments.out.name}.part")
@@ -80,7 +88,7 @@ def _build(
     except FileExistsError:
         raise ConfigError(part, "is left from a fold that was killed; remove it") from None
     try:
-        copier = _copy(part, sources, site, wanted, headless=arguments.json)
+        copier = _copy(part, sources, site, selection, headless=arguments.json)
         (part / SITE_FILE).write_text(site_toml(site), encoding="utf-8")
         (part / CONFIG_FILE).write_text(text, encoding="utf-8")
         info = _fold(part, site, config)
@@ -93,7 +101,7 @@ def _build(
         "archives": len(sources),
         "rows": info["journalled"],
         "samples": copier.kept.total(),
-        "left_out": dict(copier.left_out),
+        "excluded": dict(copier.excluded),
         "too_unsure": info["samples_too_unsure"],
         "machines": _by_machine(copier.kept),
         "cells": info["cells"],
@@ -101,9 +109,9 @@ def _build(
     }
 
 
-def _sources(path: Path, wanted: Wanted, opened: ExitStack) -> Iterator[Source]:
-    """What a Parquet file, a folder of them or a store holds; by time only what is wanted is read."""
-    in_time = Wanted(from_ns=wanted.from_ns, to_ns=wanted.to_ns)
+def _sources(path: Path, selection: Selection, opened: ExitStack) -> Iterator[SampleSource]:
+    """What a Parquet file, a folder of them or a store holds; only samples of the selected time are read."""
+    in_time = Selection(from_ns=selection.from_ns, to_ns=selection.to_ns)
     if (path / JOURNAL_FILE).exists():
         yield _store(path, in_time, opened)
         return
@@ -113,22 +121,24 @@ def _sources(path: Path, wanted: Wanted, opened: ExitStack) -> Iterator[Source]:
     if not files:
         raise ConfigError(path, f"holds neither Parquet files nor a {JOURNAL_FILE}")
     for file in map(ArchiveFile, files):
-        said, rows = file.header, file.read(wanted=in_time)
-        machines = frozenset(said.machines)
-        yield Source(
-            file.path, said.site.name, said.frame, said.site, machines, file.samples, file.first_received_ns, rows
+        header, rows = file.header, file.read(selection=in_time)
+        machines = frozenset(header.machines)
+        yield SampleSource(
+            file.path, header.site.name, header.frame, header.site, machines, file.samples, file.first_received_ns, rows
         )
 
 
-def _store(path: Path, wanted: Wanted, opened: ExitStack) -> Source:
+def _store(path: Path, selection: Selection, opened: ExitStack) -> SampleSource:
     journal = opened.enter_context(JournalReader(path / JOURNAL_FILE))
-    history, marks = History.of(journal), journal.marks()
+    history, watermarks = History.beside(journal), journal.watermarks()
     first = next(history_rows(history), None)
-    samples = sum(mark.seq - mark.lost for mark in marks.values())
-    machines = frozenset(machine for machine, _ in marks)
+    samples = sum(watermark.seq - watermark.lost for watermark in watermarks.values())
+    machines = frozenset(machine for machine, _ in watermarks)
     first_ns = first.received_ns if first else 0
-    rows = history_rows(history, wanted=wanted)
-    return Source(path, journal.site, journal.frame, _site_of(path), machines, samples, first_ns, rows, marks)
+    rows = history_rows(history, selection=selection)
+    return SampleSource(
+        path, journal.site, journal.frame, _site_of(path), machines, samples, first_ns, rows, watermarks
+    )
 
 
 def _site_of(store: Path) -> SiteConfig | None:
@@ -139,15 +149,15 @@ def _site_of(store: Path) -> SiteConfig | None:
     return ArchiveFile(paths[-1]).header.site if paths else None
 
 
-def _site(sources: list[Source], arguments: Namespace) -> SiteConfig:
+def _site(sources: list[SampleSource], arguments: Namespace) -> SiteConfig:
     """The one site of all sources, with what the options change."""
     for source in sources[1:]:
         if (source.name, source.frame) != (sources[0].name, sources[0].frame):
             problem = f"is of site {source.name!r}, frame {source.frame}"
             problem += f", but {sources[0].path} of {sources[0].name!r}, {sources[0].frame}; fold them apart"
             raise ConfigError(source.path, problem)
-    said = load_site(arguments.site_file) if arguments.site_file else None
-    site = said or next((source.site for source in sources if source.site), None)
+    given = load_site(arguments.site_file) if arguments.site_file else None
+    site = given or next((source.site for source in sources if source.site), None)
     if not site:
         raise ConfigError(sources[0].path, "does not say where its site is; give --site-file")
     if (site.name, site.frame) != (sources[0].name, sources[0].frame):
@@ -168,10 +178,10 @@ def _config(arguments: Namespace) -> tuple[ServerConfig, str]:
     return from_table(ServerConfig, load_toml(path), str(path)), path.read_text(encoding="utf-8")
 
 
-def _copy(part: Path, sources: list[Source], site: SiteConfig, wanted: Wanted, *, headless: bool) -> Copier:
+def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: Selection, *, headless: bool) -> Copier:
     """Write the journal of the new store."""
     journal = Journal(part / JOURNAL_FILE, site.name, site.frame)
-    copier = Copier(journal, site.frame, wanted)
+    copier = Copier(journal, site.frame, selection)
     total, done = sum(source.samples for source in sources), 0
     sources = sorted(sources, key=lambda source: (source.first_ns, sorted(source.machines), source.path))
     origins = [(str(source.path), source.first_ns, source.rows) for source in sources]
@@ -188,11 +198,11 @@ def _copy(part: Path, sources: list[Source], site: SiteConfig, wanted: Wanted, *
                 journal.begin()
                 if display:
                     display.show(done, total, f"{done / 1e6:.2f} of {total / 1e6:.2f} M samples")
-        copier.left_out["time"] += max(0, total - done)  # whole batches and files that were passed over
-        copier.finish({spool: mark.seq for source in sources for spool, mark in source.marks.items()})
+        copier.excluded["time"] += max(0, total - done)  # whole batches and files that were passed over
+        copier.finish({spool: watermark.seq for source in sources for spool, watermark in source.watermarks.items()})
         journal.commit()
     if not copier.kept.total():
-        raise ConfigError("sitegrid fold", f"no sample is left: {json.dumps(copier.left_out)} are left out")
+        raise ConfigError("sitegrid fold", f"no sample is left: {json.dumps(copier.excluded)} are excluded")
     return copier
 
 
@@ -203,7 +213,7 @@ def _fold(part: Path, site: SiteConfig, config: ServerConfig) -> dict[str, Any]:
         return store.info()
 
 
-def _by_machine(kept: Mapping[Spool, int]) -> dict[str, int]:
+def _by_machine(kept: Mapping[SpoolKey, int]) -> dict[str, int]:
     machines: Counter[str] = Counter()
     for (machine, _), samples in kept.items():
         machines[machine] += samples
@@ -212,12 +222,12 @@ def _by_machine(kept: Mapping[Spool, int]) -> dict[str, int]:
 
 def _lines(summary: Mapping[str, Any]) -> list[str]:
     """The summary for people."""
-    left, store = summary["left_out"], summary["store"]
+    excluded, store = summary["excluded"], summary["store"]
     size = f"{summary['rows']} journal rows, {summary['cells']} cells of {summary['cell_m']:g} m"
     return [
         f"{store}: {summary['samples']} samples in {size}",
         *(f"  {machine}: {samples} samples" for machine, samples in summary["machines"].items()),
-        f"  left out: {left['machine']} of machines, {left['time']} by time, {left['twice']} that came twice",
-        f"  too unsure of their place to vote: {summary['too_unsure']}",
+        f"  excluded: {excluded['machine']} of machines, {excluded['time']} by time, {excluded['twice']} duplicates",
+        f"  too uncertain of their position to vote: {summary['too_unsure']}",
         f"sitegrid server --store {store} --site-file {store}/{SITE_FILE} --config {store}/{CONFIG_FILE}",
     ]

@@ -67,7 +67,7 @@ class Soak:
         return 100 * (float(np.median(memory[-span:]) / np.median(memory[middle - span : middle])) - 1)
 
 
-class Machine:
+class SoakMachine:
     """One machine on laps of its own around the site; positions err slowly, as those of GPS do."""
 
     def __init__(self, name: str, seed: int) -> None:
@@ -149,7 +149,7 @@ def soak(folder: Path, minutes: float, speed: float, machines: int) -> Soak:
 def _drive(site: SiteConfig, endpoint: str, watched: tuple[Child, Child], run: tuple[float, float, int]) -> Soak:
     """Send what all machines drive, one batch after the other, and look at the processes every minute of the site."""
     end_s, speed, count = run
-    machines = [Machine(f"machine-{i}", seed=i) for i in range(count)]
+    machines = [SoakMachine(f"machine-{i}", seed=i) for i in range(count)]
     session = open_session(SessionConfig(endpoint))
     looks: list[Look] = []
     begin_s, sent, late_s = time.monotonic(), 0, 0.0

@@ -16,7 +16,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
 from mapserver.query.views import read_cells, view_of
-from mapserver.trust.auditor import Auditor, TrustConfig
+from mapserver.trust.auditor import Auditor
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.site.geometry import CellWindow
 
@@ -56,7 +56,7 @@ def soft_votes(deliveries: Sequence[Delivery], window: CellWindow) -> ServerMap:
 
 def contradicting(deliveries: Sequence[Delivery]) -> tuple[str, ...]:
     """Machines that contradict all others, as the server's trust finds them at the end."""
-    auditor = Auditor(TrustConfig(), CELL_M)
+    auditor = Auditor(CELL_M)
     for delivery in deliveries:
         auditor.add(delivery.machine, delivery.rows)
     return tuple(name for name, verdict in auditor.verdicts().items() if verdict.contradicts)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.ground.truth import border_distance
-from mapserver.pictures.plotter import Layers
+from mapserver.pictures.plotter import NamedLayers
 from protocol.arrays import Bools, Floats, Ints
 from protocol.queries.answers import Region
 from protocol.site.ground_classes import UNKNOWN, resistance_class, slope_class, wrong_percent
@@ -41,7 +41,7 @@ class DrivenScore:
     by_border: list[dict[str, Any]]
 
 
-def score(region: Region, truth: Layers) -> MapScore:
+def score(region: Region, truth: NamedLayers) -> MapScore:
     """Compare a map with true layers of the same cells (resistance, grade_east, grade_north)."""
     found = resistance_class(region["resistance"])
     slope = slope_class(region["grade_east"], region["grade_north"])
@@ -52,7 +52,7 @@ def score(region: Region, truth: Layers) -> MapScore:
     )
 
 
-def score_driven(region: Region, truth: Layers, ways_m: Iterable[Floats]) -> DrivenScore:
+def score_driven(region: Region, truth: NamedLayers, ways_m: Iterable[Floats]) -> DrivenScore:
     """Compare a map with true layers of the same cells where machines truly were.
 
     Cells that are known but were never passed, because a position was wrong, do not count. ways_m: true places (n, 2)

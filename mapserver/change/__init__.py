@@ -1,1 +1,1 @@
-"""Where recent evidence contradicts older evidence, and the list of changes found so."""
+"""Where recent evidence contradicts older evidence, and the log of such changes."""

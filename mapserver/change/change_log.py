@@ -1,7 +1,7 @@
-"""Changes of the ground as they are found: where, when, from what to what; a list that grows while machines pass.
+"""A log of changes of the ground: where, when, from what to what; it grows while machines pass.
 
-A change of a larger area is seen piece by piece. What is found next to a change of about the same time is the same
-change, which is larger than it was then.
+A change of a larger area is seen piece by piece. What changed next to a change of about the same time is the same
+change, which is then larger.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 
 from mapserver.change.detection import ChangeConfig, cuts
-from mapserver.change.validity import evidence, image_of, valid_pages
+from mapserver.change.validity import image_of, valid_pages
 from mapserver.evidence import cells as ev
+from mapserver.evidence.sums import evidence
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.layers import cell_layers
 from protocol.arrays import Bools, Floats32, Ints
@@ -29,10 +30,10 @@ _BEFORE_AFTER = ("resistance", "grade")
 
 
 @dataclass(frozen=True)
-class Change:
+class GroundChange:
     """One change of the ground.
 
-    id: its number. first_ns, last_ns: between them it took place, cell by cell. bounds: west, south, east, north [m].
+    id: its number. first_ns, last_ns: it took place between them, cell by cell. bounds: west, south, east, north [m].
     cells: how many are known to be changed. resistance, grade before and after: medians, None where not known.
     """
 
@@ -52,28 +53,28 @@ class Change:
         return {**asdict(self), "bounds": list(self.bounds)}
 
     @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Change:
+    def from_values(cls, values: Mapping[str, Any]) -> GroundChange:
         """Undo `values`."""
         west, south, east, north = values["bounds"]
         return cls(**{**values, "bounds": (west, south, east, north)})
 
 
-class ChangeWatch:
-    """Changes of one site. known: plain values of those from before, the newest of each number last."""
+class ChangeLog:
+    """Changes of one site. kept: plain values of those from before, the newest of each number last."""
 
     def __init__(
-        self, cell_m: float, change: ChangeConfig, read: cell_layers.ReadConfig, known: Iterable[Mapping[str, Any]] = ()
+        self, cell_m: float, change: ChangeConfig, read: cell_layers.ReadConfig, kept: Iterable[Mapping[str, Any]] = ()
     ) -> None:
         self._cell_m, self._config, self._read = cell_m, change, read
-        self._changes = {values["id"]: Change.of(values) for values in known}
-        self._told: dict[Block, Ints] = {}  # changed_ns of cells that are part of a change already
+        self._changes = {values["id"]: GroundChange.from_values(values) for values in kept}
+        self._logged: dict[Block, Ints] = {}  # changed_ns of cells that are part of a change already
         self._members: dict[int, set[tuple[int, int]]] = {number: set() for number in self._changes}
 
-    def changes(self, after: int = 0) -> list[Change]:
+    def changes(self, after: int = 0) -> list[GroundChange]:
         """All changes with a number beyond `after`."""
         return [change for number, change in sorted(self._changes.items()) if number > after]
 
-    def look(self, blocks: Collection[Block], pages: Mapping[Block, Sequence[TimedPage]]) -> list[Change]:
+    def look(self, blocks: Collection[Block], pages: Mapping[Block, Sequence[TimedPage]]) -> list[GroundChange]:
         """Look at blocks, given their pages and those of their neighbours; returns changes that are new or grew."""
         first = valid_pages(pages, self._cell_m, self._config)
         changed = [block for block in blocks if block in first and first[block].any()]
@@ -90,28 +91,30 @@ class ChangeWatch:
         count, areas = cv2.connectedComponents(image.astype(np.uint8), connectivity=8)
         images = {name: image_of(dict(zip(changed, part, strict=True)), np.nan)[0] for name, part in values.items()}
         stamps, _ = image_of({block: now.changed_ns[i] for i, block in enumerate(changed)}, 0)
-        found: dict[int, Change] = {}
+        grown: dict[int, GroundChange] = {}
         for area in range(1, count):
             row, column = _of_one_time(areas == area, stamps)
             medians = {name: _median(part[row, column]) for name, part in images.items()}
             place = (row + bottom * BLOCK_CELLS, column + left * BLOCK_CELLS)
-            if change := self._note(*place, stamps[row, column], medians):
-                found[change.id] = change
-        return list(found.values())
+            if change := self._add(*place, stamps[row, column], medians):
+                grown[change.id] = change
+        return list(grown.values())
 
     def _fresh(self, block: Block, pages: Sequence[TimedPage], first: Ints, changed_ns: Ints) -> Bools:
         """Cells (256,) that changed, and are not part of a change yet."""
-        told = self._told.setdefault(block, np.zeros(ev.CELLS, np.int64))
+        logged = self._logged.setdefault(block, np.zeros(ev.CELLS, np.int64))
         spans_ns = np.array([timed.end_ns - timed.first_ns for timed in pages])
-        settled_ns = told + np.maximum(spans_ns[first], SETTLES_NS)
-        fresh = (changed_ns > 0) & ((told == 0) | (changed_ns > settled_ns))
-        told[fresh] = changed_ns[fresh]
+        settled_ns = logged + np.maximum(spans_ns[first], SETTLES_NS)
+        fresh = (changed_ns > 0) & ((logged == 0) | (changed_ns > settled_ns))
+        logged[fresh] = changed_ns[fresh]
         return np.asarray(fresh, np.bool_)
 
-    def _note(self, row: Ints, column: Ints, changed_ns: Ints, medians: Mapping[str, float | None]) -> Change | None:
+    def _add(
+        self, row: Ints, column: Ints, changed_ns: Ints, medians: Mapping[str, float | None]
+    ) -> GroundChange | None:
         """Make an area part of a change nearby, or a change of its own; None where that was known before."""
         cells = set(zip(row.tolist(), column.tolist(), strict=True))
-        area = Change(
+        area = GroundChange(
             id=max(self._changes, default=0) + 1,
             first_ns=int(changed_ns.min()),
             last_ns=int(changed_ns.max()),
@@ -127,7 +130,7 @@ class ChangeWatch:
             return area
         members = self._members[same.id]
         members |= cells
-        if len(members) <= same.cells:  # found again after a restart
+        if len(members) <= same.cells:  # the same cells, again after a restart
             return None
         boxes = zip(same.bounds, area.bounds, (min, min, max, max), strict=True)
         grown = replace(
@@ -140,7 +143,7 @@ class ChangeWatch:
         self._changes[same.id] = grown
         return grown
 
-    def _is_near(self, one: Change, other: Change) -> bool:
+    def _is_near(self, one: GroundChange, other: GroundChange) -> bool:
         reach_m = NEAR_CELLS * self._cell_m
         (west, south, east, north), (w, s, e, n) = one.bounds, other.bounds
         apart = w > east + reach_m or e < west - reach_m or s > north + reach_m or n < south - reach_m
@@ -161,11 +164,11 @@ def _older(pages: Sequence[TimedPage], first: Ints) -> Sequence[TimedPage]:
 
 def _before_and_after(old: ev.Evidence, now: ev.Evidence, config: cell_layers.ReadConfig) -> dict[str, Floats32]:
     """Layers (blocks, 256) from the evidence before a change, and from what holds now."""
-    found = {}
+    layers = {}
     for when, part in (("before", old), ("after", now)):
         for name, values in cell_layers.read(part, _BEFORE_AFTER, config).items():
-            found[f"{name}_{when}"] = values
-    return found
+            layers[f"{name}_{when}"] = values
+    return layers
 
 
 def _median(values: Floats32) -> float | None:

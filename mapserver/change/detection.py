@@ -1,4 +1,4 @@
-"""Change of the ground: where recent evidence contradicts older evidence, the older is left out when the map is read.
+"""Change of the ground: where recent evidence contradicts older evidence, a read of the map skips the older.
 
 For every cell, evidence is cut in two between two of its pages by time. The cut that explains it best (two kinds of
 ground are more likely than one, by the log-likelihood ratio of their histograms) is a change if the two histograms have
@@ -21,6 +21,11 @@ from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_positive
 from protocol.site.geometry import BLOCK_CELLS
 
+VARIATION = 0.6  # total variation of two histograms, 0 to 1, above which they contradict each other
+BINS = (
+    1.5  # least difference of their medians, in bins (22 % of c_rr, 0.031 of gradient): medians are no finer than one
+)
+WEIGHT_M = 0.3  # least evidence on either side of a cut: a sample's vote in a cell beside its own is no pass
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
 ALIKE_BINS = 1.0  # kinds of ground nearer to each other are the same; cells whose pages are nearer did not change
 _PARTS = (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH)
@@ -30,24 +35,15 @@ _PARTS = (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH)
 class ChangeConfig:
     """When recent evidence replaces older evidence.
 
-    detect: whether it ever does. variation: total variation between the two [0..1] above which they contradict each
-    other. bins: least difference of their medians, in bins of votes (22 % of c_rr, 0.031 of gradient). weight_m: least
-    evidence on either side. size_m: changes narrower than this are position errors at a border, and those narrower than
-    twice this where the new kind of ground is that of the ground beside.
+    detect: whether it ever does. size_m: changes narrower than this are position errors at a border, and those narrower
+    than twice this where the new kind of ground is that of the ground beside.
     """
 
     detect: bool = True
-    variation: float = 0.6
-    bins: float = 1.5
-    weight_m: float = 0.3
     size_m: float = 5.0
 
     def __post_init__(self) -> None:
-        require_positive(self, ("weight_m", "size_m"))
-        if not self.bins >= 1:
-            raise ValueError(f"bins: {self.bins} is below 1: medians of votes are no finer")
-        if not 0 < self.variation < 1:
-            raise ValueError(f"variation: {self.variation} is not between 0 and 1")
+        require_positive(self, ("size_m",))
 
 
 @dataclass(frozen=True)
@@ -64,24 +60,24 @@ class Cuts:
 
 def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
     """Find the last change in every cell of a block."""
-    found = Cuts(np.zeros(ev.CELLS, np.int64), np.full(ev.CELLS, np.nan))
+    last = Cuts(np.zeros(ev.CELLS, np.int64), np.full(ev.CELLS, np.nan))
     if len(pages) < 2 or not config.detect:
-        return found
+        return last
     for part in _PARTS:
-        cells = np.flatnonzero(_may_differ(pages, part, config))
+        cells = np.flatnonzero(_may_differ(pages, part))
         if not len(cells):
             continue
         votes = _histograms(pages, part, cells)
         left = np.arange(len(cells))
         for _ in range(MOST_CHANGES):
-            cut, kind = _best_cut(votes[:, :, left], found.first[cells[left]], config)
-            changed = cut > found.first[cells[left]]
+            cut, kind = _best_cut(votes[:, :, left], last.first[cells[left]])
+            changed = cut > last.first[cells[left]]
             left, cut, kind = left[changed], cut[changed], kind[changed]
-            found.first[cells[left]] = cut
-            found.kind[cells[left]] = kind if part == ev.RESISTANCE else np.nan
+            last.first[cells[left]] = cut
+            last.kind[cells[left]] = kind if part == ev.RESISTANCE else np.nan
             if not len(left):
                 break
-    return found
+    return last
 
 
 def kinds(pages: Sequence[TimedPage]) -> Floats:
@@ -138,22 +134,22 @@ def _histograms(pages: Sequence[TimedPage], part: slice, cells: Ints) -> Floats:
     return metres
 
 
-def _may_differ(pages: Sequence[TimedPage], part: slice, config: ChangeConfig) -> Bools:
+def _may_differ(pages: Sequence[TimedPage], part: slice) -> Bools:
     """Cells whose pages differ at all, by the mean of their votes or by the spread: most do not."""
     sums = np.stack([moments(timed.page, part) for timed in pages])
     weight = sums[:, 0]
     mean, square = sums[:, 1] / np.maximum(weight, 1e-9), sums[:, 2] / np.maximum(weight, 1e-9)
     spread = np.sqrt(np.maximum(square - mean**2, 0))
-    seen = weight > 0.1 * config.weight_m * ev.WEIGHT_UNITS_PER_M
-    alike = min(ALIKE_BINS, config.bins / 2)
+    seen = weight > 0.1 * WEIGHT_M * ev.WEIGHT_UNITS_PER_M
+    alike = min(ALIKE_BINS, BINS / 2)
     ranges = [np.where(seen, v, -np.inf).max(axis=0) - np.where(seen, v, np.inf).min(axis=0) for v in (mean, spread)]
     return np.asarray(np.maximum(*ranges) > alike, np.bool_)
 
 
-def _best_cut(votes: Floats, first: Ints, config: ChangeConfig) -> tuple[Ints, Floats]:
+def _best_cut(votes: Floats, first: Ints) -> tuple[Ints, Floats]:
     """Index of the page (cells,) at which the ground changed, the given first page where it did not.
 
-    votes: (pages, bins, cells); pages before `first` are left out. Also returns the median (cells,) after it.
+    votes: (pages, bins, cells); pages before `first` do not count. Also returns the median (cells,) after it.
     """
     pages = np.arange(len(votes))
     kept = np.where(pages[:, None, None] >= first, votes, 0)
@@ -161,7 +157,7 @@ def _best_cut(votes: Floats, first: Ints, config: ChangeConfig) -> tuple[Ints, F
     old, new = until[:-1], until[-1] - until[:-1]  # (pages - 1, bins, cells): cut before page 1, 2, ...
     likelihood = _entropy(until[-1])[None] - _entropy(old) - _entropy(new)
     weights = np.minimum(old.sum(axis=1), new.sum(axis=1))
-    likelihood[weights < config.weight_m] = -np.inf
+    likelihood[weights < WEIGHT_M] = -np.inf
     best = likelihood.argmax(axis=0)
     cells = np.arange(votes.shape[2])
     before, after = old[best, :, cells].T, new[best, :, cells].T  # (bins, cells)
@@ -169,7 +165,7 @@ def _best_cut(votes: Floats, first: Ints, config: ChangeConfig) -> tuple[Ints, F
     variation = np.abs(share_before - share_after).sum(axis=0) / 2
     kind = _median(share_after)
     apart = np.abs(_median(share_before) - kind)
-    changed = (weights[best, cells] >= config.weight_m) & (variation > config.variation) & (apart >= config.bins)
+    changed = (weights[best, cells] >= WEIGHT_M) & (variation > VARIATION) & (apart >= BINS)
     return np.where(changed, best + 1, first), kind
 
 

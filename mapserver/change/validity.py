@@ -1,15 +1,12 @@
-"""From pages to evidence that holds now: what a read of the map begins with."""
+"""Which pages of evidence still hold: for every cell, those from its last credible change on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapserver.change.detection import ChangeConfig, credible, cuts, kinds, reach_blocks
-from mapserver.evidence import cells as ev
-from mapserver.evidence.pages import pick
 from mapserver.evidence.timeline import Block, TimedPage
 from protocol.arrays import AnyArray, Ints
 from protocol.site.geometry import BLOCK_CELLS
@@ -22,15 +19,15 @@ def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block
 
     Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted.
     """
-    found = {block: cuts(of_block, config) for block, of_block in pages.items()}
-    first = {block: cut.first for block, cut in found.items()}
-    changed = [block for block, cut in found.items() if cut.first.any()]
+    last = {block: cuts(block_pages, config) for block, block_pages in pages.items()}
+    first = {block: last[block].first for block in pages}
+    changed = [block for block in first if first[block].any()]
     if not changed:
         return first
     reach = reach_blocks(cell_m, config)
-    near = {block for one in changed for block in around(one, reach) if block in found}
+    near = {block for one in changed for block in around(one, reach) if block in pages}
     image, corner = image_of({block: first[block] > 0 for block in near}, False)
-    kind, _ = image_of({block: found[block].kind for block in near}, np.nan)
+    kind, _ = image_of({block: last[block].kind for block in near}, np.nan)
     now, _ = image_of({block: kinds(pages[block]) for block in near}, np.nan)
     holds = credible(image, kind, now, cell_m, config)
     for block in changed:
@@ -43,42 +40,6 @@ def around(block: Block, reach: int) -> list[Block]:
     x, y = block
     steps = range(-reach, reach + 1)
     return [(x + dx, y + dy) for dy in steps for dx in steps]
-
-
-def evidence(pages: Sequence[Sequence[TimedPage]], first: Sequence[Ints] | None = None) -> ev.Evidence:
-    """Sum the pages of blocks, from the first that holds on in each cell; all of them where `first` is not given."""
-    counts = np.zeros((len(pages), ev.COUNTS, ev.CELLS), np.uint64)
-    bitmaps = np.zeros((len(pages), ev.CELLS, 2), np.uint64)
-    newest_ns = np.zeros((len(pages), ev.CELLS), np.int64)
-    changed_ns = np.zeros((len(pages), ev.CELLS), np.int64)
-    for i, of_block in enumerate(pages):
-        start = first[i] if first else np.zeros(ev.CELLS, np.int64)
-        _sum(of_block, start, counts[i].reshape(-1), bitmaps[i], newest_ns[i])
-        if start.any():
-            changed_ns[i] = _changed_ns(of_block, start)
-    return ev.Evidence(counts.transpose(0, 2, 1), bitmaps, newest_ns, changed_ns)
-
-
-def _sum(
-    pages: Sequence[TimedPage], start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints
-) -> None:
-    last = int(start.max(initial=0))
-    for index, timed in enumerate(pages):
-        page = timed.page if index >= last else pick(timed.page, start <= index)
-        page.add_to(counts, bitmaps, newest_ns)
-
-
-def _changed_ns(pages: Sequence[TimedPage], start: Ints) -> Ints:
-    """When each cell (256,) changed, 0 where it did not: after its last old sample, and within the first new span."""
-    changed_ns = np.zeros(ev.CELLS, np.int64)
-    for index, timed in enumerate(pages):
-        begins = start == index
-        changed_ns[begins & (start > 0)] = np.maximum(changed_ns, timed.first_ns)[begins & (start > 0)]
-        cells = timed.page.cells
-        old = start[cells["cell"]] > index
-        at = cells["cell"][old]
-        changed_ns[at] = np.maximum(changed_ns[at], cells["newest_ns"][old])
-    return changed_ns
 
 
 def image_of(blocks: Mapping[Block, AnyArray], nothing: float) -> tuple[AnyArray, Block]:

@@ -1,4 +1,4 @@
-"""What a cell keeps: evidence, not averages (DESIGN, "Evidence").
+"""What a cell keeps: evidence, not averages (docs/design.md).
 
 Per cell and time bucket only non-negative integers, so that sums commute and the same samples give the same grid, bit
 for bit, in any order. A count is metres driven in units of 1/4096 m; counts saturate instead of wrapping.
@@ -20,7 +20,8 @@ CELLS = BLOCK_CELLS * BLOCK_CELLS  # of a block
 WEIGHT_UNITS_PER_M = 4096
 COUNT_MAX = np.iinfo(np.uint32).max
 
-# c_rr votes: centres spaced evenly in log(c_rr); 24 bins separate 0.04 from 0.06 by two bins (EVIDENCE: 8 bins fail).
+# c_rr votes: centres spaced evenly in log(c_rr); 24 bins separate 0.04 from 0.06 by two bins, 8 bins do not
+# (docs/evidence.md).
 RESISTANCE_BINS = 24
 RESISTANCE_CENTRES = np.geomspace(0.004, 0.4, RESISTANCE_BINS)
 # Gradient votes: centres every 1/32 over +-0.5 [m/m].
@@ -43,7 +44,7 @@ class Evidence:
     """Evidence of whole blocks, summed over the time buckets that are still valid.
 
     counts: (blocks, 256, COUNTS) uint64; bitmaps: (blocks, 256, 2) uint64; newest_ns: (blocks, 256), 0 for never.
-    changed_ns: (blocks, 256) when the ground changed, so that older evidence was left out; 0 where it did not.
+    changed_ns: (blocks, 256) when the ground changed, so that older evidence is excluded; 0 where it did not.
     """
 
     counts: NDArray[np.uint64]

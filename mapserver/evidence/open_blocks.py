@@ -1,4 +1,4 @@
-"""Hot blocks: evidence unpacked, where kernels write. A packed page takes it over when the space is wanted."""
+"""Open blocks: evidence unpacked, for the fold to write into. It is packed into pages when its space is needed."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ FREE = -1
 _MASK = (1 << CODE_BITS) - 1
 
 
-class NoRoom(Exception):  # noqa: N818 - what it says is no error
-    """Not so many blocks can be opened. wanted: how many."""
+class NoRoom(Exception):  # noqa: N818 - the grid makes room: it is no error
+    """So many blocks cannot be opened. blocks: how many."""
 
-    def __init__(self, wanted: int) -> None:
-        super().__init__(wanted)
-        self.wanted = wanted
+    def __init__(self, blocks: int) -> None:
+        super().__init__(blocks)
+        self.blocks = blocks
 
 
-class Hot:
+class OpenBlocks:
     """A fixed number of block buckets, zero when they are opened.
 
     counts: (slots, COUNTS, 256) uint32; planes: (slots, COUNTS) which of them have been written to; bitmaps:
@@ -83,6 +83,6 @@ def code_of(bucket: Ints, x: Ints, y: Ints) -> Ints:
     return (bucket << 2 * CODE_BITS) | ((x + CODE_HALF) << CODE_BITS) | (y + CODE_HALF)
 
 
-def of_code(code: int) -> tuple[int, int, int]:
+def split_code(code: int) -> tuple[int, int, int]:
     """Undo `code_of`."""
     return code >> 2 * CODE_BITS, (code >> CODE_BITS & _MASK) - CODE_HALF, (code & _MASK) - CODE_HALF

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
@@ -17,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.grid import Grid, GridState, Placed
+from mapserver.evidence.grid import Grid, GridState, PlacedPage
 from mapserver.evidence.pages import CELL, NARROW, WIDE, Page, frozen
-from mapserver.evidence.votes import FoldConfig
+from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
 from protocol.arrays import AnyArray
+from protocol.files import whole_file
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2
@@ -29,24 +29,19 @@ log = logging.getLogger("mapserver.evidence.snapshot")
 
 
 def save(
-    folder: Path, row: int, state: GridState, cell_m: float, config: FoldConfig, left_out: Collection[str] = ()
+    folder: Path, row: int, state: GridState, cell_m: float, config: FoldConfig, excluded: Collection[str] = ()
 ) -> Path:
     """Write a snapshot that is true for journal row `row`, and remove all but the newest two.
 
-    left_out: machines whose rows were not folded.
+    excluded: machines whose rows were not folded. Raises OSError.
     """
     path = folder / f"snapshot-{row}.npz"
-    temporary = folder / "snapshot.tmp"
+    for part in folder.glob(".snapshot-*.part"):  # of a process that was killed: one alone writes to a store
+        part.unlink(missing_ok=True)
     totals = {name: getattr(state, name) for name in _TOTALS}
-    header = {**_parameters(cell_m, config, left_out), "row": row, **totals}
-    try:
-        with temporary.open("wb") as file:
-            np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.pages))  # type: ignore[arg-type]
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)  # after a full disk
+    header = {**_parameters(cell_m, config, excluded), "row": row, **totals}
+    with whole_file(path) as file:
+        np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.pages))  # type: ignore[arg-type]
     for old in rows_on_disk(folder)[KEEP:]:
         (folder / f"snapshot-{old}.npz").unlink(missing_ok=True)
     return path
@@ -68,12 +63,12 @@ def remove_beyond(folder: Path, last_row: int) -> None:
             (folder / f"snapshot-{row}.npz").unlink(missing_ok=True)
 
 
-def load(path: Path, cell_m: float, config: FoldConfig, left_out: Collection[str] = ()) -> tuple[int, Grid] | None:
+def load(path: Path, cell_m: float, config: FoldConfig, excluded: Collection[str] = ()) -> tuple[int, Grid] | None:
     """Return the row and the grid of a snapshot, or None if it is damaged or was made with other parameters."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
-            expected = _parameters(cell_m, config, left_out)
+            expected = _parameters(cell_m, config, excluded)
             if {key: header.get(key) for key in expected} != expected:
                 return None
             state = GridState(_pages(file), *(header[name] for name in _TOTALS))
@@ -86,28 +81,28 @@ def load(path: Path, cell_m: float, config: FoldConfig, left_out: Collection[str
 
 
 def load_newest(
-    folder: Path, last_row: int, cell_m: float, config: FoldConfig, left_out: Collection[str] = ()
+    folder: Path, last_row: int, cell_m: float, config: FoldConfig, excluded: Collection[str] = ()
 ) -> tuple[int, Grid]:
     """Return the newest usable snapshot that the journal reaches, or row 0 and an empty grid."""
     for row in rows_on_disk(folder):
-        if row <= last_row and (found := load(folder / f"snapshot-{row}.npz", cell_m, config, left_out)):
-            return found
+        if row <= last_row and (loaded := load(folder / f"snapshot-{row}.npz", cell_m, config, excluded)):
+            return loaded
     return 0, Grid(cell_m, config)
 
 
-def _parameters(cell_m: float, config: FoldConfig, left_out: Collection[str]) -> dict[str, object]:
-    """What the evidence depends on; the kernel and its space are not part of it, all give the same bits."""
-    fold = {key: value for key, value in asdict(config).items() if key not in ("kernel", "hot_blocks")}
+def _parameters(cell_m: float, config: FoldConfig, excluded: Collection[str]) -> dict[str, object]:
+    """What the evidence depends on."""
+    fold = {**asdict(config), "std_floor_m": STD_FLOOR_M}
     bins = [ev.RESISTANCE_BINS, ev.GRADE_BINS, ev.SECTORS]
-    return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": bins, "left_out": sorted(left_out), **fold}
+    return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": bins, "excluded": sorted(excluded), **fold}
 
 
-def _arrays(pages: Sequence[Placed]) -> dict[str, AnyArray]:
+def _arrays(pages: Sequence[PlacedPage]) -> dict[str, AnyArray]:
     """Pages as few long arrays: what each is and how long its parts are, and the parts end to end."""
     narrow = [at.page.votes for at in pages if at.page.votes.dtype == NARROW]
     wide = [at.page.votes for at in pages if at.page.votes.dtype == WIDE]
     rows = [
-        (at.x, at.y, at.rung, at.index, at.page.votes.dtype == WIDE, len(at.page.votes), len(at.page.cells))
+        (at.x, at.y, at.tier, at.index, at.page.votes.dtype == WIDE, len(at.page.votes), len(at.page.cells))
         for at in pages
     ]
     return {
@@ -118,7 +113,7 @@ def _arrays(pages: Sequence[Placed]) -> dict[str, AnyArray]:
     }
 
 
-def _pages(file: Mapping[str, AnyArray]) -> tuple[Placed, ...]:
+def _pages(file: Mapping[str, AnyArray]) -> tuple[PlacedPage, ...]:
     """Undo `_arrays`; pages are copies, so that those which are merged later give their memory back."""
     table, cells, parts = file["pages"], file["cells"], (file["narrow"], file["wide"])
     wide, votes, k = table[:, 4], table[:, 5], table[:, 6]
@@ -127,19 +122,19 @@ def _pages(file: Mapping[str, AnyArray]) -> tuple[Placed, ...]:
     for which, part in enumerate(parts):
         _check_order(part["place"], votes[wide == which], ev.COUNTS * ev.CELLS)
     _check_order(cells["cell"], k, ev.CELLS)
-    found, taken = [], [0, 0, 0]
-    for x, y, rung, index, which, n, m in table.tolist():
-        page = Page(frozen(parts[which][taken[which] :][:n]), frozen(cells[taken[2] :][:m]))
-        found.append(Placed(x, y, rung, index, page))
-        taken[which] += n
-        taken[2] += m
-    return tuple(found)
+    pages, read = [], [0, 0, 0]
+    for x, y, tier, index, which, n, m in table.tolist():
+        page = Page(frozen(parts[which][read[which] :][:n]), frozen(cells[read[2] :][:m]))
+        pages.append(PlacedPage(x, y, tier, index, page))
+        read[which] += n
+        read[2] += m
+    return tuple(pages)
 
 
 def _check_order(values: AnyArray, lengths: AnyArray, limit: int) -> None:
-    """Refuse what the pages of a part, laid end to end, cannot be: each in order, and below a limit."""
+    """ValueError unless a part consists of pages, end to end: each in increasing order and below a limit."""
     if int(lengths.sum()) != len(values):
-        raise ValueError("parts of other lengths than its pages say")
+        raise ValueError("its parts have other lengths than its table of pages")
     rises = np.ones(len(values), np.bool_)
     rises[1:] = values[1:] > values[:-1]
     starts = np.cumsum(lengths)[:-1]

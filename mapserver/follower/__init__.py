@@ -1,1 +1,1 @@
-"""What goes on beside the map: the journal followed, machines judged, changes found, old rows archived."""
+"""Jobs that follow the journal and the grid beside the writer: audit, exclusion, changes, archiving."""

@@ -1,10 +1,11 @@
-"""What may enter the journal: the rules of identity, as a pure function (DESIGN, "Samples, identity")."""
+"""What may enter the journal: the rules of identity, as a pure function."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from mapserver.journal.rows import Admission
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_batch
@@ -18,20 +19,6 @@ class GapError(MessageError):
         problem = f"{first_seq}: sample {expected} is expected next; send from there, or say lost_before"
         super().__init__(Refusal.GAP, problem, field="first_seq")
         self.expected = expected
-
-
-@dataclass(frozen=True)
-class Admission:
-    """What of a batch is new. batch: trimmed to it; trimmed: samples it had already; lost: samples declared lost."""
-
-    batch: SampleBatch
-    trimmed: int
-    lost: int
-
-    @property
-    def watermark(self) -> int:
-        """The last sample that is on disk once this is committed."""
-        return self.batch.last_seq
 
 
 def parse(payload: bytes, machine: str, site: SiteConfig, now_ns: Callable[[], int]) -> SampleBatch:

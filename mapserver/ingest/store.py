@@ -6,7 +6,7 @@ import fcntl
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,13 +15,13 @@ from typing import Any
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import Admission, GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, parse
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import Journal
-from mapserver.journal.rows import Wanted
+from mapserver.journal.rows import Admission, Selection
 from mapserver.trust.decisions import KIND as TRUST
-from mapserver.trust.decisions import Decisions
+from mapserver.trust.decisions import TrustDecisions
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
@@ -45,7 +45,10 @@ class Incoming:
 
 
 class Store:
-    """Journal, grid, watermarks and counters of one site."""
+    """Journal, grid, watermarks and counters of one site.
+
+    excluded: machines whose rows are not in the grid. merged: the last journal row that is; newest_ns: the site's now.
+    """
 
     def __init__(
         self,
@@ -66,44 +69,43 @@ class Store:
         self._now_ns = now_ns
         with ExitStack() as opened:
             opened.enter_context(_hold(folder))
-            self._journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
-            opened.callback(self._journal.close)
-            last_row = self._journal.last_row
-            self.left_out = Decisions(self._journal.events(TRUST)).distrusted
+            self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
+            opened.callback(self.journal.close)
+            last_row = self.journal.last_row
+            self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
             snapshot.remove_beyond(folder, last_row)
-            found = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.left_out)
-            self.merged, self.grid = found
+            self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
-            self._fold_tail(self.grid, self.merged, self.left_out)
+            self._fold_tail(self.grid, self.merged, self.excluded)
             self.merged = last_row
-            self.newest_ns = self._journal.newest_ns()
+            self.newest_ns = self.journal.newest_ns()
             self._opened = opened.pop_all()
 
     @property
     def journalled(self) -> int:
         """The last row on disk."""
-        return self._journal.last_row
+        return self.journal.last_row
 
-    def take(self, group: list[Incoming]) -> list[Ack | Refused]:
+    def commit(self, group: list[Incoming]) -> list[Ack | Refused]:
         """Journal a group of batches in one commit, fold it, and return the answer to each.
 
         Nothing is acknowledged before its commit; where the commit fails, every batch of the group is refused.
         """
         try:
-            self._journal.begin()
-            taken = [self._take_one(incoming) for incoming in group]
+            self.journal.begin()
+            answers = [self._admit(incoming) for incoming in group]
             began_s = time.monotonic()
-            self._journal.commit()
+            self.journal.commit()
             self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
         except (sqlite3.Error, OSError) as error:
-            self._journal.rollback()
+            self.journal.rollback()
             self.counters[f"refused_{Refusal.STORE}"] += len(group)
             return [Refused(Refusal.STORE, f"the server cannot write: {error}") for _ in group]
-        for answer, admission in taken:
+        for answer, admission in answers:
             self._count(answer, admission)
             if isinstance(answer, Ack) and admission and len(admission.batch.rows):
                 self._fold(answer.row, admission.batch)
-        return [answer for answer, _ in taken]
+        return [answer for answer, _ in answers]
 
     def save_snapshot(self) -> None:
         """Write a snapshot of the grid as it is."""
@@ -114,38 +116,22 @@ class Store:
         """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
         if self.merged <= self.snapshot_row:
             return None
-        row, grid, left_out = self.merged, self.grid, self.left_out
+        row, grid, excluded = self.merged, self.grid, self.excluded
         state = grid.state()
 
         def write() -> None:
-            snapshot.save(self._folder, row, state, self.site.cell_m, self.config.fold, left_out)
+            snapshot.save(self._folder, row, state, self.site.cell_m, self.config.fold, excluded)
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
                 self.snapshot_row = row
 
         return write
 
-    def adopt(self, grid: Grid, row: int, left_out: frozenset[str]) -> None:
-        """Go on with a grid that was folded elsewhere up to a journal row, without the machines in left_out."""
-        self._fold_tail(grid, row, left_out)
-        self.grid, self.left_out = grid, left_out
+    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
+        """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines."""
+        self._fold_tail(grid, row, excluded)
+        self.grid, self.excluded = grid, excluded
         self.snapshot_row = 0  # what is on disk has other machines in it
         self.grid.touch_all()
-
-    def touch_all(self) -> None:
-        """Have everything looked at for changes."""
-        self.grid.touch_all()
-
-    def remember(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> None:
-        """Keep an event with the journal."""
-        self._journal.append_event(kind, stamp_ns, body)
-
-    def forget(self, until: int) -> int:
-        """Remove some of the journal rows up to `until`, which are archived; returns the last that is gone."""
-        return self._journal.forget(until)
-
-    def shrink(self) -> int:
-        """Give some of the space of removed rows back to the disk."""
-        return self._journal.shrink()
 
     def close(self) -> None:
         """Close the journal and let go of the folder."""
@@ -166,14 +152,14 @@ class Store:
             "wall_ns": self._now_ns(),
             "version": package_version(),
             "machines": self.machines(),
-            "distrusted": sorted(self.left_out),
+            "distrusted": sorted(self.excluded),
             "counters": dict(self.counters),
         }
 
     def machines(self) -> dict[str, dict[str, int]]:
         """What each machine sent: spools, samples, samples that it declared lost, newest stamp."""
         machines: dict[str, dict[str, int]] = {}
-        for (machine, _), mark in self._journal.marks().items():
+        for (machine, _), mark in self.journal.watermarks().items():
             entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0})
             entry["spools"] += 1
             entry["samples"] += mark.seq - mark.lost
@@ -181,19 +167,19 @@ class Store:
             entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
         return machines
 
-    def _take_one(self, incoming: Incoming) -> tuple[Ack | Refused, Admission | None]:
+    def _admit(self, incoming: Incoming) -> tuple[Ack | Refused, Admission | None]:
         try:
             if self._verify:
                 self._check_signature(self._verify, incoming)
             batch = parse(incoming.payload, incoming.machine, self.site, self._now_ns)
-            admission = admit(batch, self._journal.mark(batch.machine, batch.spool_id).seq)
+            admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
         new = len(admission.batch.rows) > 0
-        row = self._journal.append(admission, self._now_ns()) if new else self.journalled
+        row = self.journal.append(admission, self._now_ns()) if new else self.journalled
         if admission.lost and not new:
-            self._journal.declare_lost(admission)
+            self.journal.declare_lost(admission)
         return Ack(admission.watermark, row, admission.trimmed), admission
 
     def _check_signature(self, verify: Verify, incoming: Incoming) -> None:
@@ -212,15 +198,15 @@ class Store:
             self.counters["samples_lost"] += admission.lost
 
     def _fold(self, row: int, batch: SampleBatch) -> None:
-        if batch.machine not in self.left_out:
+        if batch.machine not in self.excluded:
             self.grid.fold(batch.rows, batch.machine)
         self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
         self.merged = row
 
-    def _fold_tail(self, grid: Grid, merged: int, left_out: frozenset[str]) -> None:
+    def _fold_tail(self, grid: Grid, merged: int, excluded: frozenset[str]) -> None:
         """Fold what a grid does not hold yet."""
-        history = History(self._journal, Archive(self._folder / FOLDER))
-        for row in history_rows(history, after=merged, wanted=Wanted(without=left_out)):
+        history = History(self.journal, Archive(self._folder / FOLDER))
+        for row in history_rows(history, after=merged, selection=Selection(without=excluded)):
             grid.fold(row.rows, row.machine)
 
 

@@ -1,4 +1,4 @@
-"""The thread that owns the store: batches are journalled, acknowledged and folded here; readers ask it for copies."""
+"""The thread that owns the store: batches are journalled, acknowledged and folded here; other threads hand it work."""
 
 from __future__ import annotations
 
@@ -23,9 +23,14 @@ Reply = Callable[[Ack | Refused], None]
 log = logging.getLogger("mapserver.ingest.writer")
 
 
+QUEUE_BATCHES = 256  # so many batches may wait before machines have to send again later; some MB
+GROUP_BATCHES = 64  # committed together at most: one sync to disk for all of them
+SNAPSHOT_ROWS = 2000  # a burst of so many rows brings the next snapshot forward: the next start would have to fold them
+
+
 @dataclass(frozen=True)
-class _Read:
-    """Work for the owner's thread on behalf of a reader."""
+class _Work:
+    """Work of another thread for the one that owns the store."""
 
     work: Callable[[Store], Any]
     result: Future[Any]
@@ -34,7 +39,7 @@ class _Read:
 class Writer:
     """Owns a Store on a thread of its own.
 
-    `submit` and `read` may be called from any thread; both return at once or wait for the owner, never touch the store.
+    `submit` and `run` may be called from any thread; both return at once or wait for the owner, never touch the store.
     """
 
     def __init__(
@@ -45,10 +50,10 @@ class Writer:
         now_ns: Callable[[], int],
         verify: Verify | None = None,
     ) -> None:
-        self._config = config.store
+        self._snapshot_s = config.store.snapshot_s
         self._store = Store(folder, site, config, now_ns, verify)
-        self._batches: queue.Queue[tuple[Incoming, Reply] | _Read | None] = queue.Queue()
-        self._waiting = threading.Semaphore(config.store.queue_batches)
+        self._batches: queue.Queue[tuple[Incoming, Reply] | _Work | None] = queue.Queue()
+        self._waiting = threading.Semaphore(QUEUE_BATCHES)
         self._overloaded = 0
         self._merged = threading.Condition()
         self.failed = False
@@ -66,10 +71,10 @@ class Writer:
             return
         self._batches.put((incoming, reply))
 
-    def read(self, work: Callable[[Store], T], timeout_s: float = 60.0) -> T:
+    def run(self, work: Callable[[Store], T], timeout_s: float = 60.0) -> T:
         """Run `work` on the owner's thread, between two groups of batches, and return its result."""
         result: Future[T] = Future()
-        self._batches.put(_Read(work, result))
+        self._batches.put(_Work(work, result))
         return result.result(timeout_s)
 
     def wait_merged(self, row: int, wait_s: float) -> None:
@@ -81,11 +86,11 @@ class Writer:
 
     def count_refusal(self, reason: str) -> None:
         """Count a refused query."""
-        self.read(lambda store: store.counters.update({f"refused_query_{reason}": 1}))
+        self.run(lambda store: store.counters.update({f"refused_query_{reason}": 1}))
 
     def info(self) -> dict[str, Any]:
         """State of the store."""
-        info = self.read(Store.info)
+        info = self.run(Store.info)
         commits, commit_s = self._store.commits, self._store.commit_s
         info["writer"] = {"waiting": self._batches.qsize(), "commits": commits, "commit_s": commit_s}
         if self._overloaded:
@@ -93,14 +98,14 @@ class Writer:
         return info
 
     def close(self) -> None:
-        """Finish what is waiting, snapshot, close."""
+        """Finish what is waiting, snapshot, close; once more does nothing."""
         self._batches.put(None)
         self._thread.join()
 
     def _guard(self) -> None:
-        """A bug must end the process visibly: a server that takes nothing more is worse than none."""
+        """A bug must end the process visibly: a server that accepts nothing more is worse than none."""
         try:
-            self._run()
+            self._serve()
         except Exception:
             self.failed = True
             log.critical("writer failed", exc_info=True)
@@ -116,48 +121,48 @@ class Writer:
         """Leave nobody waiting until the process ends."""
         problem = "the server's writer has failed; restart the server"
         while (item := self._batches.get()) is not None:
-            if isinstance(item, _Read):
+            if isinstance(item, _Work):
                 item.result.set_exception(QueryError(Refusal.STORE, problem))
             else:
                 self._waiting.release()
                 item[1](Refused(Refusal.STORE, problem))
 
-    def _run(self) -> None:
+    def _serve(self) -> None:
         tried_row = self._store.snapshot_row
-        next_snapshot_s = time.monotonic() + self._config.snapshot_s
+        next_snapshot_s = time.monotonic() + self._snapshot_s
         while (first := self._next(next_snapshot_s)) is not None:
-            if isinstance(first, _Read):
+            if isinstance(first, _Work):
                 _answer(first, self._store)
             elif first:
-                self._take_group(first)
-            if self._store.merged - tried_row >= self._config.snapshot_rows or time.monotonic() >= next_snapshot_s:
+                self._commit_group(first)
+            if self._store.merged - tried_row >= SNAPSHOT_ROWS or time.monotonic() >= next_snapshot_s:
                 self._save_snapshot()
                 tried_row = self._store.merged
-                next_snapshot_s = time.monotonic() + self._config.snapshot_s
+                next_snapshot_s = time.monotonic() + self._snapshot_s
 
-    def _next(self, deadline_s: float) -> tuple[Incoming, Reply] | _Read | tuple[()] | None:
+    def _next(self, deadline_s: float) -> tuple[Incoming, Reply] | _Work | tuple[()] | None:
         """Return the next piece of work, () when it is time for a snapshot, None to end."""
         try:
             return self._batches.get(timeout=max(0.0, deadline_s - time.monotonic()))
         except queue.Empty:
             return ()
 
-    def _take_group(self, first: tuple[Incoming, Reply]) -> None:
-        group, reads, ending = [first], [], False
-        while len(group) < self._config.group_batches and not ending:
+    def _commit_group(self, first: tuple[Incoming, Reply]) -> None:
+        group, works, ending = [first], [], False
+        while len(group) < GROUP_BATCHES and not ending:
             try:
                 item = self._batches.get_nowait()
             except queue.Empty:
                 break
-            if isinstance(item, _Read):
-                reads.append(item)
+            if isinstance(item, _Work):
+                works.append(item)
             elif item is None:
                 ending = True
             else:
                 group.append(item)
         if ending:
             self._batches.put(None)
-        answers = self._store.take([incoming for incoming, _ in group])
+        answers = self._store.commit([incoming for incoming, _ in group])
         with self._merged:
             self._merged.notify_all()
         for (incoming, reply), answer in zip(group, answers, strict=True):
@@ -165,7 +170,7 @@ class Writer:
             if isinstance(answer, Refused):
                 log.warning("refused machine=%s reason=%s problem=%r", incoming.machine, answer.reason, answer.problem)
             reply(answer)
-        for item in reads:
+        for item in works:
             _answer(item, self._store)
 
     def _save_snapshot(self) -> None:
@@ -183,8 +188,8 @@ def _written(write: Callable[[], None]) -> None:
         log.exception("snapshot failed")
 
 
-def _answer(item: _Read, store: Store) -> None:
+def _answer(item: _Work, store: Store) -> None:
     try:
         item.result.set_result(item.work(store))
-    except Exception as error:  # handed on to the reader that asked
+    except Exception as error:  # handed on to the thread that asked
         item.result.set_exception(error)

@@ -1,8 +1,7 @@
-"""What a journal holds, as values: rows, which of them are wanted, progress of spools, events; and their checksums."""
+"""What a journal holds, as values: admitted batches, rows, watermarks, events; which rows to read; checksums."""
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
 from collections.abc import Mapping
@@ -16,8 +15,23 @@ from protocol.arrays import Table
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.geometry import Bounds
+from protocol.wire.messages import SampleBatch
 
 _EXTENT = struct.Struct("<3q4d")
+
+
+@dataclass(frozen=True)
+class Admission:
+    """What of a batch is new. batch: trimmed to it; trimmed: samples it had already; lost: samples declared lost."""
+
+    batch: SampleBatch
+    trimmed: int
+    lost: int
+
+    @property
+    def watermark(self) -> int:
+        """The last sample that is on disk once this is committed."""
+        return self.batch.last_seq
 
 
 @dataclass(frozen=True)
@@ -33,11 +47,11 @@ class JournalRow:
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """Which journal rows to read. A row that may hold a wanted sample is given whole.
+class Selection:
+    """Which journal rows to read. A row that may hold a selected sample is given whole.
 
     from_ns, to_ns: rows with samples in from_ns <= stamp <= to_ns. bounds: rows whose samples' bounding box touches it.
-    without: machines that are left out.
+    without: machines to exclude.
     """
 
     from_ns: int = 0
@@ -47,15 +61,15 @@ class Wanted:
 
     @property
     def everywhere(self) -> bool:
-        """Whether neither time nor place keeps a row out."""
-        return self == Wanted(without=self.without)
+        """Whether neither time nor place excludes a row."""
+        return self == Selection(without=self.without)
 
 
-ALL = Wanted()
+ALL = Selection()
 
 
 @dataclass(frozen=True)
-class Mark:
+class Watermark:
     """Progress of one spool: the last committed sample, how many it declared lost, and its newest stamp."""
 
     seq: int = 0
@@ -74,24 +88,24 @@ class Event:
 
 
 def pack(rows: Table) -> bytes:
-    """Columns of a journal row; named, so that a column that is added later reads as NaN in older rows."""
+    """Encode samples for a journal row: a map from the name of each column to its bytes."""
     packed: bytes = msgpack.packb({name: rows[name].tobytes() for name in SAMPLE_DTYPE.names or ()})
     return packed
 
 
 def unpack(payload: bytes) -> Table:
     """Undo `pack`."""
-    cols = msgpack.unpackb(payload)
-    rows = np.zeros(len(cols["stamp_ns"]) // 8, SAMPLE_DTYPE)
+    columns = msgpack.unpackb(payload)
+    rows = np.zeros(len(columns["stamp_ns"]) // 8, SAMPLE_DTYPE)
     for name in SAMPLE_DTYPE.names or ():
-        rows[name] = np.frombuffer(cols[name], SAMPLE_DTYPE[name]) if name in cols else np.nan
+        rows[name] = np.frombuffer(columns[name], SAMPLE_DTYPE[name])
     return rows
 
 
-def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float | None) -> int:
-    """CRC-32 of when and where a row lies, ten times as fast as `checksum`; none of what it cannot be."""
+def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float) -> int:
+    """CRC-32 of when and where a row lies, ten times as fast as `checksum`; -1 where a value has the wrong type."""
     try:
-        return zlib.crc32(_EXTENT.pack(row, first_ns, last_ns, *((math.nan,) * 4 if None in box else box)))
+        return zlib.crc32(_EXTENT.pack(row, first_ns, last_ns, *box))
     except struct.error:
         return -1
 

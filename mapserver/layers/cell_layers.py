@@ -1,7 +1,8 @@
 """Read layers: from evidence to float32 values, NaN where unknown (docs/layers.md).
 
 A new layer of a cell is a function and a line in LAYERS; one that looks at its neighbours, a function and a line in
-`filling.AREA_LAYERS`. What is debatable, such as the classes' boundaries, is applied here, without folding again.
+`gap_filling.AREA_LAYERS`. What is debatable, such as the classes' boundaries, is applied here,
+without folding again.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class ReadConfig:
 
 
 @dataclass(frozen=True)
-class Reading:
+class CellEvidence:
     """What the layers of cells are derived from.
 
     evidence: of cells, arrays (cells, ...) as in Evidence. now_ns: the site's now, 0 where it is not known.
@@ -82,92 +83,92 @@ class Reading:
 
 # --- layers of a cell ------------------------------------------------------------------------------------------------
 
-Layer = Callable[[Reading], Floats]
+Layer = Callable[[CellEvidence], Floats]
 
 
-def resistance(reading: Reading) -> Floats:
+def resistance(cells: CellEvidence) -> Floats:
     """Rolling resistance coefficient [-]: robust centre of the votes, in log(c_rr)."""
-    centre: Floats = ev.RESISTANCE_CENTRES[0] * np.exp(LOG_STEP * reading.resistance_bin)
+    centre: Floats = ev.RESISTANCE_CENTRES[0] * np.exp(LOG_STEP * cells.resistance_bin)
     return centre
 
 
-def resistance_std(reading: Reading) -> Floats:
+def resistance_std(cells: CellEvidence) -> Floats:
     """Standard deviation of the votes for c_rr [-], without the spread that binning adds."""
-    return resistance(reading) * LOG_STEP * robust_spread(reading.votes(ev.RESISTANCE))
+    return resistance(cells) * LOG_STEP * robust_spread(cells.votes(ev.RESISTANCE))
 
 
-def resistance_class(reading: Reading) -> Floats:
+def resistance_class(cells: CellEvidence) -> Floats:
     """Index of the ground class with most votes (by default 0 dry concrete ... 4 sand)."""
-    votes = _class_votes(reading)
+    votes = _class_votes(cells)
     return np.where(votes.sum(axis=-1) > 0, votes.argmax(axis=-1), np.nan)
 
 
-def confidence(reading: Reading) -> Floats:
+def confidence(cells: CellEvidence) -> Floats:
     """Share of the votes that the leading ground class has."""
-    votes = _class_votes(reading)
+    votes = _class_votes(cells)
     return ratio(votes.max(axis=-1), votes.sum(axis=-1))
 
 
-def grade_east(reading: Reading) -> Floats:
+def grade_east(cells: CellEvidence) -> Floats:
     """Eastern component of the gradient [m/m], positive where the ground rises to the east."""
-    return reading.gradient[0]
+    return cells.gradient[0]
 
 
-def grade_north(reading: Reading) -> Floats:
+def grade_north(cells: CellEvidence) -> Floats:
     """Northern component of the gradient [m/m], positive where the ground rises to the north."""
-    return reading.gradient[1]
+    return cells.gradient[1]
 
 
-def grade(reading: Reading) -> Floats:
+def grade(cells: CellEvidence) -> Floats:
     """Steepness: length of the gradient [m/m]."""
-    return np.hypot(*reading.gradient)
+    return np.hypot(*cells.gradient)
 
 
-def grade_std(reading: Reading) -> Floats:
+def grade_std(cells: CellEvidence) -> Floats:
     """Standard deviation of the votes for one component of the gradient [m/m]: root mean square of the two."""
-    east, north = (robust_spread(reading.votes(part)) for part in (ev.GRADE_EAST, ev.GRADE_NORTH))
+    east, north = (robust_spread(cells.votes(part)) for part in (ev.GRADE_EAST, ev.GRADE_NORTH))
     return GRADE_STEP * np.hypot(east, north) / math.sqrt(2)
 
 
-def slope_class(reading: Reading) -> Floats:
+def slope_class(cells: CellEvidence) -> Floats:
     """0 flat, 1 slope (the paper's: steeper than 7.5 degrees)."""
-    return _known_class(ground_classes.slope_class(*reading.gradient))
+    return _known_class(ground_classes.slope_class(*cells.gradient))
 
 
-def heading(reading: Reading) -> Floats:
+def heading(cells: CellEvidence) -> Floats:
     """Axis along which machines drive [rad], -pi/2 to pi/2 from east, both ways alike; NaN where none is preferred."""
     # the axis, not the direction: a haul road is driven both ways, and doubled angles do not cancel then
-    votes = reading.votes(ev.HEADING)
+    votes = cells.votes(ev.HEADING)
     doubled = np.exp(4j * np.pi / ev.SECTORS * np.arange(ev.SECTORS))
     east, north = votes @ doubled.real, votes @ doubled.imag
     sure = np.hypot(east, north) >= SURE_AXIS * np.maximum(votes.sum(axis=-1), 1)
     return np.where(sure, np.arctan2(north, east) / 2, np.nan)
 
 
-def visits(reading: Reading) -> Floats:
+def visits(cells: CellEvidence) -> Floats:
     """How many visits a cell had; at most 266."""
-    return linear_count(reading.evidence.bitmaps[..., ev.VISITS])
+    return linear_count(cells.evidence.bitmaps[..., ev.VISITS])
 
 
-def machines(reading: Reading) -> Floats:
+def machines(cells: CellEvidence) -> Floats:
     """How many machines drove here; at most 266."""
-    return linear_count(reading.evidence.bitmaps[..., ev.MACHINES])
+    return linear_count(cells.evidence.bitmaps[..., ev.MACHINES])
 
 
-def weight(reading: Reading) -> Floats:
+def weight(cells: CellEvidence) -> Floats:
     """Metres of evidence."""
-    metres: Floats = reading.evidence.weight / float(ev.WEIGHT_UNITS_PER_M)
+    metres: Floats = cells.evidence.weight / float(ev.WEIGHT_UNITS_PER_M)
     return metres
 
 
-def age_s(reading: Reading) -> Floats:
+def age_s(cells: CellEvidence) -> Floats:
     """Time from the newest sample to the site's now [s]; NaN where now is not known."""
-    return _seconds_ago(reading.evidence.newest_ns, reading.now_ns)
+    return _seconds_ago(cells.evidence.newest_ns, cells.now_ns)
 
 
-def changed_s(reading: Reading) -> Floats:
-    """Time from the ground's last change to the site's now [s]; NaN where none was found or now is not known."""
-    return _seconds_ago(reading.evidence.changed_ns, reading.now_ns)
+def changed_s(cells: CellEvidence) -> Floats:
+    """Time from the ground's last change to the site's now [s]; NaN where there was none or now is not known."""
+    return _seconds_ago(cells.evidence.changed_ns, cells.now_ns)
 
 
 LAYERS: dict[str, Layer] = {
@@ -189,7 +190,7 @@ LAYERS: dict[str, Layer] = {
 }
 
 
-# --- reading ---------------------------------------------------------------------------------------------------------
+# --- values ----------------------------------------------------------------------------------------------------------
 
 
 def select(names: Sequence[str]) -> tuple[str, ...]:
@@ -205,10 +206,10 @@ def read(evidence: ev.Evidence, names: Sequence[str], config: ReadConfig, now_ns
     """Derive layers of cells, each (blocks, 256), NaN where the evidence is too thin. now_ns: the site's now."""
     metres = evidence.weight
     known = (metres > 0) & (metres >= config.min_weight_m * ev.WEIGHT_UNITS_PER_M)
-    reading = Reading(_cells(evidence, known), now_ns, config)
+    cells = CellEvidence(_cells(evidence, known), now_ns, config)
     out = {name: np.full(known.shape, np.nan, np.float32) for name in names}
     for name, values in out.items():
-        values[known] = LAYERS[name](reading)
+        values[known] = LAYERS[name](cells)
     return out
 
 
@@ -245,13 +246,13 @@ def derive_area(
 # --- shared by layers -------------------------------------------------------------------------------------------------
 
 
-def _class_votes(reading: Reading) -> Floats:
+def _class_votes(cells: CellEvidence) -> Floats:
     """Votes (cells, classes): each bin's, by the share of its width, in log(c_rr), that lies in each class."""
-    position = np.log(np.array(reading.config.boundaries) / ev.RESISTANCE_CENTRES[0]) / LOG_STEP
+    position = np.log(np.array(cells.config.boundaries) / ev.RESISTANCE_CENTRES[0]) / LOG_STEP
     edges = np.concatenate([[-np.inf], position, [np.inf]])
     bins = np.arange(ev.RESISTANCE_BINS)[:, None]
     share = np.maximum(np.minimum(bins + 0.5, edges[1:]) - np.maximum(bins - 0.5, edges[:-1]), 0)
-    votes: Floats = reading.votes(ev.RESISTANCE) @ share
+    votes: Floats = cells.votes(ev.RESISTANCE) @ share
     return votes
 
 

@@ -1,4 +1,4 @@
-"""Filling of gaps by kernel inference: what a cell that nobody drove is like, and how unsure that is.
+"""Filling of gaps by kernel inference: an estimate for cells that nobody drove, and its uncertainty.
 
 Known cells vote for the unknown ones around them, each with a weight that falls to zero at the kernel's reach: Bayesian
 generalised kernel inference (Shan, Wang, Englot, Doherty, "Bayesian Generalized Kernel Inference for Terrain
@@ -21,8 +21,8 @@ from protocol.arrays import Bools, Floats
 RESISTANCE_PRIOR_STD = 1.3  # of log(c_rr): anything between 0.004 and 0.4 is equally likely (log 100 / sqrt 12)
 GRADE_PRIOR_STD = 0.1  # of one component [m/m]
 PRIOR_M2 = 0.1  # the prior weighs as much as this area of sure ground right at the cell
-HALF_SURE_M = 1.0  # so many metres of evidence make a cell count half: more of them tell nothing of the ground beside
-# Less evidence than this [m2] is none: beyond 0.94 of the reach a single cell says nothing, and the filters' rounding
+HALF_SURE_M = 1.0  # a cell with so many metres of evidence counts half: more do not describe the ground beside it
+# Less evidence than this [m2] is none: beyond 0.94 of the reach a single cell has no effect, and the filters' rounding
 # stays far below what counts.
 LEAST_M2 = 1e-5
 
@@ -43,7 +43,7 @@ def sparse_kernel(reach_m: float, cell_m: float) -> Floats:
 def cell_weights(values: Floats, weight_m: Floats, std: Floats, prior_std: float) -> Floats:
     """How much each known cell counts, 0 to 1: half with HALF_SURE_M of evidence, half with votes as wide as the prior.
 
-    Saturates, because a hundred passes over one cell tell nothing more of its neighbours. 0 where values are NaN.
+    Saturates, because a hundred passes over one cell say no more about its neighbours than ten. 0 where values are NaN.
     """
     weights: Floats = weight_m / (weight_m + HALF_SURE_M) / (1 + (std / prior_std) ** 2)
     return np.where(np.isfinite(values), weights, 0.0)

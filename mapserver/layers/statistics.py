@@ -13,8 +13,8 @@ from protocol.arrays import AnyArray, Floats
 def robust_centre(votes: Floats, reach: float) -> Floats:
     """Centre of votes (cells, bins) on the bin axis.
 
-    Starts from the median bin and the larger of its neighbours, which leaves a second kind of ground in the cell aside
-    where it is one and a half bins away, then takes the mean of what is near, twice: votes within one bin of the centre
+    Starts from the median bin and the larger of its neighbours, which ignores a second kind of ground in the cell where
+    it is one and a half bins away, then takes the mean of what is near, twice: votes within one bin of the centre
     count, those beyond `reach` bins do not. Exact where all votes agree, because a vote is split linearly between two
     bins, and unbiased where noise is symmetric.
     """
@@ -37,10 +37,10 @@ def robust_centre(votes: Floats, reach: float) -> Floats:
 def robust_spread(votes: Floats) -> Floats:
     """Standard deviation of votes (cells, bins) about their mean, in bins.
 
-    Votes further from the median than the quartiles allow are left out. A vote at fraction f between two bins is split
+    Votes further from the median than the quartiles allow do not count. A vote at fraction f between two bins is split
     between them, which adds f (1 - f) to the variance of votes that agree, and 1/6, the mean of it, to that of votes
     that spread over bins; in between the difference decays as exp(-2 pi^2 variance), the first term of its Fourier
-    series. That is taken off, so votes that agree give 0; a spread below a third of a bin cannot be told from none.
+    series. That is taken off, so votes that agree give 0; a spread below a third of a bin looks like none.
     """
     summed = votes.cumsum(axis=-1)
     first, median, third = ((4 * summed >= k * summed[..., -1:]).argmax(axis=-1) for k in (1, 2, 3))

@@ -1,4 +1,4 @@
-"""The sheet around a picture of the ground: title, axes in metres, legend, north arrow, scale bar."""
+"""The frame of a figure, around the picture of the ground: title, axes in metres, legend, north arrow, scale bar."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ INK, PAPER, EDGE = (45, 45, 45), (255, 255, 255), (25, 25, 25)
 
 
 @dataclass(frozen=True)
-class Entry:
+class LegendEntry:
     """One line of the legend: a colour and what it means."""
 
     colour: Colour
@@ -40,10 +40,15 @@ class Axes:
 
 
 def compose(
-    ground: Image, axes: Axes, title: str, classes: Sequence[Entry], machines: Sequence[Entry] = (), note: str = ""
+    ground: Image,
+    axes: Axes,
+    title: str,
+    classes: Sequence[LegendEntry],
+    machines: Sequence[LegendEntry] = (),
+    note: str = "",
 ) -> Image:
-    """Set the painted ground into a sheet that is large enough for everything around it."""
-    named = [Entry(machine.colour, machine.text[:MAX_NAME]) for machine in machines[:MAX_LISTED]]
+    """Set the painted ground into a figure that is large enough for everything around it."""
+    named = [LegendEntry(machine.colour, machine.text[:MAX_NAME]) for machine in machines[:MAX_LISTED]]
     notes = [note] if note else []
     if len(machines) > MAX_LISTED:
         notes.append(f"and {len(machines) - MAX_LISTED} more machines")
@@ -53,14 +58,14 @@ def compose(
     height, width = ground.shape[:2]
     panel_left = LEFT + width + PAD + 8
     title_scale = TITLE_SCALE * min(1.0, MAX_TITLE_PX / max(1, text_size(title, TITLE_SCALE)[0]))
-    sheet_width = max(panel_left + panel_width, LEFT + text_size(title, title_scale)[0]) + PAD
-    sheet = np.full((TOP + max(height + BOTTOM, panel_height), sheet_width, 3), 255, np.uint8)
-    sheet[TOP : TOP + height, LEFT : LEFT + width] = ground
-    text(sheet, title, (LEFT, 30), INK, title_scale)
-    _draw_axes(sheet, axes, width, height)
-    below = _draw_legend(sheet, classes, named, notes, (panel_left, TOP))
-    _draw_compass(sheet, axes, (panel_left, below + LINE_PX))
-    return sheet
+    figure_width = max(panel_left + panel_width, LEFT + text_size(title, title_scale)[0]) + PAD
+    figure = np.full((TOP + max(height + BOTTOM, panel_height), figure_width, 3), 255, np.uint8)
+    figure[TOP : TOP + height, LEFT : LEFT + width] = ground
+    text(figure, title, (LEFT, 30), INK, title_scale)
+    _draw_axes(figure, axes, width, height)
+    below = _draw_legend(figure, classes, named, notes, (panel_left, TOP))
+    _draw_compass(figure, axes, (panel_left, below + LINE_PX))
+    return figure
 
 
 def text_size(words: str, scale: float = FONT_SCALE) -> tuple[int, int]:
@@ -69,26 +74,26 @@ def text_size(words: str, scale: float = FONT_SCALE) -> tuple[int, int]:
     return width, height
 
 
-def text(sheet: Image, words: str, at: tuple[int, int], colour: Colour, scale: float = FONT_SCALE) -> None:
+def text(figure: Image, words: str, at: tuple[int, int], colour: Colour, scale: float = FONT_SCALE) -> None:
     """Write words; `at` is the left end of their base line."""
-    cv2.putText(sheet, words, at, FONT, scale, colour, 1, cv2.LINE_AA)
+    cv2.putText(figure, words, at, FONT, scale, colour, 1, cv2.LINE_AA)
 
 
-def _draw_axes(sheet: Image, axes: Axes, width: int, height: int) -> None:
-    """Frame, ticks with metres, and the names of the axes, outside the ground."""
+def _draw_axes(figure: Image, axes: Axes, width: int, height: int) -> None:
+    """Border, ticks with metres, and the names of the axes, outside the ground."""
     right, bottom, bounds, px_per_m = LEFT + width, TOP + height, axes.bounds, axes.px_per_m
-    cv2.rectangle(sheet, (LEFT - 1, TOP - 1), (right, bottom), INK, 1)
+    cv2.rectangle(figure, (LEFT - 1, TOP - 1), (right, bottom), INK, 1)
     widest = max(text_size(_metres(round(m)))[0] for m in (bounds.west_m, bounds.east_m))
     for metres in _ticks(bounds.west_m, width, px_per_m, max(min(80, width // 3), widest + 6)):
         x, label = LEFT + round((metres - bounds.west_m) * px_per_m), _metres(metres)
-        cv2.line(sheet, (x, bottom), (x, bottom + 5), INK, 1)
-        text(sheet, label, (x - text_size(label)[0] // 2, bottom + 20), INK)
+        cv2.line(figure, (x, bottom), (x, bottom + 5), INK, 1)
+        text(figure, label, (x - text_size(label)[0] // 2, bottom + 20), INK)
     for metres in _ticks(bounds.south_m, height, px_per_m, max(18, min(60, height // 3))):
         y, label = bottom - round((metres - bounds.south_m) * px_per_m), _metres(metres)
-        cv2.line(sheet, (LEFT - 6, y), (LEFT - 1, y), INK, 1)
-        text(sheet, label, (LEFT - 11 - text_size(label)[0], y + 5), INK)
-    text(sheet, "east [m]", (LEFT + width // 2 - text_size("east [m]")[0] // 2, bottom + 42), INK)
-    text(sheet, "north [m]", (LEFT - 11 - text_size("north [m]")[0], TOP - 14), INK)
+        cv2.line(figure, (LEFT - 6, y), (LEFT - 1, y), INK, 1)
+        text(figure, label, (LEFT - 11 - text_size(label)[0], y + 5), INK)
+    text(figure, "east [m]", (LEFT + width // 2 - text_size("east [m]")[0] // 2, bottom + 42), INK)
+    text(figure, "north [m]", (LEFT - 11 - text_size("north [m]")[0], TOP - 14), INK)
 
 
 def _nice(length: float) -> float:
@@ -111,38 +116,42 @@ def _metres(value: float) -> str:
 
 
 def _draw_legend(
-    sheet: Image, classes: Sequence[Entry], machines: Sequence[Entry], notes: Sequence[str], at: tuple[int, int]
+    figure: Image,
+    classes: Sequence[LegendEntry],
+    machines: Sequence[LegendEntry],
+    notes: Sequence[str],
+    at: tuple[int, int],
 ) -> int:
     """Swatches of the classes, lines of the machines, notes; returns the pixel row below."""
     left, y = at
     for entry in classes:
         box = ((left, y), (left + SWATCH_PX, y + SWATCH_PX))
-        cv2.rectangle(sheet, *box, entry.colour, cv2.FILLED)
-        cv2.rectangle(sheet, *box, INK, 1)
-        text(sheet, entry.text, (left + SWATCH_PX + 10, y + 13), INK)
+        cv2.rectangle(figure, *box, entry.colour, cv2.FILLED)
+        cv2.rectangle(figure, *box, INK, 1)
+        text(figure, entry.text, (left + SWATCH_PX + 10, y + 13), INK)
         y += LINE_PX
     y += LINE_PX // 2 if machines else 0
     for machine in machines:
         ends = ((left, y + 8), (left + SWATCH_PX, y + 8))
-        cv2.line(sheet, *ends, EDGE, 5)
-        cv2.line(sheet, *ends, machine.colour, 3)
-        text(sheet, machine.text, (left + SWATCH_PX + 10, y + 13), INK)
+        cv2.line(figure, *ends, EDGE, 5)
+        cv2.line(figure, *ends, machine.colour, 3)
+        text(figure, machine.text, (left + SWATCH_PX + 10, y + 13), INK)
         y += LINE_PX
     for note in notes:
-        text(sheet, note, (left, y + 13), INK)
+        text(figure, note, (left, y + 13), INK)
         y += LINE_PX
     return y
 
 
-def _draw_compass(sheet: Image, axes: Axes, at: tuple[int, int]) -> None:
+def _draw_compass(figure: Image, axes: Axes, at: tuple[int, int]) -> None:
     """Arrow to the north and a bar of known length."""
     left, y = at
     arrow = np.array([(left + 8, y), (left + 15, y + 26), (left + 8, y + 20), (left + 1, y + 26)], np.int32)
-    cv2.fillPoly(sheet, [arrow], INK, cv2.LINE_AA)
-    text(sheet, "N", (left + 3, y + 42), INK)
+    cv2.fillPoly(figure, [arrow], INK, cv2.LINE_AA)
+    text(figure, "N", (left + 3, y + 42), INK)
     length_m = _nice(BAR_PX / axes.px_per_m)
     start, end, base = left + 36, left + 36 + round(length_m * axes.px_per_m), y + 36
-    cv2.line(sheet, (start, base), (end, base), INK, 2)
+    cv2.line(figure, (start, base), (end, base), INK, 2)
     for x in (start, end):
-        cv2.line(sheet, (x, base - 5), (x, base + 5), INK, 2)
-    text(sheet, f"{_metres(length_m)} m", (start, base - 12), INK)
+        cv2.line(figure, (x, base - 5), (x, base + 5), INK, 2)
+    text(figure, f"{_metres(length_m)} m", (start, base - 12), INK)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.pictures.frame import EDGE, MAX_NAME, PAPER, Axes, Colour, Entry, Image, compose, text, text_size
+from mapserver.pictures.frame import EDGE, MAX_NAME, PAPER, Axes, Colour, Image, LegendEntry, compose, text, text_size
 from protocol.arrays import AnyArray, Floats, Ints
+from protocol.files import write_whole
 from protocol.queries.answers import Region
 from protocol.site.ground_classes import SLOPE, UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
 
@@ -40,7 +39,7 @@ class Track:
     y_m: Floats
 
 
-class Layers(Protocol):
+class NamedLayers(Protocol):
     """Anything that gives layers by name: a Region, or a dictionary of arrays."""
 
     def __getitem__(self, layer: str, /) -> AnyArray:
@@ -49,7 +48,7 @@ class Layers(Protocol):
 
 
 @dataclass(frozen=True)
-class _View:
+class _Scale:
     """The scale of a picture: whole pixels per `shrink` cells, so that cells stay crisp."""
 
     axes: Axes
@@ -65,36 +64,36 @@ class _View:
 
 def draw_resistance(region: Region, tracks: Sequence[Track] = (), title: str = "Rolling resistance") -> Image:
     """Draw the layer `resistance` in the paper's classes and colours."""
-    entries = [Entry(zone.bgr, f"{zone.name}  {zone.c_rr:g}") for zone in ZONES]
-    view = _view(region)
-    ground = _paint(resistance_class(region["resistance"]), entries, view)
-    return _finish(ground, view, entries, tracks, title)
+    entries = [LegendEntry(zone.bgr, f"{zone.name}  {zone.c_rr:g}") for zone in ZONES]
+    scale = _scale(region)
+    ground = _paint(resistance_class(region["resistance"]), entries, scale)
+    return _finish(ground, scale, entries, tracks, title)
 
 
 def draw_grade(region: Region, tracks: Sequence[Track] = (), title: str = "Grade") -> Image:
     """Draw the layers `grade_east`, `grade_north` as flat and slope, with arrows that point uphill."""
-    entries = [Entry(FLAT_COLOUR, "flat"), Entry(SLOPE_COLOUR, "slope > 7.5 deg")]
-    view, classes = _view(region), slope_class(region["grade_east"], region["grade_north"])
-    ground = _paint(classes, entries, view)
-    _draw_arrows(ground, region, classes, view)
-    return _finish(ground, view, entries, tracks, title, note="arrows: uphill" if (classes == SLOPE).any() else "")
+    entries = [LegendEntry(FLAT_COLOUR, "flat"), LegendEntry(SLOPE_COLOUR, "slope > 7.5 deg")]
+    scale, classes = _scale(region), slope_class(region["grade_east"], region["grade_north"])
+    ground = _paint(classes, entries, scale)
+    _draw_arrows(ground, region, classes, scale)
+    return _finish(ground, scale, entries, tracks, title, note="arrows: uphill" if (classes == SLOPE).any() else "")
 
 
-def draw_difference(region: Region, truth: Layers, kind: Literal["resistance", "grade"]) -> Image:
+def draw_difference(region: Region, truth: NamedLayers, kind: Literal["resistance", "grade"]) -> Image:
     """Draw where the map's class differs from the truth; the title says how much of the known ground is wrong."""
     classes, true = _classes(region, kind), _classes(truth, kind)
     if classes.shape != true.shape:
         raise ValueError(f"truth has shape {true.shape}, the map {classes.shape}")
     colours = [zone.bgr for zone in ZONES] if kind == "resistance" else [FLAT_COLOUR, SLOPE_COLOUR]
     names = [zone.name for zone in ZONES] if kind == "resistance" else ["flat", "slope"]
-    entries = [Entry(_pale(colour), f"right: {name}") for colour, name in zip(colours, names, strict=True)]
-    entries.append(Entry(WRONG_COLOUR, "wrong class"))
+    entries = [LegendEntry(_pale(colour), f"right: {name}") for colour, name in zip(colours, names, strict=True)]
+    entries.append(LegendEntry(WRONG_COLOUR, "wrong class"))
     known = (classes != UNKNOWN) & (true != UNKNOWN)
     shown = np.where(known, np.where(classes == true, classes, len(entries) - 1), UNKNOWN)
-    view, wrong = _view(region), wrong_percent(classes, true)
+    scale, wrong = _scale(region), wrong_percent(classes, true)
     share = "no known cells" if math.isnan(wrong) else f"{wrong:.2f} % of {known.sum()} known cells wrong"
     what = "Rolling resistance" if kind == "resistance" else "Grade"
-    return _finish(_paint(shown, entries, view), view, entries, (), f"{what} against truth: {share}")
+    return _finish(_paint(shown, entries, scale), scale, entries, (), f"{what} against truth: {share}")
 
 
 def side_by_side(images: Sequence[Image]) -> Image:
@@ -109,18 +108,13 @@ def write_image(path: Path, image: Image) -> None:
     done, data = cv2.imencode(path.suffix, image)
     if not done:
         raise ValueError(f"{path}: cannot encode the picture")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
-    try:
-        temporary.write_bytes(data.tobytes())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, data.tobytes())
 
 
 # --- the ground ------------------------------------------------------------------------------------------------------
 
 
-def _classes(layers: Layers, kind: str) -> Ints:
+def _classes(layers: NamedLayers, kind: str) -> Ints:
     if kind == "resistance":
         return resistance_class(layers["resistance"])
     return slope_class(layers["grade_east"], layers["grade_north"])
@@ -131,21 +125,21 @@ def _pale(colour: Colour) -> Colour:
     return blue, green, red
 
 
-def _view(region: Region) -> _View:
+def _scale(region: Region) -> _Scale:
     columns, rows = len(region.x_m), len(region.y_m)
     longest = max(columns, rows)
     shrink = math.ceil(longest / MAX_SIDE_PX)
     fit = min(MAX_SIDE_PX // longest, math.isqrt(MAX_AREA_PX // (columns * rows)), MAX_CELL_PX)
     cell_px = max(1, fit)
-    return _View(Axes(region.bounds, cell_px / (shrink * region.cell_m)), cell_px, shrink)
+    return _Scale(Axes(region.bounds, cell_px / (shrink * region.cell_m)), cell_px, shrink)
 
 
-def _paint(classes: Ints, entries: Sequence[Entry], view: _View) -> Image:
+def _paint(classes: Ints, entries: Sequence[LegendEntry], scale: _Scale) -> Image:
     """Picture of the classes, north up, without margins."""
     palette = np.array([*(entry.colour for entry in entries), UNKNOWN_COLOUR], np.uint8)
-    shown = _commonest(classes, len(entries), view.shrink)
+    shown = _commonest(classes, len(entries), scale.shrink)
     cells = palette[shown[::-1]]  # UNKNOWN, -1, takes the last colour
-    return np.ascontiguousarray(cells.repeat(view.cell_px, axis=0).repeat(view.cell_px, axis=1))
+    return np.ascontiguousarray(cells.repeat(scale.cell_px, axis=0).repeat(scale.cell_px, axis=1))
 
 
 def _commonest(classes: Ints, count: int, shrink: int) -> Ints:
@@ -160,26 +154,26 @@ def _commonest(classes: Ints, count: int, shrink: int) -> Ints:
     return np.where(votes.any(axis=0), votes.argmax(axis=0), UNKNOWN)
 
 
-def _draw_arrows(ground: Image, region: Region, classes: Ints, view: _View) -> None:
-    step = max(1, round(ARROW_SPACING_PX * view.shrink / view.cell_px))
+def _draw_arrows(ground: Image, region: Region, classes: Ints, scale: _Scale) -> None:
+    step = max(1, round(ARROW_SPACING_PX * scale.shrink / scale.cell_px))
     picked = np.zeros(classes.shape, bool)
     picked[step // 2 :: step, step // 2 :: step] = True
     rows, columns = np.nonzero(picked & (classes == SLOPE))
     east, north = (region[layer][rows, columns].astype(np.float64) for layer in ("grade_east", "grade_north"))
     half = 0.32 * ARROW_SPACING_PX * np.stack([east, -north], axis=-1) / np.hypot(east, north)[:, None]
-    middle = view.pixels(region.x_m[columns], region.y_m[rows], ground.shape[0])
+    middle = scale.pixels(region.x_m[columns], region.y_m[rows], ground.shape[0])
     for tail, tip in zip(_fixed(middle - half), _fixed(middle + half), strict=True):
         for colour, thickness in ((EDGE, 3), (PAPER, 1)):
             cv2.arrowedLine(ground, tail.tolist(), tip.tolist(), colour, thickness, cv2.LINE_AA, shift=4, tipLength=0.4)
 
 
 def _finish(
-    ground: Image, view: _View, entries: Sequence[Entry], tracks: Sequence[Track], title: str, note: str = ""
+    ground: Image, scale: _Scale, entries: Sequence[LegendEntry], tracks: Sequence[Track], title: str, note: str = ""
 ) -> Image:
-    """Draw the tracks on the painted ground and set it into its sheet."""
-    _draw_tracks(ground, tracks, view)
-    machines = [Entry(colour, track.name) for track, colour in zip(tracks, _colours(tracks), strict=True)]
-    return compose(ground, view.axes, title, [*entries, Entry(UNKNOWN_COLOUR, "unknown")], machines, note)
+    """Draw the tracks on the painted ground and set it into its frame."""
+    _draw_tracks(ground, tracks, scale)
+    machines = [LegendEntry(colour, track.name) for track, colour in zip(tracks, _colours(tracks), strict=True)]
+    return compose(ground, scale.axes, title, [*entries, LegendEntry(UNKNOWN_COLOUR, "unknown")], machines, note)
 
 
 # --- tracks ----------------------------------------------------------------------------------------------------------
@@ -190,11 +184,11 @@ def _fixed(pixels: Floats) -> NDArray[np.int32]:
     return np.rint(np.clip(pixels, -1e6, 1e6) * 16).astype(np.int32)
 
 
-def _draw_tracks(ground: Image, tracks: Sequence[Track], view: _View) -> None:
+def _draw_tracks(ground: Image, tracks: Sequence[Track], scale: _Scale) -> None:
     height, width = ground.shape[:2]
     ends: list[tuple[Track, Colour, Floats]] = []
     for track, colour in zip(tracks, _colours(tracks), strict=True):
-        pixels = view.pixels(track.x_m, track.y_m, height)
+        pixels = scale.pixels(track.x_m, track.y_m, height)
         finite = np.isfinite(pixels).all(axis=1)
         pieces = np.split(pixels, np.flatnonzero(~finite))
         lines = [_fixed(piece[np.isfinite(piece).all(axis=1)]) for piece in pieces]

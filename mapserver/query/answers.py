@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from mapserver.config import ServerConfig
+from mapserver.follower.follower import Follower
 from mapserver.ingest.writer import Writer
-from mapserver.journal.history import Moment
-from mapserver.journal.rows import Wanted
+from mapserver.journal.history import SpanEvidence
+from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
-from mapserver.query.views import Past, View, cropped, read_cells, view_now, widened
+from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import (
     encode_changes,
@@ -46,65 +47,17 @@ from protocol.site.site_config import SiteConfig
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 
 
-class Keeper(Protocol):
-    """What the server finds out about its machines and its ground; any thread may ask (docs/protocol.md)."""
-
-    def machines(self) -> list[dict[str, Any]]:
-        """What is known of every machine, as plain values."""
-        ...
-
-    def changes(self, after: int) -> list[dict[str, Any]]:
-        """Changes of the ground with a number beyond `after`, as plain values."""
-        ...
-
-    def trust(self, machine: str, trusted: bool | None, reason: str, wait_s: float) -> dict[str, Any]:  # noqa: FBT001
-        """Trust a machine or not, wait until the map is folded so; QueryError for an unknown machine."""
-        ...
-
-    def distrusted(self) -> frozenset[str]:
-        """Machines whose samples are left out of the map."""
-        ...
-
-
-class Nobody:
-    """A keeper where none watches."""
-
-    def machines(self) -> list[dict[str, Any]]:
-        """None."""
-        return []
-
-    def changes(self, after: int) -> list[dict[str, Any]]:  # noqa: ARG002
-        """None."""
-        return []
-
-    def trust(self, machine: str, trusted: bool | None, reason: str, wait_s: float) -> dict[str, Any]:  # noqa: ARG002, FBT001
-        """Refuse."""
-        raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine}` is not known: nobody watches machines here")
-
-    def distrusted(self) -> frozenset[str]:
-        """None."""
-        return frozenset()
-
-
 class Answers:
-    """Answers the queries of one map, from any thread.
-
-    journal: where the past is read; without it only the map as it is can be asked for.
-    """
+    """Answers the queries of one map, from any thread. journal: where the past is read."""
 
     def __init__(
-        self,
-        writer: Writer,
-        site: SiteConfig,
-        config: ServerConfig,
-        keeper: Keeper | None = None,
-        journal: Path | None = None,
+        self, writer: Writer, follower: Follower, site: SiteConfig, config: ServerConfig, journal: Path
     ) -> None:
         self._writer = writer
+        self._follower = follower
         self._site = site
         self._config = config
-        self._keeper = keeper or Nobody()
-        self._past = Past(journal, site.cell_m, config) if journal else None
+        self._past = PastMaps(journal, site.cell_m, config)
 
     def answer(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and answer one query; QueryError says what is wrong with it."""
@@ -124,9 +77,9 @@ class Answers:
         if isinstance(query, HistoryQuery):
             return encode_history(self.history(query))
         if isinstance(query, MachinesQuery):
-            return encode_machines(self._keeper.machines())
+            return encode_machines(self._follower.machines())
         if isinstance(query, ChangesQuery):
-            return encode_changes(self._keeper.changes(query.after))
+            return encode_changes(self._follower.changes(query.after))
         return encode_info(self.info())
 
     def info(self) -> dict[str, Any]:
@@ -146,19 +99,19 @@ class Answers:
     def history(self, query: HistoryQuery) -> HistoryAnswer:
         """Layers of the cell that a position lies in, span by span."""
         names = _of_cells(query.layers)
-        now_ns = self._writer.read(lambda store: store.newest_ns)
+        now_ns = self._writer.run(lambda store: store.newest_ns)
         span_s = query.span_s or self._config.fold.bucket_s
         from_ns, to_ns = _time_of(query, now_ns, span_s)
         cell = self._cell(query.x_m, query.y_m)
-        wanted = Wanted(from_ns, to_ns, without=self._keeper.distrusted())
-        moments, merged = self._known_past().moments((cell.column, cell.row), wanted, span_s)
+        selection = Selection(from_ns, to_ns, without=self._follower.excluded())
+        moments, merged = self._past.moments((cell.column, cell.row), selection, span_s)
         x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
         return HistoryAnswer(x_m, y_m, tuple(self._span(moment, names) for moment in moments), merged, now_ns)
 
     def trust(self, command: TrustCommand) -> dict[str, Any]:
         """What is known of the machine once the command counts, and the journal row of the map that it counts in."""
-        row = self._keeper.trust(command.machine, command.trusted, command.reason, command.wait_s)
-        return {**row, "merged": self._writer.read(lambda store: store.merged)}
+        row = self._follower.trust(command.machine, command.trusted, command.reason, command.wait_s)
+        return {**row, "merged": self._writer.run(lambda store: store.merged)}
 
     def _cell(self, x_m: float, y_m: float) -> CellWindow:
         window = self._site.geometry.window(Bounds(x_m, y_m, np.nextafter(x_m, np.inf), np.nextafter(y_m, np.inf)))
@@ -190,17 +143,12 @@ class Answers:
 
     def _view(self, window: CellWindow, as_of_ns: int | None) -> View:
         if as_of_ns is None:
-            return self._writer.read(lambda store: view_now(store, window))
-        return self._known_past().view(window, as_of_ns, self._keeper.distrusted())
+            return self._writer.run(lambda store: view_now(store, window))
+        return self._past.view(window, as_of_ns, self._follower.excluded())
 
-    def _span(self, moment: Moment, names: tuple[str, ...]) -> HistorySpan:
+    def _span(self, moment: SpanEvidence, names: tuple[str, ...]) -> HistorySpan:
         values = cell_layers.read(moment.evidence, names, self._config.read, moment.last_ns)
         return HistorySpan(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
-
-    def _known_past(self) -> Past:
-        if self._past is None:
-            raise QueryError(Refusal.STORE, "this server keeps no journal; ask for the map as it is")
-        return self._past
 
 
 def reads_past(name: str, parameters: Mapping[str, str]) -> bool:

@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Pages, evidence, valid_pages
+from mapserver.change.validity import Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
+from mapserver.evidence.sums import evidence
 from mapserver.evidence.timeline import Block
 from mapserver.ingest.store import Store
-from mapserver.journal.history import History, Moment, grid_as_of, point_history
-from mapserver.journal.journal import JournalReader
-from mapserver.journal.rows import Wanted
+from mapserver.journal.history import History, SpanEvidence, grid_as_of, point_history
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from protocol.arrays import Floats32
 from protocol.errors import QueryError, Refusal, StoreError
@@ -37,8 +38,8 @@ class View:
 
 
 @dataclass(frozen=True)
-class Past:
-    """The past of one store. Every call opens the journal anew, so that any thread may ask."""
+class PastMaps:
+    """Maps of one store as of any time. Every call opens the journal anew, so that any thread may ask."""
 
     journal: Path
     cell_m: float
@@ -51,17 +52,17 @@ class Past:
             grid = grid_as_of(history, stamp_ns, self.cell_m, self.config.fold, _surroundings(window, reach), without)
         return View(_pages(grid, window, reach), last_row, stamp_ns)
 
-    def moments(self, cell: tuple[int, int], wanted: Wanted, span_s: float) -> tuple[list[Moment], int]:
+    def moments(self, cell: tuple[int, int], selection: Selection, span_s: float) -> tuple[list[SpanEvidence], int]:
         """Evidence of a cell (column, row) span by span, and the journal row that it is true for."""
         with self._history() as (history, last_row):
-            return point_history(history, cell, self.cell_m, self.config.fold, wanted, span_s), last_row
+            return point_history(history, cell, self.cell_m, self.config.fold, selection, span_s), last_row
 
     @contextmanager
     def _history(self) -> Iterator[tuple[History, int]]:
         try:
             reader = JournalReader(self.journal)
             try:
-                yield History.of(reader), reader.last_row
+                yield History.beside(reader), reader.last_row
             finally:
                 reader.close()
         except StoreError as error:
@@ -87,8 +88,8 @@ def read_cells(
     shape = (window.rows, window.columns)
     out: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in names}
     for some in chunks([block for block in view.pages if _touches(block, window)]):
-        found = evidence([view.pages[block] for block in some], [first[block] for block in some])
-        for name, values in cell_layers.read(found, names, config.read, view.stamp_ns).items():
+        sums = evidence([view.pages[block] for block in some], [first[block] for block in some])
+        for name, values in cell_layers.read(sums, names, config.read, view.stamp_ns).items():
             _place(out[name], window, some, values)
     return out
 

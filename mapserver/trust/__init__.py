@@ -1,1 +1,1 @@
-"""Which machines contradict all others, and whose samples are left out of the map."""
+"""Which machines contradict all others, and which are excluded from the map."""

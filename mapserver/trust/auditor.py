@@ -1,9 +1,9 @@
 """Trust: which machines contradict all others, why, and by what evidence.
 
-Each machine has a coarse map of its own (trust_ledger.py). All pairs of maps are compared (trust_compare.py), and so
-are the stamps at reception (trust_clock.py). A machine is found where it is outvoted by machines that agree among
-themselves (trust_vote.py), and where its difference from the map of all that are in good standing is beyond doubt
-(trust_judge.py). No clock, no threads, no files. Whether and when to distrust is the caller's decision.
+Each machine has a coarse map of its own (coarse_map.py). All pairs of maps are compared (comparison.py), and so are the
+stamps at reception. A machine contradicts all others where it is outvoted by machines that agree among themselves, and
+where its difference from the map of all that are in good standing is beyond doubt (judgement.py). Whether and when to
+exclude a machine is the caller's decision.
 """
 
 from __future__ import annotations
@@ -17,19 +17,26 @@ from typing import Any
 import numpy as np
 
 from mapserver.evidence.votes import FoldConfig, is_foldable
-from mapserver.trust.clock import ClockWatch
-from mapserver.trust.coarse_map import Ledger, map_cell_m, pooled
-from mapserver.trust.comparison import CompareConfig, Difference, Map, compare, reverse
-from mapserver.trust.judgement import GROUND, Finding, Reason, TrustConfig, judge
-from mapserver.trust.machine_vote import AGREE, DISAGREE, UNKNOWN, outvoted
+from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
+from mapserver.trust.comparison import ComparedMap, Difference, compare, reverse
+from mapserver.trust.judgement import (
+    AGREE,
+    DISAGREE,
+    GROUND,
+    UNKNOWN,
+    ClockLeads,
+    Judgement,
+    Reason,
+    judge,
+    outvoted,
+)
 from protocol.arrays import Ints, Table
 
-__all__ = ["Auditor", "Reason", "TrustConfig", "Verdict"]
-
-_PAIR_SIGMAS = 1.0  # a vote may be doubtful where several are needed, a verdict may not
+# Standard errors that are added to each limit: a vote may be doubtful where several are needed, a verdict may not.
+PAIR_SIGMAS, VERDICT_SIGMAS = 1.0, 2.0
 _PRINTED = {AGREE: "agrees_with", DISAGREE: "disagrees_with", UNKNOWN: "undecided_with"}
 
-Pairs = dict[tuple[str, str], dict[Reason, Finding]]  # findings about the first of two machines
+Pairs = dict[tuple[str, str], dict[Reason, Judgement]]  # of the first of two machines
 
 
 @dataclass(frozen=True)
@@ -49,94 +56,92 @@ class Verdict:
 
 
 class Auditor:
-    """Listens to all machines of one site. cell_m: of the site's grid; fold: which samples know their place."""
+    """Compares all machines of one site. cell_m: of the site's grid; fold: which samples know their place."""
 
-    def __init__(self, config: TrustConfig, cell_m: float, fold: FoldConfig | None = None) -> None:
-        self._config = config
+    def __init__(self, cell_m: float, fold: FoldConfig | None = None) -> None:
         self._cell_m = cell_m
         self._fold = fold or FoldConfig()
-        self._ledgers: dict[str, Ledger] = {}
-        self._clocks = ClockWatch(config.clock_span_s, config.clock_steady_s, config.clock_limit_s)
-        limits = (config.min_cells, config.zero_error, config.error_length_m, config.tolerance)
-        self._compare = CompareConfig(map_cell_m(cell_m), *limits)
+        self._maps: dict[str, CoarseMap] = {}
+        self._clocks = ClockLeads()
 
     @property
     def nbytes(self) -> int:
         """Memory of all machines' maps."""
-        return sum(ledger.nbytes for ledger in self._ledgers.values())
+        return sum(coarse.nbytes for coarse in self._maps.values())
 
     def add(self, machine: str, rows: Table) -> None:
         """Add samples of one machine, as they lie in a journal row; rows in the order of the journal.
 
         The maps depend on no order. The clocks do: compared is what the machines sent at about the same time, and the
-        order of the journal tells that better than the time of receipt, which steps where the server's clock is set.
+        order of the journal shows that better than the time of receipt, which steps where the server's clock is set.
         """
         if not len(rows):
             return
-        if machine not in self._ledgers:
-            self._ledgers[machine] = Ledger(self._cell_m, round(self._config.period_s * 1e9), self._config.periods)
+        if machine not in self._maps:
+            self._maps[machine] = CoarseMap(self._cell_m)
         sure = is_foldable(rows, self._fold)
-        self._ledgers[machine].add(rows if sure.all() else rows[sure])
+        self._maps[machine].add(rows if sure.all() else rows[sure])
         self._clocks.add(machine, int(rows["stamp_ns"].max()))
 
     def verdicts(self) -> dict[str, Verdict]:
         """Judge every machine."""
-        names = sorted(self._ledgers)
-        maps = [Map(surface, surface.places()) for surface in (self._ledgers[name].surface() for name in names)]
+        names = sorted(self._maps)
+        surfaces = [self._maps[name].surface() for name in names]
+        maps = [ComparedMap(surface, surface.places()) for surface in surfaces]
         pairs = self._pairs(names, maps)
         states = {reason: _states(names, pairs, reason) for reason in Reason}
         groups = {reason: outvoted(states[reason]) for reason in Reason}
         suspected = [any(groups[reason][i] for reason in GROUND) for i in range(len(names))]
         verdicts = {}
         for i, difference in enumerate(self._from_pool(maps, suspected)):
-            findings = judge(difference, self._config, self._config.sigmas)
-            findings[Reason.CLOCK], lead = self._clock(names, i, groups[Reason.CLOCK][i])
-            reasons = tuple(r for r in Reason if groups[r][i] and findings[r].state == DISAGREE)
-            excess = {str(r): round(f.excess, 3) for r, f in findings.items() if f.excess}
+            judgements = judge(difference, VERDICT_SIGMAS)
+            judgements[Reason.CLOCK], lead = self._clock(names, i, groups[Reason.CLOCK][i])
+            reasons = tuple(r for r in Reason if groups[r][i] and judgements[r].state == DISAGREE)
+            excess = {str(r): round(j.excess, 3) for r, j in judgements.items() if j.excess}
             evidence = _measured(difference) | lead | {"excess": excess} | _sides(names, states, i)
             verdicts[names[i]] = Verdict(names[i], reasons, evidence, bool(reasons))
         return verdicts
 
-    def _pairs(self, names: Sequence[str], maps: Sequence[Map]) -> Pairs:
-        """Findings about every machine against every other."""
+    def _pairs(self, names: Sequence[str], maps: Sequence[ComparedMap]) -> Pairs:
+        """Judge every machine against every other."""
         pairs: Pairs = {}
         for (one, one_map), (other, other_map) in combinations(zip(names, maps, strict=True), 2):
-            difference = compare(one_map, other_map, self._compare)
-            pairs[one, other] = judge(difference, self._config, _PAIR_SIGMAS)
-            pairs[other, one] = judge(reverse(difference) if difference else None, self._config, _PAIR_SIGMAS)
-        for (one, other), findings in pairs.items():
-            findings[Reason.CLOCK] = self._clocks.compare(one, other)[1]
+            difference = compare(one_map, other_map, map_cell_m(self._cell_m))
+            pairs[one, other] = judge(difference, PAIR_SIGMAS)
+            pairs[other, one] = judge(reverse(difference) if difference else None, PAIR_SIGMAS)
+        for (one, other), judgements in pairs.items():
+            judgements[Reason.CLOCK] = self._clocks.compare(one, other)[1]
         return pairs
 
-    def _from_pool(self, maps: Sequence[Map], suspected: Sequence[bool]) -> Iterator[Difference | None]:
+    def _from_pool(self, maps: Sequence[ComparedMap], suspected: Sequence[bool]) -> Iterator[Difference | None]:
         """Differences of each machine from all others in good standing together: more ground than any one has."""
         good = [each for each, bad in zip(maps, suspected, strict=True) if not bad]
-        pool = Map(pooled([each.timed for each in good]), pooled([each.placed for each in good]))
+        pool = ComparedMap(pooled([each.timed for each in good]), pooled([each.placed for each in good]))
         for own, bad in zip(maps, suspected, strict=True):
-            rest = pool if bad else Map(pool.timed.without(own.timed), pool.placed.without(own.placed))
-            yield compare(own, rest, self._compare)
+            rest = pool if bad else ComparedMap(pool.timed.without(own.timed), pool.placed.without(own.placed))
+            yield compare(own, rest, map_cell_m(self._cell_m))
 
-    def _clock(self, names: Sequence[str], i: int, group: Sequence[int]) -> tuple[Finding, dict[str, Any]]:
+    def _clock(self, names: Sequence[str], i: int, group: Sequence[int]) -> tuple[Judgement, dict[str, Any]]:
         """Typical lead over the machines that outvote this one, or else over all others."""
         others = group or [j for j in range(len(names)) if j != i]
         leads = [self._clocks.compare(names[i], names[j]) for j in others]
-        leads = [(lead, finding) for lead, finding in leads if isfinite(lead)]
+        leads = [(lead, judgement) for lead, judgement in leads if isfinite(lead)]
         if not leads:
-            return Finding(), {}
-        lead, finding = sorted(leads, key=lambda each: each[0])[len(leads) // 2]
-        return finding, {"clock_s": round(lead, 1)}
+            return Judgement(), {}
+        lead, judgement = sorted(leads, key=lambda each: each[0])[len(leads) // 2]
+        return judgement, {"clock_s": round(lead, 1)}
 
 
 def _states(names: Sequence[str], pairs: Pairs, reason: Reason) -> Ints:
     """Matrix of AGREE, UNKNOWN, DISAGREE for one reason."""
     states = np.full((len(names), len(names)), UNKNOWN, np.int64)
-    for (one, other), findings in pairs.items():
-        states[names.index(one), names.index(other)] = findings[reason].state
+    for (one, other), judgements in pairs.items():
+        states[names.index(one), names.index(other)] = judgements[reason].state
     return states
 
 
 def _measured(difference: Difference | None) -> dict[str, Any]:
-    """What a comparison found, in plain values."""
+    """A comparison in plain values."""
     if difference is None:
         return {"cells": 0}
     shift = difference.shift

@@ -1,4 +1,4 @@
-"""What trust remembers of one machine: its own coarse map of the newest periods in which it drove.
+"""What trust remembers of one machine: a coarse map of its own of the newest periods in which it drove.
 
 A key is a cell of about 2 m in a period of half an hour, because only values of the same ground at the same time can
 contradict each other: between two times it may have rained, or a zone may have been repaved. Values are sums of
@@ -17,6 +17,8 @@ import numpy as np
 from protocol.arrays import Floats, Ints, Table
 
 CELL_M = 2.0  # about one standard deviation of a position: finer cells would compare single samples
+PERIOD_S = 1800.0  # only cells driven in the same period are compared: rain and repaving are no contradiction
+PERIODS = 16  # that are remembered; a repaired machine is cleared when most of them are good
 UNITS_PER_M = 1024
 UNITS_PER_LEVEL = 1024
 # Levels are log(c_rr + 0.01): the noise and the zero error of a balance are additive (0.002 to 0.006), and without the
@@ -94,13 +96,11 @@ def _summed(codes: Ints, sums: Ints, std_m: float) -> Surface:
     return Surface(codes[first], np.add.reduceat(sums[order], first, axis=0), std_m)
 
 
-class Ledger:
-    """Sums of one machine, for the newest `periods` periods in which it drove."""
+class CoarseMap:
+    """Sums of one machine, for the newest periods in which it drove."""
 
-    def __init__(self, cell_m: float, period_ns: int, periods: int) -> None:
+    def __init__(self, cell_m: float) -> None:
         self._cell_m = map_cell_m(cell_m)
-        self._period_ns = period_ns
-        self._periods = periods
         self._codes: Ints = np.zeros(0, np.int64)
         self._sums: Ints = np.zeros((0, 2), np.int64)
         self._pending: list[tuple[Ints, Ints]] = []
@@ -129,7 +129,7 @@ class Ledger:
         variance = np.rint((rows["cov_xx_m2"] + rows["cov_yy_m2"]) * np.float64(_VARIANCE_UNITS / 2)).astype(np.int64)
         self._variance += int(metres @ variance)
         self._metres += int(metres.sum())
-        self._pending.append(((rows["stamp_ns"] // self._period_ns << _PERIOD_SHIFT) + row * ROW + column, sums))
+        self._pending.append(((rows["stamp_ns"] // round(PERIOD_S * 1e9) << _PERIOD_SHIFT) + row * ROW + column, sums))
         self._waiting += len(rows)
         if self._waiting > max(_PENDING_ROWS, len(self._codes) // 4):
             self._merge()
@@ -148,6 +148,6 @@ class Ledger:
         self._pending, self._waiting = [], 0
         # what waits is small: summed first, it leaves two sorted runs to merge
         whole = pooled([Surface(self._codes, self._sums, 0.0), pooled(waiting)])
-        newest = np.unique(whole.codes >> _PERIOD_SHIFT)[-self._periods :]
+        newest = np.unique(whole.codes >> _PERIOD_SHIFT)[-PERIODS:]
         start = int(np.searchsorted(whole.codes, newest[0] << _PERIOD_SHIFT)) if len(newest) else 0
         self._codes, self._sums = whole.codes[start:].copy(), whole.sums[start:].copy()

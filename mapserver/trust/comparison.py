@@ -14,6 +14,9 @@ from mapserver.trust.coarse_map import LEVEL_FLOOR, ROW, Surface
 from mapserver.trust.shift import Shift, find_shift, near_borders
 from protocol.arrays import Floats, Ints
 
+MIN_CELLS = 20  # of about 4 m2 that two machines must share; with fewer nothing is decided
+ZERO_ERROR = 0.003  # of c_rr: an accelerometer's zero error divided by g may explain a difference on hard ground
+TOLERANCE = 0.3  # of log(c_rr + 0.01), within which cells agree; dry and wet dirt are 0.34 apart
 _LOWEST_C_RR = 0.004  # the lowest that the map knows: ratios of less mean nothing
 _SCATTER = 0.1  # of log(c_rr) between two machines on one cell, besides the zero error
 _MOST_CELLS = 8000
@@ -40,8 +43,9 @@ class Gain:
 class Difference:
     """How one map differs from another.
 
-    cells: compared, of the same period; shift: None where no border tells; agreement: share of the cells whose levels
-    agree within the tolerance once gain and shift are taken out; spreads: standard deviations of both levels on them.
+    cells: compared, of the same period; shift: None where no border shows it; agreement: share of the cells whose
+    levels agree within TOLERANCE once gain and shift are taken out; spreads: standard deviations of the levels, own and
+    other, on these cells.
     """
 
     cells: int
@@ -52,7 +56,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Map:
+class ComparedMap:
     """One side of a comparison: its map by periods, and by places alone."""
 
     timed: Surface
@@ -64,35 +68,24 @@ class Map:
         return near_borders(self.placed)
 
 
-@dataclass(frozen=True)
-class CompareConfig:
-    """What a comparison takes as given: cell_m of the maps, the others as in TrustConfig."""
-
-    cell_m: float
-    min_cells: int
-    zero_error: float
-    error_length_m: float
-    tolerance: float
-
-
-def compare(one: Map, other: Map, config: CompareConfig) -> Difference | None:
-    """Compare two maps; None where they have too little ground in common.
+def compare(one: ComparedMap, other: ComparedMap, cell_m: float) -> Difference | None:
+    """Compare two maps with cells of this edge; None where they have too little ground in common.
 
     Gain and agreement compare cells of the same period, for it may have rained in between. The shift compares places:
     rain moves no border, and it needs every border that there is.
     """
     a, b = _common(one.timed.codes, other.timed.codes)
     cells = len(a)
-    if cells < config.min_cells:
+    if cells < MIN_CELLS:
         return None
     a, b = _thinned(a, b)
-    gain = _gain(one.timed, other.timed, a, b, config)
-    shift = _shift(one, other, config)
+    gain = _gain(one.timed, other.timed, a, b, cell_m)
+    shift = _shift(one, other, cell_m)
     return Difference(
         cells=cells,
         gain=gain,
         shift=shift,
-        agreement=_agreement(one.timed, other.timed, b, gain.log, shift, config),
+        agreement=_agreement(one.timed, other.timed, b, gain.log, shift, cell_m),
         spreads=(float(np.std(one.timed.level[a])), float(np.std(other.timed.level[b]))),
     )
 
@@ -112,12 +105,12 @@ def _common(one: Ints, other: Ints) -> tuple[Ints, Ints]:
     return place[hit], hit
 
 
-def _gain(one: Surface, other: Surface, a: Ints, b: Ints, config: CompareConfig) -> Gain:
+def _gain(one: Surface, other: Surface, a: Ints, b: Ints, cell_m: float) -> Gain:
     """Median of the log ratio; a zero error hides it on concrete, so that each cell weighs by what it can tell."""
     c_one, c_other = _c_rr(one.level[a]), _c_rr(other.level[b])
     c_rr = np.sqrt(c_one * c_other)
-    metres = np.minimum(np.minimum(one.metres[a], other.metres[b]), config.cell_m)
-    weight = metres / (_SCATTER**2 + (config.zero_error / c_rr) ** 2)
+    metres = np.minimum(np.minimum(one.metres[a], other.metres[b]), cell_m)
+    weight = metres / (_SCATTER**2 + (ZERO_ERROR / c_rr) ** 2)
     ratio = np.log(c_one / c_other)
     log = _weighted_median(ratio, weight)
     draws = max(1.0, weight.sum() ** 2 / (weight @ weight) / CELLS_PER_DRAW)
@@ -130,25 +123,23 @@ def _gain(one: Surface, other: Surface, a: Ints, b: Ints, config: CompareConfig)
     )
 
 
-def _shift(one: Map, other: Map, config: CompareConfig) -> Shift | None:
+def _shift(one: ComparedMap, other: ComparedMap, cell_m: float) -> Shift | None:
     """Displacement of the places, once the gain between them is taken out."""
     a, b = _thinned(*_common(one.placed.codes, other.placed.codes))
-    expected = _with_gain(other.placed.level[other.borders], _gain(one.placed, other.placed, a, b, config).log)
-    return find_shift(one.placed, other.placed, other.borders, expected, config.cell_m, config.error_length_m)
+    expected = _with_gain(other.placed.level[other.borders], _gain(one.placed, other.placed, a, b, cell_m).log)
+    return find_shift(one.placed, other.placed, other.borders, expected, cell_m)
 
 
-def _agreement(
-    one: Surface, other: Surface, b: Ints, log_gain: float, shift: Shift | None, config: CompareConfig
-) -> float:
+def _agreement(one: Surface, other: Surface, b: Ints, log_gain: float, shift: Shift | None, cell_m: float) -> float:
     """Share of these cells whose levels agree: where the maps lie, or moved by the shift, whichever is better."""
     moves = {0}
     if shift:
-        moves.add(round(shift.north_m / config.cell_m) * ROW + round(shift.east_m / config.cell_m))
+        moves.add(round(shift.north_m / cell_m) * ROW + round(shift.east_m / cell_m))
     expected = _with_gain(other.level[b], log_gain)
     shares = []
     for move in moves:
-        found, at = _common(one.codes, other.codes[b] + move)
-        shares.append(float(np.mean(np.abs(one.level[found] - expected[at]) <= config.tolerance)) if len(at) else 0.0)
+        own, at = _common(one.codes, other.codes[b] + move)
+        shares.append(float(np.mean(np.abs(one.level[own] - expected[at]) <= TOLERANCE)) if len(at) else 0.0)
     return max(shares)
 
 

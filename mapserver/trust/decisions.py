@@ -1,4 +1,4 @@
-"""Whom the map trusts: decisions by the audit and by people, with their reasons, kept in the journal's events.
+"""Which machines the map trusts: decisions by the audit and by people, kept with their reasons as journal events.
 
 A machine's newest decision counts. One made by a person stands until a person hands it back to the audit; the audit
 waits for the same verdict several times, so that a doubtful machine does not go in and out.
@@ -19,7 +19,7 @@ DISTRUST_AFTER, TRUST_AFTER = 2, 4  # verdicts in a row
 
 
 @dataclass(frozen=True)
-class Decision:
+class TrustDecision:
     """What was decided about a machine. by: the audit or a person; evidence: plain values."""
 
     machine: str
@@ -35,32 +35,33 @@ class Decision:
         return asdict(self)
 
 
-class Decisions:
+class TrustDecisions:
     """Newest decision about each machine."""
 
     def __init__(self, events: Iterable[Event]) -> None:
-        self._newest = {event.body["machine"]: Decision(**event.body) for event in events}
+        self._newest = {event.body["machine"]: TrustDecision(**event.body) for event in events}
         self._in_a_row: dict[str, int] = {}
 
     @property
     def distrusted(self) -> frozenset[str]:
-        """Machines whose rows are left out of the map."""
+        """Machines whose rows are excluded from the map."""
         return frozenset(name for name, decision in self._newest.items() if not decision.trusted)
 
-    def of(self, machine: str) -> Decision | None:
-        """The newest decision, None where there never was one."""
+    def newest(self, machine: str) -> TrustDecision | None:
+        """The newest decision about a machine, None where there never was one."""
         return self._newest.get(machine)
 
-    def take(self, decision: Decision) -> None:
-        """Let a decision count."""
+    def add(self, decision: TrustDecision) -> None:
+        """Make a decision the newest one about its machine."""
         self._newest[decision.machine] = decision
         self._in_a_row.pop(decision.machine, None)
 
-    def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> list[Decision]:
-        """What the audit decides on these verdicts; the caller keeps it, then calls `take`."""
-        return [found for verdict in verdicts.values() if (found := self._judge(verdict, stamp_ns))]
+    def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> list[TrustDecision]:
+        """What the audit decides on these verdicts; the caller keeps it, then calls `add`."""
+        decisions = (self._judge(verdict, stamp_ns) for verdict in verdicts.values())
+        return [decision for decision in decisions if decision]
 
-    def _judge(self, verdict: Verdict, stamp_ns: int) -> Decision | None:
+    def _judge(self, verdict: Verdict, stamp_ns: int) -> TrustDecision | None:
         machine, now = verdict.machine, self._newest.get(verdict.machine)
         trusted = now is None or now.trusted
         if (now and now.by == PERSON) or verdict.contradicts != trusted:
@@ -70,4 +71,4 @@ class Decisions:
         if self._in_a_row[machine] < (DISTRUST_AFTER if trusted else TRUST_AFTER):
             return None
         reason = ", ".join(verdict.reasons) if trusted else "agrees with the others again"
-        return Decision(machine, not trusted, AUDIT, reason, stamp_ns, dict(verdict.evidence))
+        return TrustDecision(machine, not trusted, AUDIT, reason, stamp_ns, dict(verdict.evidence))

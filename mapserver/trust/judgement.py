@@ -1,67 +1,32 @@
-"""From a difference of two maps to what it means: for each reason, how far beyond its limit it is."""
+"""From a difference to what it means: how far beyond its limit it is, and which machines are outvoted because of it."""
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
 from math import hypot, log, sqrt
 
-from mapserver.trust.comparison import CELLS_PER_DRAW, Difference, Gain
-from mapserver.trust.machine_vote import AGREE, DISAGREE, UNKNOWN
+import numpy as np
+
+from mapserver.trust.comparison import CELLS_PER_DRAW, ZERO_ERROR, Difference, Gain
 from mapserver.trust.shift import Shift
-from protocol.config import require_positive
+from protocol.arrays import Ints
 
-_ALIKE = 0.75  # of the limit: above it nothing is said
-
-
-@dataclass(frozen=True)
-class TrustConfig:
-    """When machines count as contradicting each other.
-
-    period_s: only cells driven in the same period are compared: rain and repaving are no contradiction. periods: so
-    many of a machine's newest periods are remembered; a repaired machine is cleared when most of them are good.
-    min_cells: of about 4 m2 that two machines must share; with fewer nothing is decided.
-    gain_limit: ratio of coefficients; agents know mass and torque to 3 % each, a class is wrong from about 1.25.
-    share: of the ground that must differ by a gain in the same direction, and of the borders that must speak for a
-    displacement: a repaved corner is neither.
-    zero_error: of c_rr, an accelerometer's zero error divided by g; it may explain a difference on hard ground.
-    offset_limit_m: of positions; what slow receiver errors leave after hours. error_length_m: metres over which a
-    position error stays the same (twice 30 s at 3 m/s). sigmas: so many standard errors are added to each limit.
-    tolerance: of log(c_rr + 0.01); dry and wet dirt are 0.34 apart. agreement: share of the ground on which two
-    machines must agree within it.
-    stuck_spread: a sensor is stuck where its values vary by less than this share of what the others' do, if those vary
-    by at least min_spread.
-    clock_limit_s: what batches and links may explain. clock_steady_s, clock_span_s: a clock is wrong where its lead
-    stays within so much for so long; the lag of a machine that catches up shrinks faster.
-    """
-
-    period_s: float = 1800.0
-    periods: int = 16
-    min_cells: int = 20
-    gain_limit: float = 1.15
-    share: float = 0.75
-    zero_error: float = 0.003
-    offset_limit_m: float = 1.5
-    error_length_m: float = 200.0
-    sigmas: float = 2.0
-    tolerance: float = 0.3
-    agreement: float = 0.6
-    stuck_spread: float = 0.25
-    min_spread: float = 0.3
-    clock_limit_s: float = 300.0
-    clock_steady_s: float = 60.0
-    clock_span_s: float = 600.0
-
-    def __post_init__(self) -> None:
-        require_positive(self, self.__dataclass_fields__)
-        if self.gain_limit <= 1:
-            raise ValueError(f"gain_limit: {self.gain_limit} is not above 1")
-        for name in ("share", "agreement", "stuck_spread"):
-            if getattr(self, name) >= 1:
-                raise ValueError(f"{name}: {getattr(self, name)} is not below 1")
-        for small, large in (("clock_steady_s", "clock_limit_s"), ("clock_steady_s", "clock_span_s")):
-            if getattr(self, small) >= getattr(self, large):
-                raise ValueError(f"{small}: must be below {large}")
+AGREE, UNKNOWN, DISAGREE = 1, 0, -1
+ALIKE = 0.75  # share of the limit up to which maps agree; between it and the limit nothing is said
+GAIN_LIMIT = 1.15  # ratio of coefficients: agents know mass and torque to 3 % each, a class is wrong from about 1.25
+# Share of the ground that must differ by a gain in the same direction, and of the borders that must speak for a
+# displacement: a repaved corner is neither.
+SHARE = 0.75
+OFFSET_LIMIT_M = 1.5  # of positions: what slow receiver errors leave after hours
+AGREEMENT = 0.6  # share of the ground on which two machines must agree within the tolerance of a comparison
+# A sensor is stuck where its levels vary by less than this share of what the others' do, if those vary by so much.
+STUCK_SPREAD, MIN_SPREAD = 0.25, 0.3
+CLOCK_LIMIT_S = 300.0  # lead or lag that batches and links may explain
+# A clock is wrong where its lead stays within so much for so long; the lag of a machine that catches up shrinks faster.
+CLOCK_STEADY_S, CLOCK_SPAN_S = 60.0, 600.0
+LEADS, LEADS_NEEDED = 16, 8  # leads that are noted in a span, and how many of them tell
 
 
 class Reason(StrEnum):
@@ -75,7 +40,7 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class Judgement:
     """How far one difference goes (1: at its limit), and what that means: AGREE, UNKNOWN or DISAGREE."""
 
     excess: float = 0.0
@@ -83,55 +48,127 @@ class Finding:
 
 
 GROUND = (Reason.GAIN, Reason.OFFSET, Reason.STUCK, Reason.DISAGREES)
-_NO_FINDING = Finding()
+_NO_JUDGEMENT = Judgement()
 
 
-def judge(difference: Difference | None, config: TrustConfig, sigmas: float) -> dict[Reason, Finding]:
-    """Findings about the first of two maps, for every reason that shows in the ground.
+# --- the ground ------------------------------------------------------------------------------------------------------
 
-    Between maps that have nothing in common, gain and offset mean nothing.
+
+def judge(difference: Difference | None, sigmas: float) -> dict[Reason, Judgement]:
+    """Judge the first of two maps, for every reason that shows in the ground.
+
+    sigmas: so many standard errors are added to each limit. Between maps that have nothing in common, gain and offset
+    mean nothing.
     """
-    findings = dict.fromkeys(GROUND, _NO_FINDING)
+    judgements = dict.fromkeys(GROUND, _NO_JUDGEMENT)
     if difference is None:
-        return findings
-    findings[Reason.STUCK] = _stuck(difference.spreads, config)
-    if DISAGREE in (findings[Reason.STUCK].state, _stuck(difference.spreads[::-1], config).state):
-        return findings
-    findings[Reason.DISAGREES] = _disagrees(difference, config, sigmas)
-    if findings[Reason.DISAGREES].state != DISAGREE:
-        findings[Reason.GAIN] = _gain(difference.gain, config, sigmas)
-        findings[Reason.OFFSET] = _offset(difference.shift, config, sigmas)
-    return findings
+        return judgements
+    judgements[Reason.STUCK] = _stuck(difference.spreads)
+    if DISAGREE in (judgements[Reason.STUCK].state, _stuck(difference.spreads[::-1]).state):
+        return judgements
+    judgements[Reason.DISAGREES] = _disagrees(difference, sigmas)
+    if judgements[Reason.DISAGREES].state != DISAGREE:
+        judgements[Reason.GAIN] = _gain(difference.gain, sigmas)
+        judgements[Reason.OFFSET] = _offset(difference.shift, sigmas)
+    return judgements
 
 
-def _stuck(spreads: tuple[float, float], config: TrustConfig) -> Finding:
+def _stuck(spreads: tuple[float, float]) -> Judgement:
     own, theirs = spreads
-    if theirs < config.min_spread:
-        return _NO_FINDING
-    excess = config.stuck_spread * theirs / max(own, 1e-3)
-    return Finding(excess, DISAGREE if excess > 1 else AGREE)
+    if theirs < MIN_SPREAD:
+        return _NO_JUDGEMENT
+    excess = STUCK_SPREAD * theirs / max(own, 1e-3)
+    return Judgement(excess, DISAGREE if excess > 1 else AGREE)
 
 
-def _disagrees(difference: Difference, config: TrustConfig, sigmas: float) -> Finding:
+def _disagrees(difference: Difference, sigmas: float) -> Judgement:
     error = 0.5 * sqrt(CELLS_PER_DRAW / difference.cells)  # of a share, at most
-    excess = (1 - difference.agreement) / (1 - config.agreement + sigmas * error)
-    return Finding(excess, DISAGREE if excess > 1 else AGREE if excess <= _ALIKE else UNKNOWN)
+    excess = (1 - difference.agreement) / (1 - AGREEMENT + sigmas * error)
+    return Judgement(excess, DISAGREE if excess > 1 else AGREE if excess <= ALIKE else UNKNOWN)
 
 
-def _gain(gain: Gain, config: TrustConfig, sigmas: float) -> Finding:
-    limit = log(config.gain_limit) + config.zero_error / gain.c_rr
+def _gain(gain: Gain, sigmas: float) -> Judgement:
+    limit = log(GAIN_LIMIT) + ZERO_ERROR / gain.c_rr
     excess = abs(gain.log) / (limit + sigmas * gain.std)
-    if excess > 1 and gain.share >= config.share:
-        return Finding(excess, DISAGREE)
-    return Finding(excess, AGREE if abs(gain.log) <= limit else UNKNOWN)
+    if excess > 1 and gain.share >= SHARE:
+        return Judgement(excess, DISAGREE)
+    return Judgement(excess, AGREE if abs(gain.log) <= limit else UNKNOWN)
 
 
-def _offset(shift: Shift | None, config: TrustConfig, sigmas: float) -> Finding:
+def _offset(shift: Shift | None, sigmas: float) -> Judgement:
     if shift is None:
-        return _NO_FINDING
-    far_m, limit_m = hypot(shift.east_m, shift.north_m), config.offset_limit_m
-    excess = far_m / (limit_m + sigmas * shift.std_m)
-    if excess > 1 and shift.share >= config.share:
-        return Finding(excess, DISAGREE)
-    agrees = far_m <= limit_m and shift.std_m <= limit_m
-    return Finding(excess, AGREE if agrees else UNKNOWN)
+        return _NO_JUDGEMENT
+    far_m = hypot(shift.east_m, shift.north_m)
+    excess = far_m / (OFFSET_LIMIT_M + sigmas * shift.std_m)
+    if excess > 1 and shift.share >= SHARE:
+        return Judgement(excess, DISAGREE)
+    agrees = far_m <= OFFSET_LIMIT_M and shift.std_m <= OFFSET_LIMIT_M
+    return Judgement(excess, AGREE if agrees else UNKNOWN)
+
+
+# --- clocks ----------------------------------------------------------------------------------------------------------
+
+
+class ClockLeads:
+    """Steady leads of one machine's stamps over those of the others, whenever its samples arrive.
+
+    Only stamps are compared with stamps: sites replay old logs, and run faster than real time. A machine that was
+    offline and catches up is behind too, but its lag shrinks; where the others have stopped, the lead of one that works
+    on grows.
+    """
+
+    def __init__(self) -> None:
+        self._newest: dict[str, int] = {}
+        self._noted: dict[str, deque[tuple[int, dict[str, int]]]] = {}
+
+    def add(self, machine: str, newest_ns: int) -> None:
+        """Note the newest stamp of a batch; in order of arrival."""
+        noted = self._noted.setdefault(machine, deque(maxlen=LEADS + 1))
+        if not noted or abs(newest_ns - noted[-1][0]) >= CLOCK_SPAN_S * 1e9 / LEADS:
+            noted.append((newest_ns, dict(self._newest)))
+        self._newest[machine] = newest_ns
+
+    def compare(self, machine: str, other: str) -> tuple[float, Judgement]:
+        """By how much [s] one machine's stamps are ahead of another's, NaN where that is not known; what it means."""
+        stamps = [(own, newest[other]) for own, newest in self._noted[machine] if other in newest]
+        if len(stamps) < LEADS_NEEDED:
+            return np.nan, _NO_JUDGEMENT
+        own, theirs = np.array(stamps, np.int64).T
+        leads_s = (own - theirs) / 1e9
+        lead_s = float(np.median(leads_s))
+        excess = abs(lead_s) / CLOCK_LIMIT_S
+        if np.abs(leads_s).max() <= CLOCK_LIMIT_S:
+            return lead_s, Judgement(excess, AGREE)
+        steady = np.ptp(leads_s) <= CLOCK_STEADY_S and np.ptp(own) >= 0.75e9 * CLOCK_SPAN_S
+        return lead_s, Judgement(excess, DISAGREE if steady and excess > 1 else UNKNOWN)
+
+
+# --- the vote --------------------------------------------------------------------------------------------------------
+
+
+def outvoted(states: Ints) -> list[tuple[int, ...]]:
+    """For each machine the group of others by which it is outvoted; empty where it is not.
+
+    states: (n, n) AGREE, UNKNOWN or DISAGREE of row's machine with column's.
+    A machine is outvoted by a group of at least two that it disagrees with, and that agree among themselves, if the
+    group is larger than the machine's own side, and at least half of all that can be compared with it: of two machines
+    nobody knows which is right, nor when most of a fleet is wrong.
+    """
+    return [_outvoters(states, machine) for machine in range(len(states))]
+
+
+def _outvoters(states: Ints, machine: int) -> tuple[int, ...]:
+    against = [int(other) for other in (states[machine] == DISAGREE).nonzero()[0]]
+    side = 1 + int((states[machine] == AGREE).sum())
+    group = max((_group(states, seed, against) for seed in against), key=len, default=())
+    decides = len(group) >= 2 and len(group) > side and 2 * len(group) >= len(against) + side
+    return group if decides else ()
+
+
+def _group(states: Ints, seed: int, candidates: list[int]) -> tuple[int, ...]:
+    """The seed and those who agree with it, without those who disagree with one already in."""
+    group = [seed]
+    for other in candidates:
+        if states[seed, other] == AGREE and all(states[other, member] != DISAGREE for member in group):
+            group.append(other)
+    return tuple(sorted(group))

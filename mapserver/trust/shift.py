@@ -12,11 +12,12 @@ from protocol.arrays import Bools, Floats, Ints
 REACH = 3  # cells; shifts up to here each way are tried
 _EDGE = 2 * REACH + 1
 _SHIFTS = _EDGE * _EDGE
+ERROR_LENGTH_M = 200.0  # driven, over which a position error stays the same: twice 30 s at 3 m/s
 _MOST_CELLS = 4000  # more make it slower, not surer
 _FEWEST_CELLS = 50
 _BORDER_BITS, _BORDER_LEVELS = 3, 0.25  # a square of 16 m in which levels differ by so much holds a border
 _CLIP = 1.0  # levels: beyond, a difference counts as this one; else the borders of sand alone would decide
-# Where borders run one way only, nothing tells the shift along them: a shift by one cell must improve the cost by 1 %.
+# Where borders run one way only, nothing shows the shift along them: a shift by one cell must improve the cost by 1 %.
 _PRICE = 0.01
 _GROUPS = 8  # of squares of 32 m, left out in turn (jackknife)
 _GROUP_BITS = 4
@@ -35,13 +36,10 @@ class Shift:
     share: float
 
 
-def find_shift(
-    one: Surface, other: Surface, borders: Ints, expected: Floats, cell_m: float, error_length_m: float
-) -> Shift | None:
+def find_shift(one: Surface, other: Surface, borders: Ints, expected: Floats, cell_m: float) -> Shift | None:
     """Displacement of the first map from the other; None where too few borders tell.
 
     borders: indices of the other's cells, expected: levels that the first map should have there, both (n,).
-    error_length_m: a position error stays the same for about so many metres.
     """
     if not len(borders) or not len(one.codes):
         return None
@@ -55,7 +53,7 @@ def find_shift(
     rest = np.array([_best(c, n) for c, n in zip(costs.sum(axis=0) - costs, counts.sum(axis=0) - counts, strict=True)])
     jackknife = (1 - 1 / len(rest)) * float(((rest - rest.mean(axis=0)) ** 2).sum()) * cell_m**2
     metres = float(one.metres.mean()) * both.sum(), float(other.metres[borders][both].sum())
-    drawn = sum(2 * s.std_m**2 * error_length_m / m for s, m in zip((one, other), metres, strict=True))
+    drawn = sum(2 * s.std_m**2 * ERROR_LENGTH_M / m for s, m in zip((one, other), metres, strict=True))
     moved = (round(north) + REACH) * _EDGE + round(east) + REACH
     gained = np.where(both & known[:, moved], error[:, _SHIFTS // 2] - error[:, moved], 0.0)
     return Shift(east * cell_m, north * cell_m, float(np.sqrt(jackknife + drawn)), _share(at, gained))
@@ -83,7 +81,7 @@ def near_borders(surface: Surface) -> Ints:
 
 def _errors(codes: Ints, level: Floats, at: Ints, expected: Floats) -> tuple[Floats, Bools]:
     """Squared differences of levels (n, shifts), clipped, 0 where the shifted cell is not known; and where it is."""
-    found = np.full((len(at), _EDGE, _EDGE), np.nan)
+    levels = np.full((len(at), _EDGE, _EDGE), np.nan)
     for i, north in enumerate(_STEPS):
         west = at + north * ROW - REACH
         place = np.searchsorted(codes, west)
@@ -91,8 +89,8 @@ def _errors(codes: Ints, level: Floats, at: Ints, expected: Floats) -> tuple[Flo
             index = np.minimum(place + step, len(codes) - 1)
             column = codes[index] - west
             hit = np.flatnonzero((column >= 0) & (column < _EDGE))
-            found[hit, i, column[hit]] = level[index[hit]]
-    difference = found.reshape(len(at), _SHIFTS) - expected[:, None]
+            levels[hit, i, column[hit]] = level[index[hit]]
+    difference = levels.reshape(len(at), _SHIFTS) - expected[:, None]
     known = ~np.isnan(difference)
     return np.where(known, np.minimum(difference**2, _CLIP**2), 0.0), known
 

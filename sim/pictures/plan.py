@@ -10,7 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from mapserver.pictures.frame import Axes, Colour, Entry, Image, compose
+from mapserver.pictures.frame import Axes, Colour, Image, LegendEntry, compose
 from protocol.arrays import Floats
 from protocol.site.geometry import Bounds
 from protocol.site.ground_classes import ZONES
@@ -67,9 +67,9 @@ def draw_plan(scenario: Scenario, models: Sequence[MachineModel], start: FleetSt
         longest = max(lane, key=len)
         canvas.label(config.name, longest[len(longest) // 3], colour)
 
-    soils = [Entry(_pale(zone.bgr), f"{zone.name}  {zone.c_rr:g}") for zone in ZONES]
+    soils = [LegendEntry(_pale(zone.bgr), f"{zone.name}  {zone.c_rr:g}") for zone in ZONES]
     lines = [
-        Entry(colour, f"{config.name} {route.length_m:.0f} m")
+        LegendEntry(colour, f"{config.name} {route.length_m:.0f} m")
         for config, route, colour in zip(scenario.route, routes, colours, strict=True)
     ]
     axes = Axes(Bounds(0.0, 0.0, ground.width_m, ground.depth_m), px_per_m)

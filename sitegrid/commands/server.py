@@ -88,12 +88,10 @@ def _verifier(keys: Path | None) -> Verify | None:
 
 def _export(opened: ExitStack, session: zenoh.Session, server: Server, site: str, arguments: Namespace) -> str:
     """Show metrics for as long as the server runs; returns where."""
-    from mapserver.monitoring.exporter import Exporter, HealthEar, text_of
+    from mapserver.monitoring.exporter import Exporter
+    from mapserver.monitoring.health import HealthListener
+    from mapserver.monitoring.metrics import ServerCollector
 
-    store: Path = arguments.store
-    ear = opened.enter_context(closing(HealthEar(session, site)))
-
-    def text() -> str:
-        return text_of(server.answers.info, ear.heard, store, package_version())
-
-    return opened.enter_context(closing(Exporter(arguments.metrics, text))).url
+    health = opened.enter_context(closing(HealthListener(session, site)))
+    collector = ServerCollector(server.answers.info, health.received, arguments.store, package_version())
+    return opened.enter_context(closing(Exporter(arguments.metrics, collector))).url

@@ -147,7 +147,7 @@ def read_store(folder: Path, now_s: float) -> StoreState:
         snapshot,  # imported here: needs the `server` extra, which a machine's host does not have
     )
     from mapserver.ingest.store import JOURNAL_FILE
-    from mapserver.journal.journal import JournalReader
+    from mapserver.journal.reader import JournalReader
     from mapserver.journal.schema import SCHEMA
 
     if not (folder / JOURNAL_FILE).is_file():
@@ -155,7 +155,7 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     with JournalReader(folder / JOURNAL_FILE) as journal:
         journal.check()
         last_row, archived = journal.last_row, journal.archived_row
-        machines = {machine for machine, _ in journal.marks()}
+        machines = {machine for machine, _ in journal.watermarks()}
         site, frame = journal.site, journal.frame
     newest = next(iter(snapshot.rows_on_disk(folder)), 0)
     age_s = now_s - (folder / f"snapshot-{newest}.npz").stat().st_mtime if newest else math.inf

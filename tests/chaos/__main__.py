@@ -13,27 +13,27 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.chaos.outcome import InterruptError, Told, table
+from tests.chaos.outcome import Console, InterruptError, table
 from tests.chaos.suite import FAULTS, WHOLE_S, run_suite, totals
 
 
 def main(words: list[str] | None = None) -> int:
     """Run the suite."""
     arguments = _parse(words)
-    told, began_s = Told(), time.monotonic()
-    told.stop_on_signals()
+    console, began_s = Console(), time.monotonic()
+    console.stop_on_signals()
     faults = [fault for fault in FAULTS if fault.name in arguments.faults]
     with tempfile.TemporaryDirectory(prefix="sitegrid-chaos-") as folder:
-        told.say(f"seed {arguments.seed}")
+        console.say(f"seed {arguments.seed}")
         try:
-            outcomes = run_suite(faults, arguments.keep or Path(folder), told, arguments.seed, arguments.seconds)
+            outcomes = run_suite(faults, arguments.keep or Path(folder), console, arguments.seed, arguments.seconds)
         except InterruptError:
-            told.say("interrupted; everything is ended")
+            console.say("interrupted; everything is ended")
             return 130
-    told.say(f"\n{table(outcomes)}\n")
+    console.say(f"\n{table(outcomes)}\n")
     result = totals(outcomes, arguments.seed) | {"seconds": round(time.monotonic() - began_s, 1)}
     verdict = "nothing lost, nothing double" if result["ok"] else "FAILED"
-    told.say(json.dumps(result) if arguments.json else f"{verdict}, in {result['seconds']} s")
+    console.say(json.dumps(result) if arguments.json else f"{verdict}, in {result['seconds']} s")
     return 0 if result["ok"] else 1
 
 

@@ -17,18 +17,18 @@ from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.rows import Wanted
+from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
 from protocol.site.site_config import load_site
-from tests.chaos.chaos_site import ROUTER, SERVER, Site
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.chaos_site import ROUTER, SERVER, ChaosSite
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 STUCK_S = 2.0  # reading a spool of the suite takes milliseconds
 
 
-class Verdict(StrEnum):
+class FlipVerdict(StrEnum):
     """What became of a bit."""
 
     DETECTED = "detected"
@@ -41,25 +41,25 @@ FLIPS = 400  # of each file, in the whole suite
 Content = dict[Any, Any]
 
 
-def flips(scenario: Scenario) -> Outcome:
+def flips(scenario: FaultRun) -> FaultOutcome:
     """Stop a site, flip bits in copies of its files; then damage the files themselves, and restore them."""
     with scenario.site() as site:
         site.start_all()
         site.linger(scenario.seconds)
         for role in (SERVER, *site.machines, ROUTER):  # the server first: spools are to have samples
             site.stop(role)
-            site.told.wait(1.0)
+            site.console.wait(1.0)
         n, verdicts = max(20, round(FLIPS * scenario.scale)), Counter[str]()
         for path, look in _files(site):
-            found = _flip_all(path, look, scenario.rng, n, site.folder / "flipped")
-            scenario.say(f"{path.name} " + ", ".join(f"{what} {k}" for what, k in sorted(found.items())))
-            if served := found[Verdict.SERVED]:
+            counts = _flip_all(path, look, scenario.rng, n, site.folder / "flipped")
+            scenario.say(f"{path.name} " + ", ".join(f"{what} {k}" for what, k in sorted(counts.items())))
+            if served := counts[FlipVerdict.SERVED]:
                 site.problem(f"{served} of {n} flips in {path.name} are served as data")
-            if unnamed := found[Verdict.UNNAMED]:
-                kinds = ", ".join(sorted(set(found) - set(Verdict)))
+            if unnamed := counts[FlipVerdict.UNNAMED]:
+                kinds = ", ".join(sorted(set(counts) - set(FlipVerdict)))
                 site.problem(f"{unnamed} of {n} flips in {path.name} end in {kinds}, which does not name the file")
-            for verdict in Verdict:
-                verdicts[verdict] += found[verdict]
+            for verdict in FlipVerdict:
+                verdicts[verdict] += counts[verdict]
         _damage_and_restore(site)
         site.start_all()
         outcome = site.finish(scenario.fault, verdicts.total())
@@ -68,7 +68,7 @@ def flips(scenario: Scenario) -> Outcome:
         return outcome
 
 
-def _files(site: Site) -> list[tuple[Path, Callable[[Path], Content]]]:
+def _files(site: ChaosSite) -> list[tuple[Path, Callable[[Path], Content]]]:
     """Files, and how to read what they say."""
     store = site.folder / "store"
     definition = load_site(site.folder / "site.toml")
@@ -87,16 +87,18 @@ def read_store(folder: Path, definition: Any) -> Content:
     try:
         rows = {
             row.row: (row.machine, row.spool_id, row.first_seq, row.received_ns, row.rows.tobytes())
-            for row in history_rows(History.of(store._journal))
+            for row in history_rows(History.beside(store.journal))
         }
         grid = store.grid.state()
-        votes = [(at.x, at.y, at.rung, at.index, at.page.votes.tobytes()) for at in grid.pages]
-        marks = {key: (mark.seq, mark.lost) for key, mark in store._journal.marks().items()}
-        placed = [(row.row, int(row.rows["stamp_ns"].min())) for row in store._journal.read(wanted=Wanted(from_ns=1))]
+        votes = [(at.x, at.y, at.tier, at.index, at.page.votes.tobytes()) for at in grid.pages]
+        marks = {key: (mark.seq, mark.lost) for key, mark in store.journal.watermarks().items()}
+        placed = [
+            (row.row, int(row.rows["stamp_ns"].min())) for row in store.journal.read(selection=Selection(from_ns=1))
+        ]
         return {
             "rows": rows,
             "placed": placed,  # what is found by time and place
-            "events": store._journal.events(),
+            "events": store.journal.events(),
             "marks": marks,
             "grid": (grid.folded, sorted(votes)),
             "last": store.journalled,
@@ -106,18 +108,18 @@ def read_store(folder: Path, definition: Any) -> Content:
 
 
 def read_spool(path: Path) -> Content:
-    """All that an agent would send: contents by identity, and what it says is lost."""
-    spool, found, end_s = Spool(path, SpoolConfig()), {}, time.monotonic() + STUCK_S
+    """All that an agent would send: contents by identity, and what it declares lost."""
+    spool, contents, end_s = Spool(path, SpoolConfig()), {}, time.monotonic() + STUCK_S
     declared = 0  # lost, to the server, which counts them
     spool._db.set_progress_handler(lambda: time.monotonic() > end_s, 20)
     try:
         while head := spool.head(1000):
             declared += head.lost_before
             for i, row in enumerate(head.rows):
-                found[head.spool_id, head.first_seq + i] = content_hash(row)
+                contents[head.spool_id, head.first_seq + i] = content_hash(row)
             spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
         counters = spool.counters()
-        return {"contents": found, "named": counters["put_aside"] + declared}
+        return {"contents": contents, "named": counters["put_aside"] + declared}
     except StoreError:  # the uplink reports it, and sends nothing
         if time.monotonic() > end_s:
             raise TimeoutError from None
@@ -129,10 +131,10 @@ def read_spool(path: Path) -> Content:
 def _flip_all(path: Path, look: Callable[[Path], Content], rng: random.Random, n: int, folder: Path) -> Counter[str]:
     """Flip one bit in each of n copies of a file's folder, and compare what is read with what was there."""
     truth, verdicts = look(_copy(path, folder)), Counter[str]()
-    hot = _near_identities(path.read_bytes(), truth)
+    identities = _near_identities(path.read_bytes(), truth)
     for i in range(n):
         copy = _copy(path, folder)
-        flip(copy, rng, hot if i % 4 == 0 else None)
+        flip(copy, rng, identities if i % 4 == 0 else None)
         verdict, error = judge(copy, look, truth)
         verdicts[verdict] += 1
         if error:
@@ -141,19 +143,19 @@ def _flip_all(path: Path, look: Callable[[Path], Content], rng: random.Random, n
     return verdicts
 
 
-def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[Verdict, str]:
+def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[FlipVerdict, str]:
     """Return what became of a damaged file, and the kind of an error that is not what a person should see."""
     try:
-        found = look(path)
+        content = look(path)
     except StoreError as error:
-        return (Verdict.DETECTED, "") if str(path) in str(error) else (Verdict.UNNAMED, str(error))
+        return (FlipVerdict.DETECTED, "") if str(path) in str(error) else (FlipVerdict.UNNAMED, str(error))
     except Exception as error:  # whatever damage can raise
-        return Verdict.UNNAMED, type(error).__name__
-    if found == truth:
-        return Verdict.HARMLESS, ""
-    if found.get("named", 0) > truth.get("named", 0) and found["contents"].items() <= truth["contents"].items():
-        return Verdict.DETECTED, ""  # the damaged samples are named or declared lost, the others sent
-    return Verdict.SERVED, ""
+        return FlipVerdict.UNNAMED, type(error).__name__
+    if content == truth:
+        return FlipVerdict.HARMLESS, ""
+    if content.get("named", 0) > truth.get("named", 0) and content["contents"].items() <= truth["contents"].items():
+        return FlipVerdict.DETECTED, ""  # the damaged samples are named or declared lost, the others sent
+    return FlipVerdict.SERVED, ""
 
 
 def _near_identities(content: bytes, truth: Content) -> list[int]:
@@ -161,8 +163,8 @@ def _near_identities(content: bytes, truth: Content) -> list[int]:
     ids = {spool_id for _, spool_id in truth.get("marks", ())} | {spool_id for spool_id, _ in truth.get("contents", ())}
     texts = {spool_id.to_bytes(8, "big") for spool_id in ids} | {f"{spool_id:016x}".encode() for spool_id in ids}
     texts |= {stamp_ns.to_bytes(8, "big") for _, stamp_ns in truth.get("placed", ())}
-    found = [match.span() for text in texts for match in re.finditer(re.escape(text), content)]
-    return [at for begin, end in found for at in range(max(0, begin - 12), min(len(content), end + 8))]
+    spans = [match.span() for text in texts for match in re.finditer(re.escape(text), content)]
+    return [at for begin, end in spans for at in range(max(0, begin - 12), min(len(content), end + 8))]
 
 
 def flip(path: Path, rng: random.Random, among: list[int] | None = None) -> None:
@@ -178,7 +180,7 @@ def _copy(path: Path, folder: Path) -> Path:
     return folder / path.name
 
 
-def _damage_and_restore(site: Site) -> None:
+def _damage_and_restore(site: ChaosSite) -> None:
     """With files that are damaged for sure, server and agent must not start, and say which file it is."""
     machine = site.machines[0]
     site.start(ROUTER)

@@ -14,13 +14,13 @@ from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from protocol.errors import StoreError
 from protocol.machine.log_folder import open_log
 from protocol.site.site_config import load_site, site_toml
 from protocol.wire.session import free_endpoint
 from tests.chaos.leashed import Process
-from tests.chaos.outcome import Outcome, Span, Told, longest_pause
+from tests.chaos.outcome import Console, FaultOutcome, TimeSpan, longest_pause
 from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings
 
 READY_S = 40.0
@@ -35,7 +35,7 @@ class StartError(Exception):
     """The site did not come to life, before any fault."""
 
 
-class Site:
+class ChaosSite:
     """Router, map server and agents. Leaving the block ends them all.
 
     clock: the site's clock. server_toml: options of the map server. first_ns: when the first drives begin.
@@ -45,7 +45,7 @@ class Site:
         self,
         folder: Path,
         recordings: Recordings,
-        told: Told,
+        console: Console,
         *,
         clock: str = "data",
         server_toml: str = "",
@@ -53,7 +53,7 @@ class Site:
     ) -> None:
         for name in ("log", "spool", "audit", "store"):
             (folder / name).mkdir(parents=True)
-        self.folder, self.told = folder, told
+        self.folder, self.console = folder, console
         self.machines = recordings.machines
         self.endpoints = dict.fromkeys((ROUTER, SERVER, *self.machines), free_endpoint())
         self.prefix: dict[str, tuple[str, ...]] = {}
@@ -61,8 +61,8 @@ class Site:
         self.options: dict[str, tuple[str, ...]] = {}
         self.modules: dict[str, tuple[str, ...]] = {}
         self.excuses: tuple[str, ...] = ()  # last words with which a process may end, to be started again
-        self.outcome = Outcome("")
-        self.faults: list[Span] = []
+        self.outcome = FaultOutcome("")
+        self.faults: list[TimeSpan] = []
         self._recordings, self._first_ns = recordings, first_ns
         self._running: dict[str, Process] = {}
         self._starts = 0
@@ -70,7 +70,7 @@ class Site:
         (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
         (folder / "server.toml").write_text(server_toml, encoding="utf-8")
 
-    def __enter__(self) -> Site:
+    def __enter__(self) -> ChaosSite:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -155,7 +155,7 @@ class Site:
         """Let time pass, and tend."""
         end_s = time.monotonic() + seconds
         while (left_s := end_s - time.monotonic()) > 0:
-            self.told.wait(min(left_s, 0.25))
+            self.console.wait(min(left_s, 0.25))
             self.tend()
 
     def problem(self, text: str) -> None:
@@ -164,7 +164,7 @@ class Site:
 
     # --- the end -----------------------------------------------------------------------------------------------------
 
-    def finish(self, fault: str, count: int) -> Outcome:
+    def finish(self, fault: str, count: int) -> FaultOutcome:
         """Wait until every machine is served again, have everything delivered, end it, and count."""
         self.outcome.fault, self.outcome.count = fault, count
         ended_s = time.time()
@@ -189,14 +189,14 @@ class Site:
 
     def progress(self) -> dict[str, int]:
         """How many samples of each machine are in the journal."""
-        found: dict[str, int] = {}
+        counts: dict[str, int] = {}
         try:
             with JournalReader(self.folder / "store" / JOURNAL_FILE) as reader:
-                for (machine, _), mark in reader.marks().items():
-                    found[machine] = found.get(machine, 0) + mark.seq
+                for (machine, _), mark in reader.watermarks().items():
+                    counts[machine] = counts.get(machine, 0) + mark.seq
         except StoreError:  # being made, or recovered
             return {}
-        return found
+        return counts
 
     def _resume(self) -> None:
         before = self.progress()
@@ -213,8 +213,8 @@ class Site:
         store, site = self.folder / "store", load_site(self.folder / "site.toml")
         result = audit_store(audits, store, site, ServerConfig())
         with JournalReader(store / JOURNAL_FILE) as reader:
-            rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(History.of(reader))]
-            declared = sum(mark.lost for mark in reader.marks().values())
+            rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(History.beside(reader))]
+            declared = sum(mark.lost for mark in reader.watermarks().values())
         out = self.outcome
         out.recorded, out.merged, out.double = result.recorded, result.merged, result.double
         out.lost = result.lost - min(declared, result.lost)
@@ -223,7 +223,7 @@ class Site:
             self.problem(f"{result.unrecorded} samples in the journal that nobody recorded")
         commits = {m: [_true_s(s, ended_s) for name, s in rows if name == m] for m in self.machines}
         out.longest_pause_s = max(
-            longest_pause([s for s in found if s < resumed_s], self.faults, resumed_s) for found in commits.values()
+            longest_pause([s for s in stamps if s < resumed_s], self.faults, resumed_s) for stamps in commits.values()
         )
 
     def _wait(self, is_so: Callable[[], bool], timeout_s: float, problem: str) -> None:
@@ -232,7 +232,7 @@ class Site:
             if time.monotonic() > end_s:
                 self.problem(f"{problem} within {timeout_s:g} s")
                 return
-            self.told.wait(0.05)
+            self.console.wait(0.05)
 
     def _words(self, role: str, idle: bool) -> list[str]:
         where, site = ("--endpoint", self.endpoints[role]), ("--site-file", str(self.folder / "site.toml"))

@@ -6,8 +6,8 @@ import time
 
 from tests.chaos import stepped_clock
 from tests.chaos.chaos_site import HOUR_S, SERVER
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 MACHINES = "machines"
 DRIVES_BEFORE_NS = 105 * 60 * 10**9
@@ -20,7 +20,7 @@ STEPS_S = (
 )
 
 
-def clocks(scenario: Scenario) -> Outcome:
+def clocks(scenario: FaultRun) -> FaultOutcome:
     """Step the wall clock of the server or of all machines by an hour, and back; the site refuses what is to come.
 
     The server is also started anew while its clock is wrong: then it archives what looks old.
@@ -35,8 +35,8 @@ def clocks(scenario: Scenario) -> Outcome:
         site.start_all()
         while left_s > 0:
             steps_s, pause_s, lasts_s = rng.choice(STEPS_S), rng.uniform(0.5, 1.5), rng.uniform(1.0, 4.0)
-            told = ", ".join(f"{name} {step_s:+d} s" for name, step_s in steps_s.items())
-            scenario.say(f"clock of {told} for {lasts_s:.1f} s")
+            steps = ", ".join(f"{name} {step_s:+d} s" for name, step_s in steps_s.items())
+            scenario.say(f"clock of {steps} for {lasts_s:.1f} s")
             site.linger(pause_s)
             with site.fault():
                 for name, step_s in steps_s.items():

@@ -7,8 +7,8 @@ from contextlib import ExitStack
 
 from tests.chaos.chaos_site import SERVER
 from tests.chaos.disk_shim import DiskError, FailingDisk, build
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 # What SQLite and the system say; a process that starts on such a disk has to end, and is started again.
 EXCUSES = (
@@ -20,27 +20,27 @@ EXCUSES = (
 )
 
 
-def disks(scenario: Scenario) -> Outcome:
+def disks(scenario: FaultRun) -> FaultOutcome:
     """Every write of the store, or of all spools, fails for some seconds; sometimes the process is killed in it."""
     rng, left_s, count = scenario.rng, scenario.seconds, 0
     with scenario.site() as site:
         if not (library := build(site.folder)):
-            return Outcome(scenario.fault, skipped="no C compiler for the shim")
+            return FaultOutcome(scenario.fault, skipped="no C compiler for the shim")
         top = site.folder
-        found = {name: FailingDisk(library, top / name, top / f"{name}.bin") for name in ("store", "spool")}
-        site.env = {SERVER: found["store"].env, **dict.fromkeys(site.machines, found["spool"].env)}
+        disks_by_name = {name: FailingDisk(library, top / name, top / f"{name}.bin") for name in ("store", "spool")}
+        site.env = {SERVER: disks_by_name["store"].env, **dict.fromkeys(site.machines, disks_by_name["spool"].env)}
         site.start_all()
         site.excuses = EXCUSES
         while left_s > 0:
-            name, error, is_killed = rng.choice(tuple(found)), rng.choice(tuple(DiskError)), rng.random() < 0.3
+            name, error, is_killed = rng.choice(tuple(disks_by_name)), rng.choice(tuple(DiskError)), rng.random() < 0.3
             pause_s, lasts_s = rng.uniform(0.5, 1.5), rng.uniform(0.5, 4.0)
             victim = SERVER if name == "store" else rng.choice(site.machines)
             scenario.say(f"{name} {error.name.lower()} for {lasts_s:.1f} s{f', {victim} killed' if is_killed else ''}")
             site.linger(pause_s)
             with site.fault(), ExitStack() as broken:
-                broken.enter_context(found[name].failing(error))
+                broken.enter_context(disks_by_name[name].failing(error))
                 site.linger(lasts_s)
-                count += found[name].failed
+                count += disks_by_name[name].failed
                 if is_killed:
                     site.send(victim, signal.SIGKILL)
             if is_killed:

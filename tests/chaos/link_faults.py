@@ -6,10 +6,10 @@ from contextlib import ExitStack
 from enum import Enum
 from functools import partial
 
-from tests.chaos.chaos_site import ROUTER, SERVER, Site
+from tests.chaos.chaos_site import ROUTER, SERVER, ChaosSite
 from tests.chaos.net_namespace import OFFICE_IP, Cable, NotPermittedError
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 from tests.chaos.tcp_proxy import FAIR, Proxy, Weather
 
 
@@ -24,7 +24,7 @@ class Storm(Enum):
     LATE_THEN_CUT = Weather(hold_back=True), (2.0, 4.0)
 
 
-def proxy(scenario: Scenario) -> Outcome:
+def proxy(scenario: FaultRun) -> FaultOutcome:
     """Bad weather between agents and router, or between server and router."""
     with scenario.site() as site, ExitStack() as opened:
         port = int(site.endpoints[ROUTER].rpartition(":")[2])
@@ -35,7 +35,7 @@ def proxy(scenario: Scenario) -> Outcome:
         return site.finish(scenario.fault, count)
 
 
-def _weather(scenario: Scenario, site: Site, proxies: list[Proxy]) -> int:
+def _weather(scenario: FaultRun, site: ChaosSite, proxies: list[Proxy]) -> int:
     rng, left_s, storms = scenario.rng, scenario.seconds, list(Storm)
     rng.shuffle(storms)
     count = 0
@@ -55,16 +55,16 @@ def _weather(scenario: Scenario, site: Site, proxies: list[Proxy]) -> int:
     return count
 
 
-def cable(scenario: Scenario) -> Outcome:
+def cable(scenario: FaultRun) -> FaultOutcome:
     """Machines in a network namespace of their own, whose link goes down or gets slow."""
     try:
         with Cable() as made, scenario.site() as site:
             return _pull(scenario, site, made)
     except NotPermittedError as error:
-        return Outcome(scenario.fault, skipped=str(error))
+        return FaultOutcome(scenario.fault, skipped=str(error))
 
 
-def _pull(scenario: Scenario, site: Site, made: Cable) -> Outcome:
+def _pull(scenario: FaultRun, site: ChaosSite, made: Cable) -> FaultOutcome:
     endpoint = f"tcp/{OFFICE_IP}:7447"
     site.endpoints = dict.fromkeys(site.endpoints, endpoint)
     site.prefix = {role: made.inside(made.office) for role in (ROUTER, SERVER)}

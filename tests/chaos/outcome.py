@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from typing import Any
 
-Span = tuple[float, float]  # [s] of one clock
+TimeSpan = tuple[float, float]  # [s] of one clock
 
 COLUMNS = ("fault", "count", "recorded", "merged", "lost", "double", "longest pause", "")
 
@@ -19,11 +19,11 @@ class InterruptError(Exception):
 
 
 @dataclass
-class Outcome:
+class FaultOutcome:
     """Result of one fault.
 
-    count: how often it struck; recorded: samples in the audit files; declared: those of the lost that the server was
-    told are lost. longest_pause_s: between two commits of one machine, without the time that faults lasted; None where
+    count: how often it struck; recorded: samples in the audit files; declared: those of the lost that were declared
+    to the server. longest_pause_s: between two commits of one machine, without the time that faults lasted; None where
     nothing runs meanwhile. skipped: why it did not run.
     """
 
@@ -50,8 +50,8 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Told:
-    """How a scenario speaks, and how it is told to end."""
+class Console:
+    """Where scenarios print, and the signal that ends them."""
 
     line: Any = print
     stop: threading.Event = field(default_factory=threading.Event)
@@ -71,28 +71,28 @@ class Told:
             signal.signal(number, lambda *_: self.stop.set())
 
 
-def longest_pause(commits: Sequence[float], faults: Iterable[Span], end_s: float) -> float:
+def longest_pause(commits: Sequence[float], faults: Iterable[TimeSpan], end_s: float) -> float:
     """The longest time without a commit, from the first one to end_s, without what faults lasted meanwhile."""
     times = [*sorted(commits), end_s]
     spans = _united(faults)
     return max((b - a - _covered((a, b), spans) for a, b in pairwise(times)), default=0.0)
 
 
-def _united(spans: Iterable[Span]) -> list[Span]:
-    found: list[Span] = []
+def _united(spans: Iterable[TimeSpan]) -> list[TimeSpan]:
+    united: list[TimeSpan] = []
     for begin, end in sorted(spans):
-        if found and begin <= found[-1][1]:
-            found[-1] = (found[-1][0], max(end, found[-1][1]))
+        if united and begin <= united[-1][1]:
+            united[-1] = (united[-1][0], max(end, united[-1][1]))
         else:
-            found.append((begin, end))
-    return found
+            united.append((begin, end))
+    return united
 
 
-def _covered(gap: Span, spans: Iterable[Span]) -> float:
+def _covered(gap: TimeSpan, spans: Iterable[TimeSpan]) -> float:
     return sum(max(0.0, min(gap[1], end) - max(gap[0], begin)) for begin, end in spans)
 
 
-def table(outcomes: Iterable[Outcome]) -> str:
+def table(outcomes: Iterable[FaultOutcome]) -> str:
     """Lay results out for people."""
     rows = [COLUMNS, *(_row(outcome) for outcome in outcomes)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
@@ -101,7 +101,7 @@ def table(outcomes: Iterable[Outcome]) -> str:
     return "\n".join("  ".join(line).rstrip() for line in lines)
 
 
-def _row(outcome: Outcome) -> tuple[str, ...]:
+def _row(outcome: FaultOutcome) -> tuple[str, ...]:
     if outcome.skipped:
         return (outcome.fault, *("-",) * 6, f"skipped: {outcome.skipped}")
     pause = "-" if outcome.longest_pause_s is None else f"{outcome.longest_pause_s:.1f} s"

@@ -24,33 +24,33 @@ from protocol.wire.messages import Ack, SampleBatch
 from tests.chaos import power_worker as work
 from tests.chaos.disk_model import Disk, Kind, Operation, read_trace
 from tests.chaos.disk_shim import FailingDisk, build
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 CUTS = 2000  # of the whole suite, half of them of the spool
 STEPS = {"spool": 400, "store": 200}
 IN_MEMORY = Path("/dev/shm")
-Identity = tuple[int, int]  # spool_id, seq
+SampleNumber = tuple[int, int]  # spool_id, seq
 
 
 @dataclass(frozen=True)
-class Found:
+class Remains:
     """What is there after a cut. contents: of each identity, as often as it is found."""
 
-    contents: dict[Identity, list[str]]
+    contents: dict[SampleNumber, list[str]]
     problem: str = ""
 
 
-def power(scenario: Scenario) -> Outcome:
+def power(scenario: FaultRun) -> FaultOutcome:
     """Cut the power of a spool and of a store at random moments of their work, and open them again."""
-    total = Outcome(scenario.fault)
+    total = FaultOutcome(scenario.fault)
     scenario.folder.mkdir(parents=True)
     if not (library := build(scenario.folder)):
-        return Outcome(scenario.fault, skipped="no C compiler for the shim")
+        return FaultOutcome(scenario.fault, skipped="no C compiler for the shim")
     for what in ("spool", "store"):
         operations = trace(library, scenario.folder / what, what, scenario.seed)
         cuts = (scenario.strikes or round(CUTS * scenario.scale)) // 2
-        add(total, cut(operations, what, cuts, scenario.rng, scenario.told.wait))
+        add(total, cut(operations, what, cuts, scenario.rng, scenario.console.wait))
     return total
 
 
@@ -71,10 +71,10 @@ def cut(
     cuts: int,
     rng: random.Random,
     wait: Callable[[float], None] = lambda _: None,
-) -> Outcome:
+) -> FaultOutcome:
     """Cut at random points; every cut is judged against what was promised before it."""
     points = sorted(rng.choices(range(1, len(operations)), k=cuts))
-    outcome, disk, promises, done = Outcome("power", count=cuts), Disk(), "", 0
+    outcome, disk, promises, done = FaultOutcome("power", count=cuts), Disk(), "", 0
     for point in points:
         for operation in operations[done:point]:
             if operation.name == work.PROMISES:
@@ -92,20 +92,20 @@ def cut(
     return outcome
 
 
-def judge(outcome: Outcome, promises: str, found: Found) -> None:
+def judge(outcome: FaultOutcome, promises: str, left: Remains) -> None:
     """Compare what is there with what was promised, and add to the counts."""
     promised = _promised(promises)
     outcome.recorded += len(promised)
-    kept = sum(content in found.contents.get(identity, ()) for identity, content in promised.items())
+    kept = sum(content in left.contents.get(identity, ()) for identity, content in promised.items())
     outcome.merged += kept
     outcome.lost += len(promised) - kept
-    outcome.double += sum(len(contents) - 1 for contents in found.contents.values())
-    if found.problem and len(outcome.problems) < 5:
-        outcome.problems.append(found.problem)
+    outcome.double += sum(len(contents) - 1 for contents in left.contents.values())
+    if left.problem and len(outcome.problems) < 5:
+        outcome.problems.append(left.problem)
 
 
-def _promised(promises: str) -> dict[Identity, str]:
-    promised: dict[Identity, str] = {}
+def _promised(promises: str) -> dict[SampleNumber, str]:
+    promised: dict[SampleNumber, str] = {}
     for sign, spool_id, seq, *content in (line.split() for line in promises.splitlines()):
         if sign == "+":
             promised[int(spool_id, 16), int(seq)] = content[0]
@@ -114,50 +114,50 @@ def _promised(promises: str) -> dict[Identity, str]:
     return promised
 
 
-def _look_at_spool(folder: Path) -> Found:
+def _look_at_spool(folder: Path) -> Remains:
     """Open what is left, and take everything out of it."""
-    contents: dict[Identity, list[str]] = {}
+    contents: dict[SampleNumber, list[str]] = {}
     try:
         spool = Spool(folder / work.SPOOL_FILE, SpoolConfig())
     except StoreError as error:
-        return Found({}, f"spool does not open: {error}")
+        return Remains({}, f"spool does not open: {error}")
     while head := spool.head(1000):
         for i, row in enumerate(head.rows):
             contents.setdefault((head.spool_id, head.first_seq + i), []).append(content_hash(row))
         spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
     is_settled = spool.is_settled()
     spool.close()
-    return Found(contents, "" if is_settled else "spool does not settle")
+    return Remains(contents, "" if is_settled else "spool does not settle")
 
 
-def _look_at_store(folder: Path) -> Found:
+def _look_at_store(folder: Path) -> Remains:
     """Open what is left, read it, fold it anew, and send one more batch."""
-    contents: dict[Identity, list[str]] = {}
+    contents: dict[SampleNumber, list[str]] = {}
     config = ServerConfig()
     try:
         store = Store(folder / work.STORE_FOLDER, work.SITE, config, lambda: 10**18)
     except StoreError as error:
-        return Found({}, f"store does not open: {error}")
+        return Remains({}, f"store does not open: {error}")
     refolded = Grid(work.SITE.cell_m, config.fold)
-    for row in history_rows(History.of(store._journal)):
+    for row in history_rows(History.beside(store.journal)):
         refolded.fold(row.rows, row.machine)
         for i, sample in enumerate(row.rows):
             contents.setdefault((row.spool_id, row.first_seq + i), []).append(content_hash(sample))
     problem = "" if refolded.folded == store.grid.folded else "grid and journal differ"
-    watermark = store._journal.mark(work.MACHINE, work.SPOOL_ID).seq
+    watermark = store.journal.watermark(work.MACHINE, work.SPOOL_ID).seq
     rows = empty(1)
     rows["stamp_ns"] = 1
     payload = encode_batch(SampleBatch(work.MACHINE, work.SPOOL_ID, watermark + 1, rows, work.SITE.frame, 0))
-    if not isinstance(store.take([Incoming(work.MACHINE, payload)])[0], Ack):
+    if not isinstance(store.commit([Incoming(work.MACHINE, payload)])[0], Ack):
         problem = "store takes nothing more"
     store.close()
-    return Found(contents, problem)
+    return Remains(contents, problem)
 
 
 LOOK = {"spool": _look_at_spool, "store": _look_at_store}
 
 
-def add(total: Outcome, part: Outcome) -> None:
+def add(total: FaultOutcome, part: FaultOutcome) -> None:
     for name in ("count", "recorded", "merged", "lost", "double"):
         setattr(total, name, getattr(total, name) + getattr(part, name))
     total.problems += part.problems

@@ -63,7 +63,7 @@ def drive(rng: np.random.Generator, n: int, first_ns: int) -> Table:
 
 
 def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
-    """Record and acknowledge by chance. careless: with the setting that EVIDENCE says loses rows."""
+    """Record and acknowledge by chance. careless: with the setting that loses rows (docs/evidence.md)."""
     rng, chance, spool = np.random.default_rng(seed), random.Random(seed), None
     for step in range(steps):
         with suppress(StoreError, sqlite3.Error):  # a disk that fails: nothing was promised
@@ -90,14 +90,14 @@ def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, carele
         with suppress(StoreError, sqlite3.Error, OSError):
             store = store or _open_store(folder, careless=careless)
             payload = encode_batch(SampleBatch(MACHINE, SPOOL_ID, done + 1, waiting, SITE.frame, 0))
-            answers = store.take([Incoming(MACHINE, payload)] * chance.randint(1, 2))
+            answers = store.commit([Incoming(MACHINE, payload)] * chance.randint(1, 2))
             if isinstance(answers[0], Ack) and len(waiting):
                 promises.kept(SPOOL_ID, done + 1, waiting)
                 waiting, done = empty(), done + len(waiting)
             if chance.random() < 0.05:
                 store.save_snapshot()
     if store:
-        store._journal._db.close()
+        store.journal._db.close()
 
 
 def _open_spool(folder: Path, *, careless: bool) -> Spool:
@@ -110,7 +110,7 @@ def _open_spool(folder: Path, *, careless: bool) -> Spool:
 def _open_store(folder: Path, *, careless: bool) -> Store:
     store = Store(folder / STORE_FOLDER, SITE, ServerConfig(), lambda: 10**18)
     if careless:
-        store._journal._db.execute("PRAGMA synchronous=NORMAL")
+        store.journal._db.execute("PRAGMA synchronous=NORMAL")
     return store
 
 

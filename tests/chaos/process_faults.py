@@ -6,8 +6,8 @@ import random
 import signal
 
 from tests.chaos.chaos_site import ROUTER, SERVER
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 KILLS = 250  # of the whole suite; never fewer than LEAST
 LEAST = 100
@@ -22,7 +22,7 @@ def draw_kills(rng: random.Random, machines: tuple[str, ...], n: int, seconds: f
     return [(pause * scale, rng.choice(victims)) for pause in pauses]
 
 
-def kills(scenario: Scenario) -> Outcome:
+def kills(scenario: FaultRun) -> FaultOutcome:
     """Kill -9 of agents, server and router in random order, also while they start."""
     n = scenario.strikes or max(LEAST, round(KILLS * scenario.scale))
     with scenario.site() as site:
@@ -35,7 +35,7 @@ def kills(scenario: Scenario) -> Outcome:
         return site.finish(scenario.fault, n)
 
 
-def freezes(scenario: Scenario) -> Outcome:
+def freezes(scenario: FaultRun) -> FaultOutcome:
     """SIGSTOP of server and router for a while, then SIGCONT."""
     rng, used_s, count = scenario.rng, 0.0, 0
     with scenario.site() as site:

@@ -7,22 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.chaos.chaos_site import Site
-from tests.chaos.outcome import Told
+from tests.chaos.chaos_site import ChaosSite
+from tests.chaos.outcome import Console
 from tests.chaos.recordings import Recordings
 
-# Snapshots every few seconds, so that they are written under faults too; audits of trust would leave machines out.
+# Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
 SERVER_TOML = """
 [store]
-snapshot_rows = 50
 snapshot_s = 2.0
-[keep]
-distrusts = false
+[trust]
+exclude = false
 """
 
 
 @dataclass(frozen=True)
-class Scenario:
+class FaultRun:
     """One fault's run.
 
     folder: its own. seconds: how long faults strike. scale: how much of the whole suite, 0 to 1. strikes: how often to
@@ -32,7 +31,7 @@ class Scenario:
     fault: str
     folder: Path
     recordings: Recordings
-    told: Told
+    console: Console
     seed: int
     seconds: float
     scale: float = 1.0
@@ -43,10 +42,10 @@ class Scenario:
         """Random numbers of this fault alone: the same whatever else runs."""
         return random.Random(f"{self.seed} {self.fault}")
 
-    def site(self, **options: Any) -> Site:
+    def site(self, **options: Any) -> ChaosSite:
         """Return a site, not yet started."""
-        return Site(self.folder, self.recordings, self.told, server_toml=SERVER_TOML, **options)
+        return ChaosSite(self.folder, self.recordings, self.console, server_toml=SERVER_TOML, **options)
 
     def say(self, text: str) -> None:
         """Print a line."""
-        self.told.say(f"{self.fault}: {text}")
+        self.console.say(f"{self.fault}: {text}")

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.chaos import bit_flips, clock_faults, disk_faults, link_faults, power_cuts, process_faults, write_faults
-from tests.chaos.outcome import InterruptError, Outcome, Told
+from tests.chaos.outcome import Console, FaultOutcome, InterruptError
 from tests.chaos.recordings import make
-from tests.chaos.scenario import Scenario
+from tests.chaos.scenario import FaultRun
 
 MACHINES = 3
 WHOLE_S = 480.0  # of the whole suite; scales what is counted and not timed
@@ -20,37 +20,37 @@ LANES = 3  # scenarios that run at the same time: most of them mostly wait
 
 
 @dataclass(frozen=True)
-class Fault:
+class ChaosFault:
     """A scenario. share: of the suite's time that its faults strike."""
 
     name: str
-    run: Callable[[Scenario], Outcome]
+    run: Callable[[FaultRun], FaultOutcome]
     share: float = 0.0
 
 
 # The longest first, so that lanes end together.
 FAULTS = (
-    Fault("kills", process_faults.kills, 0.45),
-    Fault("power", power_cuts.power),
-    Fault("writes", write_faults.writes),
-    Fault("proxy", link_faults.proxy, 0.08),
-    Fault("cable", link_faults.cable, 0.08),
-    Fault("freezes", process_faults.freezes, 0.08),
-    Fault("disks", disk_faults.disks, 0.08),
-    Fault("clocks", clock_faults.clocks, 0.08),
-    Fault("flips", bit_flips.flips, 0.02),
+    ChaosFault("kills", process_faults.kills, 0.45),
+    ChaosFault("power", power_cuts.power),
+    ChaosFault("writes", write_faults.writes),
+    ChaosFault("proxy", link_faults.proxy, 0.08),
+    ChaosFault("cable", link_faults.cable, 0.08),
+    ChaosFault("freezes", process_faults.freezes, 0.08),
+    ChaosFault("disks", disk_faults.disks, 0.08),
+    ChaosFault("clocks", clock_faults.clocks, 0.08),
+    ChaosFault("flips", bit_flips.flips, 0.02),
 )
 
 
-def run_suite(faults: Iterable[Fault], folder: Path, told: Told, seed: int, seconds: float) -> list[Outcome]:
-    """Run faults, a few at a time; InterruptError if the suite was told to end."""
+def run_suite(
+    faults: Iterable[ChaosFault], folder: Path, console: Console, seed: int, seconds: float
+) -> list[FaultOutcome]:
+    """Run faults, a few at a time; InterruptError if the suite was stopped."""
     logging.disable()  # what the parts under test log of their misfortunes
-    recordings = make(folder / "recordings", MACHINES, seed, stop=told.stop)
+    recordings = make(folder / "recordings", MACHINES, seed, stop=console.stop)
+    scale = seconds / WHOLE_S
     scenarios = [
-        (
-            fault,
-            Scenario(fault.name, folder / fault.name, recordings, told, seed, seconds * fault.share, seconds / WHOLE_S),
-        )
+        (fault, FaultRun(fault.name, folder / fault.name, recordings, console, seed, seconds * fault.share, scale))
         for fault in faults
     ]
     with ThreadPoolExecutor(LANES) as lanes:
@@ -58,26 +58,26 @@ def run_suite(faults: Iterable[Fault], folder: Path, told: Told, seed: int, seco
         while wait(runs, timeout=0.5).not_done:  # with a time-out, or a signal that another thread got is not heard
             pass
         outcomes = [run.result() for run in runs]
-    if told.stop.is_set():
+    if console.stop.is_set():
         raise InterruptError
     return outcomes
 
 
-def _run(fault: Fault, scenario: Scenario) -> Outcome:
+def _run(fault: ChaosFault, scenario: FaultRun) -> FaultOutcome:
     """Run one; what goes wrong in it is a result, and the others go on."""
-    if scenario.told.stop.is_set():
-        return Outcome(fault.name)
+    if scenario.console.stop.is_set():
+        return FaultOutcome(fault.name)
     try:
         outcome = fault.run(scenario)
     except InterruptError:
-        return Outcome(fault.name, problems=["interrupted"])
+        return FaultOutcome(fault.name, problems=["interrupted"])
     except Exception as error:
-        return Outcome(fault.name, problems=[f"{type(error).__name__}: {error}"])
+        return FaultOutcome(fault.name, problems=[f"{type(error).__name__}: {error}"])
     scenario.say(f"done, {'ok' if outcome.is_good else 'FAILED'}")
     return outcome
 
 
-def totals(outcomes: Sequence[Outcome], seed: int) -> dict[str, Any]:
+def totals(outcomes: Sequence[FaultOutcome], seed: int) -> dict[str, Any]:
     """Sums for machines. kills: of the fault of that name."""
     table: dict[str, Any] = {"kills": sum(outcome.count for outcome in outcomes if outcome.fault == "kills")}
     for name in ("recorded", "merged", "lost", "double"):

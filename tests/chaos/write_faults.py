@@ -15,19 +15,19 @@ from pathlib import Path
 
 from tests.chaos import power_cuts, power_worker
 from tests.chaos.disk_shim import DiskError, FailingDisk, build
-from tests.chaos.outcome import Outcome
-from tests.chaos.scenario import Scenario
+from tests.chaos.outcome import FaultOutcome
+from tests.chaos.scenario import FaultRun
 
 STEPS = 12
 MOST = 5000  # writes; the work ends long before
 
 
-def writes(scenario: Scenario) -> Outcome:
+def writes(scenario: FaultRun) -> FaultOutcome:
     """Run the sweeps, each in a process under the shim."""
     scenario.folder.mkdir(parents=True)
     if not (library := build(scenario.folder)):
-        return Outcome(scenario.fault, skipped="no C compiler for the shim")
-    total, stride = Outcome(scenario.fault), max(1, round(1 / max(scenario.scale, 0.05)))
+        return FaultOutcome(scenario.fault, skipped="no C compiler for the shim")
+    total, stride = FaultOutcome(scenario.fault), max(1, round(1 / max(scenario.scale, 0.05)))
     for what in ("spool", "store"):
         folder, control = scenario.folder / what, scenario.folder / f"{what}.bin"
         folder.mkdir()
@@ -37,17 +37,17 @@ def writes(scenario: Scenario) -> Outcome:
         total.pids.append(child.pid)
         try:
             while child.poll() is None:
-                scenario.told.wait(0.1)
+                scenario.console.wait(0.1)
             text = child.communicate()[0]
         finally:
             child.kill()
-        power_cuts.add(total, Outcome(**json.loads(text.splitlines()[-1])))
+        power_cuts.add(total, FaultOutcome(**json.loads(text.splitlines()[-1])))
     return total
 
 
-def sweep(what: str, disk: FailingDisk, folder: Path, seed: int, stride: int) -> Outcome:
+def sweep(what: str, disk: FailingDisk, folder: Path, seed: int, stride: int) -> FaultOutcome:
     """Have the n-th write fail, for every n or each stride-th."""
-    outcome = Outcome(what)
+    outcome = FaultOutcome(what)
     for n in range(0, MOST, stride):
         work, promised = folder / str(n), folder.with_name(f"{what}-{n}.promises")
         work.mkdir()

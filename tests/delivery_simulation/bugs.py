@@ -12,9 +12,9 @@ from agents.delivery import link
 from agents.delivery.link import Ask
 from agents.delivery.spool import Spool, SpoolRun
 from agents.delivery.uplink import Action, Send, Uplink
-from mapserver.ingest import admission
-from mapserver.ingest.admission import Admission
+from mapserver.journal.rows import Admission
 from protocol.wire.messages import Ack, Refused, SampleBatch
+from tests.delivery_simulation import servers
 from tests.delivery_simulation.faults import KILLS, Fault
 from tests.delivery_simulation.servers import ModelServer
 
@@ -34,9 +34,9 @@ def ack_before_commit(patch: pytest.MonkeyPatch) -> None:
 
 
 def watermark_one_too_low(patch: pytest.MonkeyPatch) -> None:
-    """The server mistakes the last committed sample for the next that it expects."""
-    admit = admission.admit
-    patch.setattr(admission, "admit", lambda batch, watermark: admit(batch, max(0, watermark - 1)))
+    """The server takes the last committed sample for the next that it expects."""
+    admit = servers.admit
+    patch.setattr(servers, "admit", lambda batch, watermark: admit(batch, max(0, watermark - 1)))
 
 
 def watermark_one_too_high(patch: pytest.MonkeyPatch) -> None:
@@ -58,13 +58,13 @@ def delete_before_ack(patch: pytest.MonkeyPatch) -> None:
 
 
 def _plant_admit(patch: pytest.MonkeyPatch, wrong: Callable[[SampleBatch, int], SampleBatch]) -> None:
-    admit = admission.admit
+    admit = servers.admit
 
     def admit_wrongly(batch: SampleBatch, watermark: int) -> Admission:
         overlaps = len(batch.rows) and batch.first_seq <= watermark < batch.last_seq
         return Admission(wrong(batch, watermark), 0, 0) if overlaps else admit(batch, watermark)
 
-    patch.setattr(admission, "admit", admit_wrongly)
+    patch.setattr(servers, "admit", admit_wrongly)
 
 
 def trim_whole_batch(patch: pytest.MonkeyPatch) -> None:
@@ -83,13 +83,13 @@ def trim_nothing(patch: pytest.MonkeyPatch) -> None:
 
 def gap_is_accepted(patch: pytest.MonkeyPatch) -> None:
     """A batch beyond the next expected sample is accepted, and what is missing is not counted."""
-    admit = admission.admit
+    admit = servers.admit
 
     def admit_gap(batch: SampleBatch, watermark: int) -> Admission:
         is_gap = len(batch.rows) and batch.first_seq - watermark - 1 > batch.lost_before
         return Admission(batch, 0, 0) if is_gap else admit(batch, watermark)
 
-    patch.setattr(admission, "admit", admit_gap)
+    patch.setattr(servers, "admit", admit_gap)
 
 
 def one_identity_for_ever(patch: pytest.MonkeyPatch) -> None:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mapserver.config import ServerConfig
-from mapserver.ingest import admission as rules
-from mapserver.ingest.admission import Admission, GapError, parse
+from mapserver.ingest.admission import GapError, admit, parse
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
+from mapserver.journal.rows import Admission
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import Ack, Refused
@@ -72,7 +72,7 @@ class ModelServer:
         self._backup = _Disk()
 
     def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
-        """As Store.take."""
+        """As Store.commit."""
         fault = plan.fault
         plan.disarm()
         new = self.disk.copy()
@@ -113,7 +113,7 @@ class ModelServer:
         try:
             batch = parse(incoming.payload, incoming.machine, self._site, self._now_ns)
             seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
-            admission = rules.admit(batch, seq)  # by its module, so that a bug can be planted there
+            admission = admit(batch, seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected)
@@ -136,12 +136,12 @@ class RealServer:
         self.back_up()
 
     def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
-        """As Store.take; a killed one is started again."""
+        """As Store.commit; a killed one is started again."""
         if plan.fault:
             self._plan.arm(plan.fault, plan.left)
         plan.disarm()
         try:
-            return self._store.take(group)
+            return self._store.commit(group)
         except Killed:
             self._close()
             self._open()
@@ -169,7 +169,7 @@ class RealServer:
 
     def marks(self) -> dict[RunKey, tuple[int, int]]:
         """Watermark and lost, by run."""
-        return {run: (mark.seq, mark.lost) for run, mark in self._journal.marks().items()}
+        return {run: (mark.seq, mark.lost) for run, mark in self._journal.watermarks().items()}
 
     def close(self) -> None:
         """End the server."""
@@ -177,7 +177,7 @@ class RealServer:
 
     @property
     def _journal(self) -> Journal:
-        return self._store._journal
+        return self._store.journal
 
     def _open(self) -> None:
         self._plan = FaultPlan()

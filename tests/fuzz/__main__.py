@@ -10,7 +10,7 @@ import argparse
 import logging
 import sys
 
-from tests.fuzz.campaign import Result, fuzz_for, save
+from tests.fuzz.campaign import DecoderResult, fuzz_for, save
 from tests.fuzz.decoders import decoders
 from tests.fuzz.verdict import watched
 
@@ -37,7 +37,7 @@ def main() -> int:
     return 1 if any(result.faults for result in results) else 0
 
 
-def _show(result: Result) -> None:
+def _show(result: DecoderResult) -> None:
     counts = (result.accepted, result.refused, len(result.faults))
     print(LINE.format(result.decoder, result.accepted + result.refused, *counts))
     for problem, _ in result.faults.values():

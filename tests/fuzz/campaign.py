@@ -22,7 +22,7 @@ SHRINK = 400  # inputs that are tried to make a failing one shorter
 
 
 @dataclass
-class Result:
+class DecoderResult:
     """What became of the inputs of one decoder. faults: by signature, what happened and the shortest such input."""
 
     decoder: str
@@ -45,9 +45,9 @@ class Result:
         return None
 
 
-def replay(decoder: Decoder) -> Result:
+def replay(decoder: Decoder) -> DecoderResult:
     """Seeds, which have to be accepted, and the corpus, which has to be free of faults by now."""
-    result = Result(decoder.name)
+    result = DecoderResult(decoder.name)
     for data in decoder.seeds:
         result.take(decoder, data)
         if result.refused:
@@ -57,7 +57,7 @@ def replay(decoder: Decoder) -> Result:
     return result
 
 
-def fuzz(decoder: Decoder, result: Result, n: int, number: int) -> None:
+def fuzz(decoder: Decoder, result: DecoderResult, n: int, number: int) -> None:
     """Judge about `n` new inputs, drawn from the seed `number`; stops at the first fault that is not in `result` yet.
 
     The input is made shorter then.
@@ -90,7 +90,7 @@ def fuzz(decoder: Decoder, result: Result, n: int, number: int) -> None:
         assert first, "Hypothesis failed by itself"
 
 
-def fuzz_for(decoder: Decoder, seconds: float, number: int) -> Result:
+def fuzz_for(decoder: Decoder, seconds: float, number: int) -> DecoderResult:
     """Replay, then round after round until the time is up."""
     result, end_s, rounds = replay(decoder), time.monotonic() + seconds, 0
     while time.monotonic() < end_s:
@@ -99,7 +99,7 @@ def fuzz_for(decoder: Decoder, seconds: float, number: int) -> Result:
     return result
 
 
-def save(result: Result) -> list[Path]:
+def save(result: DecoderResult) -> list[Path]:
     """Add what failed to the corpus; returns the new files."""
     saved = []
     for _, data in result.faults.values():

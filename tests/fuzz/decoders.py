@@ -221,10 +221,10 @@ def _kept() -> Iterator[Decoder]:
 
     def decode(data: bytes) -> None:
         path.write_bytes(data)
-        found = calibration_file.load(path, "loader-1")
-        assert found is not None
-        calibration_file.save(path, "loader-1", found)
-        assert calibration_file.load(path, "loader-1") == found
+        loaded = calibration_file.load(path, "loader-1")
+        assert loaded is not None
+        calibration_file.save(path, "loader-1", loaded)
+        assert calibration_file.load(path, "loader-1") == loaded
 
     yield Decoder("calibration", (path.read_bytes(),), decode, (StoreError,), texts, path.name)
     yield journal_decoder(workshop() / "journal")

@@ -17,7 +17,7 @@ from hypothesis.strategies import DrawFn, SearchStrategy
 from tests.fuzz.mutations import damaged
 
 
-class Map(list[list[Any]]):
+class MapNode(list[list[Any]]):
     """Pairs of key and value."""
 
 
@@ -27,7 +27,7 @@ class Raw(bytes):
 
 _CLAIM = b"\xff\xff\xff\xff"
 NASTY: tuple[Any, ...] = (
-    *(None, True, False, [], [[]], Map(), b"", b"\xff" * 8, "", "a\nb\x1b[0m", "*", "x" * 70, "ä\u2028", "1"),
+    *(None, True, False, [], [[]], MapNode(), b"", b"\xff" * 8, "", "a\nb\x1b[0m", "*", "x" * 70, "ä\u2028", "1"),
     *(0, 1, 2, -1, 20_001, 2**62, 2**62 + 1, 2**63, 2**64 - 1, -(2**63), 4_102_444_800_000_000_001),
     *(float("nan"), float("inf"), -float("inf"), 1e308, -0.0, 5e-324),
     *(Raw(b"\x91" * depth + b"\x01") for depth in (20, 600, 2000)),
@@ -68,7 +68,7 @@ def pack_tree(node: Any) -> bytes:
     """A tree as bytes; what was edited to lie outside of MessagePack stays outside."""
     if isinstance(node, Raw):
         return bytes(node)
-    if isinstance(node, Map):
+    if isinstance(node, MapNode):
         return _header(0x80, b"\xdf", len(node)) + b"".join(pack_tree(part) for pair in node for part in pair)
     if isinstance(node, list):
         return _header(0x90, b"\xdd", len(node)) + b"".join(map(pack_tree, node))
@@ -82,30 +82,30 @@ def _header(short: int, long: bytes, n: int) -> bytes:
 
 def _tree(value: Any) -> Any:
     if isinstance(value, dict):
-        return Map([key, _tree(of)] for key, of in value.items())
-    return [_tree(of) for of in value] if isinstance(value, list) else value
+        return MapNode([key, _tree(inner)] for key, inner in value.items())
+    return [_tree(inner) for inner in value] if isinstance(value, list) else value
 
 
 def _places(node: Any) -> list[tuple[list[Any], int]]:
     """Every value of a tree, as the list that holds it and the place there."""
-    found: list[tuple[list[Any], int]] = []
-    if isinstance(node, list) and not isinstance(node, Map):
-        found += [(node, i) for i in range(len(node))]
-    for pair in node if isinstance(node, Map) else ():
-        found.append((pair, 1))
-    below = (holder[i] for holder, i in list(found))
-    return found + [place for part in below if isinstance(part, list) for place in _places(part)]
+    places: list[tuple[list[Any], int]] = []
+    if isinstance(node, list) and not isinstance(node, MapNode):
+        places += [(node, i) for i in range(len(node))]
+    for pair in node if isinstance(node, MapNode) else ():
+        places.append((pair, 1))
+    below = (holder[i] for holder, i in list(places))
+    return places + [place for part in below if isinstance(part, list) for place in _places(part)]
 
 
-def _maps(node: Any) -> list[Map]:
+def _maps(node: Any) -> list[MapNode]:
     parts = node if isinstance(node, list) else []
-    below = [found for part in parts for found in _maps(part)]
-    return [node, *below] if isinstance(node, Map) else below
+    below = [inner for part in parts for inner in _maps(part)]
+    return [node, *below] if isinstance(node, MapNode) else below
 
 
 def _edit(draw: DrawFn, root: list[Any]) -> None:
     """Change one thing of a tree, in place."""
-    maps = [found for found in _maps(root) if found]
+    maps = [each for each in _maps(root) if each]
     if maps and draw(st.booleans()):
         _edit_map(draw, draw(st.sampled_from(maps)))
         return
@@ -114,12 +114,12 @@ def _edit(draw: DrawFn, root: list[Any]) -> None:
     if isinstance(value, bytes) and not isinstance(value, Raw) and draw(st.integers(0, 3)):
         holder[i] = _column(draw, value)
     elif draw(st.integers(0, 5)) == 0:
-        holder[i] = Map([["v", value]]) if draw(st.booleans()) else [value] * draw(st.sampled_from((1, 2, 30)))
+        holder[i] = MapNode([["v", value]]) if draw(st.booleans()) else [value] * draw(st.sampled_from((1, 2, 30)))
     else:
         holder[i] = draw(st.sampled_from(NASTY))
 
 
-def _edit_map(draw: DrawFn, table: Map) -> None:
+def _edit_map(draw: DrawFn, table: MapNode) -> None:
     at = draw(st.integers(0, len(table) - 1))
     match draw(st.sampled_from(("drop", "rename", "twice", "more"))):
         case "drop":

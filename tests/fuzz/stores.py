@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mapserver.ingest.admission import Admission
-from mapserver.journal.archive import FOLDER, ArchiveFile, next_file
-from mapserver.journal.journal import Journal, JournalReader
-from mapserver.journal.rows import JournalRow
+from mapserver.journal.archive import FOLDER, next_file
+from mapserver.journal.archive_file import ArchiveFile
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Admission, JournalRow
 from protocol.errors import StoreError
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch
@@ -61,13 +62,13 @@ def _journal(folder: Path) -> list[JournalRow]:
         batch = SampleBatch("loader-1", 7, 1 + 3 * i, rows(), SITE.frame)
         journal.append(Admission(batch, 0, 0), T0)
     journal.commit()
-    found = list(journal.read())
+    rows_read = list(journal.read())
     journal.close()
-    return found
+    return rows_read
 
 
-def _compare(found: list[JournalRow], expected: list[JournalRow]) -> None:
-    assert [row.row for row in found] == [row.row for row in expected]
-    for one, other in zip(found, expected, strict=True):
+def _compare(rows_read: list[JournalRow], expected: list[JournalRow]) -> None:
+    assert [row.row for row in rows_read] == [row.row for row in expected]
+    for one, other in zip(rows_read, expected, strict=True):
         assert np.array_equal(one.rows.tobytes(), other.rows.tobytes())
         assert (one.machine, one.spool_id, one.first_seq) == (other.machine, other.spool_id, other.first_seq)

@@ -21,10 +21,10 @@ from tests.chaos import __main__ as command
 from tests.chaos import bit_flips, power_cuts, process_faults, stepped_clock, write_faults
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
-from tests.chaos.outcome import Outcome, Told, longest_pause, table
+from tests.chaos.outcome import Console, FaultOutcome, longest_pause, table
 from tests.chaos.recordings import make
-from tests.chaos.scenario import Scenario
-from tests.chaos.suite import FAULTS, Fault, run_suite, totals
+from tests.chaos.scenario import FaultRun
+from tests.chaos.suite import FAULTS, ChaosFault, run_suite, totals
 from tests.chaos.tcp_proxy import FAIR, Proxy, Weather
 
 
@@ -35,9 +35,9 @@ def library(tmp_path: Path) -> Path:
     return library
 
 
-def scenario(folder: Path, **options) -> Scenario:
+def scenario(folder: Path, **options) -> FaultRun:
     values = {"fault": "short", "recordings": None, "seconds": 4.0, "scale": 0.02} | options
-    return Scenario(folder=folder, told=Told(line=lambda *_, **__: None), seed=3, **values)
+    return FaultRun(folder=folder, console=Console(line=lambda *_, **__: None), seed=3, **values)
 
 
 @pytest.mark.processes
@@ -113,9 +113,9 @@ def test_a_flipped_bit_that_is_served_is_called_so(tmp_path):
     changed = path.read_bytes()
     assert changed[7].bit_count() == 1
     assert sum(changed) == changed[7]
-    assert bit_flips.judge(path, lambda _: {"rows": 2}, truth)[0] == bit_flips.Verdict.SERVED
-    assert bit_flips.judge(path, lambda _: {"rows": 1}, truth)[0] == bit_flips.Verdict.HARMLESS
-    assert bit_flips.judge(path, lambda _: [][0], truth) == (bit_flips.Verdict.UNNAMED, "IndexError")
+    assert bit_flips.judge(path, lambda _: {"rows": 2}, truth)[0] == bit_flips.FlipVerdict.SERVED
+    assert bit_flips.judge(path, lambda _: {"rows": 1}, truth)[0] == bit_flips.FlipVerdict.HARMLESS
+    assert bit_flips.judge(path, lambda _: [][0], truth) == (bit_flips.FlipVerdict.UNNAMED, "IndexError")
 
 
 def test_a_spool_whose_header_is_damaged_is_detected(tmp_path):
@@ -126,7 +126,7 @@ def test_a_spool_whose_header_is_damaged_is_detected(tmp_path):
     assert len(truth["contents"]) == 3
     bit_flips.flip(tmp_path / "spool.db", random.Random(1), [0])
     verdict, _ = bit_flips.judge(tmp_path / "spool.db", bit_flips.read_spool, truth)
-    assert verdict == bit_flips.Verdict.DETECTED
+    assert verdict == bit_flips.FlipVerdict.DETECTED
 
 
 def test_the_proxy_forwards_holds_and_cuts():
@@ -177,13 +177,13 @@ def test_the_order_of_kills_comes_from_the_seed(tmp_path):
 
 
 def test_a_loss_fails_the_suite_and_an_error_in_one_fault_lets_the_others_run(tmp_path, monkeypatch, capsys):
-    def breaks(_: Scenario) -> Outcome:
+    def breaks(_: FaultRun) -> FaultOutcome:
         raise RuntimeError("broke")
 
     faults = (
-        Fault("kills", lambda s: Outcome("kills", count=7, recorded=9, merged=8, lost=1)),
-        Fault("power", breaks),
-        Fault("cable", lambda s: Outcome("cable", skipped="not permitted")),
+        ChaosFault("kills", lambda s: FaultOutcome("kills", count=7, recorded=9, merged=8, lost=1)),
+        ChaosFault("power", breaks),
+        ChaosFault("cable", lambda s: FaultOutcome("cable", skipped="not permitted")),
     )
     monkeypatch.setattr(command, "run_suite", lambda _, *rest: run_suite(faults, *rest))
     monkeypatch.setattr(signal, "signal", lambda *_: None)
@@ -205,7 +205,7 @@ def test_a_loss_fails_the_suite_and_an_error_in_one_fault_lets_the_others_run(tm
 
 
 def test_a_skipped_fault_is_no_failure():
-    outcomes = [Outcome("kills", count=1), Outcome("cable", skipped="not permitted")]
+    outcomes = [FaultOutcome("kills", count=1), FaultOutcome("cable", skipped="not permitted")]
     assert totals(outcomes, 1)["ok"]
     assert table(outcomes).splitlines()[1].endswith("ok")
 

@@ -24,7 +24,7 @@ from tests.integration.site_run import READY_S, SiteRun, kill  # beside this fil
 
 START_NS, HOUR_NS, SIZE = 1_767_225_600 * 10**9, 3600 * 10**9, 48
 BAD, OLD, NEW = 1.6, 0.06, 0.02
-CONFIG = "[keep]\nturn_s = 0.05\njudge_s = 0.2\narchive_after_h = 0\n"
+CONFIG = "[store]\narchive_after_h = 0\n[trust]\njudge_s = 0.2\n"
 
 
 def sweep(seed: int, hour: float, gain: float = 1.0, *, repaved: bool = False) -> Table:

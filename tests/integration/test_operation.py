@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from prometheus_client.parser import text_string_to_metric_families
 
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.journal.archive import HOUR_NS, archive
+from mapserver.journal.archive import archive
+from mapserver.journal.archive_writer import HOUR_NS
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig, load_site
 from protocol.wire import keys
@@ -98,7 +100,7 @@ class Sender:
 
 def committed(store: Path) -> dict[str, int]:
     with JournalReader(store / JOURNAL_FILE) as journal:
-        return {machine: mark.seq for (machine, _), mark in journal.marks().items()}
+        return {machine: mark.seq for (machine, _), mark in journal.watermarks().items()}
 
 
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
@@ -121,13 +123,13 @@ def old_rows(store: Path, site: SiteConfig) -> None:
     with closing(Store(store, site, ServerConfig(), lambda: NOW_NS)) as opened:
         for i in range(50):
             batch = SampleBatch("old", 7, 1 + 1000 * i, drive(1000, seed=i, first_s=100 * i), site.frame)
-            assert isinstance(opened.take([Incoming("old", encode_batch(batch))])[0], Ack)
+            assert isinstance(opened.commit([Incoming("old", encode_batch(batch))])[0], Ack)
         opened.save_snapshot()
 
 
 def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committed(site: SiteRun):
     options = site.folder / "server.toml"
-    options.write_text("[keep]\nturn_s = 0.1\narchive_after_h = 0.01\n[store]\nsnapshot_rows = 50\n")
+    options.write_text("[store]\narchive_after_h = 0.01\nsnapshot_s = 0.5\n")
     config = load_site(site.site_file)
     old_rows(site.folder / "store", config)
     site.start_router()
@@ -147,13 +149,15 @@ def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committe
 
 
 def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: SiteRun, children: Children):
-    store, options = site.folder / "store", site.folder / "server.toml"
-    old_rows(store, load_site(site.site_file))
+    store, old = site.folder / "store", load_site(site.site_file)
+    old_rows(store, old)
     for cache in store.glob("snapshot-*"):
         cache.unlink()
-    options.write_text('[fold]\nkernel = "numpy"\nstd_floor_m = 2.9\n')  # slow: many cells for each sample
+    text = site.site_file.read_text()
+    site.site_file.write_text(text.replace(f"cell_m = {old.cell_m}", "cell_m = 0.05"))  # slow: many for each sample
+    assert load_site(site.site_file).cell_m == 0.05
     site.start_router()
-    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store, "--config", options)
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store)
     server = children.start("server", "server", *words)
     wait_until(lambda: (store / "journal.db-wal").exists(), READY_S, "the store is opened")
     end(server)
@@ -275,9 +279,10 @@ def test_plot_and_query_that_follow_end_in_time_also_while_the_server_hangs(site
 
 
 def scrape(url: str) -> dict[str, float]:
+    """Metrics by name, of the machines' those of the only one."""
     with urllib.request.urlopen(url, timeout=10) as answer:
-        lines = answer.read().decode().splitlines()
-    return {line.rsplit(" ", 1)[0]: float(line.rsplit(" ", 1)[1]) for line in lines if not line.startswith("#")}
+        families = text_string_to_metric_families(answer.read().decode())
+    return {sample.name: sample.value for family in families for sample in family.samples}
 
 
 def test_the_server_tells_prometheus_of_itself_and_of_the_agents(site: SiteRun):
@@ -289,9 +294,8 @@ def test_the_server_tells_prometheus_of_itself_and_of_the_agents(site: SiteRun):
     fill(site.folder / "spool.db", 500)
     agent, _ = start_agent(site)
     agent.expect("ready", READY_S)
-    machine = f'{{machine="{site.configs[0].stem}"}}'
-    wait_until(lambda: scrape(url).get(f"sitegrid_machine_samples_total{machine}") == 500, READY_S, "samples counted")
-    wait_until(lambda: scrape(url).get(f"sitegrid_agent_spool_samples{machine}") == 0, READY_S, "health heard")
+    wait_until(lambda: scrape(url).get("sitegrid_machine_samples_total") == 500, READY_S, "samples counted")
+    wait_until(lambda: scrape(url).get("sitegrid_agent_spool_samples") == 0, READY_S, "health received")
     metrics = scrape(url)
     assert metrics["sitegrid_map_samples"] == 500
     assert metrics["sitegrid_journal_rows"] == metrics["sitegrid_merged_rows"] > 0
@@ -387,17 +391,17 @@ def test_a_backup_as_the_operators_page_has_it_is_a_whole_store(tmp_path: Path, 
     first, second = code.split("if os.path")
     with closing(Store(store, site, ServerConfig(), lambda: NOW_NS)) as opened:
         late = SampleBatch("late", 7, 1, drive(10, seed=1), site.frame)
-        assert isinstance(opened.take([Incoming("late", encode_batch(late))])[0], Ack)
+        assert isinstance(opened.commit([Incoming("late", encode_batch(late))])[0], Ack)
         names: dict[str, Any] = {}
         exec(compile(first, "docs/operation.md", "exec"), names)
         with JournalReader(store / JOURNAL_FILE) as reader:  # rows move just in between
-            assert list(archive(store / "archive", reader, site, NOW_NS + 3 * HOUR_NS, opened.forget))
+            assert list(archive(store / "archive", reader, site, NOW_NS + 3 * HOUR_NS, opened.journal.forget))
         exec(compile(f"if os.path{second}", "docs/operation.md", "exec"), names)
         folded = opened.grid.folded
     with closing(Store(backup, site, ServerConfig(), lambda: NOW_NS)) as restored:
         assert restored.machines()["late"]["samples"] == 10
         assert restored.grid.folded == folded == 50_010
         with JournalReader(backup / JOURNAL_FILE) as reader:
-            assert list(archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.forget))
-            rows = [row.row for row in history_rows(History.of(reader))]
+            assert list(archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.journal.forget))
+            rows = [row.row for row in history_rows(History.beside(reader))]
     assert rows == list(range(1, 52))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.soak import Look, Machine, Soak, main, soak
+from tests.soak import Look, Soak, SoakMachine, main, soak
 
 pytestmark = pytest.mark.processes
 
@@ -40,7 +40,7 @@ def test_memory_that_grows_is_a_failure(last: float, code: int, monkeypatch: pyt
 
 
 def test_a_machine_drives_on_where_it_was():
-    one, other = Machine("a", 1), Machine("a", 1)
+    one, other = SoakMachine("a", 1), SoakMachine("a", 1)
     first = one.drive(0.0, "frame")
     assert first == other.drive(0.0, "frame")
     assert one.drive(4.0, "frame") != first

@@ -6,15 +6,16 @@ import pytest
 from benchmarks import sim
 from benchmarks.__main__ import main
 
-SMALL = (sim.Case("paper_site", "pybullet", 2, 20.0), sim.Case("busy_site", "fast", 3, 40.0))
+SMALL = (sim.FleetCase("paper_site", "pybullet", 2, 20.0), sim.FleetCase("busy_site", "fast", 3, 40.0))
 
 
-def test_the_goals_are_those_of_the_issue() -> None:
+def test_goals_stand_beside_their_fleets() -> None:
     goals = {(case.world, case.machines): case.goal for case in sim.CASES}
     slow = {("pybullet", 1): 25.0, ("pybullet", 4): 20.0, ("pybullet", 8): 15.0, ("pybullet", 32): 8.0}
     assert goals == slow | {("fast", 100): 40.0, ("fast", 1000): 12.0}
 
 
+@pytest.mark.slow
 def test_sim_prints_one_json_object_with_a_row_for_every_fleet(monkeypatch, capsys) -> None:
     monkeypatch.setattr(sim, "CASES", SMALL)
     assert main(["sim", "--json", "--seconds", "0.5", "--runs", "2"]) == 0

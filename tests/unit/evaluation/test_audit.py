@@ -13,9 +13,10 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.archive import FOLDER, archive
-from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow, checksum, pack
-from mapserver.trust.decisions import KIND, PERSON, Decision
+from mapserver.trust.decisions import KIND, PERSON, TrustDecision
 from protocol.arrays import Table
 from protocol.machine.samples import content_hash, empty
 from protocol.site.site_config import SiteConfig
@@ -33,7 +34,7 @@ def recorded_rows(seed: int) -> Table:
     rows["stamp_ns"] = 1_767_225_600_000_000_000 + np.arange(N) * 10**9
     rows["x_m"], rows["y_m"] = draw.uniform(-40, 40, (2, N))
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = draw.uniform(0.1, 2.0, N)
-    rows["cov_xx_m2"][::20] = 25.0  # too unsure of their place to vote
+    rows["cov_xx_m2"][::20] = 25.0  # too uncertain of their position to vote
     rows["distance_m"], rows["c_rr"] = draw.uniform(0.5, 1.5, N), draw.uniform(0.005, 0.3, N)
     return rows
 
@@ -52,7 +53,7 @@ def clean(tmp_path_factory) -> tuple[Path, dict[str, Path]]:
             # every batch begins with what was sent before: trimmed, not counted twice
             start = max(0, first - 3)
             batch = SampleBatch(machine, spool, start + 1, rows[start : first + BATCH], SITE.frame)
-            assert isinstance(store.take([Incoming(machine, encode_batch(batch))])[0], Ack)
+            assert isinstance(store.commit([Incoming(machine, encode_batch(batch))])[0], Ack)
     store.save_snapshot()
     store.close()
     return folder / "store", audits
@@ -225,7 +226,7 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
         rows["stamp_ns"] += i * 5 * 3600 * 10**9
         aged.append(replace(row, rows=rows))
     whole, less = grid_of(aged).state(), grid_of(aged[1:]).state()
-    assert {at.rung for at in whole.pages} >= {0, 1}
+    assert {at.tier for at in whole.pages} >= {0, 1}
     assert grid_difference(whole, whole) == (0, 0)
     assert grid_difference(whole, less) == (pytest.approx(BATCH, abs=5), 0)
 
@@ -233,10 +234,10 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
 def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, tmp_path):
     shutil.copytree(clean[0], tmp_path / "store")
     store = Store(tmp_path / "store", SITE, CONFIG, lambda: 1)
-    store.remember(KIND, 1, Decision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1).body)
+    store.journal.append_event(KIND, 1, TrustDecision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1).body)
     store.close()
     store = Store(tmp_path / "store", SITE, CONFIG, lambda: 1)
-    assert store.left_out == {"b"}
+    assert store.excluded == {"b"}
     store.save_snapshot()
     store.close()
     result = audit_store(clean[1], tmp_path / "store", SITE, CONFIG)

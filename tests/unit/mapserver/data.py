@@ -6,23 +6,26 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import zenoh
 
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
-from mapserver.evidence.grid import Grid, GridState, Placed
+from mapserver.evidence.grid import OPEN_BLOCKS, Grid, GridState, PlacedPage
 from mapserver.evidence.pages import WIDE, Page
 from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from protocol.arrays import Table
 from protocol.machine.samples import empty
+from protocol.site.geometry import CellWindow
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from tests.reference.fold import fold as reference_fold
 
 SITE = SiteConfig("pit", 48.0, 11.0)
 CONFIG = ServerConfig()
@@ -45,7 +48,7 @@ def now_ns() -> int:
 
 
 def samples(n: int = 1, **columns: Any) -> Table:
-    """Plain samples: one metre each on dry dirt, at the centre of cell (8, 8), unless told otherwise."""
+    """Plain samples: one metre each on dry dirt, at the centre of cell (8, 8), unless columns say otherwise."""
     rows = empty(n)
     usual = {"x_m": 8.5, "y_m": 8.5, "distance_m": 1.0, "c_rr": 0.04, "grade_e": 0.1, "grade_n": -0.05}
     usual |= {"stamp_ns": NOW_NS + np.arange(n) * 10**9, "cov_xx_m2": 0.01, "cov_yy_m2": 0.01}
@@ -86,10 +89,18 @@ def incoming(rows: Table, first_seq: int = 1, machine: str = "a", spool_id: int 
     return Incoming(machine, encode_batch(batch(rows, first_seq, machine, spool_id, **more)))
 
 
-def folded(rows: Table, machine: str = "a", cell_m: float = 1.0, **options: Any) -> Grid:
-    grid = Grid(cell_m, FoldConfig(**options))
+def folded(
+    rows: Table, machine: str = "a", cell_m: float = 1.0, open_blocks: int = OPEN_BLOCKS, **options: Any
+) -> Grid:
+    grid = Grid(cell_m, FoldConfig(**options), open_blocks)
     grid.fold(rows, machine)
     return grid
+
+
+def reference(rows: Table, **options: Any) -> Grid:
+    """As `folded`, by the reference in numpy."""
+    with patch("mapserver.evidence.grid.fold", reference_fold):
+        return folded(rows, **options)
 
 
 def total(grid: Grid) -> np.ndarray:
@@ -107,13 +118,23 @@ def same(one: Grid, other: Grid) -> bool:
     return totals[0] == totals[1] and [*map(_bits, a.pages)] == [*map(_bits, b.pages)]
 
 
+def same_evidence(one: Grid, other: Grid) -> bool:
+    """Equal evidence, to the bit, in all blocks, however it is spread over pages."""
+    if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
+        return False
+    column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
+    window = CellWindow(column, row, end_column - column, end_row - row)
+    a, b = (grid.evidence(grid.blocks_in(window)) for grid in (one, other))
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("counts", "bitmaps", "newest_ns"))
+
+
 def same_page(one: Page, other: Page) -> bool:
     """Equal to the bit."""
     return _bits_of(one) == _bits_of(other)
 
 
-def _bits(at: Placed) -> tuple[object, ...]:
-    return at.x, at.y, at.rung, at.index, *_bits_of(at.page)
+def _bits(at: PlacedPage) -> tuple[object, ...]:
+    return at.x, at.y, at.tier, at.index, *_bits_of(at.page)
 
 
 def _bits_of(page: Page) -> tuple[object, ...]:
@@ -139,8 +160,8 @@ def merged(parts: Iterable[Grid], **options: Any) -> Grid:
     for part in parts:
         grid = grid or Grid(part.cell_m, FoldConfig(**options))
         for at in part.state().pages:
-            assert at.rung == 0
-            grid._ladder((at.x, at.y)).add(at.index, at.page)
+            assert at.tier == 0
+            grid._timeline((at.x, at.y)).add(at.index, at.page)
         grid.folded += part.folded
         grid.skipped += part.skipped
         grid.newest_ns = max(grid.newest_ns, part.newest_ns)
@@ -182,7 +203,7 @@ def held(writer: Writer) -> Iterator[None]:
         entered.set()
         release.wait(WAIT_S)
 
-    reader = Thread(target=writer.read, args=(hold,))
+    reader = Thread(target=writer.run, args=(hold,))
     reader.start()
     assert entered.wait(WAIT_S)
     try:

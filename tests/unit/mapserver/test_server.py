@@ -6,14 +6,31 @@ import pytest
 import zenoh
 
 from mapserver.server import Server
-from protocol.errors import Refusal
-from protocol.queries.answer_codec import decode_error, decode_info, decode_point, decode_region
-from protocol.queries.requests import Freshness, InfoQuery, PointQuery, RegionQuery, encode_query
+from protocol.errors import QueryError, Refusal
+from protocol.queries.answer_codec import (
+    decode_error,
+    decode_info,
+    decode_machine,
+    decode_machines,
+    decode_point,
+    decode_region,
+    encode_change,
+)
+from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.parameters import selector_of
+from protocol.queries.requests import (
+    Freshness,
+    HistoryQuery,
+    InfoQuery,
+    PointQuery,
+    RegionQuery,
+    encode_query,
+)
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack
-from tests.unit.mapserver.data import CONFIG, SITE, WAIT_S, batch, now_ns, routed, samples
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, WAIT_S, batch, now_ns, routed, samples
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +49,9 @@ def served(sessions, tmp_path):
 
 def get(client: zenoh.Session, key: str, parameters: dict[str, str] | None = None, payload: bytes | None = None):
     """The one reply to a query."""
-    text = ";".join(f"{name}={value}" for name, value in (parameters or {}).items())
-    replies = list(client.get(f"{key}?{text}" if text else key, payload=payload, timeout=WAIT_S))
-    assert len(replies) == 1
-    return replies[0]
+    selector = f"{key}?{selector_of(parameters)}" if parameters else key
+    (reply,) = client.get(selector, payload=payload, timeout=WAIT_S)
+    return reply
 
 
 def deliver(client: zenoh.Session, sent, machine: str = "a"):
@@ -155,3 +171,78 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     assert deliver(client, batch(samples(0))) == Ack(5, 1)
     assert server.answers.info()["samples_merged"] == 5
     server.close()
+
+
+# --- changes, commands, the past --------------------------------------------------------------------------------------
+
+
+def test_events_and_queries_below_the_map_do_not_meet(served):
+    server, client = served
+    received, here = [], threading.Event()
+    subscriber = client.declare_subscriber(
+        keys.changed("pit"), lambda s: (received.append(s.payload.to_bytes()), here.set())
+    )
+    error = decode_error(get(client, keys.changed("pit")).err.payload.to_bytes())
+    assert error.reason == Refusal.UNKNOWN_QUERY
+    ask(client, InfoQuery())  # the subscription has reached the server with this answer
+    server._publish({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})
+    assert here.wait(WAIT_S)
+    assert received == [encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
+    subscriber.undeclare()
+
+
+def test_a_command_reaches_the_follower_with_its_reason(served):
+    _, client = served
+    deliver(client, batch(samples(5)))
+    command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")
+    row = decode_machine(get(client, keys.admin("pit", "trust"), encode_command(command)).ok.payload.to_bytes())
+    assert (row.name, row.trusted, row.merged) == ("a", False, 1)
+    assert row.reason == command.reason
+    gone = {"x": "8.5", "y": "8.5", "layers": "weight"}
+    for more in ({}, {"as_of": str(NOW_NS + 3600 * 10**9)}):
+        point = decode_point(get(client, keys.map_query("pit", "point"), gone | more).ok.payload.to_bytes())
+        assert np.isnan(point.values["weight"])
+    [machine] = decode_machines(get(client, keys.map_query("pit", "machines"), {}).ok.payload.to_bytes())
+    assert machine.name == "a"
+    assert not machine.trusted
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "reason"),
+    [
+        ("trust", {"machine": "c", "trusted": "yes"}, Refusal.UNKNOWN_MACHINE),
+        ("trust", {"machine": "c"}, Refusal.MISSING_FIELD),
+        ("shutdown", {}, Refusal.UNKNOWN_QUERY),
+    ],
+)
+def test_a_refused_command_gets_its_reason_and_is_counted(served, name, parameters, reason):
+    _, client = served
+    assert decode_error(get(client, keys.admin("pit", name), parameters).err.payload.to_bytes()).reason == reason
+    assert counters(client) == {f"refused_query_{reason}": 1}
+
+
+@pytest.mark.parametrize("slow", ["past", "command"])
+def test_the_map_as_it_is_does_not_wait_for_what_is_slow(served, monkeypatch, slow):
+    server, client = served
+    release, entered = threading.Event(), threading.Event()
+
+    def hold(*_):
+        entered.set()
+        assert release.wait(WAIT_S)
+        raise QueryError(Refusal.STORE, "held")
+
+    monkeypatch.setattr(server.answers, "history", hold)
+    monkeypatch.setattr(server.answers, "trust", hold)
+    key, asked = {
+        "past": (keys.map_query("pit", "history"), encode_query(HistoryQuery(0, 0))),
+        "command": (keys.admin("pit", "trust"), encode_command(TrustCommand("a", True))),
+    }[slow]
+    askers = [threading.Thread(target=get, args=(client, key, asked)) for _ in range(3)]
+    for asker in askers:
+        asker.start()
+    assert entered.wait(WAIT_S)
+    for _ in range(3):
+        ask(client, InfoQuery())
+    release.set()
+    for asker in askers:
+        asker.join()

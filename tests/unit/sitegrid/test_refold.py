@@ -14,20 +14,21 @@ import pytest
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.journal.archive import FOLDER, HOUR_NS, archive
+from mapserver.journal.archive import FOLDER, archive
+from mapserver.journal.archive_writer import HOUR_NS
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow
 from protocol.arrays import Table
 from protocol.config import from_table, load_toml
 from protocol.machine.samples import COLUMNS, empty
-from protocol.site.geometry import CellWindow
 from protocol.site.site_config import KnownGround, SiteConfig, load_site, site_toml
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import refold as fold
 from sitegrid.cli import main
 from sitegrid.options.times import parse_stamp
+from tests.unit.mapserver.data import same_evidence
 
 pytest.importorskip("pyarrow.parquet")
 SITE = SiteConfig("pit", 48.0, 11.0)
@@ -73,10 +74,10 @@ def make_store(
             if changed is not None and first <= changed < first + batch:
                 rows["c_rr"][changed - first] += 0.01
             sent = encode_batch(SampleBatch(name, spool_id, first + 1, rows, site.frame))
-            assert isinstance(store.take([Incoming(name, sent)])[0], Ack)
+            assert isinstance(store.commit([Incoming(name, sent)])[0], Ack)
         clock[0] += HOUR_NS
     with JournalReader(folder / JOURNAL_FILE) as reader:
-        list(archive(folder / FOLDER, reader, site, int(T0 + archived * HOUR_NS), store._journal.forget))
+        list(archive(folder / FOLDER, reader, site, int(T0 + archived * HOUR_NS), store.journal.forget))
     store.close()
     (folder / "site.toml").write_text(site_toml(site))
     return folder
@@ -94,7 +95,7 @@ def opened(folder: Path) -> Store:
 
 def rows_of(folder: Path) -> list[JournalRow]:
     with JournalReader(folder / JOURNAL_FILE) as reader:
-        return list(history_rows(History.of(reader)))
+        return list(history_rows(History.beside(reader)))
 
 
 def identities(folder: Path) -> list[tuple[object, ...]]:
@@ -110,16 +111,6 @@ def folded(
     return grid
 
 
-def same(one: Grid, other: Grid) -> bool:
-    """Equal evidence, to the bit, in all blocks."""
-    if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
-        return False
-    column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
-    blocks = one.blocks_in(CellWindow(column, row, end_column - column, end_row - row))
-    a, b = one.evidence(blocks), other.evidence(blocks)
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("counts", "bitmaps", "newest_ns"))
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three machines, two hours archived, four in the journal. Nothing writes to it."""
@@ -131,10 +122,10 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
     assert identities(tmp_path / "new") == identities(store)
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded())
+    assert same_evidence(again.grid, folded())
     assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
     with JournalReader(store / JOURNAL_FILE) as reader:
-        assert again._journal.marks() == reader.marks()
+        assert again.journal.watermarks() == reader.watermarks()
     assert (again.site, again.newest_ns) == (SITE, T0 + 1190 * S)
     again.close()
 
@@ -144,7 +135,7 @@ def test_the_machines_go_on_sending_to_the_new_store(store: Path, tmp_path: Path
     again = opened(tmp_path / "new")
     for name in "abc":
         more = encode_batch(SampleBatch(name, 7, 121, track(9, 5), SITE.frame))
-        assert isinstance(again.take([Incoming(name, more)])[0], Ack)
+        assert isinstance(again.commit([Incoming(name, more)])[0], Ack)
     again.close()
 
 
@@ -152,34 +143,34 @@ def test_the_size_of_cells_can_be_changed(store: Path, tmp_path: Path):
     assert run(store, "--out", tmp_path / "new", "--cell", 2.5) == 0
     again = opened(tmp_path / "new")
     assert again.site == replace(SITE, cell_m=2.5)
-    assert same(again.grid, folded(cell_m=2.5))
+    assert same_evidence(again.grid, folded(cell_m=2.5))
     again.close()
 
 
 def test_options_are_taken_and_written_beside_the_store(store: Path, tmp_path: Path):
-    text = "# mine\n[fold]\nstd_cap_m = 1.2\n[store]\ngroup_batches = 3\n"
+    text = "# mine\n[fold]\nstd_cap_m = 1.2\n[store]\nsnapshot_s = 30.0\n"
     (tmp_path / "other.toml").write_text(text)
     assert run(store, "--out", tmp_path / "new", "--config", tmp_path / "other.toml") == 0
     assert (tmp_path / "new" / "server.toml").read_text() == text
     again = opened(tmp_path / "new")
     config = from_table(ServerConfig, load_toml(tmp_path / "other.toml"), "")
-    assert same(again.grid, folded(config=config))
+    assert same_evidence(again.grid, folded(config=config))
     assert again.grid.skipped > 0
     again.close()
     assert run(tmp_path / "new", "--out", tmp_path / "newer") == 0  # a store's own options stay
     assert (tmp_path / "newer" / "server.toml").read_text() == text
 
 
-def test_machines_are_left_out_and_their_progress_is_kept(
+def test_machines_are_excluded_and_their_progress_is_kept(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert run(store, "--out", tmp_path / "new", "--without", "a", "--without", "c", "--json") == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["left_out"] == {"machine": 240, "time": 0, "twice": 0}
+    assert summary["excluded"] == {"machine": 240, "time": 0, "twice": 0}
     assert summary["machines"] == {"b": 120}
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded("b"))
-    marks = {name: (mark.seq, mark.lost) for (name, _), mark in again._journal.marks().items()}
+    assert same_evidence(again.grid, folded("b"))
+    marks = {name: (mark.seq, mark.lost) for (name, _), mark in again.journal.watermarks().items()}
     assert marks == {"a": (120, 120), "b": (120, 0), "c": (120, 120)}
     assert again.info()["machines"]["a"]["samples"] == 0
     again.close()
@@ -189,12 +180,12 @@ def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsy
     span = ("--from", "2026-01-01T00:01:40", "--until", "2026-01-01T01:05+01:00")  # samples 10 to 29
     assert run(store, "--out", tmp_path / "new", *span, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
-    assert (summary["samples"], summary["left_out"]["time"]) == (60, 300)
+    assert (summary["samples"], summary["excluded"]["time"]) == (60, 300)
     rows = rows_of(tmp_path / "new")
     assert {(r.machine, r.first_seq, len(r.rows)) for r in rows} == {(n, f, 10) for n in "abc" for f in (11, 21)}
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded(keep=slice(10, 30)))
-    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(120, 100)}
+    assert same_evidence(again.grid, folded(keep=slice(10, 30)))
+    assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(120, 100)}
     again.close()
 
 
@@ -203,11 +194,11 @@ def test_samples_out_of_time_in_the_middle_of_a_batch_cut_it_in_two(tmp_path: Pa
     rows = TRACKS["a"][:6].copy()
     rows["stamp_ns"] = T0 + S * np.array([5, 6, 900, 7, 8, 901])
     store = Store(folder, SITE, ServerConfig(), lambda: T0)
-    store.take([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
+    store.commit([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
     store.close()
     assert run(folder, "--out", tmp_path / "new", "--until", "2026-01-01T00:00:10") == 0
-    found = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
-    assert found == [(1, 2), (4, 2)]
+    pieces = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
+    assert pieces == [(1, 2), (4, 2)]
 
 
 # --- several archives ------------------------------------------------------------------------------------------------
@@ -223,7 +214,7 @@ def test_files_folders_and_stores_are_folded(store: Path, tmp_path: Path):
     assert identities(tmp_path / "file") == identities(store)[3:6]
     again = opened(tmp_path / "folder")  # the files say which site they are of
     assert again.site == SITE
-    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(40, 0)}
+    assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(40, 0)}
     again.close()
 
 
@@ -233,11 +224,11 @@ def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, cap
     file = min((store / FOLDER).glob("*.parquet"))
     assert run(store, other, file, file, "--out", tmp_path / "new", "--json") == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["left_out"] == {"machine": 0, "time": 0, "twice": 240 + 120}
+    assert summary["excluded"] == {"machine": 0, "time": 0, "twice": 240 + 120}
     assert (summary["samples"], summary["archives"]) == (360, 4)
     again = opened(tmp_path / "new")
-    assert same(again.grid, folded())
-    assert {(mark.seq, mark.lost) for mark in again._journal.marks().values()} == {(120, 0)}
+    assert same_evidence(again.grid, folded())
+    assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(120, 0)}
     again.close()
 
 
@@ -247,9 +238,9 @@ def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tm
     orders = [(store, one, two), (two, store, one), (one, two / FOLDER, two, store)]
     for i, order in enumerate(orders):
         assert run(*order, "--out", tmp_path / f"new{i}") == 0
-    found = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
-    assert found[0] == found[1] == found[2]
-    received = [row[3] for row in found[0]]
+    made = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
+    assert made[0] == made[1] == made[2]
+    received = [row[3] for row in made[0]]
     assert received == sorted(received)
 
 
@@ -363,12 +354,12 @@ def test_times_are_utc_where_no_zone_is_given():
 
 def test_people_read_what_became_of_the_samples(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run(store, "--out", tmp_path / "new", "--without", "b") == 0
-    said = capsys.readouterr()
-    assert "240 samples in 12 journal rows" in said.out
-    assert "  a: 120 samples" in said.out
-    assert "left out: 120 of machines, 0 by time, 0 that came twice" in said.out
-    assert f"sitegrid server --store {tmp_path}/new --site-file {tmp_path}/new/site.toml" in said.out
-    assert said.err == ""
+    printed = capsys.readouterr()
+    assert "240 samples in 12 journal rows" in printed.out
+    assert "  a: 120 samples" in printed.out
+    assert "excluded: 120 of machines, 0 by time, 0 duplicates" in printed.out
+    assert f"sitegrid server --store {tmp_path}/new --site-file {tmp_path}/new/site.toml" in printed.out
+    assert printed.err == ""
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.change.change_log import Change, ChangeWatch
+from mapserver.change.change_log import ChangeLog, GroundChange
 from mapserver.change.detection import ChangeConfig
 from mapserver.change.validity import around
 from mapserver.evidence.grid import Grid
@@ -21,18 +21,18 @@ def sweep(west: int, south: int, east: int, north: int, c_rr: float, hour: float
     return samples(len(x), x_m=x, y_m=y, c_rr=c_rr, grade_e=grade, grade_n=0.0, stamp_ns=stamps, cov_xx_m2=0.25)
 
 
-def look(watch: ChangeWatch, grid: Grid, most: int = 1000) -> list[Change]:
-    found, blocks = [], grid.take_touched(most)
+def look(log: ChangeLog, grid: Grid, most: int = 1000) -> list[GroundChange]:
+    changes, blocks = [], grid.take_touched(most)
     while blocks:
         wide = sorted({near for block in blocks for near in around(block, 1)})
         pages = {block: p for block, p in zip(wide, grid.pages(wide), strict=True) if p}
-        found += watch.look(blocks, pages)
+        changes += log.look(blocks, pages)
         blocks = grid.take_touched(most)
-    return found
+    return changes
 
 
-def watched(known=(), **options) -> ChangeWatch:
-    return ChangeWatch(1.0, ChangeConfig(**options), ReadConfig(), known)
+def change_log(kept=(), **options) -> ChangeLog:
+    return ChangeLog(1.0, ChangeConfig(**options), ReadConfig(), kept)
 
 
 @pytest.fixture
@@ -46,14 +46,14 @@ def repaved() -> Grid:
 
 
 def test_ground_that_stays_as_it_is_does_not_change():
-    grid, watch = Grid(1.0, FoldConfig()), watched()
+    grid, log = Grid(1.0, FoldConfig()), change_log()
     for hour in range(4):
         grid.fold(sweep(0, 0, 40, 40, 0.06, hour), "a")
-        assert look(watch, grid) == []
+        assert look(log, grid) == []
 
 
 def test_a_change_says_where_when_and_from_what_to_what(repaved):
-    (change,) = look(watched(), repaved)
+    (change,) = look(change_log(), repaved)
     west, south, east, north = change.bounds
     assert abs(np.array([west - 10, south - 10, east - 30, north - 25])).max() <= 2
     assert 200 < change.cells < 400
@@ -62,48 +62,48 @@ def test_a_change_says_where_when_and_from_what_to_what(repaved):
     assert change.resistance_after == pytest.approx(0.02, rel=0.05)
 
 
-def test_a_change_is_told_once(repaved):
-    watch = watched()
-    assert len(look(watch, repaved)) == 1
+def test_a_change_is_logged_once(repaved):
+    log = change_log()
+    assert len(look(log, repaved)) == 1
     repaved.touch_all()
-    assert look(watch, repaved) == []
+    assert look(log, repaved) == []
     repaved.fold(sweep(10, 10, 30, 25, 0.02, 3), "b")
-    assert [c.id for c in look(watch, repaved)] in ([], [1])  # a few cells at its edge may be new
+    assert [c.id for c in look(log, repaved)] in ([], [1])  # a few cells at its edge may be new
 
 
 def test_a_change_grows_while_machines_pass():
-    grid, watch = Grid(1.0, FoldConfig()), watched()
+    grid, log = Grid(1.0, FoldConfig()), change_log()
     for hour in (0, 1):
         grid.fold(sweep(0, 0, 60, 20, 0.06, hour), "a")
-    look(watch, grid)
+    look(log, grid)
     grid.fold(sweep(0, 0, 20, 20, 0.02, 2), "b")
-    (first,) = look(watch, grid)
+    (first,) = look(log, grid)
     grid.fold(sweep(20, 0, 40, 20, 0.02, 2.5), "b")
-    found = look(watch, grid)
-    assert {change.id for change in found} == {first.id}
-    assert found[-1].cells > 1.5 * first.cells
-    assert found[-1].bounds[2] > 35
-    assert [c.id for c in watch.changes()] == [first.id]
+    changes = look(log, grid)
+    assert {change.id for change in changes} == {first.id}
+    assert changes[-1].cells > 1.5 * first.cells
+    assert changes[-1].bounds[2] > 35
+    assert [c.id for c in log.changes()] == [first.id]
 
 
 def test_changes_far_apart_are_two(repaved):
     for hour in (0, 1):
         repaved.fold(sweep(200, 200, 220, 220, 0.008, hour), "a")
     repaved.fold(sweep(200, 200, 220, 220, 0.06, 2), "b")
-    watch = watched()
-    assert sorted(change.id for change in look(watch, repaved)) == [1, 2]
-    assert [change.id for change in watch.changes(after=1)] == [2]
+    log = change_log()
+    assert sorted(change.id for change in look(log, repaved)) == [1, 2]
+    assert [change.id for change in log.changes(after=1)] == [2]
 
 
 def test_a_second_change_of_the_same_ground_much_later_is_another(repaved):
-    watch = watched()
-    look(watch, repaved)
+    log = change_log()
+    look(log, repaved)
     for hour in (30, 31):
         repaved.fold(sweep(10, 10, 30, 25, 0.25, hour), "b")
-    found = look(watch, repaved)
-    assert {change.id for change in found} == {2}
-    assert found[-1].resistance_before == pytest.approx(0.02, rel=0.3)
-    assert found[-1].resistance_after == pytest.approx(0.25, rel=0.1)
+    changes = look(log, repaved)
+    assert {change.id for change in changes} == {2}
+    assert changes[-1].resistance_before == pytest.approx(0.02, rel=0.3)
+    assert changes[-1].resistance_after == pytest.approx(0.25, rel=0.1)
 
 
 def test_a_change_of_the_slope_alone_is_a_change():
@@ -111,36 +111,36 @@ def test_a_change_of_the_slope_alone_is_a_change():
     for hour in (0, 1):
         grid.fold(sweep(0, 0, 30, 30, 0.04, hour), "a")
     grid.fold(sweep(0, 0, 30, 30, 0.04, 2, grade=0.2), "a")
-    (change,) = look(watched(), grid)
+    (change,) = look(change_log(), grid)
     assert change.grade_before == pytest.approx(0.0, abs=0.01)
     assert change.grade_after == pytest.approx(0.2, abs=0.01)
 
 
 def test_looking_at_a_few_blocks_at_a_time_finds_the_same_area(repaved):
-    whole = watched()
+    whole = change_log()
     look(whole, repaved)
     repaved.touch_all()
-    pieces = watched()
+    pieces = change_log()
     look(pieces, repaved, most=1)
     assert [replace(c, resistance_before=None, resistance_after=None) for c in whole.changes()] == [
         replace(c, resistance_before=None, resistance_after=None) for c in pieces.changes()
     ]
 
 
-def test_after_a_restart_nothing_is_told_again(repaved):
-    watch = watched()
-    look(watch, repaved)
-    again = watched([change.values for change in watch.changes()])
+def test_after_a_restart_nothing_is_logged_again(repaved):
+    log = change_log()
+    look(log, repaved)
+    again = change_log([change.values for change in log.changes()])
     repaved.touch_all()
     assert look(again, repaved) == []
-    assert again.changes() == watch.changes()
+    assert again.changes() == log.changes()
 
 
 def test_without_detection_nothing_changes(repaved):
-    assert look(watched(detect=False), repaved) == []
+    assert look(change_log(detect=False), repaved) == []
 
 
 def test_values_are_plain_and_come_back(repaved):
-    (change,) = look(watched(), repaved)
-    assert Change.of(change.values) == change
+    (change,) = look(change_log(), repaved)
+    assert GroundChange.from_values(change.values) == change
     assert all(type(v) in (int, float, list, type(None)) for v in change.values.values())

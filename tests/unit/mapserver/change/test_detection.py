@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.change.detection import ChangeConfig, credible, cuts, kinds
+from mapserver.change.detection import BINS, VARIATION, WEIGHT_M, ChangeConfig, credible, cuts, kinds
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import TimedPage
@@ -104,7 +104,7 @@ def test_the_kind_of_a_cell_is_the_median_of_all_its_votes():
     assert np.isnan(kinds(passes(0.1, column="grade_e")[:0])).all()
 
 
-# --- options ---------------------------------------------------------------------------------------------------------
+# --- limits ----------------------------------------------------------------------------------------------------------
 
 
 def test_detect_off_keeps_everything():
@@ -112,59 +112,36 @@ def test_detect_off_keeps_everything():
 
 
 def test_medians_nearer_than_bins_are_no_change():
-    pages = passes(0.04, 0.04 * np.exp(2.5 * BIN))
-    assert firsts(pages, replace(CONFIG, bins=2.4)) == [1]
-    assert firsts(pages, replace(CONFIG, bins=2.6)) == [0]
+    old = float(ev.RESISTANCE_CENTRES[8])
+    assert firsts(passes(old, old * np.exp((BINS + 0.1) * BIN))) == [1]
+    assert firsts(passes(old, old * np.exp((BINS - 0.1) * BIN))) == [0]
+
+
+def two_passes(*grounds: dict[float, float]) -> list[TimedPage]:
+    """Pages of one block that is driven all over twice; for each pass the metres on each kind of ground."""
+    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
+    grid = Grid(1.0, FoldConfig())
+    for hour, metres in enumerate(grounds):
+        for c_rr, distance_m in metres.items():
+            values = {"stamp_ns": NOW_NS + hour * HOUR_NS, "c_rr": c_rr, "distance_m": distance_m}
+            grid.fold(samples(256, x_m=x, y_m=y, cov_xx_m2=0, cov_yy_m2=0, **values), "a")
+    return grid.pages([(0, 0)])[0]
 
 
 def test_a_cell_on_a_border_that_was_repaved_with_something_between_is_changed():
-    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
-    grid = Grid(1.0, FoldConfig())
-    between = float(np.sqrt(0.02 * 0.2))
-    for hour, grounds in enumerate([{0.02: 0.55, 0.2: 0.45}, {between: 1.0}]):
-        for c_rr, distance_m in grounds.items():
-            stamp_ns = NOW_NS + hour * HOUR_NS
-            rows = samples(256, x_m=x, y_m=y, stamp_ns=stamp_ns, c_rr=c_rr, distance_m=distance_m, cov_xx_m2=0)
-            rows["cov_yy_m2"] = 0
-            grid.fold(rows, "a")
-    assert firsts(grid.pages([(0, 0)])[0]) == [1]
+    assert firsts(two_passes({0.02: 0.55, 0.2: 0.45}, {float(np.sqrt(0.02 * 0.2)): 1.0})) == [1]
 
 
 def test_histograms_that_have_more_in_common_than_variation_are_no_change():
-    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
-    grid = Grid(1.0, FoldConfig())
-    for hour, distances in enumerate(((0.8, 0.2), (0.1, 0.9))):  # metres of 0.04 and of 0.2: 0.7 of them differ
-        for c_rr, distance_m in zip((0.04, 0.2), distances, strict=True):
-            stamp_ns = NOW_NS + hour * HOUR_NS
-            rows = samples(256, x_m=x, y_m=y, stamp_ns=stamp_ns, c_rr=c_rr, distance_m=distance_m, cov_xx_m2=0)
-            rows["cov_yy_m2"] = 0
-            grid.fold(rows, "a")
-    pages = grid.pages([(0, 0)])[0]
-    assert firsts(pages, replace(CONFIG, variation=0.65)) == [1]
-    assert firsts(pages, replace(CONFIG, variation=0.75)) == [0]
+    for moved, change in ((VARIATION + 0.05, 1), (VARIATION - 0.05, 0)):  # share of the metres on other ground
+        assert firsts(two_passes({0.04: 0.8, 0.2: 0.2}, {0.04: 0.8 - moved, 0.2: 0.2 + moved})) == [change]
 
 
-@pytest.mark.parametrize("distances", [(0.25, 2.0), (2.0, 0.25)])
-def test_less_evidence_than_weight_on_either_side_is_no_change(distances):
-    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
-    grid = Grid(1.0, FoldConfig())
-    for hour, (c_rr, distance_m) in enumerate(zip((0.04, 0.2), distances, strict=True)):
-        stamp_ns = NOW_NS + hour * HOUR_NS
-        rows = samples(256, x_m=x, y_m=y, stamp_ns=stamp_ns, c_rr=c_rr, distance_m=distance_m, cov_xx_m2=0)
-        rows["cov_yy_m2"] = 0
-        grid.fold(rows, "a")
-    pages = grid.pages([(0, 0)])[0]
-    assert firsts(pages, replace(CONFIG, weight_m=0.2)) == [1]
-    assert firsts(pages, replace(CONFIG, weight_m=0.3)) == [0]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("variation", 0.0), ("variation", 1.0), ("bins", 0.0), ("weight_m", -1.0), ("size_m", 0.0), ("size_m", np.nan)],
-)
-def test_bad_option_is_refused_by_name(name, value):
-    with pytest.raises(ValueError, match=name):
-        ChangeConfig(**{name: value})
+@pytest.mark.parametrize("old_is_less", [True, False])
+def test_less_evidence_than_weight_on_either_side_is_no_change(old_is_less):
+    for metres, change in ((WEIGHT_M + 0.02, 1), (WEIGHT_M - 0.02, 0)):
+        old, new = (metres, 2.0) if old_is_less else (2.0, metres)
+        assert firsts(two_passes({0.04: old}, {0.2: new})) == [change]
 
 
 # --- areas -----------------------------------------------------------------------------------------------------------
@@ -194,7 +171,7 @@ def test_an_area_of_the_least_size_is_kept_as_it_is(edge):
 
 
 @pytest.mark.parametrize("edge", [2, 3, 4, 5, 10])
-def test_an_area_narrower_than_the_least_size_is_left_out(edge):
+def test_an_area_narrower_than_the_least_size_does_not_count(edge):
     for strip in (square(edge - 1, 3 * edge), square(3 * edge, edge - 1)):
         assert not counts(strip, size_m=float(edge)).any()
 

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from mapserver.change.detection import ChangeConfig
-from mapserver.change.validity import around, evidence, valid_pages
+from mapserver.change.validity import around, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
+from mapserver.evidence.sums import evidence
 from mapserver.evidence.votes import FoldConfig
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import ReadConfig
-from tests.unit.mapserver.data import NOW_NS, folded, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, samples
 
 HOUR_NS = 3600 * 10**9
 CONFIG = ChangeConfig()
@@ -43,17 +44,17 @@ def read(grid: Grid, config: ChangeConfig = CONFIG) -> ev.Evidence:
     blocks = [(x, y) for y in range(-2, 2) for x in range(-2, 2)]
     pages = dict(zip(blocks, grid.pages(blocks), strict=True))
     first = valid_pages(pages, grid.cell_m, config)
-    found = evidence([pages[block] for block in blocks], [first[block] for block in blocks])
+    sums = evidence([pages[block] for block in blocks], [first[block] for block in blocks])
 
     def image(values: np.ndarray) -> np.ndarray:
         tiles = values.reshape(4, 4, 16, 16, *values.shape[2:])
         return np.moveaxis(tiles, 2, 1).reshape(64, 64, *values.shape[2:])
 
-    return ev.Evidence(*(image(getattr(found, f)) for f in ("counts", "bitmaps", "newest_ns", "changed_ns")))
+    return ev.Evidence(*(image(getattr(sums, f)) for f in ("counts", "bitmaps", "newest_ns", "changed_ns")))
 
 
-def resistance(found: ev.Evidence) -> np.ndarray:
-    return cell_layers.read(found, ["resistance"], ReadConfig())["resistance"]
+def resistance(now: ev.Evidence) -> np.ndarray:
+    return cell_layers.read(now, ["resistance"], ReadConfig())["resistance"]
 
 
 def area(west: int, south: int, size: int, margin: int = 0) -> np.ndarray:
@@ -68,36 +69,36 @@ def area(west: int, south: int, size: int, margin: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("place", [(-12, -12), (3, 3), (-5, 4), (12, -20), (-30, -30)])
 def test_a_repaved_area_is_seen_after_one_pass_and_the_rest_stays(place):
-    found = read(repaved(*place, 10))
-    value = resistance(found)
+    now = read(repaved(*place, 10))
+    value = resistance(now)
     inside, outside = area(*place, 10, -1), ~area(*place, 10, 1)
     assert np.allclose(value[inside], NEW, rtol=0.05)
     assert np.allclose(value[outside], OLD, rtol=0.05)
-    assert not found.changed_ns[outside].any()
-    assert found.weight[inside].max() < 2 * ev.WEIGHT_UNITS_PER_M  # of one pass
-    assert found.weight[outside].min() > (PASSES - 2) * ev.WEIGHT_UNITS_PER_M  # of all
+    assert not now.changed_ns[outside].any()
+    assert now.weight[inside].max() < 2 * ev.WEIGHT_UNITS_PER_M  # of one pass
+    assert now.weight[outside].min() > (PASSES - 2) * ev.WEIGHT_UNITS_PER_M  # of all
 
 
 def test_the_time_of_the_change_lies_between_the_last_old_and_the_first_new_sample():
-    found, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
-    changed = found.changed_ns[inside]
+    now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
+    changed = now.changed_ns[inside]
     last_old = NOW_NS + (PASSES - 2) * HOUR_NS
     assert (changed >= last_old).all()
     assert (changed <= NOW_NS + (PASSES - 1) * HOUR_NS).all()
-    assert (changed <= found.newest_ns[inside]).all()
+    assert (changed <= now.newest_ns[inside]).all()
 
 
 def test_after_a_pause_a_change_is_dated_where_the_first_new_bucket_begins():
-    found, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
-    assert (found.changed_ns[inside] == NOW_NS + (PASSES - 1) * HOUR_NS).all()
+    now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
+    assert (now.changed_ns[inside] == NOW_NS + (PASSES - 1) * HOUR_NS).all()
 
 
 @pytest.mark.parametrize("keep_buckets", [1, 2, 3])
 def test_a_change_is_dated_also_where_old_passes_are_summed(keep_buckets):
-    found, inside = read(repaved(-5, 4, 10, keep_buckets=keep_buckets)), area(-5, 4, 10, -1)
-    assert np.allclose(resistance(found)[inside], NEW, rtol=0.05)
-    assert (found.changed_ns[inside] >= NOW_NS + (PASSES - 2) * HOUR_NS).all()
-    assert (found.changed_ns[inside] <= NOW_NS + (PASSES - 1) * HOUR_NS).all()
+    now, inside = read(repaved(-5, 4, 10, keep_buckets=keep_buckets)), area(-5, 4, 10, -1)
+    assert np.allclose(resistance(now)[inside], NEW, rtol=0.05)
+    assert (now.changed_ns[inside] >= NOW_NS + (PASSES - 2) * HOUR_NS).all()
+    assert (now.changed_ns[inside] <= NOW_NS + (PASSES - 1) * HOUR_NS).all()
 
 
 def test_a_change_is_dated_after_the_last_old_sample_of_the_same_span():
@@ -109,10 +110,10 @@ def test_a_change_is_dated_after_the_last_old_sample_of_the_same_span():
         rows["stamp_ns"] = stamp_ns
         grid.fold(rows, "a")
     pages = {(0, 0): grid.pages([(0, 0)])[0]}
-    found = evidence([pages[0, 0]], [valid_pages(pages, 1.0, CONFIG)[0, 0]])
+    valid = evidence([pages[0, 0]], [valid_pages(pages, 1.0, CONFIG)[0, 0]])
     inside = np.zeros((16, 16), np.bool_)
     inside[2:-2, 2:-2] = True
-    changed = found.changed_ns[0][inside.ravel()]
+    changed = valid.changed_ns[0][inside.ravel()]
     assert (changed >= stamps[1]).all()
     assert (changed <= stamps[2]).all()
 
@@ -120,27 +121,23 @@ def test_a_change_is_dated_after_the_last_old_sample_of_the_same_span():
 @pytest.mark.parametrize("size", [2, 3])
 def test_a_contradiction_narrower_than_the_least_size_leaves_everything(size):
     grid = repaved(3, 3, size)
-    found = read(grid)
-    assert not found.changed_ns.any()
+    now = read(grid)
+    assert not now.changed_ns.any()
     everything = grid.evidence([(0, 0)])
-    assert np.array_equal(found.counts[32:48, 32:48].reshape(256, -1), everything.counts[0])
+    assert np.array_equal(now.counts[32:48, 32:48].reshape(256, -1), everything.counts[0])
 
 
 @pytest.mark.parametrize(("size_m", "seen"), [(7.0, True), (13.0, False)])
 def test_the_least_size_is_obeyed(size_m, seen):
-    found = read(repaved(3, 3, 10), replace(CONFIG, size_m=size_m))
-    assert found.changed_ns.any() == seen
+    now = read(repaved(3, 3, 10), replace(CONFIG, size_m=size_m))
+    assert now.changed_ns.any() == seen
 
 
 def test_detection_off_leaves_everything():
-    found = read(repaved(-5, 4, 10), replace(CONFIG, detect=False))
-    assert not found.changed_ns.any()
-    everything = grid_of_blocks(repaved(-5, 4, 10))
-    assert found.counts.sum() == everything.counts.sum()
-
-
-def grid_of_blocks(grid: Grid) -> ev.Evidence:
-    return grid.evidence([(x, y) for x in range(-2, 2) for y in range(-2, 2)])
+    now = read(repaved(-5, 4, 10), replace(CONFIG, detect=False))
+    assert not now.changed_ns.any()
+    everything = repaved(-5, 4, 10).evidence([(x, y) for x in range(-2, 2) for y in range(-2, 2)])
+    assert now.counts.sum() == everything.counts.sum()
 
 
 @pytest.mark.parametrize("grounds", [[OLD, NEW, OLD], [OLD, OLD, OLD, NEW, OLD], [OLD, OLD, NEW, NEW, OLD]])
@@ -156,20 +153,14 @@ def test_of_two_changes_the_last_counts_and_dates():
     grid = Grid(1.0, FoldConfig())
     for hour, c_rr in enumerate([OLD, OLD, NEW, NEW, 0.01]):
         grid.fold(lane(hour, -16, -16, 32, 32, c_rr=c_rr), "a")
-    found = read(grid)
+    now = read(grid)
     inside = area(-16, -16, 32, -2)
-    assert np.allclose(resistance(found)[inside], 0.01, rtol=0.1)
-    assert (found.changed_ns[inside] >= NOW_NS + 3 * HOUR_NS).all()
-    assert (found.changed_ns[inside] <= NOW_NS + 4 * HOUR_NS).all()
+    assert np.allclose(resistance(now)[inside], 0.01, rtol=0.1)
+    assert (now.changed_ns[inside] >= NOW_NS + 3 * HOUR_NS).all()
+    assert (now.changed_ns[inside] <= NOW_NS + 4 * HOUR_NS).all()
 
 
-@pytest.mark.parametrize(
-    "days",
-    [
-        0,
-        1,
-    ],
-)
+@pytest.mark.parametrize("days", [0, 1])
 def test_a_change_stays_found_where_the_rest_of_its_block_is_driven_on(days):
     grid = Grid(1.0, FoldConfig())
     for hour, c_rr in [(0, OLD), (1, OLD), (2, OLD), (5, NEW)]:
@@ -180,7 +171,7 @@ def test_a_change_stays_found_where_the_rest_of_its_block_is_driven_on(days):
     assert np.allclose(resistance(read(grid))[area(1, 1, 8)], NEW, rtol=0.05)
 
 
-def test_late_samples_of_the_time_before_the_change_are_left_out_too():
+def test_late_samples_of_the_time_before_the_change_do_not_count_either():
     grid = repaved(-5, 4, 10)
     late = lane(0, -32, -32, 64, 64, c_rr=OLD)
     grid.fold(late, "b")
@@ -188,28 +179,15 @@ def test_late_samples_of_the_time_before_the_change_are_left_out_too():
 
 
 def test_bits_and_newest_stamp_are_those_of_the_evidence_that_holds():
-    found, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
+    now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
     outside = ~area(-5, 4, 10, 1)
-    assert np.bitwise_count(found.bitmaps[..., ev.VISITS])[inside].max() <= 5  # the minutes of the last pass
-    assert np.bitwise_count(found.bitmaps[..., ev.VISITS])[outside].min() >= PASSES - 1
-    assert (found.newest_ns >= NOW_NS + (PASSES - 1) * HOUR_NS).all()
-
-
-def test_without_first_pages_everything_is_summed():
-    grid = folded(random_samples(300, 1))
-    blocks = [(0, 0), (-1, -1), (40, 40)]
-    found = evidence(grid.pages(blocks))
-    assert np.array_equal(found.counts, grid.evidence(blocks).counts)
-    assert not found.changed_ns.any()
-    assert not found.counts[2].any()
-    assert found.counts.shape == (3, 256, ev.COUNTS)
-    assert found.bitmaps.shape == (3, 256, 2)
-    assert found.newest_ns.shape == found.changed_ns.shape == found.weight.shape == (3, 256)
+    assert np.bitwise_count(now.bitmaps[..., ev.VISITS])[inside].max() <= 5  # the minutes of the last pass
+    assert np.bitwise_count(now.bitmaps[..., ev.VISITS])[outside].min() >= PASSES - 1
+    assert (now.newest_ns >= NOW_NS + (PASSES - 1) * HOUR_NS).all()
 
 
 def test_no_blocks_and_blocks_without_pages_are_read():
     assert valid_pages({}, 1.0, CONFIG) == {}
-    assert evidence([]).counts.shape == (0, 256, ev.COUNTS)
     nothing = valid_pages({(0, 0): [], (5, -3): []}, 1.0, CONFIG)
     assert {block: first.any() for block, first in nothing.items()} == {(0, 0): False, (5, -3): False}
 
@@ -224,6 +202,6 @@ def test_blocks_far_apart_are_read_in_one_image():
 
 @pytest.mark.parametrize("reach", [0, 1, 3])
 def test_around_a_block_are_all_blocks_so_far(reach):
-    found = around((0, -1), reach)
-    assert len(found) == len(set(found)) == (2 * reach + 1) ** 2
-    assert {max(abs(x), abs(y + 1)) for x, y in found} == set(range(reach + 1))
+    blocks = around((0, -1), reach)
+    assert len(blocks) == len(set(blocks)) == (2 * reach + 1) ** 2
+    assert {max(abs(x), abs(y + 1)) for x, y in blocks} == set(range(reach + 1))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.pages import Page, merge, pack
-from mapserver.evidence.timeline import DAY_S, HOUR_S, PATIENCE, Ladder, rungs
+from mapserver.evidence.timeline import DAY_S, HOUR_S, PATIENCE, Timeline, tiers
 from mapserver.evidence.votes import FoldConfig
 from tests.unit.mapserver.data import same_page
 
@@ -26,32 +26,32 @@ def page(bucket: int, weight: int = 1, cells: tuple[int, ...] = (5,)) -> Page:
     return pack(counts, counts.any(axis=1), bitmaps, newest_ns)
 
 
-def ladder(buckets, **keeps: int) -> Ladder:
+def timeline(buckets, **keeps: int) -> Timeline:
     usual = {"keep_buckets": 2, "keep_hours": 2, "keep_days": 2}
-    found = Ladder(rungs(FoldConfig(**usual | keeps)))
+    line = Timeline(tiers(FoldConfig(**usual | keeps)))
     for bucket in buckets:
-        found.add(bucket, page(bucket))
-    return found
+        line.add(bucket, page(bucket))
+    return line
 
 
-def places(found: Ladder) -> list[tuple[int, int]]:
-    return [(rung, index) for rung, index, _ in found.items()]
+def places(line: Timeline) -> list[tuple[int, int]]:
+    return [(tier, index) for tier, index, _ in line.items()]
 
 
-def same(one: Ladder, other: Ladder) -> bool:
+def same(one: Timeline, other: Timeline) -> bool:
     a, b = list(one.items()), list(other.items())
     return places(one) == places(other) and all(same_page(p[2], q[2]) for p, q in zip(a, b, strict=True))
 
 
 def by_definition(buckets, keeps: tuple[int, int, int]) -> set[tuple[int, int]]:
     """Which pages there are: the newest of each length apart, what is older by the next length."""
-    found, left, spans = set(), set(buckets), (1, PER_HOUR, PER_DAY)
-    for rung, (keep, span) in enumerate(zip(keeps, spans, strict=True)):
+    kept, left, spans = set(), set(buckets), (1, PER_HOUR, PER_DAY)
+    for tier, (keep, span) in enumerate(zip(keeps, spans, strict=True)):
         index = {bucket: bucket // span for bucket in left}
         newest = set(sorted(set(index.values()))[-keep:])
-        found |= {(rung, i) for i in newest}
+        kept |= {(tier, i) for i in newest}
         left = {bucket for bucket in left if index[bucket] not in newest}
-    return found | ({(3, 0)} if left else set())
+    return kept | ({(3, 0)} if left else set())
 
 
 bucket = st.one_of(st.integers(0, 12 * PER_DAY), st.integers(0, 30)).map(lambda i: START + i)
@@ -60,13 +60,13 @@ keep = st.integers(1, 4)
 
 @settings(max_examples=150)
 @given(st.lists(bucket, min_size=1, max_size=40), keep, keep, keep, st.randoms(use_true_random=False))
-def test_any_order_of_buckets_gives_the_same_ladder(buckets, a, b, c, random):
+def test_any_order_of_buckets_gives_the_same_timeline(buckets, a, b, c, random):
     keeps = {"keep_buckets": a, "keep_hours": b, "keep_days": c}
     shuffled = buckets.copy()
     random.shuffle(shuffled)
-    found = ladder(buckets, **keeps)
-    assert same(found, ladder(shuffled, **keeps))
-    assert set(places(found)) == by_definition(buckets, (a, b, c))
+    line = timeline(buckets, **keeps)
+    assert same(line, timeline(shuffled, **keeps))
+    assert set(places(line)) == by_definition(buckets, (a, b, c))
 
 
 @settings(max_examples=100)
@@ -77,23 +77,23 @@ def test_any_order_of_buckets_gives_the_same_ladder(buckets, a, b, c, random):
 )
 def test_what_stays_apart_is_decided_cell_by_cell(driven, keeps, random):
     named = dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True))
-    found = Ladder(rungs(FoldConfig(**named)))
+    line = Timeline(tiers(FoldConfig(**named)))
     for bucket_, cells in driven:
-        found.add(bucket_, page(bucket_, cells=cells))
+        line.add(bucket_, page(bucket_, cells=cells))
     for cell in range(4):
-        of_cell = {(rung, index) for rung, index, one in found.items() if cell in one.cells["cell"]}
-        assert of_cell == by_definition([b for b, cells in driven if cell in cells], keeps)
-    again = Ladder(rungs(FoldConfig(**named)))
+        in_cell = {(tier, index) for tier, index, one in line.items() if cell in one.cells["cell"]}
+        assert in_cell == by_definition([b for b, cells in driven if cell in cells], keeps)
+    again = Timeline(tiers(FoldConfig(**named)))
     random.shuffle(driven)
     for bucket_, cells in driven:
         again.add(bucket_, page(bucket_, cells=cells))
-    assert same(found, again)
+    assert same(line, again)
 
 
 @settings(max_examples=60)
 @given(st.lists(st.tuples(bucket, st.booleans(), st.sets(st.integers(0, 3), min_size=1).map(tuple)), max_size=40))
 def test_reading_in_between_changes_nothing(driven):
-    read, unread = ladder([]), ladder([])
+    read, unread = timeline([]), timeline([])
     for bucket_, is_read, cells in driven:
         for one in (read, unread):
             one.add(bucket_, page(bucket_, cells=cells))
@@ -102,25 +102,25 @@ def test_reading_in_between_changes_nothing(driven):
     assert same(read, unread)
 
 
-def test_a_ladder_that_nobody_reads_does_not_grow():
-    found = ladder(START + 3 * i for i in range(1003))
-    assert all(len(pages) <= 2 + PATIENCE for pages in found._pages)
-    assert len(found._pages[0]) > 2, "it does not hand on with each page"
+def test_a_timeline_that_nobody_reads_does_not_grow():
+    line = timeline(START + 3 * i for i in range(1003))
+    assert all(len(pages) <= 2 + PATIENCE for pages in line._pages)
+    assert len(line._pages[0]) > 2, "it does not hand on with each page"
 
 
 @pytest.mark.parametrize("keeps", [(1, 2, 4), (4, 1, 2), (2, 4, 1)])
 def test_the_newest_of_each_length_stay_apart(keeps):
     buckets = [START + i * PER_HOUR // 2 for i in range(8 * 48)]
-    found = ladder(buckets, **dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True)))
-    assert [len([rung for rung, _ in places(found) if rung == k]) for k in range(4)] == [*keeps, 1]
-    assert set(places(found)) == by_definition(buckets, keeps)
+    line = timeline(buckets, **dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True)))
+    assert [len([tier for tier, _ in places(line) if tier == k]) for k in range(4)] == [*keeps, 1]
+    assert set(places(line)) == by_definition(buckets, keeps)
 
 
 @given(st.lists(bucket, min_size=1, max_size=30))
 def test_no_evidence_is_lost_or_doubled(buckets):
     counts, bitmaps = np.zeros(ev.COUNTS * ev.CELLS, np.uint64), np.zeros((ev.CELLS, 2), np.uint64)
     newest_ns = np.zeros(ev.CELLS, np.int64)
-    for timed in ladder(buckets).timed():
+    for timed in timeline(buckets).timed():
         timed.page.add_to(counts, bitmaps, newest_ns)
     assert counts.sum() == len(buckets)
     assert newest_ns.max() == max(buckets) * BUCKET_S * S + 7
@@ -129,25 +129,25 @@ def test_no_evidence_is_lost_or_doubled(buckets):
 def test_late_samples_go_where_their_bucket_was_summed():
     early = [START, START + 1, START + 2]
     later = [START + 5 * PER_DAY + i * PER_HOUR for i in range(6)]
-    found = ladder([*early, *later, *early, START + 1])
-    assert same(found, ladder(sorted([*early, *later, *early, START + 1])))
-    assert places(found)[-2:] == [(2, START // PER_DAY), (2, START // PER_DAY + 5)]
+    line = timeline([*early, *later, *early, START + 1])
+    assert same(line, timeline(sorted([*early, *later, *early, START + 1])))
+    assert places(line)[-2:] == [(2, START // PER_DAY), (2, START // PER_DAY + 5)]
 
 
-def test_a_late_bucket_does_not_push_out_a_newer_one():
-    found = ladder([START + 10, START + 11, START])
-    assert places(found) == [(0, START + 10), (0, START + 11), (1, START // PER_HOUR)]
+def test_a_late_bucket_does_not_replace_a_newer_one():
+    line = timeline([START + 10, START + 11, START])
+    assert places(line) == [(0, START + 10), (0, START + 11), (1, START // PER_HOUR)]
 
 
 def test_evidence_of_one_bucket_is_one_page():
-    assert places(ladder([START] * 5)) == [(0, START)]
+    assert places(timeline([START] * 5)) == [(0, START)]
 
 
 def test_what_was_taken_out_is_put_back_where_it_was():
-    one = ladder(START + np.arange(0, 3 * PER_DAY, 7))
-    again = Ladder(rungs(FoldConfig(keep_buckets=2, keep_hours=2, keep_days=2)))
-    for rung, index, found in one.items():
-        again.put(rung, index, found)
+    one = timeline(START + np.arange(0, 3 * PER_DAY, 7))
+    again = Timeline(tiers(FoldConfig(keep_buckets=2, keep_hours=2, keep_days=2)))
+    for tier, index, kept in one.items():
+        again.put(tier, index, kept)
     assert same(one, again)
     one.add(START + 3 * PER_DAY, page(START)), again.add(START + 3 * PER_DAY, page(START))
     assert same(one, again)
@@ -159,7 +159,7 @@ def test_what_was_taken_out_is_put_back_where_it_was():
 @settings(max_examples=60)
 @given(st.lists(bucket, min_size=1, max_size=40), keep, keep, keep)
 def test_pages_lie_in_their_spans_and_in_the_order_of_time(buckets, a, b, c):
-    timed = ladder(buckets, keep_buckets=a, keep_hours=b, keep_days=c).timed()
+    timed = timeline(buckets, keep_buckets=a, keep_hours=b, keep_days=c).timed()
     for one in timed:
         stamps = one.page.cells["newest_ns"]
         assert one.first_ns <= stamps.min()
@@ -171,7 +171,7 @@ def test_pages_lie_in_their_spans_and_in_the_order_of_time(buckets, a, b, c):
 @pytest.mark.parametrize("offset", [0, PER_HOUR - 1])
 def test_spans_are_whole_buckets_hours_and_days(offset):
     buckets = [START + offset + i * PER_HOUR for i in range(4 * 24)]
-    timed = ladder(buckets).timed()
+    timed = timeline(buckets).timed()
     lengths = [(one.end_ns - one.first_ns) // S for one in timed]
     assert lengths[1:] == [DAY_S, DAY_S, HOUR_S, HOUR_S, BUCKET_S, BUCKET_S]
     assert timed[0].first_ns == 0
@@ -184,22 +184,22 @@ def test_the_first_and_the_last_bucket_of_an_hour_are_of_that_hour():
     hour = START // PER_HOUR
     newer = [START + 100, START + 101]
     for bucket, index in ((START, hour), (START + PER_HOUR - 1, hour), (START + PER_HOUR, hour + 1)):
-        assert places(ladder([bucket, *newer]))[-1] == (1, index)
+        assert places(timeline([bucket, *newer]))[-1] == (1, index)
 
 
 def test_buckets_of_an_hour_are_not_cut_by_it():
     config = FoldConfig(bucket_s=3600.0, keep_buckets=1, keep_hours=1, keep_days=1)
-    found = Ladder(rungs(config))
+    line = Timeline(tiers(config))
     for bucket in range(500_000, 500_005):
-        found.add(bucket, page(bucket))
-    assert places(found) == [(0, 500_004), (1, 500_003), (2, 500_002 // 24)]
+        line.add(bucket, page(bucket))
+    assert places(line) == [(0, 500_004), (1, 500_003), (2, 500_002 // 24)]
 
 
-def test_a_sum_in_a_ladder_saturates():
-    found = Ladder(rungs(FoldConfig(keep_buckets=1)))
+def test_a_sum_in_a_timeline_saturates():
+    line = Timeline(tiers(FoldConfig(keep_buckets=1)))
     for _ in range(3):
-        found.add(START, page(START, ev.COUNT_MAX - 1))
-    (_, _, only), *more = found.items()
+        line.add(START, page(START, ev.COUNT_MAX - 1))
+    (_, _, only), *more = line.items()
     assert not more
     assert only.votes["count"].tolist() == [ev.COUNT_MAX]
     assert same_page(only, merge(page(START, ev.COUNT_MAX), page(START, ev.COUNT_MAX)))

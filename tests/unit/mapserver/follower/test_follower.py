@@ -1,62 +1,87 @@
-"""The keeper on a real writer and store: decisions fold machines out and in, changes are told, old rows move away."""
+"""The follower and its jobs on a real writer and store: machines are excluded, changes published, old rows archived."""
 
+import shutil
 import threading
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mapserver.config import KeepConfig, ServerConfig
+from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
-from mapserver.follower.follower import Keeper
+from mapserver.follower import follower
+from mapserver.follower.archiving import Archiving
+from mapserver.follower.audit import Audit
+from mapserver.follower.follower import Follower
+from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER
-from mapserver.trust.auditor import TrustConfig
-from protocol.errors import QueryError
+from mapserver.journal.reader import JournalReader
+from mapserver.trust.auditor import Auditor
+from protocol.errors import QueryError, StoreError
 from protocol.site.ground_classes import ZONES
-from tests.unit.mapserver.data import NOW_NS, SITE, incoming, now_ns, random_samples, same, samples, send, wait_for
+from tests.unit.mapserver.data import (
+    NOW_NS,
+    SITE,
+    folded,
+    incoming,
+    now_ns,
+    open_store,
+    random_samples,
+    same,
+    samples,
+    send,
+    wait_for,
+)
 
-QUICK: dict[str, Any] = {"turn_s": 0.01, "judge_s": 0.02, "archive_after_h": 0.0}
+JUDGE_S = 0.05
 HOUR_NS = 3600 * 10**9
 
 
 class Site:
-    """A writer with its keeper over a folder, and what was published."""
+    """A writer with its follower over a folder, and what was published."""
 
-    def __init__(self, folder, now=now_ns, **keep: Any) -> None:
-        self.told: list[dict[str, Any]] = []
-        self.config = ServerConfig(keep=KeepConfig(**(QUICK | keep)), trust=TrustConfig(min_cells=20))
-        self.writer = Writer(folder, SITE, self.config, now)
-        self.keeper = Keeper(self.writer, folder, SITE, self.config, self.told.append, now)
+    def __init__(self, folder: Path, judge_s: float = 60.0, *, exclude: bool = True) -> None:
+        self.published: list[dict[str, Any]] = []
+        self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0), trust=TrustConfig(judge_s, exclude))
+        self.writer = Writer(folder, SITE, self.config, now_ns)
+        self.follower = Follower(self.writer, folder, SITE, self.config, self.published.append, now_ns)
 
     @property
     def grid(self) -> Grid:
-        return self.writer.read(lambda store: store.grid)
+        return self.writer.run(lambda store: store.grid)
 
     def machine(self, name: str) -> dict[str, Any]:
-        return next(row for row in self.keeper.machines() if row["name"] == name)
+        return next(row for row in self.follower.machines() if row["name"] == name)
 
     def close(self) -> None:
-        self.keeper.close()
+        self.follower.close()
         self.writer.close()
 
 
 @pytest.fixture
-def opened(tmp_path):
-    sites: list[Site] = []
+def opened(tmp_path, monkeypatch):
+    monkeypatch.setattr(follower, "TURN_S", 0.01)
 
     @contextmanager
     def open_site(**options: Any):
-        sites.append(Site(tmp_path / "store", **options))
-        try:
-            yield sites[-1]
-        finally:
-            sites.pop().close()
+        with closing(Site(tmp_path / "store", **options)) as site:
+            yield site
 
-    yield open_site
-    for site in sites:
-        site.close()
+    return open_site
+
+
+@pytest.fixture
+def store(tmp_path):
+    """A writer without a follower, and a reader of its journal."""
+    folder = tmp_path / "store"
+    with (
+        closing(Writer(folder, SITE, ServerConfig(), now_ns)) as writer,
+        JournalReader(folder / JOURNAL_FILE) as reader,
+    ):
+        yield writer, reader
 
 
 def fleet(bad: dict[str, float], passes: int = 2, size: int = 48) -> dict[str, list[Any]]:
@@ -95,51 +120,51 @@ def fold_of(sent: dict[str, list[Any]], config: ServerConfig, without: str = "")
     return grid
 
 
-def test_a_distrusted_machine_is_folded_out_and_in_again_to_the_bit(opened):
-    sent = fleet({})
-    with opened(distrusts=False) as site:
+def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
+    sent = fleet({}, size=16)
+    with opened() as site:
         deliver(site, sent)
-        row = site.keeper.trust("b", False, "its scale is broken", 20.0)
+        row = site.follower.trust("b", False, "its scale is broken", 20.0)
         assert (row["trusted"], row["by"], row["reason"]) == (False, "person", "its scale is broken")
         assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert site.keeper.distrusted() == {"b"}
-        assert site.keeper.trust("b", True, "repaired", 20.0)["trusted"]
+        assert site.follower.excluded() == {"b"}
+        assert site.follower.trust("b", True, "repaired", 20.0)["trusted"]
         assert same(site.grid, fold_of(sent, site.config))
 
 
-def test_rows_of_a_distrusted_machine_are_kept_and_stay_out(opened):
-    sent = fleet({})
-    with opened(distrusts=False) as site:
+def test_rows_of_an_excluded_machine_are_kept_and_stay_out(opened):
+    sent = fleet({}, size=16)
+    with opened() as site:
         for name in sent:
             send(site.writer, [incoming(sent[name][0], 1, name)])
-        site.keeper.trust("b", False, "", 20.0)
+        site.follower.trust("b", False, "", 20.0)
         for name in sent:
             send(site.writer, [incoming(sent[name][1], 1 + len(sent[name][0]), name)])
         assert same(site.grid, fold_of(sent, site.config, without="b"))
         assert site.machine("b")["samples"] == sum(map(len, sent["b"]))
-        site.keeper.trust("b", True, "", 20.0)
+        site.follower.trust("b", True, "", 20.0)
         assert same(site.grid, fold_of(sent, site.config))
 
 
 @pytest.mark.parametrize("snapshot", [True, False])
 def test_a_decision_outlives_the_server(opened, tmp_path, snapshot):
-    sent = fleet({})
-    with opened(distrusts=False) as site:
+    sent = fleet({}, size=16)
+    with opened() as site:
         deliver(site, sent)
-        site.keeper.trust("b", False, "why", 20.0)
+        site.follower.trust("b", False, "why", 20.0)
     if not snapshot:
         for path in (tmp_path / "store").glob("snapshot-*"):
             path.unlink()
-    with opened(distrusts=False) as site:
+    with opened() as site:
         assert same(site.grid, fold_of(sent, site.config, without="b"))
         assert (site.machine("b")["trusted"], site.machine("b")["reason"]) == (False, "why")
 
 
-def test_a_machine_that_contradicts_all_others_is_found_and_left_out(opened):
+def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
-    with opened() as site:
+    with opened(judge_s=JUDGE_S) as site:
         deliver(site, sent)
-        wait_for(lambda: site.keeper.distrusted() == {"c"})
+        wait_for(lambda: site.follower.excluded() == {"c"})
         row = site.machine("c")
         assert (row["trusted"], row["by"]) == (False, "audit")
         assert "gain" in row["reason"]
@@ -148,33 +173,33 @@ def test_a_machine_that_contradicts_all_others_is_found_and_left_out(opened):
         assert all(site.machine(name)["trusted"] for name in "abd")
 
 
-def test_a_bad_machine_is_only_named_where_the_server_may_not_distrust(opened):
-    with opened(distrusts=False) as site:
+def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
+    with opened(judge_s=JUDGE_S, exclude=False) as site:
         deliver(site, fleet({"c": 1.6}))
         wait_for(lambda: site.machine("c")["contradicts"])
         never = threading.Event()
-        for _ in range(10):  # turns in which it could be left out
-            never.wait(QUICK["judge_s"])
-        assert site.keeper.distrusted() == frozenset()
+        for _ in range(4):  # turns in which it could be excluded
+            never.wait(JUDGE_S)
+        assert site.follower.excluded() == frozenset()
         assert site.machine("c")["trusted"]
         assert site.machine("c")["reasons"]
 
 
 def test_a_person_overrules_the_audit_and_hands_back(opened):
-    with opened() as site:
+    with opened(judge_s=JUDGE_S) as site:
         deliver(site, fleet({"c": 1.6}))
-        wait_for(lambda: site.keeper.distrusted() == {"c"})
-        assert site.keeper.trust("c", True, "I know better", 20.0)["by"] == "person"
-        assert site.keeper.distrusted() == frozenset()
-        assert not site.keeper.trust("c", None, "", 20.0)["trusted"]
-        assert site.keeper.distrusted() == {"c"}
+        wait_for(lambda: site.follower.excluded() == {"c"})
+        assert site.follower.trust("c", True, "I know better", 20.0)["by"] == "person"
+        assert site.follower.excluded() == frozenset()
+        assert not site.follower.trust("c", None, "", 20.0)["trusted"]
+        assert site.follower.excluded() == {"c"}
 
 
 def test_a_machine_that_sent_nothing_is_refused_by_name(opened):
     with opened() as site:
         send(site.writer, [incoming(samples(3), machine="a")])
         with pytest.raises(QueryError, match="`nobody` has sent nothing; known: a"):
-            site.keeper.trust("nobody", False, "", 1.0)
+            site.follower.trust("nobody", False, "", 1.0)
 
 
 def repaved(site: Site) -> None:
@@ -188,58 +213,104 @@ def repaved(site: Site) -> None:
         first += len(rows)
 
 
-def test_a_change_is_told_listed_and_remembered(opened):
+def test_a_change_is_published_listed_and_kept(opened):
     with opened() as site:
         repaved(site)
-        wait_for(lambda: site.told)
-        wait_for(lambda: site.keeper.changes() and site.keeper.changes()[0]["cells"] > 1000)
-        (change,) = site.keeper.changes()
-        assert site.told[-1] == change
+        wait_for(lambda: site.published)
+        wait_for(lambda: site.follower.changes() and site.follower.changes()[0]["cells"] > 1000)
+        (change,) = site.follower.changes()
+        assert site.published[-1] == change
         assert change["resistance_after"] == pytest.approx(0.02, rel=0.05)
     with opened() as site:
-        assert site.keeper.changes() == [change]
-        wait_for(lambda: not site.writer.read(lambda store: store.grid.take_touched(1)))
-        assert site.told == []
-        assert site.keeper.changes(after=change["id"]) == []
+        assert site.follower.changes() == [change]
+        wait_for(lambda: not site.writer.run(lambda store: store.grid.take_touched(1)))
+        assert site.published == []
+        assert site.follower.changes(after=change["id"]) == []
 
 
-@pytest.mark.parametrize("hours", [0.0, 1.0])
-def test_old_rows_move_to_the_archive_and_the_map_stays(opened, tmp_path, hours):
+# --- archiving -------------------------------------------------------------------------------------------------------
+
+
+def archiving(writer: Writer, reader: JournalReader, after_h: float, hours_later: float = 3.0) -> Archiving:
+    now = NOW_NS + round(hours_later * HOUR_NS)
+    return Archiving(writer, reader, SITE, after_h, lambda: now, threading.Event())
+
+
+@pytest.mark.parametrize("after_h", [0.0, 1.0, 4.0])
+def test_rows_that_are_old_enough_move_to_the_archive_and_the_map_stays(store, tmp_path, after_h):
+    writer, reader = store
     rows = random_samples(400, 3)
-    later = [NOW_NS]
-    with opened(now=lambda: later[0], archive_after_h=hours) as site:
-        for first in range(0, 400, 100):
-            send(site.writer, [incoming(rows[first : first + 100], first + 1)])
-        later[0] += 3 * HOUR_NS
-        send(site.writer, [incoming(samples(5), 401)])
-        site.keeper._due_s["archive"] = 0.0
-        if hours:
-            wait_for(lambda: site.writer.read(lambda store: store._journal.archived_row) == 4)
-        before = site.grid.state()
-        site.keeper.trust("a", False, "", 20.0)
-        site.keeper.trust("a", True, "", 20.0)  # folded from archive and journal
-        assert [p.page.votes.tobytes() for p in site.grid.state().pages] == [
-            p.page.votes.tobytes() for p in before.pages
-        ]
-    files = list((tmp_path / "store" / FOLDER).glob("*.parquet"))
-    assert bool(files) == bool(hours)
-    for path in (tmp_path / "store").glob("snapshot-*"):
-        path.unlink()
-    with opened(archive_after_h=hours) as site:
-        assert site.grid.state().folded == before.folded
+    for first in range(0, 400, 100):
+        send(writer, [incoming(rows[first : first + 100], first + 1)])
+    archiving(writer, reader, after_h).run()
+    assert reader.archived_row == (4 if after_h == 1.0 else 0)
+    assert bool(list((tmp_path / "store" / FOLDER).glob("*.parquet"))) == (after_h == 1.0)
+    shutil.copytree(tmp_path / "store", tmp_path / "copy")  # as a kill leaves it: without a snapshot
+    with closing(open_store(tmp_path / "copy")) as again:  # folded from archive and journal
+        assert same(again.grid, folded(rows))
+    assert same(writer.run(lambda store: store.grid), folded(rows))
+
+
+def test_where_nothing_was_old_enough_it_looks_again_only_later(store):
+    writer, reader = store
+    job = archiving(writer, reader, 1.0)
+    job.run()
+    send(writer, [incoming(samples(5))])
+    job.run()
+    assert reader.archived_row == 0, "it looked a moment ago"
 
 
 def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, caplog):
-    later = [NOW_NS]
-    with opened(now=lambda: later[0], archive_after_h=1.0) as site:
+    with opened() as site, JournalReader(tmp_path / "store" / JOURNAL_FILE) as reader:
         send(site.writer, [incoming(samples(5))])
-        later[0] += 3 * HOUR_NS
-        site.keeper._due_s["archive"] = 0.0
-        wait_for(lambda: site.writer.read(lambda store: store._journal.archived_row) == 1)
+        archiving(site.writer, reader, 1.0).run()
         (path,) = (tmp_path / "store" / FOLDER).glob("*.parquet")
         path.write_bytes(path.read_bytes()[:-50])
         with pytest.raises(QueryError, match="not folded again"):
-            site.keeper.trust("a", False, "", 0.5)
+            site.follower.trust("a", False, "", 0.5)
         assert path.name in caplog.text
+        assert caplog.text.count("job=exclusion") > 1, "it is tried again"
+        assert len(reader.events("trust")) == 1
         send(site.writer, [incoming(samples(5), 6)])
         assert site.grid.state().folded == 10
+
+
+# --- the audit -------------------------------------------------------------------------------------------------------
+
+
+def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(store, monkeypatch):
+    writer, reader = store
+    send(writer, [incoming(samples(5))])
+    reports: list[Any] = []
+
+    def report(*verdicts: Any) -> None:
+        reports.append(verdicts)
+
+    def damaged(*_: Any, **__: Any) -> Any:
+        raise StoreError("journal.db", "is damaged")
+
+    audit = Audit(writer, reader, Auditor(SITE.cell_m), 1e-9, report, lambda: False)
+    audit.run()
+    monkeypatch.setattr(reader, "read", damaged)
+    with pytest.raises(StoreError):
+        audit.run()
+    assert [(list(verdicts), stamp_ns) for verdicts, stamp_ns in reports] == [(["a"], NOW_NS + 4 * 10**9)] * 2
+
+
+@pytest.mark.parametrize(("judge_s", "times"), [(1e-9, 3), (60.0, 1)])
+def test_machines_are_judged_so_often(store, judge_s, times):
+    writer, reader = store
+    reports: list[Any] = []
+    audit = Audit(writer, reader, Auditor(SITE.cell_m), judge_s, lambda *report: reports.append(report), lambda: False)
+    for _ in range(3):
+        audit.run()
+    assert len(reports) == times
+
+
+def test_other_work_interrupts_the_audit_which_goes_on_where_it_was(store):
+    writer, reader = store
+    send(writer, [incoming(samples(5), machine=name) for name in "abc"])
+    audit = Audit(writer, reader, Auditor(SITE.cell_m), 1e-9, lambda *_: None, lambda: True)
+    for followed in ("a", "ab", "abc", "abc"):
+        audit.run()
+        assert sorted(audit.verdicts) == list(followed)

@@ -25,7 +25,7 @@ def signed(machine: str = "a", key: bytes = PRIVATE, under: str = "") -> Incomin
 
 
 def test_a_signed_batch_is_taken(store):
-    assert isinstance(store.take([signed()])[0], Ack)
+    assert isinstance(store.commit([signed()])[0], Ack)
     assert store.grid.state().folded == 3
 
 
@@ -41,7 +41,7 @@ def test_a_signed_batch_is_taken(store):
     ],
 )
 def test_any_other_is_refused_counted_and_leaves_no_trace(store, batch, problem):
-    (answer,) = store.take([batch])
+    (answer,) = store.commit([batch])
     assert answer.reason == "wrong_machine"
     assert problem in answer.problem
     assert store.counters["refused_wrong_machine"] == 1

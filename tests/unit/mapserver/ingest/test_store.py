@@ -26,8 +26,14 @@ from tests.unit.mapserver.data import (
 )
 
 
-def test_a_group_is_answered_in_order(tmp_path):
-    store = open_store(tmp_path)
+@pytest.fixture
+def store(tmp_path):
+    opened = open_store(tmp_path)
+    yield opened
+    opened.close()
+
+
+def test_a_group_is_answered_in_order(store):
     group = [
         incoming(samples(3), 1),
         incoming(samples(2), 9),
@@ -36,7 +42,7 @@ def test_a_group_is_answered_in_order(tmp_path):
         incoming(samples(5), 2),
         incoming(samples(0), 1),
     ]
-    answers = store.take(group)
+    answers = store.commit(group)
     assert answers[0] == Ack(3, 1)
     assert answers[1] == Refused(Refusal.GAP, answers[1].problem, expected=4)
     assert answers[2] == Ack(4, 2)
@@ -44,81 +50,69 @@ def test_a_group_is_answered_in_order(tmp_path):
     assert answers[4] == Ack(6, 3, trimmed=2)
     assert answers[5] == Ack(6, 3)
     assert (store.merged, store.journalled, store.grid.folded) == (3, 3, 10)
-    store.close()
 
 
-def test_a_refused_batch_leaves_no_trace(tmp_path):
-    store = open_store(tmp_path)
+def test_a_refused_batch_leaves_no_trace(store):
     bad = samples(3, speed_mps=[1.0, 1e6, 1.0])
-    answer = store.take([incoming(bad)])[0]
+    answer = store.commit([incoming(bad)])[0]
     assert answer == Refused(Refusal.OUT_OF_RANGE, "speed_mps[1]: 1e+06: not between -100 and 100", 0)
     assert store.journalled == store.grid.folded == 0
-    assert store.take([incoming(samples(3))])[0] == Ack(3, 1)
-    store.close()
+    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sent_at_least_once_is_merged_exactly_once(tmp_path, seed):
+def test_sent_at_least_once_is_merged_exactly_once(store, seed):
     rows, draw = random_samples(120, seed), np.random.default_rng(seed)
-    store = open_store(tmp_path)
     watermark = 0
     while watermark < len(rows):
         first = max(1, watermark + 1 - int(draw.integers(0, 15)))
         group = [incoming(rows[first - 1 : first - 1 + n], first) for n in draw.integers(1, 30, 3).tolist()]
-        answers = store.take(group)
+        answers = store.commit(group)
         watermark = max([watermark, *(a.watermark for a in answers if isinstance(a, Ack))])
     assert same(store.grid, folded(rows))
     assert store.counters["samples_trimmed"] > 0
-    store.close()
 
 
-def test_a_failed_commit_refuses_all_and_folds_nothing(tmp_path, monkeypatch):
-    store = open_store(tmp_path)
-    store.take([incoming(samples(2))])
+def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
+    store.commit([incoming(samples(2))])
 
     def full():
         raise sqlite3.OperationalError("database or disk is full")
 
     with monkeypatch.context() as patched:
-        patched.setattr(store._journal, "commit", full)
-        answers = store.take([incoming(samples(3), 3), incoming(samples(4), machine="b"), Incoming("a", b"?")])
+        patched.setattr(store.journal, "commit", full)
+        answers = store.commit([incoming(samples(3), 3), incoming(samples(4), machine="b"), Incoming("a", b"?")])
     assert [(a.reason, a.problem) for a in answers] == [
         (Refusal.STORE, "the server cannot write: database or disk is full")
     ] * 3
     assert (store.grid.folded, store.merged, store.journalled) == (2, 1, 1)
     assert store.counters == {"batches": 1, "samples_trimmed": 0, "samples_lost": 0, "refused_store": 3}
-    again = store.take([incoming(samples(3), 3), incoming(samples(4), machine="b")])
+    again = store.commit([incoming(samples(3), 3), incoming(samples(4), machine="b")])
     assert [(a.watermark, a.trimmed) for a in again] == [(5, 0), (4, 0)]
     assert store.grid.folded == 9
     assert store.info()["machines"]["b"] == {"spools": 1, "samples": 4, "lost": 0, "newest_ns": NOW_NS + 3 * 10**9}
-    store.close()
 
 
 @pytest.mark.parametrize("method", ["begin", "append"])
-def test_a_journal_that_cannot_be_written_refuses(tmp_path, monkeypatch, method):
-    store = open_store(tmp_path)
+def test_a_journal_that_cannot_be_written_refuses(store, monkeypatch, method):
 
     def locked(*_):
         raise sqlite3.OperationalError("database is locked")
 
     with monkeypatch.context() as patched:
-        patched.setattr(store._journal, method, locked)
-        assert store.take([incoming(samples(3))])[0].reason == Refusal.STORE
-    assert store.take([incoming(samples(3))])[0] == Ack(3, 1)
-    store.close()
+        patched.setattr(store.journal, method, locked)
+        assert store.commit([incoming(samples(3))])[0].reason == Refusal.STORE
+    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1)
 
 
-def test_losses_and_repeats_are_counted(tmp_path):
-    store = open_store(tmp_path)
-    store.take([incoming(samples(3)), incoming(samples(2), 2), incoming(samples(1), 10, lost_before=6)])
+def test_losses_and_repeats_are_counted(store):
+    store.commit([incoming(samples(3)), incoming(samples(2), 2), incoming(samples(1), 10, lost_before=6)])
     assert store.counters == {"batches": 2, "samples_trimmed": 2, "samples_lost": 6}
     assert store.info()["machines"] == {"a": {"spools": 1, "samples": 4, "lost": 6, "newest_ns": NOW_NS + 2 * 10**9}}
-    store.close()
 
 
-def test_info_tells_the_state_in_plain_values(tmp_path):
-    store = open_store(tmp_path)
-    store.take([
+def test_info_tells_the_state_in_plain_values(store):
+    store.commit([
         incoming(samples(3)),
         incoming(samples(2), spool_id=8),
         incoming(samples(2, cov_xx_m2=10.0, x_m=900.0, stamp_ns=NOW_NS + 10**12), machine="b"),
@@ -133,12 +127,11 @@ def test_info_tells_the_state_in_plain_values(tmp_path):
     assert info["bounds"] == (0, 0, 16, 16)
     assert info["stamp_ns"] == NOW_NS + 10**12
     assert info["machines"]["a"] == {"spools": 2, "samples": 5, "lost": 0, "newest_ns": NOW_NS + 2 * 10**9}
-    store.close()
 
 
 def test_now_is_the_newest_accepted_stamp_also_after_a_restart(tmp_path):
     store = open_store(tmp_path)
-    store.take([incoming(samples(2, stamp_ns=[500, 300])), incoming(samples(1, stamp_ns=400), machine="b")])
+    store.commit([incoming(samples(2, stamp_ns=[500, 300])), incoming(samples(1, stamp_ns=400), machine="b")])
     assert store.newest_ns == 500
     store.close()
     store = open_store(tmp_path)
@@ -148,10 +141,10 @@ def test_now_is_the_newest_accepted_stamp_also_after_a_restart(tmp_path):
 
 def test_a_restart_goes_on_where_it_ended(tmp_path):
     store = open_store(tmp_path)
-    store.take([incoming(samples(3)), incoming(samples(1), machine="b")])
+    store.commit([incoming(samples(3)), incoming(samples(1), machine="b")])
     store.close()
     store = open_store(tmp_path)
-    assert store.take([incoming(samples(5))])[0] == Ack(5, 3, trimmed=3)
+    assert store.commit([incoming(samples(5))])[0] == Ack(5, 3, trimmed=3)
     assert store.grid.folded == 6
     store.close()
 
@@ -174,7 +167,7 @@ def test_a_store_that_cannot_be_opened_is_let_go(tmp_path):
 
 def test_a_damaged_journal_is_named_at_the_start(tmp_path):
     store = open_store(tmp_path)
-    store.take([incoming(samples(3))])
+    store.commit([incoming(samples(3))])
     store.close()
     db = sqlite3.connect(tmp_path / "journal.db")
     db.execute("UPDATE journal SET crc32 = crc32 + 1")
@@ -186,57 +179,56 @@ def test_a_damaged_journal_is_named_at_the_start(tmp_path):
 
 def test_a_grid_adopted_while_a_snapshot_is_written_gets_one_of_its_own(tmp_path):
     store = open_store(tmp_path)
-    store.take([incoming(samples(3)), incoming(samples(3), machine="b")])
+    store.commit([incoming(samples(3)), incoming(samples(3), machine="b")])
     write = store.snapshot()
     store.adopt(folded(samples(3)), store.merged, frozenset({"b"}))
     write()
     store.save_snapshot()
-    found = snapshot.load_newest(tmp_path, store.merged, SITE.cell_m, store.config.fold, {"b"})
+    row, _ = snapshot.load_newest(tmp_path, store.merged, SITE.cell_m, store.config.fold, {"b"})
     store.close()
-    assert found[0] == 2
+    assert row == 2
 
 
 @pytest.mark.parametrize("row", [0, 1])
-def test_an_adopted_grid_takes_what_came_since_without_those_left_out(tmp_path, row):
-    store = open_store(tmp_path)
-    store.take([incoming(samples(3)), incoming(samples(3), machine="b"), incoming(samples(5), 4)])
+def test_an_adopted_grid_gets_what_came_since_without_those_excluded(store, row):
+    store.commit([incoming(samples(3)), incoming(samples(3), machine="b"), incoming(samples(5), 4)])
     store.adopt(folded(samples(3 * row)), row, frozenset({"b"}))
     expected = folded(samples(3))
     expected.fold(samples(5), "a")
     assert same(store.grid, expected)
-    store.take([incoming(samples(1), 4, machine="b"), incoming(samples(2), 9)])
+    store.commit([incoming(samples(1), 4, machine="b"), incoming(samples(2), 9)])
     expected.fold(samples(2), "a")
     assert same(store.grid, expected)
     assert (store.merged, store.journalled) == (5, 5)
-    store.close()
 
 
 # --- kill and replay -------------------------------------------------------------------------------------------------
 
-# Takes batches of 20 samples; in the fold of number `stuck`, half of it lies in the hot blocks, and nothing goes on.
+# Takes batches of 20 samples; in the fold of number `stuck`, half of it lies in the open blocks, and nothing goes on.
 TAKES = """
 import signal
 import sys
 from pathlib import Path
 import numpy as np
+from mapserver.evidence import grid
 from tests.unit.mapserver.data import incoming, open_store
 
 folder, stuck, saved = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 store = open_store(folder / "store")
-kernel = store.grid._kernel
+fold = grid.fold
 
-def half(rows, machine, cell_m, config, hot):
+def half(rows, *rest):
     if store.merged < stuck - 1:
-        return kernel(rows, machine, cell_m, config, hot)
-    kernel(rows[: len(rows) // 2], machine, cell_m, config, hot)
+        return fold(rows, *rest)
+    fold(rows[: len(rows) // 2], *rest)
     print("folding", flush=True)
     signal.pause()
 
-store.grid._kernel = half
+grid.fold = half
 for i, part in enumerate(np.split(np.load(folder / "rows.npy"), 10)):
     if i == saved:
         store.save_snapshot()
-    store.take([incoming(part, 1 + 20 * i)])
+    store.commit([incoming(part, 1 + 20 * i)])
     print("taken", i + 1, flush=True)
 """
 
@@ -260,8 +252,8 @@ def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, sa
     np.save(tmp_path / "rows.npy", rows)
     with taking(tmp_path, stuck, saved) as child:
         lines = iter(child.stdout.readline, "")
-        heard = list(iter(lambda: next(lines), "folding\n"))
-        assert heard == [f"taken {i + 1}\n" for i in range(stuck - 1)]
+        printed = list(iter(lambda: next(lines), "folding\n"))
+        assert printed == [f"taken {i + 1}\n" for i in range(stuck - 1)]
         with pytest.raises(StoreError, match="another server"):
             open_store(tmp_path / "store")
         child.send_signal(signal.SIGKILL)
@@ -270,7 +262,7 @@ def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, sa
     assert store.snapshot_row == (saved if saved < stuck else 0)
     assert (store.merged, store.journalled) == (stuck, stuck)  # committed, though never acknowledged
     assert same(store.grid, folded(rows[: 20 * stuck]))
-    answers = store.take([incoming(part, 1 + 20 * i) for i, part in enumerate(np.split(rows, 10))])
+    answers = store.commit([incoming(part, 1 + 20 * i) for i, part in enumerate(np.split(rows, 10))])
     assert [answer.trimmed for answer in answers] == [20] * stuck + [0] * (10 - stuck)
     assert same(store.grid, folded(rows))
     store.close()
@@ -282,7 +274,7 @@ def test_a_replay_of_any_part_of_the_journal_after_a_snapshot_gives_the_same_bit
     rows["stamp_ns"] += np.arange(100) % 9 * 10**9 * 40_000
     store = open_store(tmp_path / "store")
     for i, part in enumerate(np.split(rows, parts * 4)):
-        store.take([incoming(part, 1 + i * len(part))])
+        store.commit([incoming(part, 1 + i * len(part))])
         if i == parts:
             store.save_snapshot()
     shutil.copytree(tmp_path / "store", tmp_path / "copy")  # as a kill leaves it
@@ -295,8 +287,8 @@ def test_a_replay_of_any_part_of_the_journal_after_a_snapshot_gives_the_same_bit
 
 def test_samples_at_the_end_of_a_spool_are_declared_lost_without_a_row(tmp_path):
     store = open_store(tmp_path)
-    store.take([incoming(samples(3))])
-    (answer,) = store.take([incoming(samples(0), 8, lost_before=4)])
+    store.commit([incoming(samples(3))])
+    (answer,) = store.commit([incoming(samples(0), 8, lost_before=4)])
     assert (answer.watermark, answer.row) == (7, 1)
     assert store.counters["samples_lost"] == 4
     store.close()

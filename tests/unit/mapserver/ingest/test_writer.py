@@ -9,8 +9,9 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
-from mapserver.ingest.store import Store
-from mapserver.ingest.writer import Writer
+from mapserver.ingest import writer as writer_module
+from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.writer import GROUP_BATCHES, QUEUE_BATCHES, Writer
 from mapserver.journal.journal import Journal
 from mapserver.query.answers import Answers
 from protocol.errors import QueryError, Refusal
@@ -34,20 +35,21 @@ from tests.unit.mapserver.data import (
     send,
     wait_for,
 )
+from tests.unit.mapserver.query.fake_follower import FakeFollower
 
 
 @pytest.fixture
-def start(tmp_path):
+def start(tmp_path, monkeypatch):
     writers = []
 
-    def open_writer(site=SITE, **options: Any) -> Writer:
+    def open_writer(site=SITE, snapshot_rows: int = 2000, **options: Any) -> Writer:
+        monkeypatch.setattr(writer_module, "SNAPSHOT_ROWS", snapshot_rows)
         writers.append(Writer(tmp_path, site, ServerConfig(store=StoreConfig(**options)), now_ns))
         return writers[-1]
 
     yield open_writer
     for writer in writers:
-        if writer._thread.is_alive():
-            writer.close()
+        writer.close()
 
 
 def spied(monkeypatch, method: str) -> list[str]:
@@ -72,7 +74,7 @@ def test_batches_are_acknowledged_in_order_and_merged(start):
     parts = np.split(random_samples(200, 9), 20)
     answers = send(writer, [incoming(part, 1 + 10 * i) for i, part in enumerate(parts)])
     assert answers == [Ack(10 * (i + 1), i + 1) for i in range(20)]
-    assert same(writer.read(lambda store: store.grid), folded(np.concatenate(parts)))
+    assert same(writer.run(lambda store: store.grid), folded(np.concatenate(parts)))
 
 
 def test_acknowledged_only_after_the_commit(start, monkeypatch):
@@ -89,20 +91,20 @@ def test_acknowledged_only_after_the_commit(start, monkeypatch):
     assert events.count("commit") <= 2
 
 
-@pytest.mark.parametrize(("group_batches", "commits"), [(1, 6), (4, 2), (64, 1)])
-def test_what_waits_is_committed_in_groups(start, monkeypatch, group_batches, commits):
+@pytest.mark.parametrize(("waiting", "commits"), [(6, 1), (GROUP_BATCHES, 1), (GROUP_BATCHES + 1, 2)])
+def test_what_waits_is_committed_in_groups(start, monkeypatch, waiting, commits):
     events = spied(monkeypatch, "commit")
-    writer, replies = start(group_batches=group_batches), Replies()
+    writer, replies = start(), Replies()
     with held(writer):
-        for i in range(6):
+        for i in range(waiting):
             writer.submit(incoming(samples(1), i + 1), replies[i])
-    assert [a.watermark for a in replies.wait(6)] == [1, 2, 3, 4, 5, 6]
+    assert [a.watermark for a in replies.wait(waiting)] == list(range(1, waiting + 1))
     assert len(events) == commits
 
 
 def test_a_failed_commit_refuses_all_and_later_batches_work(start, monkeypatch):
     writer, replies = start(), Replies()
-    journal = writer.read(lambda store: store._journal)
+    journal = writer.run(lambda store: store.journal)
 
     def full():
         raise sqlite3.OperationalError("database or disk is full")
@@ -120,24 +122,23 @@ def test_a_failed_commit_refuses_all_and_later_batches_work(start, monkeypatch):
     assert not writer.failed
 
 
-@pytest.mark.parametrize("queue_batches", [1, 3])
-def test_a_full_queue_refuses_at_once_and_is_counted(start, queue_batches):
-    writer, waiting, refused = start(queue_batches=queue_batches), Replies(), Replies()
+def test_a_full_queue_refuses_at_once_and_is_counted(start):
+    writer, waiting, refused = start(), Replies(), Replies()
     with held(writer):
-        for i in range(queue_batches):
+        for i in range(QUEUE_BATCHES):
             writer.submit(incoming(samples(1), i + 1), waiting[i])
         for i in range(2):
-            writer.submit(incoming(samples(1), queue_batches + 1), refused[i])
+            writer.submit(incoming(samples(1), QUEUE_BATCHES + 1), refused[i])
         assert [a.reason for _, a in refused.all] == [Refusal.OVERLOADED] * 2
-    waiting.wait(queue_batches)
+    waiting.wait(QUEUE_BATCHES)
     assert writer.info()["counters"]["refused_overloaded"] == 2
-    assert writer.info()["samples_merged"] == queue_batches
-    answers = send(writer, [incoming(samples(1), queue_batches + 1)])
+    assert writer.info()["samples_merged"] == QUEUE_BATCHES
+    answers = send(writer, [incoming(samples(1), QUEUE_BATCHES + 1)])
     assert isinstance(answers[0], Ack)  # room again
 
 
 def test_closing_finishes_what_is_waiting(start, tmp_path):
-    writer, replies = start(group_batches=2), Replies()
+    writer, replies = start(), Replies()
     with held(writer):
         for i in range(7):
             writer.submit(incoming(samples(1), i + 1), replies[i])
@@ -150,25 +151,25 @@ def test_closing_finishes_what_is_waiting(start, tmp_path):
     assert again.info()["snapshot"] == again.info()["merged"] == 7
 
 
-# --- reads -----------------------------------------------------------------------------------------------------------
+# --- work of other threads -------------------------------------------------------------------------------------------
 
 
-def test_a_reader_gets_the_error_that_its_work_raised(start):
+def test_a_thread_gets_the_error_that_its_work_raised(start):
     writer = start()
     with pytest.raises(ZeroDivisionError):
-        writer.read(lambda _: 1 // 0)
+        writer.run(lambda _: 1 // 0)
     assert not writer.failed
 
 
-def test_reads_run_on_the_owners_thread(start):
-    assert start().read(lambda _: threading.current_thread().name) == "writer"
+def test_work_runs_on_the_owners_thread(start):
+    assert start().run(lambda _: threading.current_thread().name) == "writer"
 
 
-def test_reads_between_batches_are_answered_and_see_those_before(start):
+def test_work_between_batches_is_done_and_sees_those_before(start):
     writer, replies, seen = start(), Replies(), []
     with held(writer):
         writer.submit(incoming(samples(2)), replies[0])
-        reader = threading.Thread(target=lambda: seen.append(writer.read(lambda store: store.grid.folded)))
+        reader = threading.Thread(target=lambda: seen.append(writer.run(lambda store: store.grid.folded)))
         reader.start()
         wait_for(lambda: writer._batches.qsize() == 2)
         writer.submit(incoming(samples(2), 3), replies[1])
@@ -285,7 +286,7 @@ def test_a_snapshot_that_fails_is_tried_again_only_when_due(start, tmp_path, mon
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_bug_in_the_snapshot_is_told(start, monkeypatch, caplog):
+def test_a_bug_in_the_snapshot_is_logged(start, monkeypatch, caplog):
     monkeypatch.setattr(snapshot, "save", lambda *_: 1 // 0)
     writer = start(snapshot_rows=1)
     send(writer, [incoming(samples(1))])
@@ -297,8 +298,8 @@ def test_a_bug_in_the_snapshot_is_told(start, monkeypatch, caplog):
 # --- the end of the thread -------------------------------------------------------------------------------------------
 
 
-def test_a_bug_in_the_writer_is_told_and_leaves_nobody_waiting(start, monkeypatch):
-    writer = start(queue_batches=2)
+def test_a_bug_in_the_writer_shows_and_leaves_nobody_waiting(start, monkeypatch):
+    writer = start()
     assert not writer.failed
     monkeypatch.setattr(Store, "_fold", lambda *_: 1 // 0)
     with held(writer):
@@ -309,7 +310,6 @@ def test_a_bug_in_the_writer_is_told_and_leaves_nobody_waiting(start, monkeypatc
     with pytest.raises(QueryError, match="restart the server"):
         writer.info()
     writer.close()
-    assert not writer._thread.is_alive()
 
 
 def test_closing_after_a_bug_in_the_last_group_ends(start, monkeypatch):
@@ -404,9 +404,9 @@ QUERIES = [
 
 
 @pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
-def test_a_refused_query_says_why(start, reason, name, parameters):
+def test_a_refused_query_says_why(start, tmp_path, reason, name, parameters):
     with pytest.raises(QueryError) as caught:
-        Answers(start(), SITE, CONFIG).answer(name, parameters)
+        Answers(start(), FakeFollower(), SITE, CONFIG, tmp_path / JOURNAL_FILE).answer(name, parameters)
     assert caught.value.reason == reason
 
 

@@ -1,5 +1,6 @@
 import os
 import signal
+import sqlite3
 import stat
 import subprocess
 import sys
@@ -14,11 +15,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapserver.ingest.admission import Admission
 from mapserver.journal import archive as ar
-from mapserver.journal.archive import HOUR_NS, Archive, ArchiveFile, archive, next_file
-from mapserver.journal.journal import Journal, JournalReader
-from mapserver.journal.rows import ALL, JournalRow, Wanted
+from mapserver.journal import archive_file, archive_writer
+from mapserver.journal.archive import Archive, archive, next_file
+from mapserver.journal.archive_file import ArchiveFile
+from mapserver.journal.archive_writer import HOUR_NS
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import ALL, Admission, JournalRow, Selection, checksum
+from protocol import files
 from protocol.errors import ConfigError, StoreError
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
@@ -50,10 +55,12 @@ class Machines:
         made = archive(self.folder, self.reader, SITE, before_ns, forget or self.journal.forget)
         return [path.name for path in made]
 
-    def both(self, wanted: Wanted = ALL) -> list[tuple]:
+    def both(self, selection: Selection = ALL) -> list[tuple]:
         """All rows, from archive and journal."""
         archived = self.journal.archived_row
-        return plain([*Archive(self.folder).read(0, archived, wanted), *self.reader.read(archived, wanted=wanted)])
+        return plain(
+            [*Archive(self.folder).read(0, archived, selection), *self.reader.read(archived, selection=selection)]
+        )
 
     def close(self) -> None:
         self.reader.close()
@@ -116,7 +123,7 @@ def test_files_are_contiguous_where_the_clock_steps_back(tmp_path):
 
 def test_a_full_hour_is_cut_and_row_groups_never_cut_a_batch(tmp_path, monkeypatch):
     monkeypatch.setattr(ar, "FILE_SAMPLES", 12)
-    monkeypatch.setattr(ar, "GROUP_SAMPLES", 6)
+    monkeypatch.setattr(archive_writer, "GROUP_SAMPLES", 6)
     with opened(tmp_path) as machines:
         for _ in range(7):
             machines.send(4, NOW_NS)
@@ -168,7 +175,7 @@ def test_without_pyarrow_the_error_says_what_to_install(day, monkeypatch):
     def missing(name: str) -> None:
         raise ModuleNotFoundError(name)
 
-    monkeypatch.setattr(ar, "import_module", missing)
+    monkeypatch.setattr(archive_file, "import_module", missing)
     with pytest.raises(ConfigError, match=r"pyarrow is not installed: pip install 'sitegrid\[archive\]'"):
         day.archive()
     assert day.journal.archived_row == 0
@@ -179,7 +186,7 @@ def test_a_full_disk_leaves_the_journal_as_it_was(day, monkeypatch):
         raise OSError(28, "No space left on device")
 
     before = day.both()
-    monkeypatch.setattr(ar.os, "fsync", full)
+    monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(StoreError, match=r"cannot be written.*No space"):
         day.archive()
     monkeypatch.undo()
@@ -190,21 +197,21 @@ def test_a_full_disk_leaves_the_journal_as_it_was(day, monkeypatch):
 
 PLACE = Bounds(-20.0, -20.0, 10.0, 15.0)
 FILTERS = [
-    Wanted(from_ns=NOW_NS + 900 * 10**9),
-    Wanted(to_ns=NOW_NS + 200 * 10**9),
-    Wanted(bounds=PLACE),
-    Wanted(bounds=Bounds(59.0, 59.0, 60.0, 60.0)),
-    Wanted(without=frozenset({"a"})),
-    Wanted(without=frozenset({"a", "b", "c"})),
-    Wanted(to_ns=NOW_NS + 600 * 10**9, bounds=PLACE, without=frozenset({"b"})),
+    Selection(from_ns=NOW_NS + 900 * 10**9),
+    Selection(to_ns=NOW_NS + 200 * 10**9),
+    Selection(bounds=PLACE),
+    Selection(bounds=Bounds(59.0, 59.0, 60.0, 60.0)),
+    Selection(without=frozenset({"a"})),
+    Selection(without=frozenset({"a", "b", "c"})),
+    Selection(to_ns=NOW_NS + 600 * 10**9, bounds=PLACE, without=frozenset({"b"})),
 ]
 
 
-@pytest.mark.parametrize("wanted", FILTERS)
-def test_filters_choose_the_same_rows_in_journal_and_archive(day, wanted):
-    before = day.both(wanted)
+@pytest.mark.parametrize("selection", FILTERS)
+def test_filters_choose_the_same_rows_in_journal_and_archive(day, selection):
+    before = day.both(selection)
     day.archive(NOW_NS + 2 * HOUR_NS)
-    assert day.both(wanted) == before
+    assert day.both(selection) == before
 
 
 @pytest.mark.parametrize(("after", "until"), [(0, 7), (1, 7), (3, 6), (2, 5), (6, 7), (7, 7), (0, 0)])
@@ -215,7 +222,7 @@ def test_any_span_of_rows_is_read(day, after, until):
 
 
 def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
-    monkeypatch.setattr(ar, "GROUP_SAMPLES", 1)
+    monkeypatch.setattr(archive_writer, "GROUP_SAMPLES", 1)
     with opened(tmp_path) as machines:
         for i in range(4):
             rows = samples(3, x_m=10.0 * i, stamp_ns=NOW_NS + i)
@@ -224,23 +231,24 @@ def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
             machines.journal.commit()
         machines.archive()
         decoded: list[int] = []
-        real = ar._batches
-        monkeypatch.setattr(ar, "_batches", lambda table, *rest: decoded.append(1) or real(table, *rest))
+        real = archive_file._batches
+        monkeypatch.setattr(archive_file, "_batches", lambda table, *rest: decoded.append(1) or real(table, *rest))
         checked: list[Path] = []
-        whole = ar._checked
-        monkeypatch.setattr(ar, "_checked", lambda path: checked.append(path) or whole(path))
-        for wanted, groups, files in (
+        whole = archive_file._checked
+        monkeypatch.setattr(archive_file, "_checked", lambda path: checked.append(path) or whole(path))
+        for selection, groups, files in (
             (ALL, 4, 2),
-            (Wanted(bounds=Bounds(9, 0, 11, 20)), 1, 1),
-            (Wanted(to_ns=NOW_NS + 2), 3, 2),
-            (Wanted(from_ns=NOW_NS + 4), 0, 0),
-            (Wanted(without=frozenset({"a"})), 0, 0),
+            (Selection(bounds=Bounds(9, 0, 11, 20)), 1, 1),
+            (Selection(to_ns=NOW_NS + 2), 3, 2),
+            (Selection(from_ns=NOW_NS + 4), 0, 0),
+            (Selection(without=frozenset({"a"})), 0, 0),
         ):
             decoded.clear(), checked.clear()
-            list(Archive(machines.folder).read(0, 4, wanted))
-            assert (len(decoded), len(checked)) == (groups, files), wanted
+            list(Archive(machines.folder).read(0, 4, selection))
+            assert (len(decoded), len(checked)) == (groups, files), selection
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(data=st.data())
 def test_rows_come_back_whatever_the_cuts(data):
@@ -248,7 +256,7 @@ def test_rows_come_back_whatever_the_cuts(data):
     sized = pytest.MonkeyPatch.context()
     with tempfile.TemporaryDirectory() as folder, opened(Path(folder)) as machines, sized as patch:
         patch.setattr(ar, "FILE_SAMPLES", data.draw(st.integers(1, 30)))
-        patch.setattr(ar, "GROUP_SAMPLES", data.draw(st.integers(1, 30)))
+        patch.setattr(archive_writer, "GROUP_SAMPLES", data.draw(st.integers(1, 30)))
         now_ns, before = NOW_NS, []
         for i, step in enumerate(data.draw(st.lists(st.integers(0, 6), min_size=1, max_size=8))):
             now_ns += step * HOUR_NS // 4
@@ -257,11 +265,11 @@ def test_rows_come_back_whatever_the_cuts(data):
             if data.draw(st.booleans()):
                 machines.archive(now_ns - data.draw(st.integers(0, 4)) * HOUR_NS // 2)
                 assert machines.both() == before
-        for wanted in FILTERS:
-            chosen = machines.both(wanted)
+        for selection in FILTERS:
+            chosen = machines.both(selection)
             assert [row for row in before if row in chosen] == chosen
             machines.archive()
-            assert machines.both(wanted) == chosen
+            assert machines.both(selection) == chosen
         assert machines.both() == before
 
 
@@ -301,7 +309,7 @@ def test_damaged_statistics_do_not_hide_rows(file, day):
     data[-60] ^= 1
     path.write_bytes(data)
     with pytest.raises(StoreError, match="is damaged"):
-        list(Archive(day.folder).read(0, 7, Wanted(from_ns=FUTURE)))
+        list(Archive(day.folder).read(0, 7, Selection(from_ns=FUTURE)))
 
 
 def test_a_parquet_file_of_somebody_else_is_refused(tmp_path):
@@ -318,10 +326,10 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
         ArchiveFile(tmp_path / "nothing.parquet")
 
 
-def test_a_file_of_a_newer_schema_is_refused(day, monkeypatch):
-    monkeypatch.setattr(ar, "asdict", lambda header: asdict(header) | {"schema": 2})
-    path = ar._write(day.folder, SITE, day.reader.read())
-    with pytest.raises(StoreError, match="has schema 2, known is 1"):
+def test_a_file_of_another_schema_is_refused(day, monkeypatch):
+    monkeypatch.setattr(archive_writer, "asdict", lambda header: asdict(header) | {"schema": 2})
+    path = archive_writer.write_file(day.folder, SITE, day.reader.read())
+    with pytest.raises(StoreError, match="has schema 2, this version knows 1"):
         ArchiveFile(path)
 
 
@@ -346,18 +354,11 @@ def test_a_missing_file_is_an_error(day):
 
 def test_two_files_with_the_same_row_are_an_error(day):
     names = day.archive()
-    ar._write(day.folder, SITE, iter([row for row in ArchiveFile(day.folder / names[0]).read() if row.row == 3]))
+    archive_writer.write_file(
+        day.folder, SITE, iter([row for row in ArchiveFile(day.folder / names[0]).read() if row.row == 3])
+    )
     with pytest.raises(StoreError, match="row 3 is also in another file"):
         list(Archive(day.folder).read(0, 7))
-
-
-def test_a_column_that_an_older_file_lacks_reads_as_nan(day, monkeypatch):
-    monkeypatch.setattr(ar, "COLUMNS", tuple(name for name in ar.COLUMNS if name != "grade_var"))
-    path = ar._write(day.folder, SITE, day.reader.read(until=3))
-    monkeypatch.undo()
-    for old, row in zip(ArchiveFile(path).read(), day.reader.read(until=3), strict=True):
-        assert np.isnan(old.rows["grade_var"]).all()
-        assert old.rows["c_rr"].tobytes() == row.rows["c_rr"].tobytes()
 
 
 # --- crashes ---------------------------------------------------------------------------------------------------------
@@ -367,17 +368,27 @@ class Crash(BaseException):
     """Whatever ends a process at once."""
 
 
-@pytest.mark.parametrize("step", ["_write_parquet", "_seal", "_sync_folder", "_compare"])
+STEPS = {
+    "write_parquet": archive_writer,
+    "seal": archive_writer,
+    "sync_folder": archive_writer,
+    "sync_folder of the temporary file": files,
+    "_compare": ar,
+}
+
+
+@pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_a_crash_at_any_step_loses_and_doubles_nothing(day, monkeypatch, step, when):
-    before, real = day.both(), getattr(ar, step)
+    before, name = day.both(), step.split()[0]
+    real = getattr(STEPS[step], name)
 
     def crash(*arguments: object) -> None:
         if when == "after":
             real(*arguments)
         raise Crash
 
-    monkeypatch.setattr(ar, step, crash)
+    monkeypatch.setattr(STEPS[step], name, crash)
     with pytest.raises(Crash):
         day.archive()
     assert day.both() == before
@@ -417,24 +428,28 @@ def test_nothing_is_forgotten_before_file_and_name_are_on_disk(day, monkeypatch)
 
         return call
 
-    monkeypatch.setattr(ar.os, "fsync", spy("sync", os.fsync))
+    monkeypatch.setattr(files.os, "fsync", spy("sync", os.fsync))
+    monkeypatch.setattr(Path, "replace", spy("replace", Path.replace))
     monkeypatch.setattr(Path, "rename", spy("rename", Path.rename))
     day.archive(NOW_NS + HOUR_NS, forget=spy("forget", day.journal.forget))
-    assert done == ["sync", "rename", "sync folder", "forget"]
+    assert done == ["sync", "replace", "sync folder", "rename", "sync folder", "forget"]
 
 
 def test_what_a_kill_left_half_written_is_removed(day):
     day.folder.mkdir()
-    (day.folder / ar._TEMPORARY).write_bytes(b"half")
+    for name in (archive_writer.TEMPORARY, f".{archive_writer.TEMPORARY}.{os.getpid()}.0.part"):
+        (day.folder / name).write_bytes(b"half")
     day.archive()
     assert len(list(day.folder.iterdir())) == 3
 
 
 KILLED = """
 import os, signal, sys
+from importlib import import_module
 from pathlib import Path
-from mapserver.journal import archive as ar
-from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.archive import archive
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
 from protocol.site.site_config import SiteConfig
 
 site = SiteConfig("pit", 48.0, 11.0)
@@ -455,18 +470,30 @@ if step == "forget":
     forget = killing(forget)
 elif step == "delete":
     journal._db.set_trace_callback(killing(lambda text: None))
-elif step == "rename":
-    Path.rename = killing(Path.rename)
+elif step in ("rename", "replace"):
+    setattr(Path, step, killing(getattr(Path, step)))
 else:
-    setattr(ar, step, killing(getattr(ar, step)))
-for _ in ar.archive(folder / "archive", JournalReader(folder / "journal.db"), site, 2**62, forget):
+    module, _, name = step.rpartition(".")
+    module = import_module(f"mapserver.journal.{module}")
+    setattr(module, name, killing(getattr(module, name)))
+for _ in archive(folder / "archive", JournalReader(folder / "journal.db"), site, 2**62, forget):
     pass
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("step", "calls"),
-    [("_table", 0), ("_seal", 1), ("rename", 0), ("_compare", 0), ("forget", 2), ("delete", 5), ("delete", 13)],
+    [
+        ("archive_writer._table", 0),
+        ("archive_writer.seal", 1),
+        ("replace", 0),
+        ("rename", 0),
+        ("archive._compare", 0),
+        ("forget", 2),
+        ("delete", 5),
+        ("delete", 13),
+    ],
 )
 def test_a_killed_process_loses_and_doubles_nothing(tmp_path, step, calls):
     with opened(tmp_path) as machines:
@@ -487,16 +514,19 @@ def test_a_killed_process_loses_and_doubles_nothing(tmp_path, step, calls):
 def test_a_file_that_is_not_the_journal_s_is_never_a_reason_to_forget(day):
     """The journal was restored from a backup, and went on with other rows."""
     path = next_file(day.folder, day.reader, SITE, FUTURE)
-    day.journal._db.execute(
+    db = sqlite3.connect(day.journal.path, isolation_level=None)
+    db.create_function("checksum", -1, checksum)
+    db.execute(
         "UPDATE journal SET received_ns = received_ns + 1,"
         " crc32 = checksum(row, machine, spool_id, first_seq, received_ns + 1, payload) WHERE row = 3"
     )
     with pytest.raises(StoreError, match=r"000003\.parquet: row 3 is not the journal's; .* move this file away"):
         day.archive()
-    day.journal._db.execute("UPDATE journal SET machine = 'c' WHERE row = 1")
+    db.execute("UPDATE journal SET machine = 'c' WHERE row = 1")
     with pytest.raises(StoreError, match="row 1 is damaged"):
         day.archive()
-    day.journal._db.execute("UPDATE journal SET machine = 'a' WHERE row = 1")
+    db.execute("UPDATE journal SET machine = 'a' WHERE row = 1")
+    db.close()
     assert day.journal.archived_row == 0
     path.rename(path.with_suffix(".away"))
     assert len(day.archive()) == 3

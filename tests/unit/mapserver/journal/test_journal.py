@@ -1,23 +1,35 @@
 import sqlite3
-import zlib
+from collections.abc import Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 
-import msgpack
 import numpy as np
 import pytest
 
-from mapserver.ingest.admission import Admission
-from mapserver.journal import journal as journal_module
-from mapserver.journal.journal import ArchivedError, Journal, JournalReader, JournalReads
-from mapserver.journal.rows import ALL, Event, Mark, Wanted
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import ArchivedError, JournalQueries, JournalReader
+from mapserver.journal.rows import ALL, Admission, Event, Selection, Watermark
 from protocol.errors import StoreError
-from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples, samples
 
 
 def open_journal(folder: Path, site: str = SITE.name, frame: str = SITE.frame) -> Journal:
     return Journal(folder / "journal.db", site, frame)
+
+
+@pytest.fixture
+def journal(tmp_path) -> Iterator[Journal]:
+    journal = open_journal(tmp_path)
+    yield journal
+    with suppress(sqlite3.ProgrammingError):  # a test may have closed it
+        journal.close()
+
+
+def sql(journal: JournalQueries, statement: str) -> list[tuple]:
+    """What a statement gives on a connection of its own."""
+    with closing(sqlite3.connect(journal.path, isolation_level=None)) as db:
+        return db.execute(statement).fetchall()
 
 
 def write(journal: Journal, *admissions: Admission) -> None:
@@ -31,16 +43,13 @@ def admission(n: int = 3, first_seq: int = 1, lost: int = 0, **more) -> Admissio
     return Admission(batch(random_samples(n, first_seq), first_seq, **more), trimmed=0, lost=lost)
 
 
-def test_commits_are_synced_to_disk(tmp_path):
-    journal = open_journal(tmp_path)
-    pragma = {name: journal._db.execute(f"PRAGMA {name}").fetchone()[0] for name in ("journal_mode", "synchronous")}
-    assert pragma == {"journal_mode": "wal", "synchronous": 2}  # 2 is FULL
-    assert journal._db.execute("PRAGMA journal_size_limit").fetchone()[0] == 64 * 2**20
-    journal.close()
+def test_commits_are_synced_to_disk(journal):
+    assert journal._query("PRAGMA journal_mode") == [("wal",)]
+    assert journal._number("PRAGMA synchronous") == 2  # FULL
+    assert journal._number("PRAGMA journal_size_limit") == 64 * 2**20
 
 
-def test_rows_read_back_bit_for_bit(tmp_path):
-    journal = open_journal(tmp_path)
+def test_rows_read_back_bit_for_bit(journal):
     first, second = admission(5), admission(4, machine="b", spool_id=2**64 - 1)
     write(journal, first, second)
     rows = list(journal.read())
@@ -48,7 +57,6 @@ def test_rows_read_back_bit_for_bit(tmp_path):
     for row, sent in zip(rows, (first, second), strict=True):
         assert row.rows.tobytes() == sent.batch.rows.tobytes()
     assert [r.row for r in journal.read(after=1)] == [2]
-    journal.close()
 
 
 def test_spool_ids_beyond_signed_integers_are_kept_apart(tmp_path):
@@ -57,22 +65,20 @@ def test_spool_ids_beyond_signed_integers_are_kept_apart(tmp_path):
     write(journal, *(admission(i + 1, spool_id=spool) for i, spool in enumerate(ids)))
     journal.close()
     journal = open_journal(tmp_path)
-    assert {spool: mark.seq for (_, spool), mark in journal.marks().items()} == dict(zip(ids, range(1, 6), strict=True))
+    assert {spool: mark.seq for (_, spool), mark in journal.watermarks().items()} == {ids[i]: i + 1 for i in range(5)}
     journal.close()
 
 
-def test_rollback_leaves_neither_row_nor_watermark(tmp_path):
-    journal = open_journal(tmp_path)
+def test_rollback_leaves_neither_row_nor_watermark(journal):
     write(journal, admission(3))
     journal.begin()
     journal.append(admission(2, first_seq=4), NOW_NS)
     journal.append(admission(2, machine="b"), NOW_NS)
     assert journal.last_row == 3
     journal.rollback()
-    assert (journal.last_row, journal.marks()) == (1, {("a", 7): journal.mark("a", 7)})
-    assert (journal.mark("a", 7).seq, journal.mark("a", 7).lost) == (3, 0)
+    assert (journal.last_row, journal.watermarks()) == (1, {("a", 7): journal.watermark("a", 7)})
+    assert (journal.watermark("a", 7).seq, journal.watermark("a", 7).lost) == (3, 0)
     assert [r.row for r in journal.read()] == [1]
-    journal.close()
 
 
 def test_row_and_watermark_are_of_one_transaction(tmp_path):
@@ -92,28 +98,24 @@ def test_row_and_watermark_are_of_one_transaction(tmp_path):
     journal.close()
 
 
-def test_a_failed_watermark_takes_its_row_with_it(tmp_path):
-    journal = open_journal(tmp_path)
-    journal._db.execute("CREATE TEMP TRIGGER full BEFORE INSERT ON watermark BEGIN SELECT RAISE(FAIL, 'full'); END")
+def test_a_failed_watermark_takes_its_row_with_it(journal):
+    sql(journal, "CREATE TRIGGER full BEFORE INSERT ON watermark BEGIN SELECT RAISE(FAIL, 'full'); END")
     journal.begin()
     with pytest.raises(sqlite3.Error, match="full"):
         journal.append(admission(), NOW_NS)
     journal.rollback()
-    assert (list(journal.read()), journal.marks(), journal.last_row) == ([], {}, 0)
-    journal.close()
+    assert (list(journal.read()), journal.watermarks(), journal.last_row) == ([], {}, 0)
 
 
 @pytest.mark.parametrize("offset", [0, 40, -1])
-def test_a_damaged_row_is_detected(tmp_path, offset):
-    journal = open_journal(tmp_path)
+def test_a_damaged_row_is_detected(journal, offset):
     write(journal, admission(), admission(first_seq=4), admission(first_seq=7))
-    payload = bytearray(journal._db.execute("SELECT payload FROM journal WHERE row = 2").fetchone()[0])
+    payload = bytearray(sql(journal, "SELECT payload FROM journal WHERE row = 2")[0][0])
     payload[offset] ^= 1
-    journal._db.execute("UPDATE journal SET payload = ? WHERE row = 2", (bytes(payload),))
+    sql(journal, f"UPDATE journal SET payload = x'{payload.hex()}' WHERE row = 2")
     with pytest.raises(StoreError, match=r"journal\.db: journal row 2 is damaged"):
         list(journal.read())
     assert [r.row for r in journal.read(after=2)] == [3]
-    journal.close()
 
 
 @pytest.mark.parametrize(
@@ -125,12 +127,14 @@ def test_the_store_of_another_site_is_refused(tmp_path, site, frame, named):
         open_journal(tmp_path, site, frame)
 
 
-def test_another_schema_is_refused(tmp_path):
+@pytest.mark.parametrize("schema", [2, 99])
+def test_a_journal_of_another_schema_is_refused_with_what_to_do(tmp_path, schema):
     journal = open_journal(tmp_path)
-    journal._db.execute("UPDATE meta SET value = '99' WHERE key = 'schema'")
+    sql(journal, f"UPDATE meta SET value = '{schema}' WHERE key = 'schema'")
     journal.close()
-    with pytest.raises(StoreError, match="schema '99'"):
-        open_journal(tmp_path)
+    for opened in (lambda: open_journal(tmp_path), lambda: JournalReader(journal.path)):
+        with pytest.raises(StoreError, match=f"schema '{schema}', this version knows 3; open it with the version that"):
+            opened()
 
 
 def test_a_file_that_is_no_database_is_refused(tmp_path):
@@ -152,17 +156,15 @@ def test_reopening_continues_the_numbers(tmp_path):
     write(journal, admission(3), admission(2, first_seq=4))
     journal.close()
     journal = open_journal(tmp_path)
-    assert (journal.last_row, journal.mark("a", 7).seq) == (2, 5)
+    assert (journal.last_row, journal.watermark("a", 7).seq) == (2, 5)
     write(journal, admission(2, first_seq=6))
     assert journal.last_row == 3
     journal.close()
 
 
-def test_an_unknown_spool_has_no_progress(tmp_path):
-    journal = open_journal(tmp_path)
-    assert journal.mark("nobody", 1) == Mark(0, 0)
+def test_an_unknown_spool_has_no_progress(journal):
+    assert journal.watermark("nobody", 1) == Watermark(0, 0)
     assert (journal.last_row, journal.newest_ns(), list(journal.read())) == (0, 0, [])
-    journal.close()
 
 
 def test_lost_samples_are_summed_and_kept(tmp_path):
@@ -171,19 +173,16 @@ def test_lost_samples_are_summed_and_kept(tmp_path):
     write(journal, admission(2, first_seq=10, lost=6), admission(1, first_seq=13, lost=1))
     journal.close()
     journal = open_journal(tmp_path)
-    mark = journal.mark("a", 7)
-    assert (mark.seq, mark.lost) == (13, 7)
+    watermark = journal.watermark("a", 7)
+    assert (watermark.seq, watermark.lost) == (13, 7)
     journal.close()
 
 
-def test_newest_stamp_is_that_of_all_rows(tmp_path):
-    journal = open_journal(tmp_path)
+def test_newest_stamp_is_that_of_all_rows(journal):
     for first, stamps in ((1, [50, 90, 10]), (4, [60, 20, 30])):
         write(journal, Admission(batch(samples(3, stamp_ns=stamps), first), trimmed=0, lost=0))
     assert journal.newest_ns() == 90
-    bounds = journal._db.execute("SELECT first_stamp_ns, last_stamp_ns FROM journal ORDER BY row").fetchall()
-    assert bounds == [(10, 90), (20, 60)]
-    journal.close()
+    assert sql(journal, "SELECT first_stamp_ns, last_stamp_ns FROM journal ORDER BY row") == [(10, 90), (20, 60)]
 
 
 def test_closing_folds_the_log_into_the_file(tmp_path):
@@ -196,15 +195,6 @@ def test_closing_folds_the_log_into_the_file(tmp_path):
     assert len(copy) > 1000 * 64
 
 
-def test_column_that_an_older_row_lacks_reads_as_nan():
-    rows = np.ones(3, SAMPLE_DTYPE)
-    older = msgpack.unpackb(journal_module.pack(rows))
-    del older["grade_var"]
-    found = journal_module.unpack(msgpack.packb(older))
-    assert np.isnan(found["grade_var"]).all()
-    assert (found["c_rr"] == 1).all()
-
-
 # --- reading by row, time, place and machine -------------------------------------------------------------------------
 
 
@@ -213,61 +203,53 @@ def numbers(rows) -> list[int]:
 
 
 @pytest.fixture
-def placed(tmp_path):
+def placed(journal):
     """Rows of machines a, b, a, b; row i lies at x = 10 i .. 10 i + 4, y = -x, with stamps 100 i .. 100 i + 2."""
-    journal, seqs = open_journal(tmp_path), {"a": 1, "b": 1}
+    seqs = {"a": 1, "b": 1}
     for i in (1, 2, 3, 4):
         x_m, machine = 10.0 * i + np.array([0.0, 4.0, 2.0]), "ab"[(i + 1) % 2]
         rows = samples(3, x_m=x_m, y_m=-x_m, stamp_ns=100 * i + np.array([1, 0, 2]))
         write(journal, Admission(batch(rows, seqs[machine], machine), trimmed=0, lost=0))
         seqs[machine] += 3
-    yield journal
-    journal.close()
+    return journal
 
 
 @pytest.mark.parametrize(
-    ("wanted", "expected"),
+    ("selection", "expected"),
     [
-        (Wanted(to_ns=199), [1]),
-        (Wanted(to_ns=200), [1, 2]),
-        (Wanted(from_ns=302), [3, 4]),
-        (Wanted(from_ns=303), [4]),
-        (Wanted(from_ns=103, to_ns=199), []),
-        (Wanted(without=frozenset({"a"})), [2, 4]),
-        (Wanted(without=frozenset({"a", "b"})), []),
-        (Wanted(without=frozenset({"a' OR TRUE --"})), [1, 2, 3, 4]),
-        (Wanted(bounds=Bounds(15, -24, 19, -20)), []),
-        (Wanted(bounds=Bounds(15, -24, 20, -20)), [2]),
-        (Wanted(bounds=Bounds(24, -50, 40, 0)), [2, 3, 4]),
-        (Wanted(bounds=Bounds(24.1, -50, 40, 0)), [3, 4]),
-        (Wanted(bounds=Bounds(0, -20, 50, 0)), [1, 2]),
-        (Wanted(bounds=Bounds(0, -50, 50, -34)), [3, 4]),
-        (Wanted(bounds=Bounds(0, -50, 50, -34.1)), [4]),
-        (Wanted(to_ns=350, bounds=Bounds(20, -50, 50, 0), without=frozenset({"b"})), [3]),
+        (Selection(to_ns=199), [1]),
+        (Selection(to_ns=200), [1, 2]),
+        (Selection(from_ns=302), [3, 4]),
+        (Selection(from_ns=303), [4]),
+        (Selection(from_ns=103, to_ns=199), []),
+        (Selection(without=frozenset({"a"})), [2, 4]),
+        (Selection(without=frozenset({"a", "b"})), []),
+        (Selection(without=frozenset({"a' OR TRUE --"})), [1, 2, 3, 4]),
+        (Selection(bounds=Bounds(15, -24, 19, -20)), []),
+        (Selection(bounds=Bounds(15, -24, 20, -20)), [2]),
+        (Selection(bounds=Bounds(24, -50, 40, 0)), [2, 3, 4]),
+        (Selection(bounds=Bounds(24.1, -50, 40, 0)), [3, 4]),
+        (Selection(bounds=Bounds(0, -20, 50, 0)), [1, 2]),
+        (Selection(bounds=Bounds(0, -50, 50, -34)), [3, 4]),
+        (Selection(bounds=Bounds(0, -50, 50, -34.1)), [4]),
+        (Selection(to_ns=350, bounds=Bounds(20, -50, 50, 0), without=frozenset({"b"})), [3]),
     ],
 )
-def test_reads_by_time_place_and_machine(placed, wanted, expected):
-    assert numbers(placed.read(wanted=wanted)) == expected
+def test_reads_by_time_place_and_machine(placed, selection, expected):
+    assert numbers(placed.read(selection=selection)) == expected
 
 
 def test_reads_by_row_numbers(placed):
     assert numbers(placed.read(after=1, until=3)) == [2, 3]
-    assert numbers(placed.read(after=1, until=3, wanted=Wanted(to_ns=250))) == [2]
+    assert numbers(placed.read(after=1, until=3, selection=Selection(to_ns=250))) == [2]
     assert numbers(placed.read(until=0)) == []
 
 
-def test_a_row_whose_box_is_not_known_is_read(placed):
-    placed._db.execute("UPDATE extent SET west_m = NULL, south_m = NULL, east_m = NULL, north_m = NULL WHERE row = 2")
-    assert numbers(placed.read(wanted=Wanted(bounds=Bounds(30, -34, 34, -30)))) == [2, 3]
-
-
 @pytest.mark.parametrize("rows", [199, 200, 201, 401])
-def test_reading_in_pieces_leaves_nothing_out(tmp_path, rows):
-    journal = open_journal(tmp_path)
+def test_reading_in_pieces_leaves_nothing_out(journal, rows):
     write(journal, *(admission(1, first_seq=i + 1) for i in range(rows)))
     assert numbers(journal.read()) == list(range(1, rows + 1))
-    assert numbers(journal.read(wanted=Wanted(from_ns=1))) == list(range(1, rows + 1))
-    journal.close()
+    assert numbers(journal.read(selection=Selection(from_ns=1))) == list(range(1, rows + 1))
 
 
 def test_rows_say_when_they_were_received(placed):
@@ -286,17 +268,16 @@ def test_opening_and_the_newest_stamp_read_no_journal_row(placed):
 # --- readers ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_reader_sees_what_is_committed(tmp_path):
-    journal = open_journal(tmp_path)
+def test_a_reader_sees_what_is_committed(journal):
     write(journal, admission(3))
     reader = JournalReader(journal.path)
     journal.begin()
     journal.append(admission(2, first_seq=4), NOW_NS)
-    assert (numbers(reader.read()), reader.last_row, reader.marks()["a", 7].seq) == ([1], 1, 3)
+    assert (numbers(reader.read()), reader.last_row, reader.watermarks()["a", 7].seq) == ([1], 1, 3)
     journal.commit()
-    assert (numbers(reader.read()), reader.last_row, reader.marks()) == ([1, 2], 2, journal.marks())
+    assert (numbers(reader.read()), reader.last_row, reader.watermarks()) == ([1, 2], 2, journal.watermarks())
     assert (reader.site, reader.frame, reader.newest_ns()) == (SITE.name, SITE.frame, journal.newest_ns())
-    reader.close(), journal.close()
+    reader.close()
 
 
 def test_a_reader_cannot_write(tmp_path):
@@ -307,108 +288,20 @@ def test_a_reader_cannot_write(tmp_path):
     reader.close()
 
 
-def test_a_reader_in_the_middle_holds_no_lock_on_the_log(tmp_path):
-    journal = open_journal(tmp_path)
+def test_a_reader_in_the_middle_holds_no_lock_on_the_log(journal):
     write(journal, *(admission(1, first_seq=i + 1) for i in range(300)))
     reader = JournalReader(journal.path)
     rows = reader.read()
     next(rows)
     write(journal, admission(1, first_seq=301))
-    assert journal._db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0] == 0  # 1 would be: busy
+    assert sql(journal, "PRAGMA wal_checkpoint(TRUNCATE)")[0][0] == 0  # 1 would be: busy
     assert len(list(rows)) == 300
-    reader.close(), journal.close()
+    reader.close()
 
 
-def test_a_reader_of_nothing_or_of_another_schema_is_refused(tmp_path):
+def test_a_reader_of_nothing_is_refused(tmp_path):
     with pytest.raises(StoreError, match="no usable journal"):
         JournalReader(tmp_path / "journal.db")
-    journal = open_journal(tmp_path)
-    journal._db.execute("UPDATE meta SET value = '99' WHERE key = 'schema'")
-    journal.close()
-    with pytest.raises(StoreError, match="schema '99', known is 3"):
-        JournalReader(tmp_path / "journal.db")
-
-
-# --- journals of older schemas ---------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def older(tmp_path) -> Path:
-    """A journal as schema 1 left it, with rows of two spools."""
-    journal = open_journal(tmp_path)
-    write(journal, admission(5), admission(2, first_seq=6, lost=1), admission(4, spool_id=2**64 - 1))
-    journal._db.executescript(
-        "DROP TABLE extent; DROP TABLE events; ALTER TABLE watermark DROP COLUMN newest_ns;"
-        "ALTER TABLE watermark DROP COLUMN crc32; UPDATE meta SET value = '1' WHERE key = 'schema'"
-    )
-    for row, payload in journal._db.execute("SELECT row, payload FROM journal").fetchall():
-        journal._db.execute("UPDATE journal SET crc32 = ? WHERE row = ?", (zlib.crc32(payload), row))
-    journal.close()
-    return tmp_path / "journal.db"
-
-
-def on_disk(path: Path, query: str) -> list[tuple]:
-    db = sqlite3.connect(path)
-    found = db.execute(query).fetchall()
-    db.close()
-    return found
-
-
-def test_a_journal_of_schema_1_is_brought_up_in_place(older):
-    reader = JournalReader(older)
-    rows, newest = [r.rows.tobytes() for r in reader.read()], reader.newest_ns()
-    assert (numbers(reader.read(wanted=Wanted(from_ns=1))), reader.events(), reader.archived_row) == ([1, 2, 3], [], 0)
-    assert reader.marks()["a", 7].lost == 1
-    reader.close()
-    assert on_disk(older, "SELECT value FROM meta WHERE key = 'schema'") == [("1",)]  # a reader changes nothing
-    for _ in range(2):
-        journal = open_journal(older.parent)
-        assert [r.rows.tobytes() for r in journal.read()] == rows
-        assert journal.newest_ns() == newest == max(mark.newest_ns for mark in journal.marks().values())
-        assert {(m.seq, m.lost) for m in journal.marks().values()} == {(7, 1), (4, 0)}
-        assert numbers(journal.read(wanted=Wanted(bounds=Bounds(1e4, 1e4, 2e4, 2e4)))) == [1, 2, 3]  # boxes unknown
-        assert numbers(journal.read(wanted=Wanted(to_ns=1))) == []
-        journal.close()
-    assert on_disk(older, "SELECT value FROM meta WHERE key = 'schema'") == [("3",)]
-    journal = open_journal(older.parent)
-    write(journal, admission(1, first_seq=8))
-    assert numbers(journal.read(wanted=Wanted(bounds=Bounds(-60, -60, 60, 60)))) == [1, 2, 3, 4]
-    journal.close()
-
-
-def test_an_upgrade_that_fails_leaves_schema_1_as_it_was(older, monkeypatch):
-    before = on_disk(older, "SELECT * FROM sqlite_master")
-    broken = journal_module.UPGRADES["1"].replace("COMMIT;", "INSERT INTO nowhere VALUES (1); COMMIT;")
-    monkeypatch.setitem(journal_module.UPGRADES, "1", broken)
-    with pytest.raises(StoreError, match="nowhere"):
-        open_journal(older.parent)
-    monkeypatch.undo()
-    assert on_disk(older, "SELECT * FROM sqlite_master") == before
-    open_journal(older.parent).close()
-
-
-def test_a_journal_of_schema_2_is_brought_up_in_place(placed):
-    kept = placed.append_event("t", 5, {"machine": "a"})
-    rows, marks, folder = numbers(placed.read()), placed.marks(), placed.path.parent
-    placed._db.executescript(
-        "ALTER TABLE extent DROP COLUMN crc32; ALTER TABLE events DROP COLUMN crc32;"
-        "UPDATE meta SET value = '2' WHERE key = 'schema'"
-    )
-    placed.close()
-
-    def check(journal: JournalReads) -> None:
-        journal.check()
-        assert (numbers(journal.read()), journal.marks(), journal.last_row) == (rows, marks, 4)
-        assert journal.events() == [Event(kept, "t", 5, {"machine": "a"})]
-        assert numbers(journal.read(wanted=Wanted(from_ns=400))) == [4]
-        journal.close()
-
-    check(JournalReader(folder / "journal.db"))
-    assert on_disk(folder / "journal.db", "SELECT value FROM meta WHERE key = 'schema'") == [("2",)]
-    check(open_journal(folder))
-    assert on_disk(folder / "journal.db", "SELECT value FROM meta WHERE key = 'schema'") == [("3",)]
-    check(open_journal(folder))
-    placed._db = sqlite3.connect(":memory:")  # the fixture closes it again
 
 
 # --- rows that are archived ------------------------------------------------------------------------------------------
@@ -419,35 +312,33 @@ def test_forgotten_rows_are_gone_and_asked_for_in_vain(placed):
     assert placed.forget(3, most=2) == 3
     assert placed.forget(1) == 3  # what is gone stays gone
     assert (placed.archived_row, placed.last_row, numbers(placed.read(after=3))) == (3, 4, [4])
-    for after, wanted in ((0, ALL), (2, ALL), (0, Wanted(from_ns=400))):
+    for after, selection in ((0, ALL), (2, ALL), (0, Selection(from_ns=400))):
         with pytest.raises(ArchivedError, match="rows up to 3 are in the archive") as caught:
-            list(placed.read(after, wanted=wanted))
+            list(placed.read(after, selection=selection))
         assert caught.value.archived_row == 3
     assert list(placed.read(after=2, until=2)) == []
     assert placed._number("SELECT COUNT(*) FROM extent") == 1
 
 
 def test_numbers_marks_and_now_outlive_the_rows(placed):
-    marks = placed.marks()
+    marks = placed.watermarks()
     assert placed.forget(99) == 4
     placed.close()
     journal = open_journal(placed.path.parent)
-    assert (journal.last_row, journal.archived_row, journal.marks(), journal.newest_ns()) == (4, 4, marks, 402)
+    assert (journal.last_row, journal.archived_row, journal.watermarks(), journal.newest_ns()) == (4, 4, marks, 402)
     write(journal, admission(1, first_seq=7))
     assert numbers(journal.read(after=4)) == [5]
     journal.close()
-    placed._db = sqlite3.connect(":memory:")  # the fixture closes it again
 
 
 def test_forgetting_is_one_transaction(placed):
-    placed._db.execute("CREATE TEMP TRIGGER full BEFORE INSERT ON meta BEGIN SELECT RAISE(FAIL, 'full'); END")
+    sql(placed, "CREATE TRIGGER full BEFORE INSERT ON meta BEGIN SELECT RAISE(FAIL, 'full'); END")
     with pytest.raises(sqlite3.Error, match="full"):
         placed.forget(3)
     assert (placed.archived_row, numbers(placed.read())) == (0, [1, 2, 3, 4])
 
 
-def test_a_journal_with_much_free_space_shrinks_in_steps(tmp_path):
-    journal = open_journal(tmp_path)
+def test_a_journal_with_much_free_space_shrinks_in_steps(journal):
     assert journal._number("PRAGMA auto_vacuum") == 2  # incremental
     write(journal, *(admission(100, first_seq=1 + 100 * i) for i in range(200)))
     pages = journal._number("PRAGMA page_count")
@@ -460,7 +351,6 @@ def test_a_journal_with_much_free_space_shrinks_in_steps(tmp_path):
         pass
     assert journal._number("PRAGMA page_count") < 0.2 * pages
     assert len(list(journal.read(190))) == 10
-    journal.close()
 
 
 # --- events ----------------------------------------------------------------------------------------------------------
@@ -478,19 +368,16 @@ def test_events_are_kept_in_order(tmp_path):
     reader.close()
 
 
-def test_an_event_is_never_part_of_a_group_commit(tmp_path):
-    journal = open_journal(tmp_path)
+def test_an_event_is_never_part_of_a_group_commit(journal):
     journal.begin()
     journal.append(admission(), NOW_NS)
     with pytest.raises(sqlite3.OperationalError, match="within a transaction"):
         journal.append_event("t", 1, {})
     journal.commit()
     assert (numbers(journal.read()), journal.events()) == ([1], [])
-    journal.close()
 
 
-def test_an_event_that_cannot_be_numbered_leaves_no_transaction_open(tmp_path, monkeypatch):
-    journal = open_journal(tmp_path)
+def test_an_event_that_cannot_be_numbered_leaves_no_transaction_open(journal, monkeypatch):
 
     def broken(query: str) -> int:
         raise StoreError(journal.path, "cannot be read: disk I/O error")
@@ -502,7 +389,6 @@ def test_an_event_that_cannot_be_numbered_leaves_no_transaction_open(tmp_path, m
             journal.append_event("t", 1, {})
     write(journal, admission(1))
     assert numbers(journal.read()) == [1]
-    journal.close()
 
 
 # --- damage ----------------------------------------------------------------------------------------------------------
@@ -519,22 +405,20 @@ def test_an_event_that_cannot_be_numbered_leaves_no_transaction_open(tmp_path, m
         "crc32 = 1",
     ],
 )
-def test_a_row_that_is_not_what_was_written_is_named_and_not_read(tmp_path, change):
-    journal = open_journal(tmp_path)
+def test_a_row_that_is_not_what_was_written_is_named_and_not_read(journal, change):
     write(journal, admission(3))
-    journal._db.execute(f"UPDATE journal SET {change} WHERE row = 1")
+    sql(journal, f"UPDATE journal SET {change} WHERE row = 1")
     with pytest.raises(StoreError, match="journal row 1 is damaged"):
         list(journal.read())
-    journal.close()
 
 
 @pytest.mark.parametrize(
-    "change", ["machine = 'b'", "seq = 2", "lost = 1", "newest_ns = 7", "crc32 = 1", "crc32 = NULL"]
+    "change", ["machine = 'b'", "seq = 2", "lost = 1", "newest_ns = 7", "crc32 = 1", "crc32 = '1x'"]
 )
 def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
     journal = open_journal(tmp_path)
     write(journal, admission(3))
-    journal._db.execute(f"UPDATE watermark SET {change}")
+    sql(journal, f"UPDATE watermark SET {change}")
     journal.close()
     with pytest.raises(StoreError, match=r"the watermark of . is damaged"):
         open_journal(tmp_path)
@@ -544,7 +428,7 @@ def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
     ("change", "problem"),
     [
         ("UPDATE extent SET first_stamp_ns = 1 WHERE row = 2", "the extent of journal row 2"),
-        ("UPDATE extent SET west_m = NULL WHERE row = 2", "the extent of journal row 2"),
+        ("UPDATE extent SET west_m = 'x' WHERE row = 2", "the extent of journal row 2"),
         ("UPDATE extent SET crc32 = 1 WHERE row = 2", "the extent of journal row 2"),
         ("DELETE FROM extent WHERE row = 2", "what follows number 1"),
         ("DELETE FROM extent WHERE row = 4", "what follows number 3"),
@@ -556,12 +440,12 @@ def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
         ("INSERT INTO meta VALUES ('archived_row', '2x')", "the value '2x'"),
     ],
 )
-def test_what_stands_beside_the_rows_is_looked_at_on_opening(placed, monkeypatch, change, problem):
-    monkeypatch.setattr(journal_module, "_EXTENTS_AT_ONCE", 3)  # read in two pieces
+def test_what_stands_beside_the_rows_is_checked_on_opening(placed, monkeypatch, change, problem):
+    monkeypatch.setattr("mapserver.journal.reader._EXTENTS_AT_ONCE", 3)  # read in two pieces
     for i in range(2):
         placed.append_event("t", i, {"machine": "a"})
     placed.check()
-    placed._db.execute(change)
+    sql(placed, change)
     for _ in range(2):  # nothing is left open by the first
         with pytest.raises(StoreError, match=rf"journal\.db: {problem} is damaged; restore"):
             placed.check()
@@ -571,17 +455,15 @@ def test_what_stands_beside_the_rows_is_looked_at_on_opening(placed, monkeypatch
 
 @pytest.mark.parametrize("row", [1, 3, 4])
 def test_a_row_that_is_gone_is_missed(placed, row):
-    placed._db.execute("DELETE FROM journal WHERE row = ?", (row,))
+    sql(placed, f"DELETE FROM journal WHERE row = {row}")
     with pytest.raises(StoreError, match=f"what follows number {row - 1} is damaged"):
         list(placed.read())
     with pytest.raises(StoreError, match=f"journal row {row} is damaged"):
-        list(placed.read(wanted=Wanted(from_ns=1)))
+        list(placed.read(selection=Selection(from_ns=1)))
     assert numbers(placed.read(until=row - 1)) == list(range(1, row))
 
 
-def test_machines_that_are_left_out_are_not_missed(tmp_path):
-    journal = open_journal(tmp_path)
+def test_machines_that_are_excluded_are_not_missed(journal):
     write(journal, *(admission(1, first_seq=1 + i // 2, machine="ab"[i % 2]) for i in range(500)))
-    assert numbers(journal.read(wanted=Wanted(without=frozenset("a")))) == list(range(2, 501, 2))
-    assert numbers(journal.read(wanted=Wanted(without=frozenset("ab")))) == []
-    journal.close()
+    assert numbers(journal.read(selection=Selection(without=frozenset("a")))) == list(range(2, 501, 2))
+    assert numbers(journal.read(selection=Selection(without=frozenset("ab")))) == []

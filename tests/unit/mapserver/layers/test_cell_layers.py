@@ -154,10 +154,10 @@ def test_a_minority_does_not_widen_the_spread():
 def test_heading_is_the_axis_driven_both_ways(degrees):
     angle = np.radians(degrees)
     there = np.tile([angle, angle + np.pi, angle - np.pi], 20)
-    found = value(folded(samples(60, heading_rad=there)), "heading")
-    off = (found - angle + np.pi / 2) % np.pi - np.pi / 2
+    axis = value(folded(samples(60, heading_rad=there)), "heading")
+    off = (axis - angle + np.pi / 2) % np.pi - np.pi / 2
     assert abs(off) <= np.pi / 16 + 1e-6
-    assert -np.pi / 2 <= found <= np.float32(np.pi / 2)
+    assert -np.pi / 2 <= axis <= np.float32(np.pi / 2)
 
 
 def test_heading_is_the_mean_of_neighbouring_sectors():

@@ -154,10 +154,10 @@ def test_failed_write_keeps_the_old_picture(tmp_path: Path, monkeypatch):
     write_image(path, np.zeros((2, 2, 3), np.uint8))
     old = path.read_bytes()
 
-    def full(self, data):
+    def full(_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="space"):
         write_image(path, np.ones((2, 2, 3), np.uint8))
     assert path.read_bytes() == old

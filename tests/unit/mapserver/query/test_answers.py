@@ -1,9 +1,11 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mapserver.ingest.store import Store
+from mapserver.config import ServerConfig
+from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import LAYERS, ReadConfig
@@ -13,7 +15,9 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
 from protocol.queries.requests import PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
+from protocol.site.site_config import SiteConfig
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, folded, incoming, now_ns, random_samples, samples, send
+from tests.unit.mapserver.query.fake_follower import FakeFollower
 
 # One sample in each cell of two diagonals, the value tells the cell.
 STEPS = np.arange(-40, 40)
@@ -23,11 +27,15 @@ def diagonal() -> np.ndarray:
     return samples(len(STEPS), x_m=STEPS + 0.5, y_m=-STEPS - 0.5, grade_e=STEPS / 100, distance_m=8.0)
 
 
+def asked(writer: Writer, folder: Path, site: SiteConfig = SITE, config: ServerConfig = CONFIG) -> Answers:
+    return Answers(writer, FakeFollower(), site, config, folder / JOURNAL_FILE)
+
+
 @pytest.fixture
 def answers(tmp_path):
     writer = Writer(tmp_path, SITE, CONFIG, now_ns)
     send(writer, [incoming(diagonal())])
-    yield Answers(writer, SITE, CONFIG)
+    yield asked(writer, tmp_path)
     writer.close()
 
 
@@ -97,7 +105,7 @@ def test_many_blocks_are_read_in_pieces_and_put_together(tmp_path, monkeypatch):
     rows = random_samples(300, 3)
     writer = Writer(tmp_path, SITE, CONFIG, now_ns)
     send(writer, [incoming(rows)])
-    here = region(Answers(writer, SITE, CONFIG), -64, -64, 64, 64, names=("resistance",))
+    here = region(asked(writer, tmp_path), -64, -64, 64, 64, names=("resistance",))
     writer.close()
     grid = folded(rows)
     for x in range(-4, 4):
@@ -122,7 +130,7 @@ def test_least_weight_of_the_read_options_is_obeyed(tmp_path):
     send(writer, [incoming(samples(distance_m=2.0))])
     query = PointQuery(8.5, 8.5, ("resistance",))
     configs = [replace(CONFIG, read=ReadConfig(least)) for least in (1.9, 2.1)]
-    values = [Answers(writer, SITE, config).point(query).values["resistance"] for config in configs]
+    values = [asked(writer, tmp_path, config=config).point(query).values["resistance"] for config in configs]
     writer.close()
     assert np.isfinite(values[0])
     assert np.isnan(values[1])
@@ -158,13 +166,13 @@ def driven(
     places = np.arange(-half, half, step) + 0.5
     x, y = (axis.ravel() for axis in np.meshgrid(places, places))
     west, south, east, north = changed
-    found = []
+    passes = []
     for hour in range(3):
         new = (hour == 2) & (x > west) & (x < east) & (y > south) & (y < north)
         stamps = NOW_NS + hour * 3600 * 10**9 + np.arange(x.size) * 240 * 10**9 // x.size
         place = {"x_m": x * cell_m, "y_m": y * cell_m, "stamp_ns": stamps, "cov_xx_m2": 0, "cov_yy_m2": 0}
-        found.append(samples(x.size, **place, c_rr=np.where(new, c_rr, 0.04), grade_e=np.where(new, -0.3, 0.1)))
-    return found
+        passes.append(samples(x.size, **place, c_rr=np.where(new, c_rr, 0.04), grade_e=np.where(new, -0.3, 0.1)))
+    return passes
 
 
 def answers_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tuple[Writer, Answers]:
@@ -176,8 +184,8 @@ def answers_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tupl
             store.grid.fold(part, "a")
         store.newest_ns = store.grid.newest_ns
 
-    writer.read(fold)
-    return writer, Answers(writer, site, config)
+    writer.run(fold)
+    return writer, asked(writer, folder, site, config)
 
 
 CHANGED = ("resistance", "weight", "changed_s", "visits", "age_s")
@@ -249,8 +257,8 @@ def test_gaps_are_filled_alike_in_every_window(tmp_path, step):
 def test_the_change_options_reach_the_answer(tmp_path):
     rows = driven(1.0, 20, (-6, -6, 6, 6))
     writer, answers = answers_of(tmp_path, rows)
-    off = Answers(writer, SITE, replace(CONFIG, change=replace(CONFIG.change, detect=False)))
-    seen, not_seen = (region(found, -20, -20, 20, 20, names=("changed_s",))["changed_s"] for found in (answers, off))
+    off = asked(writer, tmp_path, config=replace(CONFIG, change=replace(CONFIG.change, detect=False)))
+    seen, not_seen = (region(each, -20, -20, 20, 20, names=("changed_s",))["changed_s"] for each in (answers, off))
     writer.close()
     assert np.isfinite(seen).any()
     assert np.isnan(not_seen).all()

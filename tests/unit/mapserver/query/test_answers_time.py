@@ -1,49 +1,35 @@
 """Maps as of any time, their differences, the history of a point; machines, changes and commands."""
 
-import threading
-from dataclasses import asdict, replace
-
 import numpy as np
 import pytest
 
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
-from mapserver.query.answers import Answers, Nobody, reads_past
-from mapserver.server import Server
+from mapserver.query.answers import Answers, reads_past
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import (
     decode_changes,
-    decode_error,
     decode_history,
-    decode_info,
     decode_machine,
     decode_machines,
     decode_point,
     decode_region,
-    encode_change,
 )
-from protocol.queries.answers import GroundChange
 from protocol.queries.commands import TrustCommand, encode_command
-from protocol.queries.parameters import selector_of
-from protocol.queries.requests import MAX_SPANS, HistoryQuery, InfoQuery, PointQuery, RegionQuery, When, encode_query
+from protocol.queries.requests import MAX_SPANS, HistoryQuery, PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds
-from protocol.wire import keys
-from protocol.wire.codec import encode_batch
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
     SITE,
-    WAIT_S,
-    batch,
     incoming,
     now_ns,
     random_samples,
-    routed,
     samples,
     send,
 )
-from tests.unit.records import machine_state
+from tests.unit.mapserver.query.fake_follower import FakeFollower
 
 S, HOUR_NS = 10**9, 3600 * 10**9
 BOX = Bounds(-40, -40, 40, 40)
@@ -53,39 +39,12 @@ NEWEST_NS = int(ROWS["b"]["stamp_ns"].max())
 NAMES = (*LAYERS, "resistance_filled", "grade_filled_std")
 
 
-CHANGE = GroundChange(1, NOW_NS, NOW_NS, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, None)
-
-
-class Watching(Nobody):
-    """A keeper with an answer to everything."""
-
-    def __init__(self, *distrusted: str) -> None:
-        self.asked: list[object] = []
-        self._distrusted = frozenset(distrusted)
-
-    def machines(self):
-        return [machine_state("a"), machine_state("b", trusted=False)]
-
-    def changes(self, after):
-        self.asked.append(after)
-        return [replace(CHANGE, id=after + 1)]
-
-    def trust(self, machine, trusted, reason, wait_s):
-        self.asked.append((machine, trusted, reason, wait_s))
-        if machine not in "ab":
-            return super().trust(machine, trusted, reason, wait_s)
-        return asdict(machine_state(machine, trusted=trusted is not False))
-
-    def distrusted(self):
-        return self._distrusted
-
-
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     """Function that starts a writer with the samples of each machine in two rows, in a folder of its own."""
     opened = []
 
-    def start(rows=None, keeper=None) -> Answers:
+    def start(rows=None, follower=None) -> Answers:
         folder = tmp_path_factory.mktemp("store")
         writer = Writer(folder, SITE, CONFIG, now_ns)
         opened.append(writer)
@@ -93,7 +52,7 @@ def served(tmp_path_factory):
             half = len(table) // 2
             send(writer, [incoming(part, machine=machine) for part in (table[:half],) if len(part)])
             send(writer, [incoming(table[half:], 1 + half, machine)])
-        return Answers(writer, SITE, CONFIG, keeper, folder / JOURNAL_FILE)
+        return Answers(writer, follower or FakeFollower(), SITE, CONFIG, folder / JOURNAL_FILE)
 
     yield start
     for writer in opened:
@@ -167,11 +126,11 @@ def test_what_changed_later_has_not_changed_yet(served):
     assert now["resistance"] == after["resistance"]
 
 
-def test_machines_that_are_left_out_are_left_out_of_the_past(answers, served):
-    without = served(keeper=Watching("b"))
+def test_excluded_machines_are_excluded_from_the_past(answers, served):
+    without = served(follower=FakeFollower("b"))
     only_a = served({"a": ROWS["a"]})
     when = When(as_of_ns=NEWEST_NS)
-    here, there = (of.region(RegionQuery(BOX, ("resistance",), when=when)) for of in (without, only_a))
+    here, there = (asked.region(RegionQuery(BOX, ("resistance",), when=when)) for asked in (without, only_a))
     assert equal(here, there, ["resistance"])
     assert not equal(here, answers.region(RegionQuery(BOX, ("resistance",), when=when)), ["resistance"])
 
@@ -276,7 +235,7 @@ def test_without_a_first_time_the_newest_spans_are_answered(served):
 
 def test_a_history_leaves_out_machines_and_filled_layers(served):
     rows = hours(0.02, 0.05)
-    assert served(rows, Watching("a")).history(HistoryQuery(8.5, 8.5)).spans == ()
+    assert served(rows, FakeFollower("a")).history(HistoryQuery(8.5, 8.5)).spans == ()
     with pytest.raises(QueryError, match="`resistance_filled` is made from a cell's neighbours") as caught:
         served(rows).history(HistoryQuery(8.5, 8.5, ("visits", "resistance_filled")))
     assert caught.value.reason == Refusal.UNKNOWN_LAYER
@@ -295,14 +254,13 @@ def test_a_site_without_samples_has_no_history(served):
 @pytest.mark.parametrize("query", [PointQuery(0, 0, when=When(1)), HistoryQuery(0, 0)])
 def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
     writer = Writer(tmp_path, SITE, CONFIG, now_ns)
-    for journal, words in ((None, "keeps no journal"), (tmp_path / "none.db", "no usable journal")):
-        with pytest.raises(QueryError, match=words) as caught:
-            getattr(Answers(writer, SITE, CONFIG, None, journal), query.name)(query)
-        assert caught.value.reason == Refusal.STORE
+    with pytest.raises(QueryError, match="no usable journal") as caught:
+        getattr(Answers(writer, FakeFollower(), SITE, CONFIG, tmp_path / "none.db"), query.name)(query)
+    assert caught.value.reason == Refusal.STORE
     writer.close()
 
 
-def test_questions_about_the_past_are_told_apart():
+def test_questions_about_the_past_are_recognised():
     assert reads_past("history", {})
     assert reads_past("point", {"as_of": "1"})
     assert reads_past("region", {"minus": "1"})
@@ -331,114 +289,22 @@ def test_answers_about_the_past_travel_as_bytes(answers):
 # --- machines, changes, commands -------------------------------------------------------------------------------------
 
 
-def test_the_keeper_is_asked(served):
-    keeper = Watching()
-    answers = served(keeper=keeper)
-    assert decode_machines(answers.answer("machines", {"after": "1"})) == keeper.machines()
-    assert decode_changes(answers.answer("changes", {"after": "41"})) == [replace(CHANGE, id=42)]
+def test_the_follower_is_asked(served):
+    follower = FakeFollower()
+    answers = served(follower=follower)
+    assert [
+        (machine.name, machine.trusted) for machine in decode_machines(answers.answer("machines", {"after": "1"}))
+    ] == [
+        ("a", True),
+        ("b", False),
+    ]
+    assert [change.id for change in decode_changes(answers.answer("changes", {"after": "41"}))] == [42]
     row = decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
     assert (row.name, row.trusted, row.merged) == ("b", False, 4)
     answers.obey("trust", {"machine": "b", "trusted": "auto"})
-    assert keeper.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
+    assert follower.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
     with pytest.raises(QueryError, match="`c` is not known") as caught:
         answers.obey("trust", {"machine": "c", "trusted": "yes"})
     assert caught.value.reason == Refusal.UNKNOWN_MACHINE
     with pytest.raises(QueryError, match="row 9 is not merged"):
         answers.answer("machines", {"after": "9", "wait": "0.01"})
-
-
-def test_where_nobody_watches_nothing_is_known(answers):
-    assert decode_machines(answers.answer("machines", {})) == []
-    assert decode_changes(answers.answer("changes", {})) == []
-    with pytest.raises(QueryError, match="nobody watches"):
-        answers.obey("trust", {"machine": "a", "trusted": "yes"})
-
-
-# --- over Zenoh ------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def online(tmp_path):
-    with routed() as (router, client):
-        server = Server(router, tmp_path, SITE, CONFIG, now_ns)
-        yield server, client
-        server.close()
-
-
-def get(client, key: str, parameters: dict[str, str], payload: bytes | None = None):
-    selector = f"{key}?{selector_of(parameters)}" if parameters else key
-    [reply] = client.get(selector, payload=payload, timeout=WAIT_S)
-    return reply
-
-
-def test_events_and_queries_below_the_map_do_not_meet(online):
-    server, client = online
-    heard, here = [], threading.Event()
-    subscriber = client.declare_subscriber(
-        keys.changed("pit"), lambda s: (heard.append(s.payload.to_bytes()), here.set())
-    )
-    error = decode_error(get(client, keys.changed("pit"), {}).err.payload.to_bytes())
-    assert error.reason == Refusal.UNKNOWN_QUERY
-    get(client, keys.map_query("pit", "info"), {})  # the subscription has reached the server with this answer
-    server._publish(CHANGE)
-    assert here.wait(WAIT_S)
-    assert heard == [encode_change(CHANGE)]
-    subscriber.undeclare()
-
-
-def test_a_command_reaches_the_keeper_with_its_reason(online):
-    _, client = online
-    get(client, keys.ingest("pit", "a"), {}, encode_batch(batch(samples(5))))
-    command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")
-    row = decode_machine(get(client, keys.admin("pit", "trust"), encode_command(command)).ok.payload.to_bytes())
-    assert (row.name, row.trusted, row.merged) == ("a", False, 1)
-    assert row.reason == command.reason
-    gone = {"x": "8.5", "y": "8.5", "layers": "weight"}
-    for more in ({}, {"as_of": str(NOW_NS + HOUR_NS)}):
-        point = decode_point(get(client, keys.map_query("pit", "point"), gone | more).ok.payload.to_bytes())
-        assert np.isnan(point.values["weight"])
-    [machine] = decode_machines(get(client, keys.map_query("pit", "machines"), {}).ok.payload.to_bytes())
-    assert machine.name == "a"
-    assert not machine.trusted
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "reason"),
-    [
-        ("trust", {"machine": "c", "trusted": "yes"}, Refusal.UNKNOWN_MACHINE),
-        ("trust", {"machine": "c"}, Refusal.MISSING_FIELD),
-        ("shutdown", {}, Refusal.UNKNOWN_QUERY),
-    ],
-)
-def test_a_refused_command_gets_its_reason_and_is_counted(online, name, parameters, reason):
-    _, client = online
-    assert decode_error(get(client, keys.admin("pit", name), parameters).err.payload.to_bytes()).reason == reason
-    info = decode_info(get(client, keys.map_query("pit", "info"), {}).ok.payload.to_bytes())
-    assert info.counters == {f"refused_query_{reason}": 1}
-
-
-@pytest.mark.parametrize("slow", ["past", "command"])
-def test_the_map_as_it_is_does_not_wait_for_what_is_slow(online, monkeypatch, slow):
-    server, client = online
-    release, entered = threading.Event(), threading.Event()
-
-    def hold(*_):
-        entered.set()
-        assert release.wait(WAIT_S)
-        raise QueryError(Refusal.STORE, "held")
-
-    monkeypatch.setattr(server.answers, "history", hold)
-    monkeypatch.setattr(server.answers, "trust", hold)
-    key, asked = {
-        "past": (keys.map_query("pit", "history"), encode_query(HistoryQuery(0, 0))),
-        "command": (keys.admin("pit", "trust"), encode_command(TrustCommand("a", True))),
-    }[slow]
-    askers = [threading.Thread(target=get, args=(client, key, asked)) for _ in range(3)]
-    for asker in askers:
-        asker.start()
-    assert entered.wait(WAIT_S)
-    for _ in range(3):
-        assert get(client, keys.map_query("pit", "info"), encode_query(InfoQuery())).ok
-    release.set()
-    for asker in askers:
-        asker.join()

@@ -1,30 +1,31 @@
 import pytest
 
 from mapserver.journal.rows import Event
-from mapserver.trust.auditor import Reason, Verdict
-from mapserver.trust.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER, Decision, Decisions
+from mapserver.trust.auditor import Verdict
+from mapserver.trust.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER, TrustDecision, TrustDecisions
+from mapserver.trust.judgement import Reason
 
 BAD = Verdict("c", (Reason.GAIN, Reason.OFFSET), {"gain": 1.6}, True)
 GOOD = Verdict("c", (), {"gain": 1.0}, False)
 
 
-def judged(decisions: Decisions, verdict: Verdict, times: int) -> list[Decision]:
-    """What the audit decides on the same verdict again and again; each decision is taken."""
+def judged(decisions: TrustDecisions, verdict: Verdict, times: int) -> list[TrustDecision]:
+    """What the audit decides on the same verdict again and again; each decision counts at once."""
     made = []
     for stamp_ns in range(1, times + 1):
         for decision in decisions.judge({verdict.machine: verdict}, stamp_ns):
-            decisions.take(decision)
+            decisions.add(decision)
             made.append(decision)
     return made
 
 
 def test_nobody_is_distrusted_at_first():
-    assert Decisions([]).distrusted == frozenset()
-    assert Decisions([]).of("c") is None
+    assert TrustDecisions([]).distrusted == frozenset()
+    assert TrustDecisions([]).newest("c") is None
 
 
 def test_a_machine_is_distrusted_once_the_verdict_stands():
-    decisions = Decisions([])
+    decisions = TrustDecisions([])
     assert judged(decisions, BAD, DISTRUST_AFTER - 1) == []
     (decision,) = judged(decisions, BAD, 3)
     assert (decision.machine, decision.trusted, decision.by, decision.reason) == ("c", False, AUDIT, "gain, offset")
@@ -33,14 +34,14 @@ def test_a_machine_is_distrusted_once_the_verdict_stands():
 
 
 def test_a_doubtful_verdict_begins_to_count_anew():
-    decisions = Decisions([])
+    decisions = TrustDecisions([])
     for _ in range(5):
         assert judged(decisions, BAD, DISTRUST_AFTER - 1) == []
         assert judged(decisions, GOOD, 1) == []
 
 
 def test_a_machine_that_agrees_again_is_trusted_again_but_later():
-    decisions = Decisions([])
+    decisions = TrustDecisions([])
     judged(decisions, BAD, DISTRUST_AFTER)
     assert judged(decisions, GOOD, TRUST_AFTER - 1) == []
     (decision,) = judged(decisions, GOOD, 1)
@@ -51,27 +52,27 @@ def test_a_machine_that_agrees_again_is_trusted_again_but_later():
 
 @pytest.mark.parametrize("trusted", [True, False])
 def test_what_a_person_decided_stands_against_the_audit(trusted):
-    decisions = Decisions([])
-    decisions.take(Decision("c", trusted, PERSON, "because", 1))
+    decisions = TrustDecisions([])
+    decisions.add(TrustDecision("c", trusted, PERSON, "because", 1))
     assert judged(decisions, BAD if trusted else GOOD, 20) == []
     assert decisions.distrusted == (frozenset() if trusted else {"c"})
 
 
 def test_a_decision_handed_back_lets_the_audit_decide():
-    decisions = Decisions([])
-    decisions.take(Decision("c", False, PERSON, "because", 1))
-    decisions.take(Decision("c", True, AUDIT, "left to the audit", 2))
+    decisions = TrustDecisions([])
+    decisions.add(TrustDecision("c", False, PERSON, "because", 1))
+    decisions.add(TrustDecision("c", True, AUDIT, "left to the audit", 2))
     assert decisions.distrusted == frozenset()
     assert judged(decisions, BAD, DISTRUST_AFTER)
 
 
 def test_decisions_come_back_from_events_the_newest_of_each_machine():
     made = [
-        Decision("c", False, AUDIT, "gain", 1, {"gain": 1.6}),
-        Decision("b", False, PERSON, "broken", 2),
-        Decision("c", True, PERSON, "repaired", 3),
+        TrustDecision("c", False, AUDIT, "gain", 1, {"gain": 1.6}),
+        TrustDecision("b", False, PERSON, "broken", 2),
+        TrustDecision("c", True, PERSON, "repaired", 3),
     ]
-    decisions = Decisions(Event(i, "trust", d.stamp_ns, d.body) for i, d in enumerate(made, 1))
+    decisions = TrustDecisions(Event(i, "trust", d.stamp_ns, d.body) for i, d in enumerate(made, 1))
     assert decisions.distrusted == {"b"}
-    assert decisions.of("c") == made[2]
-    assert decisions.of("b") == made[1]
+    assert decisions.newest("c") == made[2]
+    assert decisions.newest("b") == made[1]

@@ -266,9 +266,9 @@ def test_free_space(tmp_path: Path):
 @pytest.mark.parametrize(
     ("state", "age_s", "level", "words"),
     [
-        (SpoolState(0, 0, 0, 0), 0, Level.PASS, "0 samples wait; 0 were dropped, 0 put aside"),
+        (SpoolState(0, 0, 0, 0), 0, Level.PASS, "0 samples wait; 0 were dropped, 0 quarantined"),
         (SpoolState(5, 0, 0, NOW_NS), 600, Level.PASS, "the oldest is of 10 min ago"),
-        (SpoolState(5, 0, 0, NOW_NS), 4 * 3600, Level.WARN, "4 h ago; 0 were dropped, 0 put aside; start its agent"),
+        (SpoolState(5, 0, 0, NOW_NS), 4 * 3600, Level.WARN, "4 h ago; 0 were dropped, 0 quarantined; start its agent"),
         (SpoolState(0, 3, 0, 0), 0, Level.WARN, "raise max_samples"),
         (SpoolState(0, 0, 2, 0), 0, Level.WARN, "table `quarantine`"),
     ],
@@ -355,10 +355,10 @@ def test_a_spool_that_cannot_be_used_is_a_finding(tmp_path: Path, broken: str, c
 def filled_store(folder: Path) -> None:
     with closing(Store(folder, SITE, ServerConfig(), time.time_ns)) as store:
         payload = encode_batch(SampleBatch("loader-1", 5, 1, samples(4), SITE.frame))
-        assert isinstance(store.take([Incoming("loader-1", payload)])[0], Ack)
+        assert isinstance(store.commit([Incoming("loader-1", payload)])[0], Ack)
         store.save_snapshot()
         payload = encode_batch(SampleBatch("loader-1", 5, 5, samples(4), SITE.frame))
-        store.take([Incoming("loader-1", payload)])
+        store.commit([Incoming("loader-1", payload)])
 
 
 def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):

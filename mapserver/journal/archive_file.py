@@ -1,0 +1,195 @@
+"""One file of the archive: its columns and metadata, the seal that finds any damage, and how it is read.
+
+Parquet's page checksums leave out the headers of pages and the footer, whose statistics decide what is skipped. So 12
+bytes before the footer, where readers of Parquet never look, hold the CRC-32 of all that is before them and of all that
+is behind them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from mapserver.journal.reader import LAST
+from mapserver.journal.rows import ALL, JournalRow, Selection
+from protocol.arrays import AnyArray, Bools, Ints, Table
+from protocol.config import from_table
+from protocol.errors import ConfigError, StoreError
+from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
+from protocol.site.site_config import SiteConfig
+
+SCHEMA = 1
+KEY = b"sitegrid"  # of our own metadata
+NAME = re.compile(r"\d{4}-\d\d-\d\dT\d\d_(\d+)-(\d+)\.parquet")
+_SEAL = b"SGRD"
+_SEAL_BYTES = 12
+
+
+@dataclass(frozen=True)
+class ArchiveHeader:
+    """What a file states about itself beside Parquet's own metadata."""
+
+    site: SiteConfig
+    frame: str
+    crs: str
+    machines: tuple[str, ...]
+    schema: int = SCHEMA
+
+
+@dataclass(frozen=True)
+class _Spans:
+    """Rows, stamps and bounding boxes of row groups or of batches, each (n,)."""
+
+    first_row: Ints
+    last_row: Ints
+    first_ns: Ints
+    last_ns: Ints
+    west_m: AnyArray
+    south_m: AnyArray
+    east_m: AnyArray
+    north_m: AnyArray
+
+    def may_hold(self, after: int, until: int, selection: Selection) -> Bools:
+        """Which of them, (n,), may hold selected samples; machines are not compared."""
+        overlaps = (self.last_row > after) & (self.first_row <= until)
+        overlaps &= (self.last_ns >= selection.from_ns) & (self.first_ns <= selection.to_ns)
+        if place := selection.bounds:
+            overlaps &= (self.west_m <= place.east_m) & (self.east_m >= place.west_m)
+            overlaps &= (self.south_m <= place.north_m) & (self.north_m >= place.south_m)
+        return np.asarray(overlaps, np.bool_)
+
+
+class ArchiveFile:
+    """One file of an archive. StoreError, with its name, where it is damaged or no file of an archive.
+
+    first_row, last_row, samples, first_received_ns: of the whole file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        metadata = arrow("parquet").read_metadata(arrow().BufferReader(_tail(path)))
+        self.header = _header(path, metadata.metadata)
+        low, high = _statistics(metadata)
+        self._groups = _spans(low, high)
+        self.first_row, self.last_row = int(low["row"].min()), int(high["row"].max())
+        self.first_received_ns = int(low["received_ns"].min())
+        self.samples = int(metadata.num_rows)
+        if NAME.fullmatch(path.name) and row_range(path) != (self.first_row, self.last_row):
+            raise StoreError(path, f"holds the rows {self.first_row} to {self.last_row}; give it back its name")
+
+    def read(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRow]:
+        """Journal rows exactly as they were, in order; selected as by `JournalReader.read`."""
+        groups = np.flatnonzero(self._groups.may_hold(after, until, selection)).tolist()
+        if not groups or selection.without.issuperset(self.header.machines):
+            return
+        file = arrow("parquet").ParquetFile(arrow().BufferReader(_checked(self.path)))
+        for group in groups:
+            yield from _batches(file.read_row_group(group), after, until, selection)
+
+
+def row_range(path: Path) -> tuple[int, int]:
+    """First and last journal row of a file, by its name."""
+    first, last = path.stem.partition("_")[2].split("-")
+    return int(first), int(last)
+
+
+def _batches(table: Any, after: int, until: int, selection: Selection) -> Iterator[JournalRow]:
+    """The selected batches of a row group."""
+    samples: Table = np.zeros(table.num_rows, SAMPLE_DTYPE)
+    for name in COLUMNS:
+        samples[name] = table.column(name).to_numpy()
+    numbers = table.column("row").to_numpy()
+    starts = np.flatnonzero(np.diff(numbers, prepend=-1))
+    ends = np.append(starts[1:], len(samples))
+    ranged = {"row": numbers, **{name: samples[name] for name in ("stamp_ns", "x_m", "y_m")}}
+    low, high = (
+        {name: f.reduceat(values, starts) for name, values in ranged.items()} for f in (np.minimum, np.maximum)
+    )
+    batches = table.select(["row", "machine", "spool_id", "seq", "received_ns"]).take(starts).to_pylist()
+    for i in np.flatnonzero(_spans(low, high).may_hold(after, until, selection)).tolist():
+        row, machine, spool_id, seq, received_ns = batches[i].values()
+        if machine not in selection.without:
+            yield JournalRow(row, machine, spool_id, seq, samples[starts[i] : ends[i]], received_ns)
+
+
+def _statistics(metadata: Any) -> tuple[dict[str, AnyArray], dict[str, AnyArray]]:
+    """Smallest and largest values of the columns of each row group, each (groups,)."""
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    columns = [{c["path_in_schema"]: c["statistics"] for c in group.to_dict()["columns"]} for group in groups]
+    names = ("row", "received_ns", "stamp_ns", "x_m", "y_m")
+    low, high = ({name: np.array([c[name][end] for c in columns]) for name in names} for end in ("min", "max"))
+    return low, high
+
+
+def _spans(low: dict[str, AnyArray], high: dict[str, AnyArray]) -> _Spans:
+    rows, stamps = ((low[name], high[name]) for name in ("row", "stamp_ns"))
+    return _Spans(*rows, *stamps, low["x_m"], low["y_m"], high["x_m"], high["y_m"])
+
+
+def seal(file: BinaryIO) -> None:
+    """Move the footer of a new file behind its seal."""
+    file.seek(0)
+    data = file.read()
+    start = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
+    body, footer = data[:start], data[start:]
+    file.seek(start)
+    file.write(_SEAL + zlib.crc32(body).to_bytes(4, "little") + zlib.crc32(footer).to_bytes(4, "little") + footer)
+    file.flush()
+
+
+def _tail(path: Path) -> bytes:
+    """Seal and footer, checked, without reading the rest."""
+    length = int.from_bytes(_read(path, 8)[:4], "little")  # of the footer alone
+    tail = _read(path, _SEAL_BYTES + length + 8)
+    if tail[-4:] != b"PAR1" or tail[:4] != _SEAL:
+        raise StoreError(path, "is damaged, or no file of a map server's archive; restore it from a backup")
+    if zlib.crc32(tail[_SEAL_BYTES:]) != int.from_bytes(tail[8:_SEAL_BYTES], "little"):
+        raise StoreError(path, "is damaged; restore it from a backup")
+    return tail
+
+
+def _checked(path: Path) -> bytes:
+    """All bytes of a file, read once, so that what is decoded is what was checked."""
+    tail = _tail(path)
+    data = _read(path)
+    body = len(data) - len(tail)
+    if data[body:] != tail or zlib.crc32(data[:body]) != int.from_bytes(tail[4:8], "little"):
+        raise StoreError(path, "is damaged; restore it from a backup")
+    return data
+
+
+def _read(path: Path, last: int | None = None) -> bytes:
+    """The bytes of a file, or so many of its last ones."""
+    try:
+        with path.open("rb") as file:
+            if last is not None:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - last))
+            return file.read()
+    except OSError as error:
+        raise StoreError(path, f"cannot be read: {error.strerror}") from None
+
+
+def _header(path: Path, metadata: dict[bytes, bytes]) -> ArchiveHeader:
+    table = json.loads(metadata[KEY])
+    if table["schema"] != SCHEMA:
+        raise StoreError(
+            path, f"has schema {table['schema']}, this version knows {SCHEMA}; read it with the version that wrote it"
+        )
+    return from_table(ArchiveHeader, table, str(path))
+
+
+def arrow(module: str = "") -> Any:
+    """Import pyarrow, or a module of it, where it is first needed: a server without an archive does without."""
+    try:
+        return import_module(f"pyarrow.{module}" if module else "pyarrow")
+    except ModuleNotFoundError:
+        raise ConfigError("archive", "pyarrow is not installed: pip install 'sitegrid[archive]'") from None

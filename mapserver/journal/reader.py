@@ -1,0 +1,207 @@
+"""What can be read of a journal, by its owner as by any other thread or process."""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mapserver.journal.rows import ALL, Event, JournalRow, Selection, Watermark, checksum, extent_checksum, unpack
+from mapserver.journal.schema import SCHEMA
+from protocol.errors import StoreError
+
+_COLUMNS = "SELECT row, machine, spool_id, first_seq, received_ns, payload, journal.crc32 FROM "
+_IN_ORDER = "AND row > :after AND row <= :until ORDER BY row LIMIT :most"
+_READ_ALL = f"{_COLUMNS} journal WHERE TRUE {_IN_ORDER}"
+# LEFT JOIN keeps SQLite from walking the journal first, and shows a row that is not there.
+_READ_SOME = f"""{_COLUMNS} extent LEFT JOIN journal USING (row)
+WHERE extent.last_stamp_ns >= :from_ns AND extent.first_stamp_ns <= :to_ns
+    AND west_m <= :east_m AND east_m >= :west_m AND south_m <= :north_m AND north_m >= :south_m
+{_IN_ORDER}"""
+ROWS_AT_ONCE = 200  # read or removed in one transaction: short ones keep the write-ahead log small
+_EXTENTS_AT_ONCE = 10_000
+LAST = 2**63 - 1
+_EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
+
+
+class ArchivedError(StoreError):
+    """Rows that are asked for have moved to the archive. archived_row: the last one that has."""
+
+    def __init__(self, path: Path, archived_row: int) -> None:
+        super().__init__(path, f"rows up to {archived_row} are in the archive beside it")
+        self.archived_row = archived_row
+
+
+class JournalQueries:
+    """What can be read of a journal, on its owner's connection as on a reader's."""
+
+    path: Path
+    _db: sqlite3.Connection
+
+    def read(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRow]:
+        """Rows after < row <= until in order, also those that are committed meanwhile.
+
+        StoreError where a row is missing or not what was written; ArchivedError as soon as one of them is archived.
+        """
+        while True:
+            last = min(until, self._last_row())  # asked before the rows are read: all up to this one must be there
+            piece = self._piece(after, until, selection)
+            # Asked after the rows were read: none beyond this one had been removed then.
+            if after < min(archived := self.archived_row, until):
+                raise ArchivedError(self.path, archived)
+            is_end = len(piece) < ROWS_AT_ONCE
+            if selection.everywhere:
+                self._require_each((row for row, *_ in piece), after, last if is_end else 0)
+            yield from (self._row(*values) for values in piece if values[1] not in selection.without)
+            if is_end:
+                return
+            after = piece[-1][0]
+
+    def newest_ns(self) -> int:
+        """The newest stamp of all samples, archived or not: the site's now."""
+        return self._number("SELECT COALESCE(MAX(newest_ns), 0) FROM watermark")
+
+    @property
+    def archived_row(self) -> int:
+        """The last row that has moved to the archive."""
+        return self._number("SELECT COALESCE(MAX(value), 0) FROM meta WHERE key = 'archived_row'")
+
+    def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
+        """Events beyond the number `after`, of one kind or of all, in the order in which they were written."""
+        query = (
+            "SELECT id, kind, stamp_ns, body, crc32 FROM events WHERE id > ? AND kind = COALESCE(?, kind) ORDER BY id"
+        )
+        return [self._event(*values) for values in self._query(query, (after, kind))]
+
+    def check(self) -> None:
+        """Check extents, events and watermarks; StoreError where one is damaged. Rows are checked when they are read.
+
+        A damaged extent would hide its row from a read by time and place, without any error.
+        """
+        self._db.execute("BEGIN")  # one state for all of it, also while a server writes
+        try:
+            self._require_each(self._extent_rows(), self.archived_row, self._last_row())
+            self._require_each((event.id for event in self.events()), 0)
+            self._load_watermarks()
+        finally:
+            if self._db.in_transaction:  # SQLite itself ends it where the disk fails
+                self._db.execute("ROLLBACK")
+
+    def _query(self, query: str, values: Sequence[Any] | Mapping[str, Any] = ()) -> list[tuple[Any, ...]]:
+        try:
+            return self._db.execute(query, values).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(self.path, f"cannot be read: {error}") from None
+
+    def _meta(self) -> dict[str, str]:
+        """All of the table meta; StoreError where the journal has another schema."""
+        meta = dict(self._query("SELECT key, value FROM meta"))
+        if meta.get("schema") != str(SCHEMA):
+            problem = f"has schema {meta.get('schema')!r}, this version knows {SCHEMA}"
+            raise StoreError(self.path, f"{problem}; open it with the version that wrote it, or choose another --store")
+        return meta
+
+    def _number(self, query: str) -> int:
+        ((value,),) = self._query(query)
+        try:
+            return int(value)
+        except ValueError:
+            raise self._damaged(f"the value {value!r}") from None
+
+    def _last_row(self) -> int:  # also where all rows are archived
+        return self._number("SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'")
+
+    def _piece(self, after: int, until: int, selection: Selection) -> list[tuple[Any, ...]]:
+        span = {"after": after, "until": until, "most": ROWS_AT_ONCE}
+        if selection.everywhere:
+            return self._query(_READ_ALL, span)
+        box = asdict(selection.bounds) if selection.bounds else _EVERYWHERE
+        return self._query(_READ_SOME, {**span, **box, "from_ns": selection.from_ns, "to_ns": selection.to_ns})
+
+    def _require_each(self, numbers: Iterable[int], after: int, last: int = 0) -> None:
+        """StoreError unless each number follows the one before, from `after` on, to `last` at least."""
+        for number in numbers:
+            if number != after + 1:
+                raise self._damaged(f"what follows number {after}")
+            after = number
+        if after < last:
+            raise self._damaged(f"what follows number {after}")
+
+    def _damaged(self, what: str) -> StoreError:
+        return StoreError(self.path, f"{what} is damaged; restore the file from a backup")
+
+    def _row(
+        self, row: int, machine: str, spool: bytes, first_seq: int, received_ns: int, payload: bytes, crc32: int
+    ) -> JournalRow:
+        if checksum(row, machine, spool, first_seq, received_ns, payload) != crc32:
+            raise self._damaged(f"journal row {row}")
+        return JournalRow(row, machine, int.from_bytes(spool, "big"), first_seq, unpack(payload), received_ns)
+
+    def _extent_rows(self) -> Iterator[int]:
+        """The rows that have an extent, in order; read in pieces, since there may be millions."""
+        query, row = "SELECT * FROM extent WHERE row > ? ORDER BY row LIMIT ?", 0
+        while piece := self._query(query, (row, _EXTENTS_AT_ONCE)):
+            for *extent, crc32 in piece:
+                row = extent[0]
+                if crc32 != extent_checksum(*extent):
+                    raise self._damaged(f"the extent of journal row {row}")
+                yield row
+
+    def _event(self, number: int, kind: str, stamp_ns: int, body: str, crc32: int) -> Event:
+        if crc32 != checksum(number, kind, stamp_ns, body):
+            raise self._damaged(f"event {number}")
+        return Event(number, kind, stamp_ns, json.loads(body))
+
+    def _load_watermarks(self) -> dict[tuple[str, int], Watermark]:
+        watermarks = {}
+        query = "SELECT machine, spool_id, seq, lost, newest_ns, crc32 FROM watermark"
+        for machine, spool, *values, crc32 in self._query(query):
+            if crc32 != checksum(machine, spool, *values):
+                raise self._damaged(f"the watermark of {machine}")
+            watermarks[machine, int.from_bytes(spool, "big")] = Watermark(*values)
+        return watermarks
+
+
+class JournalReader(JournalQueries):
+    """A read-only connection for threads other than the owner's, also while a server writes; one thread at a time.
+
+    site, frame: whose journal it is.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with ExitStack() as opened:
+            try:
+                self._db = sqlite3.connect(
+                    f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None, check_same_thread=False
+                )
+                opened.callback(self._db.close)
+                meta = self._meta()
+            except sqlite3.Error as error:
+                raise StoreError(path, f"is no usable journal: {error}") from None
+            self.site, self.frame = meta.get("site", ""), meta.get("frame", "")
+            opened.pop_all()
+
+    @property
+    def last_row(self) -> int:
+        """The last row on disk, archived or not."""
+        return self._last_row()
+
+    def watermarks(self) -> dict[tuple[str, int], Watermark]:
+        """Progress of all spools."""
+        return self._load_watermarks()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._db.close()
+
+    def __enter__(self) -> JournalReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,184 @@
+"""The fold in numpy: what the kernel of mapserver/evidence/fold.py must give, bit for bit.
+
+It adds one stencil cell at a time over all samples, and shares with the kernel only the tables of votes.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapserver.evidence import cells as ev
+from mapserver.evidence.open_blocks import FREE, OpenBlocks, code_of
+from mapserver.evidence.votes import (
+    GRADE_LOW,
+    GRADE_STEPS,
+    HASH,
+    RESISTANCE_STEPS,
+    STD_FLOOR_M,
+    TABLE,
+    TABLE_LAST,
+    TABLE_PER_UNIT,
+    VISIT_NS,
+    WEIGHT_SHIFT,
+    FoldConfig,
+    is_foldable,
+    name_hash,
+)
+from protocol.arrays import Bools, Floats, Ints, Table
+from protocol.site.geometry import BLOCK_CELLS
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Prepared samples, one entry each, positions in cells.
+
+    place: (n, 2) position; inverse: (n, 3) inverse covariance xx, 2 xy, yy; reach: (n,) half the stencil's edge, in
+    cells around the one that the sample lies in; weight: (n,); bins, shares: (n, 3) for resistance, grade east, grade
+    north; sector, stamp_ns, bucket: (n,); bits: (n, 2) one bit set in each.
+    """
+
+    place: Floats
+    inverse: Floats
+    reach: Ints
+    weight: Ints
+    bins: Ints
+    shares: Ints
+    sector: Ints
+    stamp_ns: Ints
+    bucket: Ints
+    bits: NDArray[np.uint64]
+
+    @property
+    def middle(self) -> Ints:
+        """Column and row (n, 2) of the cell that a sample lies in."""
+        return np.floor(self.place).astype(np.int64)
+
+
+def fold(rows: Table, machine: str, cell_m: float, config: FoldConfig, blocks: OpenBlocks) -> int:
+    """As `mapserver.evidence.fold.fold`."""
+    votes = prepare(rows[is_foldable(rows, config)], machine, cell_m, config)
+    corner = (votes.middle - votes.reach[:, None]) // BLOCK_CELLS
+    codes = _codes(votes, corner)
+    unique, inverse = np.unique(codes, return_inverse=True)
+    open_slots = blocks.slots_of(unique.tolist())
+    if (open_slots == FREE).any():
+        blocks.open(unique[open_slots == FREE].tolist())
+        open_slots = blocks.slots_of(unique.tolist())
+    slots = open_slots[inverse].reshape(codes.shape)
+    for offset_y, offset_x, share in _stencils(votes):
+        hit = np.flatnonzero(share)
+        column, row = votes.middle[hit, 0] + offset_x, votes.middle[hit, 1] + offset_y
+        slot = slots[hit, (row >> 4) - corner[hit, 1], (column >> 4) - corner[hit, 0]]
+        _add_votes(votes, hit, slot, (row & 15) * 16 + (column & 15), share[hit], blocks)
+    return len(votes.weight)
+
+
+def _codes(votes: Votes, corner: Ints) -> Ints:
+    """Codes (n, k, k) of all blocks that the stencils touch; where one touches fewer, its last block again."""
+    last = (votes.middle + votes.reach[:, None]) // BLOCK_CELLS
+    steps = np.arange(int((last - corner).max(initial=0)) + 1)
+    x = np.minimum(corner[:, 0, None, None] + steps[None, None, :], last[:, 0, None, None])
+    y = np.minimum(corner[:, 1, None, None] + steps[None, :, None], last[:, 1, None, None])
+    return code_of(votes.bucket[:, None, None], x, y)
+
+
+def _stencils(votes: Votes) -> list[tuple[int, int, Ints]]:
+    """Return offset_y, offset_x from the middle, and every sample's integer share of its weight there.
+
+    What rounding down leaves over goes to the middle.
+    """
+    reach = int(votes.reach.max(initial=0))
+    offsets = [(dy, dx) for dy in range(-reach, reach + 1) for dx in range(-reach, reach + 1)]
+    raw = np.stack([_raw_weight(votes, dy, dx) for dy, dx in offsets])
+    factor = (votes.weight << WEIGHT_SHIFT) // np.maximum(raw.sum(axis=0), 1)
+    share = (raw * factor) >> WEIGHT_SHIFT
+    share[len(offsets) // 2] += votes.weight - share.sum(axis=0)
+    return [(dy, dx, share[k]) for k, (dy, dx) in enumerate(offsets)]
+
+
+def _raw_weight(votes: Votes, dy: int, dx: int) -> Ints:
+    x = (votes.middle[:, 0] + dx + 0.5) - votes.place[:, 0]
+    y = (votes.middle[:, 1] + dy + 0.5) - votes.place[:, 1]
+    a, b, c = votes.inverse.T
+    d2 = (a * x + b * y) * x + c * y * y
+    inside = (abs(dx) <= votes.reach) & (abs(dy) <= votes.reach)
+    place = np.minimum(d2 * TABLE_PER_UNIT, TABLE_LAST).astype(np.int64)
+    return np.where(inside, TABLE[place], 0)
+
+
+def _add_votes(votes: Votes, hit: Ints, slot: Ints, cell: Ints, weight: Ints, blocks: OpenBlocks) -> None:
+    """Add the weights of the samples `hit` to one cell each."""
+    for part, first in enumerate((ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start)):
+        votes_for = votes.bins[hit, part] >= 0
+        at, where, bins = slot[votes_for], cell[votes_for], first + votes.bins[hit, part][votes_for]
+        upper = weight[votes_for] * votes.shares[hit, part][votes_for] // ev.SHARE_ONE
+        _add(blocks, at, bins, where, weight[votes_for] - upper)
+        _add(blocks, at, bins + 1, where, upper)
+    _add(blocks, slot, ev.HEADING.start + votes.sector[hit], cell, weight)
+    for which in (ev.VISITS, ev.MACHINES):
+        np.bitwise_or.at(blocks.bitmaps, (slot, np.full_like(slot, which), cell), votes.bits[hit, which])
+    np.maximum.at(blocks.newest, (slot, cell), votes.stamp_ns[hit])
+
+
+def _add(blocks: OpenBlocks, slot: Ints, plane: Ints, cell: Ints, weight: Ints) -> None:
+    np.add.at(blocks.counts, (slot, plane, cell), weight.astype(np.uint32))
+    blocks.planes[slot, plane] = True
+
+
+def prepare(rows: Table, machine: str, cell_m: float, config: FoldConfig) -> Votes:
+    """Turn foldable samples of one machine into votes."""
+    place = np.stack([rows["x_m"], rows["y_m"]], axis=1) / cell_m
+    floor, per_m2 = STD_FLOOR_M**2, 1 / (cell_m * cell_m)
+    xx = (rows["cov_xx_m2"].astype(np.float64) + floor) * per_m2
+    yy = (rows["cov_yy_m2"].astype(np.float64) + floor) * per_m2
+    # samples are checked in single precision: what rounding lets pass must not make the covariance indefinite
+    most = np.sqrt(rows["cov_xx_m2"].astype(np.float64) * rows["cov_yy_m2"].astype(np.float64))
+    xy = np.clip(rows["cov_xy_m2"].astype(np.float64), -most, most) * per_m2
+    scale = 1 / (xx * yy - xy * xy)
+    pairs = [split_resistance(rows["c_rr"].astype(np.float64))]
+    pairs += [split_grade(rows[name].astype(np.float64)) for name in ("grade_e", "grade_n")]
+    sector = np.floor(rows["heading_rad"].astype(np.float64) / (2 * np.pi / ev.SECTORS) + 0.5).astype(np.int64)
+    return Votes(
+        place=place,
+        inverse=np.stack([yy, -2 * xy, xx], axis=1) * scale[:, None],
+        reach=np.ceil(2 * np.sqrt(np.maximum(xx, yy))).astype(np.int64),
+        weight=np.rint(rows["distance_m"].astype(np.float64) * ev.WEIGHT_UNITS_PER_M).astype(np.int64),
+        bins=np.stack([lower for lower, _ in pairs], axis=1),
+        shares=np.stack([share for _, share in pairs], axis=1),
+        sector=sector % ev.SECTORS,
+        stamp_ns=rows["stamp_ns"].copy(),
+        bucket=rows["stamp_ns"] // config.bucket_ns,
+        bits=_bits(rows["stamp_ns"], machine),
+    )
+
+
+def split_resistance(c_rr: Floats) -> tuple[Ints, Ints]:
+    """Lower bin and share (of SHARE_ONE) of the bin above it, linear in log(c_rr); beyond the ends, the end bins."""
+    return _split(np.searchsorted(RESISTANCE_STEPS, c_rr, side="right"), np.isnan(c_rr), ev.RESISTANCE_BINS)
+
+
+def split_grade(grade: Floats) -> tuple[Ints, Ints]:
+    """Lower bin and share (of SHARE_ONE) of the bin above it; beyond the ends, the end bins."""
+    unknown = np.isnan(grade)
+    place = np.rint((np.where(unknown, 0.0, grade) - GRADE_LOW) * GRADE_STEPS)
+    return _split(np.clip(place, 0, (ev.GRADE_BINS - 1) * ev.SHARE_ONE).astype(np.int64), unknown, ev.GRADE_BINS)
+
+
+def _split(place: Ints, unknown: Bools, bins: int) -> tuple[Ints, Ints]:
+    """Split a place on the axis of bins; what is unknown gives bin -1, which means no vote."""
+    lower = np.minimum(place // ev.SHARE_ONE, bins - 2)
+    return np.where(unknown, -1, lower), np.where(unknown, 0, place - lower * ev.SHARE_ONE)
+
+
+def _bits(stamp_ns: Ints, machine: str) -> NDArray[np.uint64]:
+    """Bitmaps with the bit of the visit and the bit of the machine (a multiplicative hash takes the top six bits)."""
+    name = np.uint64(name_hash(machine))
+    visit = (name + (stamp_ns // VISIT_NS).astype(np.uint64)) * np.uint64(HASH)
+    one = np.uint64(1)
+    bits = np.empty((len(stamp_ns), 2), np.uint64)
+    bits[:, ev.VISITS] = one << (visit >> np.uint64(58))
+    bits[:, ev.MACHINES] = one << (name >> np.uint64(58))
+    return bits

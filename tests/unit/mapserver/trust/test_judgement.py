@@ -1,0 +1,146 @@
+"""Judgements: each limit from both sides, votes, clocks."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from math import log
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapserver.trust.comparison import ZERO_ERROR, Difference, Gain
+from mapserver.trust.judgement import (
+    AGREE,
+    AGREEMENT,
+    DISAGREE,
+    GAIN_LIMIT,
+    MIN_SPREAD,
+    OFFSET_LIMIT_M,
+    SHARE,
+    STUCK_SPREAD,
+    UNKNOWN,
+    ClockLeads,
+    Reason,
+    judge,
+    outvoted,
+)
+from mapserver.trust.shift import Shift
+from protocol.arrays import Ints
+
+ALIKE = Difference(10**9, Gain(0.0, 0.0, 1.0, 1e9), Shift(0.0, 0.0, 0.0, 1.0), 1.0, (0.5, 0.5))
+
+
+def gain(ratio: float, **more: float) -> dict[str, Any]:
+    return {"gain": replace(ALIKE.gain, log=log(ratio), **more)}
+
+
+def shift(far_m: float, **more: float) -> dict[str, Any]:
+    values = {"east_m": 0.6 * far_m, "north_m": -0.8 * far_m, "std_m": 0.0, "share": 1.0}
+    return {"shift": Shift(**(values | more))}
+
+
+@pytest.mark.parametrize(
+    ("reason", "changed", "state"),
+    [
+        (Reason.GAIN, gain(GAIN_LIMIT * 1.01), DISAGREE),
+        (Reason.GAIN, gain(1 / GAIN_LIMIT / 1.01), DISAGREE),
+        (Reason.GAIN, gain(GAIN_LIMIT / 1.01), AGREE),
+        (Reason.GAIN, gain(GAIN_LIMIT * 1.01, share=SHARE - 0.01), UNKNOWN),
+        (Reason.GAIN, gain(GAIN_LIMIT * 1.01, std=0.1), UNKNOWN),
+        (Reason.GAIN, gain(GAIN_LIMIT * 1.01, c_rr=ZERO_ERROR), AGREE),
+        (Reason.OFFSET, shift(OFFSET_LIMIT_M + 0.01), DISAGREE),
+        (Reason.OFFSET, shift(OFFSET_LIMIT_M - 0.01), AGREE),
+        (Reason.OFFSET, shift(OFFSET_LIMIT_M + 0.01, share=SHARE - 0.01), UNKNOWN),
+        (Reason.OFFSET, shift(OFFSET_LIMIT_M + 0.01, std_m=0.1), UNKNOWN),
+        (Reason.OFFSET, shift(0.0, std_m=OFFSET_LIMIT_M + 0.01), UNKNOWN),
+        (Reason.OFFSET, {"shift": None}, UNKNOWN),
+        (Reason.DISAGREES, {"agreement": AGREEMENT - 0.01}, DISAGREE),
+        (Reason.DISAGREES, {"agreement": AGREEMENT + 0.01}, UNKNOWN),
+        (Reason.DISAGREES, {"agreement": AGREEMENT - 0.01, "cells": 10_000}, UNKNOWN),
+        (Reason.DISAGREES, {}, AGREE),
+        (Reason.STUCK, {"spreads": (0.5 * STUCK_SPREAD * 0.99, 0.5)}, DISAGREE),
+        (Reason.STUCK, {"spreads": (0.5 * STUCK_SPREAD * 1.01, 0.5)}, AGREE),
+        (Reason.STUCK, {"spreads": (0.0, MIN_SPREAD - 0.01)}, UNKNOWN),
+    ],
+)
+def test_every_limit_counts(reason: Reason, changed: dict[str, Any], state: int) -> None:
+    assert judge(replace(ALIKE, **changed), sigmas=2.0)[reason].state == state
+
+
+@pytest.mark.parametrize("changed", [{"agreement": 0.0}, {"spreads": (0.01, 0.5)}, {"spreads": (0.5, 0.01)}])
+def test_between_maps_that_have_nothing_in_common_gain_and_offset_mean_nothing(changed: dict[str, Any]) -> None:
+    judgements = judge(replace(ALIKE, **(gain(2.0) | shift(9.0) | changed)), sigmas=0.0)
+    assert (judgements[Reason.GAIN].state, judgements[Reason.OFFSET].state) == (UNKNOWN, UNKNOWN)
+    assert {judgement.state for judgement in judge(None, sigmas=0.0).values()} == {UNKNOWN}
+
+
+# --- votes -----------------------------------------------------------------------------------------------------------
+
+
+def states(n: int, *against: tuple[int, int], unknown: tuple[tuple[int, int], ...] = ()) -> Ints:
+    matrix = np.full((n, n), AGREE)
+    np.fill_diagonal(matrix, UNKNOWN)
+    for value, pairs in ((DISAGREE, against), (UNKNOWN, unknown)):
+        for one, other in pairs:
+            matrix[one, other] = matrix[other, one] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("matrix", "expected"),
+    [
+        (states(2, (0, 1)), [(), ()]),
+        (states(3, (0, 2), (1, 2)), [(), (), (0, 1)]),
+        (states(3, (0, 1), (0, 2), (1, 2)), [(), (), ()]),
+        (states(3, (0, 2), (1, 2), unknown=((0, 1),)), [(), (), ()]),
+        (states(4, (0, 2), (0, 3), (1, 2), (1, 3)), [(), (), (), ()]),
+        (states(4, (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)), [(), (), (0, 1), (0, 1)]),
+        (states(5, *((i, j) for i in (3, 4) for j in range(3))), [(), (), (), (0, 1, 2), (0, 1, 2)]),
+        (states(5, *((i, j) for i in (2, 3, 4) for j in range(i))), [()] * 5),
+    ],
+    ids=["two", "one of three", "each of three", "strangers", "two to two", "two alone", "two alike of five", "most"],
+)
+def test_the_larger_side_that_agrees_in_itself_outvotes(matrix: Ints, expected: list[tuple[int, ...]]) -> None:
+    assert outvoted(matrix) == expected
+
+
+# --- clocks ----------------------------------------------------------------------------------------------------------
+
+
+def judged(sent: Iterator[tuple[str, float]]) -> int:
+    """State of machine x against o after these (machine, newest stamp [s]) in order of arrival."""
+    clocks = ClockLeads()
+    for machine, stamp_s in sent:
+        clocks.add(machine, round(stamp_s * 1e9))
+    return clocks.compare("x", "o")[1].state
+
+
+def both(
+    pace: float = 1.0, late_s: float = 0.0, jitter_s: float = 0.0, others_stop_s: float = 1e9
+) -> Iterator[tuple[str, float]]:
+    """Every 10 s of the others' time each sends once; x is late and sends at its own pace, as it can."""
+    rng = np.random.default_rng(0)
+    for now in range(10_000, 13_000, 10):
+        yield "o", min(now, others_stop_s)
+        yield "x", min(now, 10_000 + (now - 10_000) * pace - late_s + jitter_s * rng.random())
+
+
+@pytest.mark.parametrize(
+    ("case", "state"),
+    [
+        ({}, AGREE),
+        ({"jitter_s": -200.0}, AGREE),
+        ({"late_s": 3600.0}, DISAGREE),
+        ({"late_s": 3600.0, "jitter_s": 40.0}, DISAGREE),
+        ({"late_s": 3600.0, "jitter_s": 80.0}, UNKNOWN),
+        ({"late_s": 86_400.0, "pace": 1.2}, UNKNOWN),
+        ({"late_s": 86_400.0, "pace": 20.0}, UNKNOWN),
+        ({"others_stop_s": 11_000.0}, UNKNOWN),
+    ],
+)
+def test_only_a_steady_lead_is_a_wrong_clock(case: dict[str, float], state: int) -> None:
+    assert judged(both(**case)) == state
+
+
+def test_a_machine_that_has_caught_up_agrees() -> None:
+    assert judged(both(late_s=1000.0, pace=2.0)) == AGREE
