@@ -20,7 +20,7 @@ from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle
 from protocol.wire.session import SessionConfig, open_session
 from sim.config import SimConfig
-from sim.recorder import Recorder, write_truth
+from sim.recorder import write_truth
 from sim.simulator import Simulator
 
 MATCH_POLL_S = 0.05
@@ -93,29 +93,24 @@ def run(
     clock: Callable[[], float] = time.monotonic,
     on_progress: Callable[[float], None] | None = None,
     truth_dir: Path | None = None,
-    record_dir: Path | None = None,
     wait_s: float = WAIT_S,
 ) -> SimReport:
     """Simulate and publish until `config.seconds` are over or `stop` is set.
 
     Waits first until every machine has a subscriber, at most wait_s, else a LinkError. on_progress gets the
-    simulated time about five times a second. The truth and log folders are written at the end, whatever ends the run;
-    readings are kept in memory for record_dir.
+    simulated time about five times a second. The truth is written at the end, whatever ends the run.
     """
     with contextlib.closing(Simulator(config)) as simulator, _streams(simulator, session_config) as streams:
-        recording = Recorder(simulator) if record_dir else None
         progress = throttled(on_progress, clock) if on_progress else None
         if missing := _await_subscribers(streams, wait_s, stop, clock):
             problem = f"nobody listens to machine {missing[0]} of site {simulator.site.name}"
             advice = f"start its agent with `sitegrid agent`, within {wait_s:g} s"
             raise LinkError(session_config.endpoint, f"{problem}: {advice}")
         try:
-            report = _drive(simulator, streams, stop, clock, recording, progress)
+            report = _drive(simulator, streams, stop, clock, progress)
         finally:
             if truth_dir:
                 write_truth(truth_dir, simulator)
-            if recording and record_dir:
-                recording.write(record_dir)
     return report
 
 
@@ -124,7 +119,6 @@ def _drive(
     streams: list[Stream],
     stop: threading.Event,
     clock: Callable[[], float],
-    recording: Recorder | None,
     progress: Callable[[float], None] | None,
 ) -> SimReport:
     start, bundles, readings = clock(), 0, 0
@@ -139,8 +133,6 @@ def _drive(
             stream.put(tuple(step[stream.machine]))
         bundles += 1
         readings += sum(map(len, step.values()))
-        if recording:
-            recording.add(step)
         if progress:
             progress(simulator.simulated_s)
     wall_s = clock() - start

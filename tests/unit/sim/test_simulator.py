@@ -206,6 +206,7 @@ def folder_bytes(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["pybullet", "fast"])
 def test_same_seed_records_the_same_bytes_also_in_another_process(tmp_path: Path, world: str) -> None:
     config = changed(world=world, gps=(1, 2, 3), imu=(1, 2, 3, 4), attitude=(1, 3), seconds=3.0)

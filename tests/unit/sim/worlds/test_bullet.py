@@ -116,6 +116,7 @@ def digest() -> str:
     return hashlib.sha256(b"".join(getattr(run, f.name).tobytes() for f in fields(FleetState))).hexdigest()
 
 
+@pytest.mark.slow
 def test_a_drive_repeats_bit_for_bit_here_and_in_another_process() -> None:
     first = digest()
     assert digest() == first
