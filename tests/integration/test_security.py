@@ -198,6 +198,8 @@ def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
 
 
 def test_only_an_admin_commands(guarded: Guarded):
+    with guarded.session("loader-1") as loader:
+        assert acknowledged(loader, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "boss") as client:
         assert client.trust("loader-1", "seen to").trusted
 

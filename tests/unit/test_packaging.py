@@ -47,6 +47,6 @@ def test_everything_that_a_client_meets_stands_under_sitegrid():
     methods = [method for name, method in vars(sitegrid.Client).items() if not name.startswith("_")]
     hints = [get_type_hints(method).get("return") for method in methods if callable(method)]
     answers = {part.__name__ for hint in hints for part in (hint, *get_args(hint)) if isinstance(part, type)}
-    assert {"MapInfo", "MachineState", "GroundChange", "Region", "Span", "TrustAnswer"} <= answers
+    assert {"MapInfo", "MachineState", "GroundChange", "Region", "HistorySpan", "TrustAnswer"} <= answers
     assert answers - {"NoneType", "list", "tuple"} <= {*sitegrid.__all__}
     assert all(getattr(sitegrid, name) for name in (*sitegrid.__all__, "__version__"))
