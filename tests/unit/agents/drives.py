@@ -165,7 +165,7 @@ def _imu(sensor: SensorConfig, of: MachineConfig, ground: Ground, leg: Leg, v: f
         left - leg.turn_radps**2 * out_m[1],
         c * up - s * ahead,
     )
-    sensor_from_base = sensor.mount.base_from_sensor().T
+    sensor_from_base = sensor.mount.frame_from_sensor().T
     gyro = sensor_from_base @ (0.0, 0.0, leg.turn_radps)
     return Imu(sensor.name, stamp_ns, *gyro.tolist(), *(sensor_from_base @ felt).tolist())
 

@@ -64,7 +64,7 @@ def test_two_imus_are_told_apart_and_a_silent_one_is_not_told() -> None:
 def test_a_mounted_imu_is_turned_into_base_link(rpy_deg: tuple[float, float, float]) -> None:
     mount = Mount((0.4, 0.0, 0.9), rpy_deg)
     rates, force = np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 9.0])
-    raw = mount.base_from_sensor().T
+    raw = mount.frame_from_sensor().T
     step = one(of_imu(mount), [imu(t, raw @ rates, raw @ force) for t in (0, 100)])
     assert step.felt["imu"].rates_radps == pytest.approx(rates)
     assert step.felt["imu"].force_mps2 == pytest.approx(force)
@@ -87,7 +87,7 @@ def articulated(angle_rad: float, rate_radps: float, seconds: float, frame: str 
     readings: list[Reading] = []
     for i in range(round(seconds * 100)):
         angle = angle_rad + rate_radps * i / 100
-        rear_from_sensor = map_from_base(np.array([0.0, 0.0, angle])) @ of.sensors[0].mount.base_from_sensor()
+        rear_from_sensor = map_from_base(np.array([0.0, 0.0, angle])) @ of.sensors[0].mount.frame_from_sensor()
         rates, force = np.array([0.05, 0.02, 0.2]), np.array([1.0, 0.0, GRAVITY_MPS2])
         readings.append(Articulation("joint", START_NS + i * 10 * MS, angle))
         raw = rear_from_sensor.T @ (rates + np.array([0.0, 0.0, rate_radps])), rear_from_sensor.T @ force
@@ -129,7 +129,7 @@ def quaternion(rotation: Floats) -> tuple[float, ...]:
 
 
 def attitude(rpy: Iterable[float], mount: Mount, ms: float = 0.0, scale: float = 1.0) -> Attitude:
-    q = quaternion(map_from_base(np.array([*rpy])) @ mount.base_from_sensor())
+    q = quaternion(map_from_base(np.array([*rpy])) @ mount.frame_from_sensor())
     return Attitude("ahrs", START_NS + round(ms * MS), *(scale * v for v in q), 0.01, 0.02, 0.03)
 
 

@@ -137,9 +137,9 @@ def test_gravity_is_removed_on_a_slope_at_any_mounting(rpy_deg: tuple[float, flo
     """Made from rotation matrices alone: what the sensor feels in its own axes at rest, turned into `base_link`."""
     mount, x = Mount((0.4, 0.0, 0.9), rpy_deg), np.zeros(PAPER.n)
     x[ATTITUDE] = (0.15, -0.25, 2.0)
-    map_from_sensor = map_from_base(x[ATTITUDE]) @ mount.base_from_sensor()
+    map_from_sensor = map_from_base(x[ATTITUDE]) @ mount.frame_from_sensor()
     felt = map_from_sensor.T @ (0.0, 0.0, GRAVITY_MPS2)  # raw, in the sensor
-    measurement = imu(np.zeros(3), mount.base_from_sensor() @ felt, np.array(mount.xyz_m))
+    measurement = imu(np.zeros(3), mount.frame_from_sensor() @ felt, np.array(mount.xyz_m))
     assert told(measurement, x) == pytest.approx(measurement.z, abs=1e-12)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from protocol.config import from_table
 from protocol.errors import ConfigError
-from protocol.machine.machine_config import GIVES, MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
+from protocol.machine.machine_config import QUANTITIES, MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
 from protocol.machine.readings import KINDS
 
 GPS = SensorConfig("gps-1", "gps", Mount((1.5, -0.5, 3.25), (0.0, 0.0, 180.0)), drift_share=0.5, use=False)
@@ -33,11 +33,11 @@ def test_machine_as_toml_reads_back():
     ],
 )
 def test_mount_turns_axes(rpy_deg, axis, expected):
-    assert Mount(rpy_deg=rpy_deg).base_from_sensor() @ axis == pytest.approx(expected, abs=1e-12)
+    assert Mount(rpy_deg=rpy_deg).frame_from_sensor() @ axis == pytest.approx(expected, abs=1e-12)
 
 
 def test_mount_is_a_rotation():
-    rotation = Mount(rpy_deg=(10.0, -20.0, 130.0)).base_from_sensor()
+    rotation = Mount(rpy_deg=(10.0, -20.0, 130.0)).frame_from_sensor()
     assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
     assert math.isclose(np.linalg.det(rotation), 1.0)
 
@@ -110,7 +110,7 @@ def test_every_option_of_a_sensor_is_written_and_read_back():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_standard_deviation_goes_by_what_the_kind_gives(kind):
-    for name in GIVES.get(kind, ()):
+    for name in QUANTITIES.get(kind, ()):
         assert SensorConfig("a", kind, std={name: 0.5}).std[name] == 0.5
         for bad in (0.0, -1.0, math.nan, math.inf):
             with pytest.raises(ValueError, match=f"std: a: {name} must be positive and finite"):

@@ -98,7 +98,7 @@ def test_attitude_follows_the_bodys_rates(pitch: float) -> None:
 def test_rotation_equals_that_of_a_mount() -> None:
     attitude = np.array([0.3, -0.7, 2.1])
     mount = Mount(rpy_deg=tuple(np.degrees(attitude).tolist()))
-    np.testing.assert_allclose(map_from_base(attitude), mount.base_from_sensor(), atol=1e-15)
+    np.testing.assert_allclose(map_from_base(attitude), mount.frame_from_sensor(), atol=1e-15)
 
 
 @pytest.mark.parametrize("config", [CONFIG, PLANE])
