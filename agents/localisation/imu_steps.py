@@ -13,6 +13,7 @@ from agents.localisation.sensor_modes import StampedValue
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, FRONT, MachineConfig, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
+from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
 
 NOTHING = (0.0,) * 7  # count and sums
 MIN_NORM = 0.5  # a reference that has not found itself yet sends a quaternion of zeros
@@ -142,9 +143,10 @@ class StepGatherer:
 
     def _orientation(self, attitude: Attitude) -> StampedValue:
         """Orientation of `base_link`: map_from_base = map_from_sensor sensor_from_base."""
-        map_from_base = _rotation(attitude).dot(self._rotations[attitude.sensor].T)
+        map_from_sensor = matrix_from_quaternion((attitude.qx, attitude.qy, attitude.qz, attitude.qw))
+        map_from_base = map_from_sensor.dot(self._rotations[attitude.sensor].T)
         variances = np.array([attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2])
-        return StampedValue(attitude.stamp_ns, _angles(map_from_base), variances)
+        return StampedValue(attitude.stamp_ns, rpy_from_matrix(map_from_base), variances)
 
     def _to_base(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
         """Values of the front frame in `base_link`: turned by the articulation in mid-step, less its rate."""
@@ -177,22 +179,3 @@ class StepGatherer:
         if not self._steers:
             return Turn(mean, 1.0)
         return Turn(speed_mps * mean, speed_mps) if stamp_ns - self._rolled_ns < STALE_S * 1e9 else None
-
-
-def _rotation(attitude: Attitude) -> Floats:
-    """Matrix (3, 3) of the quaternion."""
-    norm = math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw)
-    x, y, z, w = attitude.qx / norm, attitude.qy / norm, attitude.qz / norm, attitude.qw / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _angles(rotation: Floats) -> Floats:
-    """Roll, pitch and yaw (3,) of map_from_base."""
-    (ahead, _, _), (sideways, _, _), (down, left, up) = rotation.tolist()
-    return np.array([math.atan2(left, up), -math.asin(max(-1.0, min(1.0, down))), math.atan2(sideways, ahead)])
