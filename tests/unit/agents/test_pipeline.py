@@ -176,7 +176,7 @@ def test_readings_of_unknown_sensors_are_counted_and_change_nothing(
 
 def test_an_imu_without_accelerometer_invents_no_slope(of: MachineConfig, recorded: list[Reading]) -> None:
     """Its columns of force are filled with something: they must not reach the map as a grade."""
-    sensors = tuple(replace(s, gives=("rate",)) if s.kind == "imu" else s for s in of.sensors)
+    sensors = tuple(replace(s, measures=("rate",)) if s.kind == "imu" else s for s in of.sensors)
     rows = Pipeline(simulated(3, 40.0)[0], replace(of, sensors=sensors), PipelineConfig()).step(recorded)
     assert len(rows) > 50
     assert np.isnan(rows["grade_e"]).all()
@@ -656,7 +656,7 @@ SENSOR = [
     ("imu-3", {"mount": Mount((0.4, 0.0, 0.9), (0.0, 3.0, 0.0))}),
     ("imu-3", {"use": False}),
     ("imu-3", {"frame": FRONT}),
-    ("imu-3", {"gives": ("rate",)}),
+    ("imu-3", {"measures": ("rate",)}),
     ("torque", {"use": False}),
     ("gps-1", {"std": {"position": 5.0}}),
     ("imu-3", {"std": {"rate": 0.05}}),
