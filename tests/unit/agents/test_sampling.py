@@ -154,7 +154,7 @@ def test_nothing_is_lost_while_no_pose_is_known() -> None:
 def test_marks_before_the_first_pose_are_counted() -> None:
     sampler = PlacedSampler()
     for t in (-1.0, -0.5, 0.5):
-        sampler.mark(ns(t), 0.5 * (t + 2))
+        sampler.mark(ns(t), t + 2)
     sampler.poses.append(pose(0))
     sampler.poses.append(pose(1))
     assert len(sampled(sampler, now_s=1.0)) == 1
