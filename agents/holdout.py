@@ -1,4 +1,4 @@
-"""Fixes that are withheld from the filter, to see how far off it is where it has none: an honest error on real logs."""
+"""Fixes that are withheld from the filter and compared with its poses: an honest error on real logs."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The machine's pure heart: readings in, samples out. No clock, no files, no network.
+"""The pure core of an agent: readings in, samples out. No clock, no files, no network.
 
-`Positioning` is the half of it that says where the machine is; `Pipeline` adds the ground there, and samples of it.
+`Positioning` is the half of it that locates the machine; `Pipeline` adds the estimate of the ground, and samples of it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PipelineConfig:
 
 
 class PoseSource(Protocol):
-    """What finds out where a machine is: a `Pipeline`, or its half that does nothing else."""
+    """A source of poses: a `Pipeline`, or its half that locates alone."""
 
     @property
     def pose(self) -> PoseBelief | None:
@@ -157,7 +157,7 @@ class Pipeline:
 
     @property
     def calibration(self) -> Calibration:
-        """What the ground estimator found out about the machine's sensors."""
+        """The calibration that the ground estimator has by now."""
         return self._estimator.calibration
 
     def health(self) -> dict[str, Any]:
@@ -200,7 +200,7 @@ class Pipeline:
         return self._sampler.due_samples(self._newest_ns, self._estimator.at)
 
     def _known_c_rr(self) -> float | None:
-        """Resistance of the ground here, where the site says it and the position is sure enough."""
+        """Resistance of the ground here, where the site states it and the position is sure enough."""
         pose, areas = self.pose, self._site.known_ground
         if not areas or not pose:
             return None

@@ -42,8 +42,8 @@ def run(steps: int, runs: int) -> Result:
         stock, angular = (round(seconds[f"{other}/{step}"] / took_s, 1) for other in (STOCK, ANGULAR))
         us = round(took_s / steps * 1e6, 1)
         rows.append({"filter": name, "step": step, "us": us, "x_stock": stock, "x_stock_angles": angular})
-    found = {"benchmark": "filter", "steps": steps, "runs": runs, **machine(), "rows": rows}
-    return {**found, "agent": [agent.measured(runs)]}
+    result = {"benchmark": "filter", "steps": steps, "runs": runs, **machine(), "rows": rows}
+    return {**result, "agent": [agent.measured(runs)]}
 
 
 def _timer(work: Step, steps: int) -> Callable[[], float]:

@@ -41,7 +41,7 @@ WHEEL_SCALE = 0.03  # and scale of the wheels
 class Alignment:
     """The dead-reckoned frame in `map`: rotation [rad] with its standard deviation, and the place of its origin [m].
 
-    fix_std_m: standard deviation of what the origin was found from.
+    fix_std_m: standard deviation of the origin.
     """
 
     rotation_rad: float

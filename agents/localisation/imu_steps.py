@@ -16,7 +16,7 @@ from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odom
 from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
 
 NOTHING = (0.0,) * 7  # count and sums
-MIN_NORM = 0.5  # a reference that has not found itself yet sends a quaternion of zeros
+MIN_NORM = 0.5  # a reference that has not settled yet sends a quaternion of zeros
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class StepGatherer:
         self._turn_values: list[float] = []  # rates of odometry, or curvatures of steering
         self._rolled_ns = 0
         self._begin_ns = 0
-        self._joint = WheelTracker()  # the angle of articulation, smoothed alike
+        self._joint = WheelTracker()  # the angle of articulation, smoothed in the same manner
         self._knows_joint = False
         self._rolled = False
         self._still_since = (0, math.nan)

@@ -1,9 +1,9 @@
 """Differential and relative sensors (Moore & Stouch 2014, robot_localization: `differential`, `relative`).
 
-Differential: two successive values make a rate of change. Relative: the first value only says what the filter believes
-at that moment, its anchor; later values count from there. In robot_localization the anchor is exact, as the start is
-zero by definition. Here the filter may be unsure of it and learn better later, so where the state has room an anchor
-gets states of its own: how far off the filter was at that moment.
+Differential: two successive values make a rate of change. Relative: the first value stands for what the filter
+believes at that moment, its anchor; later values count from there. In robot_localization the anchor is exact, as the
+start is zero by definition. Here the filter may be unsure of it and learn better later, so where the state has room an
+anchor gets states of its own: how far off the filter was at that moment.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from agents.localisation.filters.belief import Belief, Conditioned, Measurement
 from protocol.arrays import Floats
 from protocol.rotations import wrap_angle
 
-PAIR_S = 1.1  # a mean over more says too little of its middle; a receiver of 1 Hz, with its jitter, still makes pairs
+PAIR_S = 1.1  # a mean over more is far from the rate at its middle; a receiver of 1 Hz still makes pairs
 
 
 class Stamped(Protocol):
@@ -44,7 +44,7 @@ class ModalSensors(Protocol[Value]):
         ...
 
     def measurement(self, value: Value) -> Measurement | None:
-        """What the filter gets of this value; None where it says nothing."""
+        """What the filter gets of this value; None where there is no measurement in it."""
         ...
 
     def confirm(self, value: Value, result: Conditioned) -> None:
@@ -88,7 +88,7 @@ def anchor_states(belief: Belief, states: slice, H: Floats, variance: float) -> 
     """The belief with states e (k,) for the error of an anchor: e = -H (x_true - x) + v.
 
     H (k, n): Jacobian of what is anchored. variance: of v, whatever else makes the anchor wrong. A value that counts
-    from the anchor measures H x + e, which says nothing of x at this moment.
+    from the anchor measures H x + e, which is independent of x at this moment.
     """
     anchored = reset_states(belief, states, variance)
     seen = H @ anchored.P

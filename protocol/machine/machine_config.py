@@ -1,4 +1,4 @@
-"""What an agent knows of its machine: the body's nominal dimensions and the sensors with their mounting."""
+"""Description of a machine: the nominal dimensions of its body, and its sensors with their mounting."""
 
 from __future__ import annotations
 

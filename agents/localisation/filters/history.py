@@ -1,4 +1,4 @@
-"""Measurements in any order: a filter with a history, that goes back to where a late measurement belongs.
+"""Measurements in any order: a filter with a history, which goes back to the stamp of a late measurement.
 
 The history holds nodes: a stamp, the measurements of that stamp, and the belief after them. A measurement that comes
 late is put into its place, and everything after it is filtered again.

@@ -240,6 +240,16 @@ def made_up_samples(n: int, seed: int = 0) -> Table:
     return rows
 
 
+def reckoned(vehicle: MachineConfig, readings: Iterable[Reading], slip: float = 0.0) -> DeadReckoning:
+    """Dead reckoning after all readings."""
+    dead_reckoning = DeadReckoning(vehicle, slip)
+    for reading in readings:
+        sensor = vehicle.sensor(reading.sensor)
+        assert sensor
+        dead_reckoning.update(reading, sensor)
+    return dead_reckoning
+
+
 class RunLocaliser(Localiser):
     """A localiser with the dead reckoning that the pipeline runs for it."""
 

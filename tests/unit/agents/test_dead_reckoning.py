@@ -8,16 +8,7 @@ from agents.dead_reckoning import DeadReckoning, WheelTracker
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Odometry, Torque
 from protocol.units import GRAVITY_MPS2
-from tests.unit.agents.drives import START_NS, Drive, Leg, changed_sensor, drive, machine
-
-
-def reckon(vehicle: MachineConfig, made: Drive, slip: float = 0.0) -> DeadReckoning:
-    reckoning = DeadReckoning(vehicle, slip)
-    for reading in made.readings:
-        sensor = vehicle.sensor(reading.sensor)
-        assert sensor
-        reckoning.update(reading, sensor)
-    return reckoning
+from tests.unit.agents.drives import START_NS, Leg, changed_sensor, drive, machine, reckoned
 
 
 @pytest.mark.parametrize("rate_hz", [10, 20, 100])
@@ -69,7 +60,7 @@ def test_tracker_starts_anew_after_a_pause_and_ignores_time_that_stands_still() 
 def test_dead_reckoning_closes_a_circle() -> None:
     vehicle = machine()
     made = drive([Leg(5, 0.6), Leg(2 * math.pi / 0.2, 0.0, 0.2)], vehicle, heading_rad=0.0, without=("gps-1",))
-    reckoning = reckon(vehicle, made)
+    reckoning = reckoned(vehicle, made.readings)
     turned = reckoning.pose
     start = made.at(START_NS + 5_000_000_000)  # where the circle begins
     assert turned.angle_rad == pytest.approx(2 * math.pi, abs=0.01)
@@ -81,12 +72,12 @@ def test_dead_reckoning_closes_a_circle() -> None:
 def test_mounted_imu_gives_the_right_turn(rpy_deg: tuple[float, float, float]) -> None:
     vehicle = machine(Mount((0.4, 0.2, 0.9), rpy_deg))
     made = drive([Leg(2, 1.0), Leg(4, 0.0, 0.3)], vehicle)
-    assert reckon(vehicle, made).angle_rad == pytest.approx(1.2, abs=0.01)
+    assert reckoned(vehicle, made.readings).angle_rad == pytest.approx(1.2, abs=0.01)
 
 
 def test_distance_counts_up_in_reverse_and_travel_down() -> None:
     vehicle = machine()
-    reckoning = reckon(vehicle, drive([Leg(4, 0.5), Leg(4, -0.5), Leg(4, -0.5), Leg(4, 0.5)], vehicle))
+    reckoning = reckoned(vehicle, drive([Leg(4, 0.5), Leg(4, -0.5), Leg(4, -0.5), Leg(4, 0.5)], vehicle).readings)
     assert reckoning.travel_m == pytest.approx(0.0, abs=0.05)
     assert reckoning.distance_m == pytest.approx(16.0, abs=0.1)
 
@@ -124,9 +115,9 @@ def test_slip_is_taken_off_where_torque_drives(direction: int) -> None:
 def test_braking_makes_the_wheels_slower_than_the_machine() -> None:
     vehicle = machine()
     made = drive([Leg(4, 0.5), Leg(3, -0.6)], vehicle)
-    with_slip, without = reckon(vehicle, made, slip=0.2), reckon(vehicle, made)
+    with_slip, without = reckoned(vehicle, made.readings, slip=0.2), reckoned(vehicle, made.readings)
     driven = replace(made, readings=[r for r in made.readings if r.stamp_ns <= START_NS + 4 * 10**9])
-    driven_with_slip, driven_without = reckon(vehicle, driven, slip=0.2), reckon(vehicle, driven)
+    driven_with_slip, driven_without = reckoned(vehicle, driven.readings, slip=0.2), reckoned(vehicle, driven.readings)
     assert driven_with_slip.travel_m < driven_without.travel_m
     assert with_slip.travel_m - driven_with_slip.travel_m > without.travel_m - driven_without.travel_m
 
@@ -137,7 +128,7 @@ def test_second_imu_and_second_wheel_sensor_do_not_count_twice() -> None:
         vehicle, sensors=(*vehicle.sensors, SensorConfig("imu-2", "imu"), SensorConfig("wheels-2", "encoder"))
     )
     legs = [Leg(4, 0.5), Leg(2, 0.0, 0.2)]
-    one, two = reckon(vehicle, drive(legs, vehicle)), reckon(more, drive(legs, more))
+    one, two = reckoned(vehicle, drive(legs, vehicle).readings), reckoned(more, drive(legs, more).readings)
     assert (two.travel_m, two.angle_rad) == (one.travel_m, one.angle_rad)
 
 
@@ -151,7 +142,7 @@ def test_restarted_tick_counter_moves_nothing() -> None:
         else r
         for r in made.readings
     ]
-    before, after = reckon(vehicle, made), reckon(vehicle, replace(made, readings=readings))
+    before, after = reckoned(vehicle, made.readings), reckoned(vehicle, readings)
     assert after.travel_m == pytest.approx(before.travel_m, abs=0.15)  # what was driven between two counts
     assert after.distance_m == pytest.approx(before.distance_m, abs=0.15)
     assert after.wheels.speed_mps == pytest.approx(before.wheels.speed_mps, abs=0.1)
@@ -160,5 +151,5 @@ def test_restarted_tick_counter_moves_nothing() -> None:
 def test_more_ticks_per_turn_are_less_distance() -> None:
     vehicle = machine()
     made = drive([Leg(4, 0.5)], vehicle)
-    finer = reckon(changed_sensor(vehicle, "wheels", ticks_per_rev=200), made)
-    assert finer.travel_m == pytest.approx(reckon(vehicle, made).travel_m / 2)
+    finer = reckoned(changed_sensor(vehicle, "wheels", ticks_per_rev=200), made.readings)
+    assert finer.travel_m == pytest.approx(reckoned(vehicle, made.readings).travel_m / 2)

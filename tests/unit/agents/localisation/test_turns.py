@@ -14,7 +14,7 @@ from agents.localisation.filters.state import YAW, YAW_RATE, Layout
 from agents.localisation.imu_steps import FilterStep, StepGatherer
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Odometry, Reading, Steering
-from tests.unit.agents.drives import LEVER_M, START_NS, Drive, Leg, RunLocaliser, drive, localiser
+from tests.unit.agents.drives import LEVER_M, START_NS, Drive, Leg, RunLocaliser, drive, localiser, reckoned
 
 WHEELBASE_M = 2.5
 EIGHT = [Leg(6, 0.5), Leg(4), *[Leg(25, 0, 0.25), Leg(25, 0, -0.25)] * 2]  # at 3 m/s, circles of 12 m
@@ -98,27 +98,18 @@ def test_an_imu_is_asked_first_then_odometry_then_steering(
     assert (source.name if source else None) == expected
 
 
-def reckoned(vehicle: MachineConfig, readings: list[Reading]) -> DeadReckoning:
-    dead = DeadReckoning(vehicle, 0.0)
-    for reading in readings:
-        sensor = vehicle.sensor(reading.sensor)
-        assert sensor
-        dead.update(reading, sensor)
-    return dead
-
-
 @pytest.mark.parametrize(
     "sensors", [(ENCODER, STEERING), (ODOMETRY,), (ENCODER, replace(ODOMETRY, measures=("rate",)))]
 )
 def test_dead_reckoning_turns_without_an_imu(sensors: tuple[SensorConfig, ...]) -> None:
     vehicle = truck(*sensors)
     made = driven(vehicle, Wrong(), [Leg(6, 0.5), Leg(4 * math.pi, 0.0, 0.25)])
-    dead = reckoned(vehicle, made.readings)
+    reckoning = reckoned(vehicle, made.readings)
     x, y, _ = made.at(made.stamps_ns[-1])
     moved = complex(x - 10, y - 20) * complex(math.cos(0.7), -math.sin(0.7))
-    assert dead.angle_rad == pytest.approx(math.pi, abs=0.02)
-    assert dead.travel_m == pytest.approx(9 + 3 * 4 * math.pi, abs=0.2)
-    assert (dead.pose.x_m, dead.pose.y_m) == pytest.approx((moved.real, moved.imag), abs=0.3)
+    assert reckoning.angle_rad == pytest.approx(math.pi, abs=0.02)
+    assert reckoning.travel_m == pytest.approx(9 + 3 * 4 * math.pi, abs=0.2)
+    assert (reckoning.pose.x_m, reckoning.pose.y_m) == pytest.approx((moved.real, moved.imag), abs=0.3)
 
 
 def test_turn_of_odometry_beside_an_imu_changes_nothing() -> None:
@@ -131,8 +122,8 @@ def test_turn_of_odometry_beside_an_imu_changes_nothing() -> None:
 
 def test_odometry_without_speed_rolls_no_wheel() -> None:
     vehicle = truck(replace(ODOMETRY, measures=("rate",)))
-    dead = reckoned(vehicle, [Odometry("odom", START_NS + i * 50_000_000, 3.0, 0.0, 0.1) for i in range(21)])
-    assert (dead.travel_m, dead.angle_rad) == (0.0, pytest.approx(0.1))
+    reckoning = reckoned(vehicle, [Odometry("odom", START_NS + i * 50_000_000, 3.0, 0.0, 0.1) for i in range(21)])
+    assert (reckoning.travel_m, reckoning.angle_rad) == (0.0, pytest.approx(0.1))
 
 
 def test_odometry_without_speed_does_not_show_a_standstill() -> None:
@@ -146,18 +137,18 @@ def test_old_steering_angle_turns_nothing() -> None:
     vehicle = truck(ENCODER, STEERING)
     readings: list[Reading] = [Steering("steer", START_NS, 0.2)]
     readings += [Encoder("wheels", START_NS + i * 50_000_000, 2.0 * i, 2.0 * i) for i in range(200)]
-    dead = reckoned(vehicle, readings)
+    reckoning = reckoned(vehicle, readings)
     turned_m = 2.0 * 39 / 100 * 2 * math.pi * 0.4  # in 2 s
-    assert dead.angle_rad == pytest.approx(turned_m * math.tan(0.2) / WHEELBASE_M, rel=0.03)
+    assert reckoning.angle_rad == pytest.approx(turned_m * math.tan(0.2) / WHEELBASE_M, rel=0.03)
 
 
 def steps_of(vehicle: MachineConfig, readings: list[Reading]) -> list[FilterStep]:
-    gatherer, dead, steps = StepGatherer(vehicle, 0.1), DeadReckoning(vehicle, 0.0), []
+    gatherer, reckoning, steps = StepGatherer(vehicle, 0.1), DeadReckoning(vehicle, 0.0), []
     for reading in readings:
         sensor = vehicle.sensor(reading.sensor)
         assert sensor
-        dead.update(reading, sensor)
-        steps += [step] if (step := gatherer.gather(reading, sensor, dead)) else []
+        reckoning.update(reading, sensor)
+        steps += [step] if (step := gatherer.gather(reading, sensor, reckoning)) else []
     return steps
 
 
