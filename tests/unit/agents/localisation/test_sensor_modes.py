@@ -35,6 +35,15 @@ SECOND = 1_000_000_000
 MODES = pytest.mark.parametrize("mode", ["differential", "relative"])
 PROFILES = pytest.mark.parametrize("profile", ["default", "paper"])
 BOTH = pytest.mark.parametrize("engine", ["ekf", "ukf"])
+EACH_PAIR = pytest.mark.parametrize(  # of choices once
+    ("mode", "profile", "engine"),
+    [
+        ("differential", "default", "ekf"),
+        ("differential", "paper", "ukf"),
+        ("relative", "default", "ukf"),
+        ("relative", "paper", "ekf"),
+    ],
+)
 
 
 def errors(made: Drive, beliefs: list[Belief], east_m: float = 0.0, north_m: float = 0.0) -> list[float]:
@@ -105,9 +114,7 @@ def test_a_value_that_counts_from_an_anchor_does_not_show_where_the_anchor_was()
 # --- GPS -------------------------------------------------------------------------------------------------------------
 
 
-@BOTH
-@PROFILES
-@MODES
+@EACH_PAIR
 def test_a_machine_with_such_a_receiver_alone_never_aligns_but_runs_from_a_start(
     mode: str, profile: str, engine: str
 ) -> None:
@@ -319,9 +326,7 @@ def yaw_error(made: Drive, belief: Belief) -> float:
     return abs(math.remainder(belief.x[YAW] - made.at(belief.stamp_ns)[2], math.tau))
 
 
-@BOTH
-@PROFILES
-@MODES
+@EACH_PAIR
 def test_an_attitude_that_is_far_off_is_used_in_its_mode_in_both_profiles(mode: str, profile: str, engine: str) -> None:
     vehicle = of_ahrs(mode=mode)
     made = drive(S_BEND, vehicle)

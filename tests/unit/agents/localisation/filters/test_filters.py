@@ -185,6 +185,7 @@ def test_ukf_is_nearer_to_the_truth_than_ekf_where_the_heading_is_uncertain() ->
     assert ukf_P < 0.4 * ekf_P
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", BOTH, ids=name)
 def test_it_is_as_sure_as_it_is_right(kind: Filter) -> None:
     """NEES of drives drawn from the model itself: 21 states, 100 drives, so a mean of 21 +- 0.65."""
@@ -360,6 +361,7 @@ def turned_drive(kind: Filter, belief: Belief, fix: Floats, yaw: float) -> Belie
 # --- the covariance --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", BOTH, ids=name)
 @pytest.mark.parametrize("model", [MODEL, PLANE], ids=["space", "plane"])
 def test_covariance_stays_symmetric_and_definite_through_dropouts_and_extremes(
