@@ -20,7 +20,7 @@ from agents.localisation.consistency import Consistency, InnovationMonitor
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement
 from agents.localisation.filters.motion import GpsError
 from agents.localisation.filters.state import Layout
-from agents.localisation.sensor_modes import StampedValue, anchor_states, rate_between, reset_states
+from agents.localisation.sensor_modes import ModalSensors, StampedValue, anchor_states, reset_states
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
 from protocol.machine.readings import Gps
@@ -57,22 +57,21 @@ def drifting(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
     return [s for s in sensors if s.kind == "gps" and s.use and s.mode != DIFFERENTIAL]
 
 
-class Receivers:
+class Receivers(ModalSensors[Fix]):
     """The receivers of one machine; `errors` are those of the layout's slow errors, as they are now.
 
     slow: whether a share of each error is slow, else all of it is white.
     """
 
     def __init__(self, sensors: Sequence[SensorConfig], projection: Projection, layout: Layout, *, slow: bool) -> None:
+        super().__init__()
         self._sensors = {s.name: s for s in sensors if s.kind == "gps" and s.use}
         self._projection, self._layout, self._slow = projection, layout, slow
         self._states = {s.name: i for i, s in enumerate(drifting(sensors))} if slow else {}
         self._errors = [GpsError(MIN_DRIFT_M2, self._sensors[name].drift_time_s) for name in self._states]
         self._monitors = {name: InnovationMonitor() for name in self._sensors}
-        self._confirmed: set[str] = set()
         self._shifts: dict[str, Floats] = {}  # of relative ones, and how unsure the believed antenna was then [m2]
         self._anchor_m2: dict[str, float] = {}
-        self._last: dict[str, StampedValue] = {}  # of differential ones
 
     @property
     def errors(self) -> tuple[GpsError, ...]:
@@ -93,10 +92,6 @@ class Receivers:
         variance = [sensor.std["position"] ** 2] * 2 if "position" in sensor.std else stated
         return Fix(gps.stamp_ns, sensor, np.array([x, y]), np.array(variance), reckoned)
 
-    def needs_anchor(self, fix: Fix) -> bool:
-        """Whether it is a first fix of a relative receiver; one refused as too late does not count."""
-        return fix.sensor.mode == RELATIVE and fix.sensor.name not in self._confirmed
-
     def anchor(self, fix: Fix, belief: Belief) -> None:
         """Shift the receiver so that this fix lies at the believed antenna."""
         believed, H = _antenna(belief, fix.lever_m)
@@ -109,7 +104,7 @@ class Receivers:
 
     def confirm(self, fix: Fix, result: Conditioned) -> None:
         """Note what the filter made of a fix: the receiver's error has its first value now."""
-        self._confirmed.add(fix.sensor.name)
+        super().confirm(fix, result)
         self._monitors[fix.sensor.name].note(result)
 
     def _position(self, fix: Fix) -> Measurement:
@@ -127,32 +122,24 @@ class Receivers:
             self._errors[index] = GpsError(drift_m2, sensor.drift_time_s)
         R = np.diag(self._white(fix))
         first = None if sensor.name in self._confirmed else change  # a receiver brings its own unknown error
-        return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, _gate(sensor), first)
+        return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, sensor.gate(GATE_SIGMA), first)
 
     def _velocity(self, fix: Fix) -> Measurement | None:
         """Of the antenna, between the last fix and this one: slow errors cancel but for what they change meanwhile."""
         sensor, now = fix.sensor, StampedValue(fix.stamp_ns, fix.position_m, self._white(fix))
-        before = self._last.get(sensor.name, now)
-        if now.stamp_ns < before.stamp_ns:
-            return None
-        self._last[sensor.name] = now
-        mean = rate_between(before, now)
+        before, mean = self._last.get(sensor.name, now), self._rate(sensor.name, now)
         if mean is None:
             return None
         R, dt_s = np.diag(mean.variances), (now.stamp_ns - before.stamp_ns) * 1e-9
         if self._slow:
             R += np.eye(2) * (2 * _drift_m2(fix) * -math.expm1(-dt_s / sensor.drift_time_s) / dt_s**2)
-        return measurements.velocity(mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, _gate(sensor))
+        return measurements.velocity(mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, sensor.gate(GATE_SIGMA))
 
     def _white(self, fix: Fix) -> Floats:
         """Variance (2,) of a fix without its slow part."""
         variance = fix.variance_m2 * (1 - fix.sensor.drift_share) if self._slow else fix.variance_m2
         least = MIN_DRIFT_M2 if "position" in fix.sensor.std else MIN_FIX_STD_M**2
         return np.maximum(variance, least)
-
-
-def _gate(sensor: SensorConfig) -> float:
-    return sensor.gate_sigma or GATE_SIGMA
 
 
 def _drift_m2(fix: Fix) -> float:

@@ -15,10 +15,10 @@ from functools import partial
 import numpy as np
 
 from agents.localisation import measurements
-from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement
+from agents.localisation.filters.belief import Belief, Change, Measurement
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.imu_steps import FilterStep
-from agents.localisation.sensor_modes import StampedValue, anchor_states, rate_between
+from agents.localisation.sensor_modes import ModalSensors, StampedValue, anchor_states
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, RELATIVE, SensorConfig
 
@@ -43,16 +43,15 @@ def anchored_headings(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
     return [s for s in sensors if s.kind == "attitude" and s.use and s.mode == RELATIVE and s.provides("heading")]
 
 
-class References:
+class References(ModalSensors[Orientation]):
     """The attitude references of one machine."""
 
     def __init__(self, sensors: Sequence[SensorConfig], layout: Layout) -> None:
+        super().__init__()
         self._sensors = {s.name: s for s in sensors if s.kind == "attitude" and s.use}
         states = range(layout.heading_errors.start, layout.heading_errors.stop)
         self._states = dict(zip((s.name for s in anchored_headings(sensors)), states, strict=False))
-        self._confirmed: set[str] = set()
         self._turns: dict[str, float] = {}  # of relative ones
-        self._last: dict[str, StampedValue] = {}  # of differential ones
 
     def measurements(self, step: FilterStep) -> list[Measurement]:
         """Measurements of absolute references, at the stamp of the step."""
@@ -62,11 +61,6 @@ class References:
     def own_stamped(self, step: FilterStep) -> list[Orientation]:
         """Orientations of the other references, which become measurements of their own stamps."""
         return [o for o in self._orientations(step) if o.sensor.mode != ABSOLUTE]
-
-    def needs_anchor(self, orientation: Orientation) -> bool:
-        """Whether it is a first orientation of a relative reference; one refused as too late does not count."""
-        sensor = orientation.sensor
-        return sensor.mode == RELATIVE and sensor.name not in self._confirmed
 
     def anchor(self, orientation: Orientation, belief: Belief) -> None:
         """Turn the reference so that this heading agrees with the believed one."""
@@ -79,10 +73,6 @@ class References:
             return self._rotation(sensor, value)
         turned = value.values + np.array([0.0, 0.0, self._turns[sensor.name]])
         return self._attitude(orientation, value.stamp_ns, turned, self._first_change(orientation))
-
-    def confirm(self, orientation: Orientation, _: Conditioned) -> None:
-        """Keep the anchor of a reference: the filter had room for a measurement that counts from it."""
-        self._confirmed.add(orientation.sensor.name)
 
     def _orientations(self, step: FilterStep) -> list[Orientation]:
         """With the variances that are configured, else their own; wide open where the sensor does not measure."""
@@ -99,7 +89,9 @@ class References:
     ) -> Measurement:
         sensor, R = orientation.sensor, np.diag(orientation.value.variances)
         error = self._states.get(sensor.name)
-        return measurements.orientation(stamp_ns, sensor.name, rpy_rad, R, _gate(sensor), error, change)
+        return measurements.orientation(
+            stamp_ns, sensor.name, rpy_rad, R, sensor.gate(measurements.GATE_SIGMA), error, change
+        )
 
     def _first_change(self, orientation: Orientation) -> Change | None:
         """Gives the state of the anchor's error its first value."""
@@ -111,21 +103,15 @@ class References:
 
     def _rotation(self, sensor: SensorConfig, now: StampedValue) -> Measurement | None:
         """Angular rate between the last orientation and this one: E^-1 makes it from rates of roll, pitch and yaw."""
-        before = self._last.get(sensor.name, now)
-        if now.stamp_ns < before.stamp_ns:
-            return None
-        self._last[sensor.name] = now
-        mean = rate_between(before, now, angles=True)
+        mean = self._rate(sensor.name, now, angles=True)
         if mean is None:
             return None
         (sr, cr), (sp, cp) = ((math.sin(a), math.cos(a)) for a in now.values[:2].tolist())
         body_from_rates = np.array([[1.0, 0.0, -sp], [0.0, cr, cp * sr], [0.0, -sr, cp * cr]])
         R = body_from_rates * mean.variances @ body_from_rates.T
-        return measurements.rotation(mean.stamp_ns, sensor.name, body_from_rates @ mean.values, R, _gate(sensor))
-
-
-def _gate(sensor: SensorConfig) -> float:
-    return sensor.gate_sigma or measurements.GATE_SIGMA
+        return measurements.rotation(
+            mean.stamp_ns, sensor.name, body_from_rates @ mean.values, R, sensor.gate(measurements.GATE_SIGMA)
+        )
 
 
 def _anchor_heading(belief: Belief, states: slice, variance: float) -> Belief:

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from agents.localisation.filters.belief import Change, Measurement
+from agents.localisation.filters.belief import Change, Measurement, Model
 from agents.localisation.filters.motion import EYE, map_from_base, turned_jacobian
 from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
 from protocol.arrays import Floats
@@ -208,16 +208,7 @@ def orientation(
 
 def rotation(stamp_ns: int, sensor: str, rates_radps: Floats, R: Floats, gate: float) -> Measurement:
     """Angular rate (3,) of `base_link`, free of bias: z = w."""
-
-    def h(x: Floats) -> Floats:
-        return x[:, RATE]
-
-    def jacobian(x: Floats) -> Floats:
-        H = np.zeros((3, len(x)))
-        H[:, RATE] = EYE
-        return H
-
-    return Measurement(sensor, stamp_ns, rates_radps, R, h, jacobian, gate_sigma=gate)
+    return Measurement(sensor, stamp_ns, rates_radps, R, *_picked(RATE), gate_sigma=gate)
 
 
 def standstill(stamp_ns: int) -> Measurement:
@@ -225,17 +216,13 @@ def standstill(stamp_ns: int) -> Measurement:
 
     Gated without relocking: an articulated machine turns its rear frame as it steers, also while its wheels stand.
     """
-    R = np.diag([STILL_MPS**2] * 3 + [(0.1 * RATE_RADPS) ** 2] * 3)
+    R, model = np.diag([STILL_MPS**2] * 3 + [(0.1 * RATE_RADPS) ** 2] * 3), _picked(slice(VELOCITY.start, RATE.stop))
+    return Measurement("standstill", stamp_ns, np.zeros(6), R, *model, gate_sigma=GATE_SIGMA, relocks=False)
 
-    def h(x: Floats) -> Floats:
-        return np.concatenate([x[:, VELOCITY], x[:, RATE]], axis=1)
 
-    def jacobian(x: Floats) -> Floats:
-        H = np.zeros((6, len(x)))
-        H[:3, VELOCITY] = H[3:, RATE] = EYE
-        return H
-
-    return Measurement("standstill", stamp_ns, np.zeros(6), R, h, jacobian, gate_sigma=GATE_SIGMA, relocks=False)
+def _picked(states: slice) -> tuple[Model, Model]:
+    """H and Jacobian of a measurement of some states as they are."""
+    return lambda x: x[:, states], lambda x: np.eye(len(x))[states]
 
 
 # --- rotations of many states ----------------------------------------------------------------------------------------

@@ -59,7 +59,11 @@ class MotionSensors:
             return []
         error = layout.gyro_biases.stop - 1 if layout.imus else None
         rate, per_error = step.turn.rate_radps, step.turn.per_error
-        return [measurements.turn(step.stamp_ns, rate, _turn_std(source), error, per_error, _gate(source))]
+        return [
+            measurements.turn(
+                step.stamp_ns, rate, _turn_std(source), error, per_error, source.gate(measurements.GATE_SIGMA)
+            )
+        ]
 
     def wheels(self, step: FilterStep) -> list[Measurement]:
         """Speed of the wheels less their slip, and a standstill; nothing of wheels that are silent, not at rest."""
@@ -72,7 +76,7 @@ class MotionSensors:
         R = np.diag([forward_std**2, side_std**2, side_std**2])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
         rolled = measurements.wheels(
-            step.stamp_ns, "wheels", np.array([speed, 0.0, 0.0]), R, scale, _gate(self._wheels)
+            step.stamp_ns, "wheels", np.array([speed, 0.0, 0.0]), R, scale, self._wheels.gate(measurements.GATE_SIGMA)
         )
         return [rolled, measurements.standstill(step.stamp_ns)] if step.still_s >= STANDSTILL_S else [rolled]
 
@@ -83,12 +87,10 @@ class MotionSensors:
         z, R = np.concatenate([mean.rates_radps, mean.force_mps2]), np.diag([rate_std**2] * 3 + [force_std**2] * 3)
         bias = self._layout.gyro_bias(index) if self._layout.imus else None
         lever = np.array(sensor.mount.xyz_m)
-        return measurements.inertial(step.stamp_ns, sensor.name, z, R, lever, bias, _gate(sensor))
+        return measurements.inertial(
+            step.stamp_ns, sensor.name, z, R, lever, bias, sensor.gate(measurements.GATE_SIGMA)
+        )
 
 
 def _turn_std(source: SensorConfig) -> float:
     return source.std.get("rate", measurements.TURN_RADPS)
-
-
-def _gate(sensor: SensorConfig) -> float:
-    return sensor.gate_sigma or measurements.GATE_SIGMA

@@ -8,48 +8,18 @@ anchor gets states of its own: how far off the filter was at that moment.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement
 from protocol.arrays import Floats
+from protocol.machine.machine_config import RELATIVE, SensorConfig
 from protocol.rotations import wrap_angle
 
 PAIR_S = 1.1  # a mean over more is far from the rate at its middle; a receiver of 1 Hz still makes pairs
-
-
-class Stamped(Protocol):
-    """What was measured at a stamp."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """When it was measured."""
-        ...
-
-
-Value = TypeVar("Value", bound=Stamped, contravariant=True)
-
-
-class ModalSensors(Protocol[Value]):
-    """Sensors whose values become measurements of their own stamp, each in its mode."""
-
-    def needs_anchor(self, value: Value) -> bool:
-        """Whether the measurement of this value needs to know what the filter believes at its stamp."""
-        ...
-
-    def anchor(self, value: Value, belief: Belief) -> None:
-        """Let a relative sensor count from this value on, and from the belief at its stamp."""
-        ...
-
-    def measurement(self, value: Value) -> Measurement | None:
-        """What the filter gets of this value; None where there is no measurement in it."""
-        ...
-
-    def confirm(self, value: Value, result: Conditioned) -> None:
-        """Note that the filter had room for the measurement of this value, and what it made of it."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -74,6 +44,55 @@ def rate_between(before: StampedValue, now: StampedValue, *, angles: bool = Fals
         change = wrap_angle(change)
     middle_ns = (before.stamp_ns + now.stamp_ns) // 2
     return StampedValue(middle_ns, change / dt_s, (before.variances + now.variances) / dt_s**2)
+
+
+class Measured(Protocol):
+    """A value of a sensor at a stamp."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When it was measured."""
+        ...
+
+    @property
+    def sensor(self) -> SensorConfig:
+        """What measured it."""
+        ...
+
+
+Value = TypeVar("Value", bound=Measured)
+
+
+class ModalSensors(ABC, Generic[Value]):
+    """Sensors whose values become measurements of their own stamps, each in its mode."""
+
+    def __init__(self) -> None:
+        self._confirmed: set[str] = set()
+        self._last: dict[str, StampedValue] = {}  # of differential ones
+
+    def needs_anchor(self, value: Value) -> bool:
+        """Whether it is a first value of a relative sensor; one that was refused as too late does not count."""
+        return value.sensor.mode == RELATIVE and value.sensor.name not in self._confirmed
+
+    @abstractmethod
+    def anchor(self, value: Value, belief: Belief) -> None:
+        """Let a relative sensor count from this value, and from the belief at its stamp."""
+
+    @abstractmethod
+    def measurement(self, value: Value) -> Measurement | None:
+        """What the filter gets of this value; None where a differential sensor has no pair."""
+
+    def confirm(self, value: Value, _: Conditioned) -> None:
+        """Keep the anchor: the filter had room for a measurement that counts from it."""
+        self._confirmed.add(value.sensor.name)
+
+    def _rate(self, name: str, now: StampedValue, *, angles: bool = False) -> StampedValue | None:
+        """Rate since the last value of a sensor, which this one becomes; values out of order are dropped."""
+        before = self._last.get(name, now)
+        if now.stamp_ns < before.stamp_ns:
+            return None
+        self._last[name] = now
+        return rate_between(before, now, angles=angles)
 
 
 def reset_states(belief: Belief, states: slice, variance: float) -> Belief:

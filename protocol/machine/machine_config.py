@@ -107,6 +107,10 @@ class SensorConfig:
         """Whether its readings are used for this quantity, one of QUANTITIES."""
         return not self.measures or quantity in self.measures
 
+    def gate(self, usual_sigma: float) -> float:
+        """Its own gate where it has one, else the usual one [standard deviations]."""
+        return self.gate_sigma or usual_sigma
+
 
 @dataclass(frozen=True)
 class MachineConfig:

@@ -26,6 +26,7 @@ class Belief:
 
 
 Change = Callable[[Belief], Belief]
+Model = Callable[[Floats], Floats]  # of states
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +37,8 @@ class Motion:
     Q: noise (n, n). angles: components of the state that are angles [rad]; a filter brings their mean into +-pi.
     """
 
-    f: Callable[[Floats], Floats]
-    jacobian: Callable[[Floats], Floats]
+    f: Model
+    jacobian: Model
     Q: Floats
     angles: tuple[int, ...]
 
@@ -57,8 +58,8 @@ class Measurement:
     stamp_ns: int
     z: Floats
     R: Floats
-    h: Callable[[Floats], Floats]
-    jacobian: Callable[[Floats], Floats]
+    h: Model
+    jacobian: Model
     angles: tuple[int, ...] = ()
     gate_sigma: float = 0.0
     relocks: bool = True
