@@ -11,7 +11,7 @@ import pytest
 from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.machine.log_folder import open_log
-from protocol.machine.machine_config import QUANTITIES, MODES
+from protocol.machine.machine_config import MODES, QUANTITIES
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, columns
 from protocol.machine.samples import COLUMNS
 from protocol.queries import commands, parameters, requests
