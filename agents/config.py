@@ -1,4 +1,4 @@
-"""An agent's options (config/agent.toml): its machine, its sensors, and one table per stage."""
+"""Options of an agent (config/agent.toml): its machine, its sensors, and one table per stage."""
 
 from __future__ import annotations
 

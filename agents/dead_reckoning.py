@@ -1,27 +1,24 @@
-"""Dead reckoning from wheels and gyro: how far, how far round, how fast; and the start heading from it and GPS."""
+"""Dead reckoning: distance, turn and speed of a machine from its wheels and gyro."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque
 from protocol.units import GRAVITY_MPS2
 
-TURNS = ("imu", "odometry", "steering")  # what tells the turn, the best first
-STALE_S = 2.0  # a steering angle, or a speed to go with it, says nothing later
+TURN_KINDS = ("imu", "odometry", "steering")  # sensors that show the turn, the best first
+STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
 MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine
 MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
 
 
 def turn_source(machine: MachineConfig) -> SensorConfig | None:
-    """What the turn is taken from: IMUs, where one in use gives rates, else odometry, else steering."""
-    able = [s for kind in TURNS for s in machine.sensors if s.kind == kind and s.use and s.says("rate")]
+    """The sensor that the turn is taken from: an IMU in use that measures rates, else odometry, else steering."""
+    able = [s for kind in TURN_KINDS for s in machine.sensors if s.kind == kind and s.use and s.provides("rate")]
     return able[0] if able else None
 
 
@@ -58,8 +55,8 @@ class WheelTracker:
 
 
 @dataclass(frozen=True)
-class Dead:
-    """Dead-reckoned pose in a frame of its own: travel [m], angle [rad], x, y [m] at a stamp."""
+class DeadReckonedPose:
+    """Pose in the frame that dead reckoning started in: travel [m], angle [rad], x, y [m] at a stamp."""
 
     stamp_ns: int
     travel_m: float
@@ -69,10 +66,10 @@ class Dead:
 
 
 class DeadReckoning:
-    """Accumulates wheel travel and turn; knows nothing of GPS.
+    """Accumulates wheel travel and turn, without GPS.
 
-    slip: wheel slip per traction, taken off the travel where the machine has a torque sensor. travel_m is what remains,
-    way_m counts up in reverse too.
+    slip: wheel slip per traction (drive force over weight), taken off where the machine has a torque sensor. travel_m:
+    of the machine, down in reverse; distance_m: up in reverse too. traction: the newest.
     """
 
     def __init__(self, machine: MachineConfig, slip: float) -> None:
@@ -80,7 +77,7 @@ class DeadReckoning:
         self.stamp_ns = 0
         self.travel_m = 0.0
         self.angle_rad = 0.0
-        self.way_m = 0.0
+        self.distance_m = 0.0
         self._machine = machine
         self._slip = slip
         self.traction = 0.0
@@ -88,7 +85,7 @@ class DeadReckoning:
         self._rotation: dict[str, Floats] = {}
         self._imu: Imu | None = None
         source = turn_source(machine)
-        self._turns = source.name if source else ""
+        self._turn_sensor = source.name if source else ""
         self._turned_ns = 0  # by odometry or steering
         self._curvature = 0.0  # [1/m], by steering
         self._wheel_reading: Encoder | Odometry | None = None
@@ -96,15 +93,15 @@ class DeadReckoning:
         self._y_m = 0.0
 
     def update(self, reading: Reading, sensor: SensorConfig) -> None:
-        """Take in a reading of what tells the turn, or of the wheels; others change nothing."""
-        if isinstance(reading, Imu) and sensor.frame == BASE and sensor.says("rate"):
+        """Take in a reading of the wheels, or of the sensor that shows the turn; others change nothing."""
+        if isinstance(reading, Imu) and sensor.frame == BASE and sensor.provides("rate"):
             self._turn(reading, sensor)
         elif isinstance(reading, Encoder | Odometry):
-            if isinstance(reading, Odometry) and sensor.name == self._turns:
-                self._turn_on(reading)
-            if sensor.says("speed"):
+            if isinstance(reading, Odometry) and sensor.name == self._turn_sensor:
+                self._turn_by_odometry(reading)
+            if sensor.provides("speed"):
                 self._roll(reading, sensor)
-        elif isinstance(reading, Steering) and sensor.name == self._turns:
+        elif isinstance(reading, Steering) and sensor.name == self._turn_sensor:
             self._curvature = math.tan(reading.angle_rad) / self._machine.wheelbase_m
             self._turned_ns = reading.stamp_ns
         elif isinstance(reading, Torque):
@@ -112,16 +109,17 @@ class DeadReckoning:
             traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
             self.traction = traction if abs(traction) <= MAX_TRACTION else 0.0
 
-    def now(self) -> Dead:
-        """The dead-reckoned pose of this moment."""
-        return Dead(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
+    @property
+    def pose(self) -> DeadReckonedPose:
+        """The newest pose."""
+        return DeadReckonedPose(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
 
     def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
         """Integrate the vertical rate of the first gyro on the rear frame."""
         if self._imu is not None and self._imu.sensor != imu.sensor:
             return
         if imu.sensor not in self._rotation:
-            self._rotation[imu.sensor] = sensor.mount.base_from_sensor()
+            self._rotation[imu.sensor] = sensor.mount.frame_from_sensor()
         up = self._rotation[imu.sensor][2]
         if self._imu is not None:
             dt = (imu.stamp_ns - self._imu.stamp_ns) * 1e-9
@@ -130,15 +128,15 @@ class DeadReckoning:
         self._imu = imu
         self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
 
-    def _turn_on(self, odometry: Odometry) -> None:
-        """Turn by what odometry says of it."""
+    def _turn_by_odometry(self, odometry: Odometry) -> None:
+        """Turn by the rate of odometry."""
         if self._turned_ns:
             dt_s = (odometry.stamp_ns - self._turned_ns) * 1e-9
             self.angle_rad += odometry.rate_z_radps * min(dt_s, 1.0)
         self._turned_ns = odometry.stamp_ns
 
     def _roll(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
-        """Advance by what the first wheel sensor in use says (the others serve later issues)."""
+        """Advance by the first wheel sensor that speaks; others are not used."""
         last = self._wheel_reading or reading
         if last.sensor == reading.sensor:
             self._wheel_reading = reading
@@ -158,41 +156,10 @@ class DeadReckoning:
         self.wheels.update(stamp_ns, self._rolled_m)
         travel_m = rolled_m * (1 - self._slip * self.traction * math.copysign(1.0, rolled_m))
         self.travel_m += travel_m
-        self.way_m += abs(travel_m)
+        self.distance_m += abs(travel_m)
         steered_rad = travel_m * self._curvature if stamp_ns - self._turned_ns < STALE_S * 1e9 else 0.0
         middle_rad = self.angle_rad + steered_rad / 2
         self._x_m += travel_m * math.cos(middle_rad)
         self._y_m += travel_m * math.sin(middle_rad)
         self.angle_rad += steered_rad
         self.stamp_ns = max(self.stamp_ns, stamp_ns)
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """How the dead-reckoned frame lies in `map`: rotation [rad], its standard deviation, place of its origin [m]."""
-
-    rotation_rad: float
-    std_rad: float
-    origin_m: tuple[float, float]
-
-
-def align(dead_m: Floats, fixes_m: Floats, fix_std_m: float) -> Alignment | None:
-    """Fit dead-reckoned antenna positions (n, 2) onto fixes (n, 2) by rotation and shift (Umeyama 1991, in 2-D).
-
-    fix_std_m: error of one fix. Returns None where all positions coincide. The standard deviation takes half the
-    spread for granted: slow GPS errors do not average out.
-    """
-    origin, target = dead_m.mean(axis=0), fixes_m.mean(axis=0)
-    d, f = dead_m - origin, fixes_m - target
-    spread_m = float(np.sqrt((d**2).sum(axis=1).mean()))
-    if spread_m < 1e-6:
-        return None
-    rotation = math.atan2(float((d[:, 0] * f[:, 1] - d[:, 1] * f[:, 0]).sum()), float((d * f).sum()))
-    c, s = math.cos(rotation), math.sin(rotation)
-    shift = target - np.array([c * origin[0] - s * origin[1], s * origin[0] + c * origin[1]])
-    return Alignment(rotation, fix_std_m / (2 * spread_m), (float(shift[0]), float(shift[1])))
-
-
-def mean_std(variances_m2: Sequence[float]) -> float:
-    """Root of the mean variance."""
-    return math.sqrt(sum(variances_m2) / len(variances_m2))

@@ -1,4 +1,4 @@
-"""Fixes that are withheld from the filter, to see how far off it is where it has none: an honest error on real logs."""
+"""Fixes that are withheld from the filter and compared with its poses: an honest error on real logs."""
 
 from __future__ import annotations
 
@@ -9,30 +9,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.pipeline import Locates
+from agents.pipeline import PoseSource
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
+SETTLE_S = 40.0  # fixes are judged from so long after the first reading on: by then a machine that drives is aligned
+
 
 @dataclass(frozen=True)
 class HoldoutConfig:
-    """Withhold GPS for off_s of every period_s, and judge from settle_s after the first reading on."""
+    """Withhold GPS for off_s of every period_s."""
 
     period_s: float = 10.0
     off_s: float = 1.0
-    settle_s: float = 40.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.off_s < self.period_s or self.settle_s < 0:
-            raise ValueError("off_s must lie between 0 and period_s; settle_s must not be negative")
+        if not 0 < self.off_s < self.period_s:
+            raise ValueError("off_s must lie between 0 and period_s")
 
 
 class Holdout:
     """Splits off fixes before the pipeline sees them, and compares them with its poses afterwards."""
 
-    def __init__(self, site: SiteConfig, machine: MachineConfig, config: HoldoutConfig) -> None:
-        self._config = config
+    def __init__(
+        self, site: SiteConfig, machine: MachineConfig, config: HoldoutConfig, settle_s: float = SETTLE_S
+    ) -> None:
+        self._config, self._settle_s = config, settle_s
         self._projection = Projection(site)
         self._levers = {s.name: s.mount.xyz_m for s in machine.sensors}
         self._first_ns = 0
@@ -43,12 +46,12 @@ class Holdout:
         """Return what the pipeline may see."""
         return [r for r in readings if not self._is_withheld(r)]
 
-    def compare(self, pipeline: Locates) -> None:
+    def compare(self, pipeline: PoseSource) -> None:
         """Compare withheld fixes with the poses that are known by now."""
         pose = pipeline.pose
         while pose and self._waiting and self._waiting[0].stamp_ns <= pose.stamp_ns:
             fix = self._waiting.popleft()
-            if (at := pipeline.pose_at(fix.stamp_ns)) and self._seconds(fix) >= self._config.settle_s:
+            if (at := pipeline.pose_at(fix.stamp_ns)) and self._seconds(fix) >= self._settle_s:
                 x, y, _ = self._projection.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
                 lever, c, s = self._levers[fix.sensor], math.cos(at.heading_rad), math.sin(at.heading_rad)
                 dx = at.x_m + c * lever[0] - s * lever[1] - x

@@ -1,6 +1,6 @@
-"""The machine's pure heart: readings in, samples out. No clock, no files, no network.
+"""The pure core of an agent: readings in, samples out. No clock, no files, no network.
 
-`Positioning` is the half of it that says where the machine is; `Pipeline` adds the ground there, and samples of it.
+`Positioning` is the half of it that locates the machine; `Pipeline` adds the estimate of the ground, and samples of it.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from agents.drivers.stream_order import Order, Verdict
+from agents.dead_reckoning import DeadReckoning
+from agents.drivers.stream_order import Decision, StreamOrder
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
+from agents.localisation.config import LocalisationConfig
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import SPEED
-from agents.localisation.localiser import LocalisationConfig, Localiser
-from agents.sampling import NOTHING, PoseHistory, Sampler, SamplingConfig, Way
+from agents.localisation.localiser import Localiser
+from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
 from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Reading
@@ -27,25 +29,14 @@ from protocol.site.site_config import Projection, SiteConfig
 
 @dataclass(frozen=True)
 class PipelineConfig:
-    """Options of the pure core, one table per stage.
+    """Options of the pure core, one table per stage."""
 
-    gap_s: a pause in the readings longer than this starts localisation anew. late_s: readings that come later than
-    this behind the newest are refused.
-    """
-
-    gap_s: float = 5.0
-    late_s: float = 0.5
     localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
     estimation: EstimationConfig = field(default_factory=EstimationConfig)
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
-
-    def __post_init__(self) -> None:
-        if self.gap_s <= 0 or self.late_s < 0:
-            raise ValueError("gap_s must be positive and late_s not negative")
 
 
-class Locates(Protocol):
-    """What finds out where a machine is: a `Pipeline`, or its half that does nothing else."""
+class PoseSource(Protocol):
+    """A source of poses: a `Pipeline`, or its half that locates alone."""
 
     @property
     def pose(self) -> PoseBelief | None:
@@ -61,7 +52,7 @@ class Locates(Protocol):
         ...
 
 
-class Taken(NamedTuple):
+class Accepted(NamedTuple):
     """A reading that counts, at the stamp of what it measured; a tuple, as there are hundreds a second.
 
     poses: what it made possible or changed, oldest first. restarts: nothing before it counts any more.
@@ -74,24 +65,24 @@ class Taken(NamedTuple):
 
 
 class Positioning:
-    """Localisation of one machine: readings are judged by their order, and recent poses remembered."""
+    """Dead reckoning and localisation of one machine, and the history of its poses."""
 
     def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
-        self._machine, self._config = machine, config
+        self._machine, self._config = machine, config.localisation
         self._projection = Projection(site)
         self._sensors = {s.name: s for s in machine.sensors if s.use}
-        self._order = Order(config.gap_s, config.late_s)
+        self._order = StreamOrder()
         self._counters: Counter[str] = Counter()
         self._start()
 
     @property
     def pose(self) -> PoseBelief | None:
         """The newest pose, None until the start heading is known."""
-        return self._poses.newest
+        return self.poses.newest
 
     def pose_at(self, stamp_ns: int) -> PoseBelief | None:
         """Pose at a recent stamp, None where it is not known."""
-        return self._poses.at(stamp_ns)
+        return self.poses.at(stamp_ns)
 
     @property
     def counters(self) -> Counter[str]:
@@ -101,31 +92,33 @@ class Positioning:
     def step(self, readings: Sequence[Reading]) -> None:
         """Take in readings in the order of their stamps."""
         for reading in readings:
-            self.take(reading)
+            if accepted := self.accept(reading):
+                for pose in accepted.poses:
+                    self.poses.append(pose)
 
-    def take(self, reading: Reading) -> Taken | None:
-        """Take in one reading; None where it is refused."""
+    def accept(self, reading: Reading) -> Accepted | None:
+        """Take in one reading; None where it is refused. The caller appends its poses to `poses`, one by one."""
         sensor = self._sensors.get(reading.sensor)
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
             return None
         if sensor.delay_s:
             reading = replace(reading, stamp_ns=reading.stamp_ns - round(sensor.delay_s * 1e9))
-        verdict = self._order.judge(reading)
-        if verdict is Verdict.REFUSE:
+        decision = self._order.decide(reading)
+        if decision is Decision.REFUSE:
             return None
-        if verdict is Verdict.RESTART:
+        if decision is Decision.RESTART:
             self._counters.update(self.localiser.counters)
             self._start()
-        poses = self.localiser.update(reading, sensor)
-        for pose in poses:
-            self._poses.append(pose)
-        return Taken(reading, sensor, poses, verdict is Verdict.RESTART)
+        self.dead_reckoning.update(reading, sensor)
+        poses = self.localiser.update(reading, sensor, self.dead_reckoning)
+        return Accepted(reading, sensor, poses, decision is Decision.RESTART)
 
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""
-        self.localiser = Localiser(self._machine, self._projection, self._config.localisation)
-        self._poses = PoseHistory(self._config.sampling.history_s)
+        self.dead_reckoning = DeadReckoning(self._machine, self._config.slip)
+        self.localiser = Localiser(self._machine, self._projection, self._config)
+        self.poses = PoseHistory()
 
 
 class Pipeline:
@@ -158,13 +151,13 @@ class Pipeline:
 
     def finish(self) -> Table:
         """Samples (n,) of what still waits, as the stream ends."""
-        rows = self._sampler.take(self._newest_ns, self._estimator.at, waits=False)
+        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
         self._sampler.withheld["no_pose"] += self._sampler.waiting
         return rows
 
     @property
     def calibration(self) -> Calibration:
-        """What the ground estimator found out about the machine's sensors."""
+        """The calibration that the ground estimator has by now."""
         return self._estimator.calibration
 
     def health(self) -> dict[str, Any]:
@@ -179,37 +172,35 @@ class Pipeline:
             "without_resistance": dict(self._sampler.without_resistance),
             "ground": self._estimator.health(),
             "consistency": {
-                name: {**asdict(found), "good": found.is_good} for name, found in localiser.consistency.items()
+                name: {**asdict(value), "good": value.is_good} for name, value in localiser.consistency.items()
             },
         }
 
     def _step_one(self, reading: Reading) -> list[Table]:
-        taken = self._positioning.take(reading)
-        if taken is None:
+        accepted = self._positioning.accept(reading)
+        if accepted is None:
             return []
-        reading, sensor, poses, restarts = taken
+        reading, sensor, poses, restarts = accepted
         made: list[Table] = []
         if restarts:
             made.append(self.finish())
             self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
             self._start(self._estimator.calibration)
-        for pose in poses:  # after a late alignment more than the history holds
-            self._sampler.poses.append(pose)
-            made.append(self._take())
+        for pose in poses:  # each at once: after a late alignment they are more than the history holds
+            self._positioning.poses.append(pose)
+            made.append(self._due_samples())
         self._newest_ns = max(self._newest_ns, reading.stamp_ns)
-        localiser = self._positioning.localiser
-        dead, belief = localiser.dead, localiser.belief
-        self._estimator.update(reading, sensor, dead, self._known_c_rr())
-        way_m = self._way.update(reading, dead.way_m, float(belief.x[SPEED]) if belief else 0.0)
-        if self._sampler.is_due(way_m):
-            self._sampler.mark(reading.stamp_ns, way_m)
-        return [*made, self._take()]
+        dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
+        self._estimator.update(reading, sensor, dead_reckoning, self._known_c_rr())
+        speed_mps = float(belief.x[SPEED]) if belief else 0.0
+        self._sampler.mark(reading.stamp_ns, self._odometer.update(reading, dead_reckoning.distance_m, speed_mps))
+        return [*made, self._due_samples()]
 
-    def _take(self) -> Table:
-        return self._sampler.take(self._newest_ns, self._estimator.at)
+    def _due_samples(self) -> Table:
+        return self._sampler.due_samples(self._newest_ns, self._estimator.at)
 
     def _known_c_rr(self) -> float | None:
-        """Resistance of the ground here, where the site says it and the position is sure enough."""
+        """Resistance of the ground here, where the site states it and the position is sure enough."""
         pose, areas = self.pose, self._site.known_ground
         if not areas or not pose:
             return None
@@ -221,5 +212,5 @@ class Pipeline:
         """Start with nothing known but the calibration, as after power-up or a jump of the clock."""
         config, machine = self._config, self._machine
         self._estimator = GroundEstimator(machine, config.estimation, known)
-        self._sampler = Sampler(machine.load_centre_m, config.sampling)
-        self._way = Way()
+        self._sampler = Sampler(self._positioning.poses, machine.load_centre_m)
+        self._odometer = Odometer()

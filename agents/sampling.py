@@ -1,6 +1,6 @@
-"""When and where a sample is made: one per stretch driven, where the machine was, with the estimate of that ground.
+"""Samples: one per stretch driven, at the place where the machine was, with the estimate of the ground there.
 
-It is made a little later than the machine was there, as long as the estimator wants to look ahead.
+A sample is made LAG_S later than the machine was there, so that the estimator has seen what came next.
 """
 
 from __future__ import annotations
@@ -18,37 +18,21 @@ from agents.localisation.filters.belief import PoseBelief
 from protocol.arrays import Table
 from protocol.machine.readings import Encoder, Odometry, Reading
 from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.rotations import wrap_angle
 
 NOTHING = np.empty(0, SAMPLE_DTYPE)
-SILENT_NS = 500_000_000  # wheels that say nothing for so long are not there
-MIN_SPEED_MPS = 0.3  # of a way by the filter's speed alone: below it, it is noise
-
-
-@dataclass(frozen=True)
-class SamplingConfig:
-    """When samples are made.
-
-    every_m: one sample per so many metres driven. lag_s: how much later a sample is made than the machine was there, so
-    that the estimator has seen what came next. max_std_m: samples of a position less sure than this are withheld.
-    history_s: how long poses are remembered.
-    """
-
-    every_m: float = 0.5
-    lag_s: float = 2.0
-    max_std_m: float = 20.0
-    history_s: float = 30.0
-
-    def __post_init__(self) -> None:
-        for name in set(self.__dataclass_fields__) - {"lag_s"}:
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: must be positive")
-        if not 0 <= self.lag_s < self.history_s:
-            raise ValueError("lag_s: not between 0 and history_s")
+EVERY_M = 0.5  # driven from one sample to the next: a cell of the map at its usual size
+LAG_S = 2.0  # the ground under the wheels shows in the forces for about so long
+MAX_STD_M = 20.0  # samples of a position less sure than this are withheld: they would blur the map
+HISTORY_S = 30.0  # how long poses are kept: a sample looks back by LAG_S, and a withheld fix by less
+LAG_NS, HISTORY_NS = round(LAG_S * 1e9), round(HISTORY_S * 1e9)
+SILENT_NS = 500_000_000  # wheels without a reading for so long are taken to be gone
+MIN_SPEED_MPS = 0.3  # a slower speed of the filter alone is noise, not distance
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A place that wants an estimate: where the machine was at stamp_ns, after distance_m more metres driven."""
+    """A place to sample: where the machine was at stamp_ns, after distance_m driven since the mark before."""
 
     stamp_ns: int
     distance_m: float
@@ -57,9 +41,8 @@ class Mark:
 class PoseHistory:
     """Recent poses, to look up where the machine was."""
 
-    def __init__(self, history_s: float) -> None:
+    def __init__(self) -> None:
         self._poses: list[PoseBelief] = []
-        self._history_ns = round(history_s * 1e9)
 
     @property
     def newest(self) -> PoseBelief | None:
@@ -67,12 +50,12 @@ class PoseHistory:
         return self._poses[-1] if self._poses else None
 
     def append(self, pose: PoseBelief) -> None:
-        """Remember a pose; it replaces those that are not older."""
+        """Add a pose; it replaces those that are not older."""
         while self._poses and pose.stamp_ns <= self._poses[-1].stamp_ns:
             self._poses.pop()
         self._poses.append(pose)
-        if pose.stamp_ns - self._poses[0].stamp_ns > 2 * self._history_ns:  # in bulk: removing in front is slow
-            del self._poses[: bisect_left(self._poses, pose.stamp_ns - self._history_ns, key=_stamp)]
+        if pose.stamp_ns - self._poses[0].stamp_ns > 2 * HISTORY_NS:  # in bulk: removing in front is slow
+            del self._poses[: bisect_left(self._poses, pose.stamp_ns - HISTORY_NS, key=_stamp)]
 
     def at(self, stamp_ns: int) -> PoseBelief | None:
         """Pose at a stamp, interpolated; None outside of what is remembered."""
@@ -84,37 +67,38 @@ class PoseHistory:
         return _interpolate(self._poses[i - 1], self._poses[i], stamp_ns)
 
 
-class Way:
-    """Counts the way driven, up in reverse too: by the wheels, or by the filter's speed while they are silent."""
+class Odometer:
+    """Counts the distance driven, up in reverse too: by the wheels, or by the filter's speed while they are silent."""
 
     def __init__(self) -> None:
-        self._way_m = self._wheels_m = 0.0
+        self._distance_m = self._wheels_m = 0.0
         self._wheels_ns = self._counted_ns = 0
 
     def update(self, reading: Reading, wheels_m: float, speed_mps: float) -> float:
-        """Take in a reading, the way of the wheels so far and the filter's speed; returns the way [m]."""
+        """Take in a reading, the wheels' distance so far and the filter's speed; returns the distance [m]."""
         now_ns = reading.stamp_ns
         if isinstance(reading, Encoder | Odometry):
             self._wheels_ns = now_ns
-        self._way_m += wheels_m - self._wheels_m
+        self._distance_m += wheels_m - self._wheels_m
         self._wheels_m = wheels_m
         if now_ns - self._wheels_ns > SILENT_NS and abs(speed_mps) > MIN_SPEED_MPS and self._counted_ns:
-            self._way_m += abs(speed_mps) * max(now_ns - self._counted_ns, 0) * 1e-9
+            self._distance_m += abs(speed_mps) * max(now_ns - self._counted_ns, 0) * 1e-9
         self._counted_ns = max(self._counted_ns, now_ns)
-        return self._way_m
+        return self._distance_m
 
 
 class Sampler:
-    """Makes samples; counts by reason what is `withheld` and what is sampled `without_resistance`."""
+    """Makes samples; counts by reason what is `withheld` and what is sampled `without_resistance`.
 
-    def __init__(self, load_centre_m: float, config: SamplingConfig) -> None:
+    poses: where the machine was. load_centre_m: how far ahead of the pose a sample lies.
+    """
+
+    def __init__(self, poses: PoseHistory, load_centre_m: float) -> None:
         self.withheld: Counter[str] = Counter()
         self.without_resistance: Counter[str] = Counter()
-        self.poses = PoseHistory(config.history_s)
+        self._poses = poses
         self._load_centre_m = load_centre_m
-        self._config = config
-        self._lag_ns = round(config.lag_s * 1e9)
-        self._way_m = 0.0
+        self._marked_m = 0.0
         self._marks: deque[Mark] = deque()  # wait for the estimator
         self._estimated: deque[tuple[Mark, GroundEstimate]] = deque()  # wait for a pose
 
@@ -123,28 +107,25 @@ class Sampler:
         """How many marks are not sampled yet."""
         return len(self._marks) + len(self._estimated)
 
-    def is_due(self, way_m: float) -> bool:
-        """Whether the machine has driven far enough since the last mark; way_m counts up in reverse too."""
-        return way_m - self._way_m >= self._config.every_m
+    def mark(self, stamp_ns: int, distance_m: float) -> None:
+        """Note the distance driven so far, up in reverse too: every EVERY_M a sample becomes due."""
+        since_m = distance_m - self._marked_m
+        if since_m >= EVERY_M:
+            self._marked_m = distance_m
+            self._marks.append(Mark(stamp_ns, min(since_m, 2 * EVERY_M)))
 
-    def mark(self, stamp_ns: int, way_m: float) -> None:
-        """Note that a sample is due."""
-        distance_m = way_m - self._way_m
-        self._way_m = way_m
-        self._marks.append(Mark(stamp_ns, min(distance_m, 2 * self._config.every_m)))
-
-    def take(self, now_ns: int, estimate_at: Callable[[int], GroundEstimate], *, waits: bool = True) -> Table:
-        """Samples (n,) of all marks whose ground and place are known; waits: only of those that are lag_s old."""
-        while self._marks and self._marks[0].stamp_ns <= now_ns - self._lag_ns * waits:
+    def due_samples(self, now_ns: int, estimate_at: Callable[[int], GroundEstimate], *, waits: bool = True) -> Table:
+        """Samples (n,) of all marks whose ground and place are known; waits: only of those that are LAG_S old."""
+        while self._marks and self._marks[0].stamp_ns <= now_ns - LAG_NS * waits:
             mark = self._marks.popleft()
             self._estimated.append((mark, estimate_at(mark.stamp_ns)))
-        newest = self.poses.newest
+        newest = self._poses.newest
         if not self._estimated or not newest or self._estimated[0][0].stamp_ns > newest.stamp_ns:
             return NOTHING
         rows = []
         while self._estimated and self._estimated[0][0].stamp_ns <= newest.stamp_ns:
             mark, estimate = self._estimated.popleft()
-            if pose := self.poses.at(mark.stamp_ns):
+            if pose := self._poses.at(mark.stamp_ns):
                 rows += self._sample(mark, pose, estimate)
             else:
                 self.withheld["no_pose"] += 1
@@ -152,7 +133,7 @@ class Sampler:
 
     def _sample(self, mark: Mark, pose: PoseBelief, e: GroundEstimate) -> list[tuple[float, ...]]:
         (xx, xy), (_, yy) = pose.covariance_m2
-        if max(xx, yy) > self._config.max_std_m**2:
+        if max(xx, yy) > MAX_STD_M**2:
             self.withheld["unsure_position"] += 1
             return []
         if e.is_blurred:
@@ -173,8 +154,7 @@ def _stamp(pose: PoseBelief) -> int:
 
 def _interpolate(a: PoseBelief, b: PoseBelief, stamp_ns: int) -> PoseBelief:
     share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
-    turn = (b.heading_rad - a.heading_rad + math.pi) % (2 * math.pi) - math.pi
-    heading = (a.heading_rad + share * turn + math.pi) % (2 * math.pi) - math.pi
+    heading = wrap_angle(a.heading_rad + share * wrap_angle(b.heading_rad - a.heading_rad))
     x, y = a.x_m + share * (b.x_m - a.x_m), a.y_m + share * (b.y_m - a.y_m)
     speed = a.speed_mps + share * (b.speed_mps - a.speed_mps)
     return PoseBelief(stamp_ns, x, y, heading, speed, a.covariance_m2 + share * (b.covariance_m2 - a.covariance_m2))

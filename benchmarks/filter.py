@@ -14,14 +14,15 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from agents.localisation.filters.belief import Belief, Filter, Measurement
 from agents.localisation.filters.ekf import Ekf
-from agents.localisation.filters.motion import MotionConfig, motion
+from agents.localisation.filters.motion import MotionModel, motion
 from agents.localisation.filters.state import ATTITUDE, POSITION, RATE, VELOCITY, Layout
 from agents.localisation.filters.ukf import Ukf
 from benchmarks import agent
 from benchmarks.measure import Report, machine, medians, timed
 from protocol.arrays import Floats
 
-LAYOUT, CONFIG = Layout(), MotionConfig()  # the 15 states
+LAYOUT = Layout()  # the 15 states
+MODEL = MotionModel(LAYOUT)
 DT_S = 0.01
 MEASURED = {"update position": slice(POSITION.start, POSITION.start + 2), "update rate": RATE}
 STOCK, ANGULAR = "stock ukf", "stock ukf, angles"
@@ -66,9 +67,7 @@ def _own(kind: Filter) -> dict[str, FilterStep]:
     As in a drive a step finds the factor of its belief's covariance, and computes that of the belief it makes.
     """
     belief = _start()
-    steps: dict[str, FilterStep] = {
-        "predict": lambda: kind.predict(belief, motion(LAYOUT, CONFIG, belief, DT_S), 10_000_000)
-    }
+    steps: dict[str, FilterStep] = {"predict": lambda: kind.predict(belief, motion(MODEL, belief, DT_S), 10_000_000)}
     for name, states in MEASURED.items():
         steps[name] = _conditioned(kind, belief, states)
     return steps
@@ -90,13 +89,13 @@ def _stock(options: dict[str, Any]) -> dict[str, FilterStep]:
     points = MerweScaledSigmaPoints(LAYOUT.n, alpha=0.5, beta=2.0, kappa=0.0)
     start = _start()
     ukf = UnscentedKalmanFilter(LAYOUT.n, 2, DT_S, hx=None, fx=_stock_motion, points=points, **options)
-    ukf.Q = motion(LAYOUT, CONFIG, start, DT_S).Q
+    ukf.Q = motion(MODEL, start, DT_S).Q
     ukf.x, ukf.P = start.x, start.P
     ukf.predict()  # draws the sigma points that each update uses
 
     def predict() -> None:
         ukf.x, ukf.P = start.x, start.P
-        ukf.Q = motion(LAYOUT, CONFIG, start, DT_S).Q
+        ukf.Q = motion(MODEL, start, DT_S).Q
         ukf.predict()
 
     def updated(states: slice) -> FilterStep:

@@ -1,4 +1,4 @@
-"""Replay of a log folder, in real time, faster, or as fast as the agent takes it."""
+"""Replay of a log folder, in real time, faster, or as fast as the agent is."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ class Replay:
                 self._wait(min(early_s, timeout_s))
                 if early_s > timeout_s:
                     return ()
-        return self._take_span(self._next.stamp_ns + SPAN_NS)
+        return self._next_span(self._next.stamp_ns + SPAN_NS)
 
     def counters(self) -> Mapping[str, int]:
-        """Rows of the log that were left out, by reason."""
+        """Rows of the log that were refused, by reason."""
         return {f"log_{reason}": n for reason, n in self._log.refused.items()}
 
     def close(self) -> None:
         """Nothing is held open between two reads."""
 
-    def _take_span(self, end_ns: int) -> list[Reading]:
+    def _next_span(self, end_ns: int) -> list[Reading]:
         span: list[Reading] = []
         while self._next is not None and self._next.stamp_ns < end_ns:
             span.append(self._next)

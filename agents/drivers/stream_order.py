@@ -1,4 +1,4 @@
-"""Readings must come in the order of their stamps: duplicates and late ones are refused, clock jumps are noticed."""
+"""Order of readings by their stamps: duplicates and late readings are refused, jumps of the clock are noticed."""
 
 from __future__ import annotations
 
@@ -7,49 +7,46 @@ from enum import Enum
 
 from protocol.machine.readings import Reading
 
+GAP_NS = 5_000_000_000  # a longer pause in all readings ends dead reckoning: the machine may be anywhere after it
+LATE_NS = 500_000_000  # how far behind the newest reading one of another sensor may come
 LATE_LIMIT = 200  # so many late readings in a row are a clock that was set back, not a late sensor
 
 
-class Verdict(Enum):
+class Decision(Enum):
     """What to do with a reading."""
 
-    TAKE = "take"
+    ACCEPT = "accept"
     REFUSE = "refuse"
-    RESTART = "restart"  # take it, but nothing before it counts any more
+    RESTART = "restart"  # accept it, and forget all before it
 
 
-class Order:
-    """Judges readings of one machine. gap_s: a pause longer than this ends dead reckoning.
+class StreamOrder:
+    """Decides on the readings of one machine, by their stamps; `counters` holds refusals and restarts by reason."""
 
-    late_s: how far behind the newest reading one of another sensor may come.
-    """
-
-    def __init__(self, gap_s: float, late_s: float) -> None:
+    def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
-        self._gap_ns = round(gap_s * 1e9)
-        self._late_ns = round(late_s * 1e9)
         self._newest_ns = 0
         self._by_sensor: dict[str, int] = {}
         self._late_in_a_row = 0
 
-    def judge(self, reading: Reading) -> Verdict:
-        """Judge one reading, and count it if it is not simply taken."""
+    def decide(self, reading: Reading) -> Decision:
+        """Decide on one reading, and count it if it is not simply accepted."""
         stamp, last = reading.stamp_ns, self._by_sensor.get(reading.sensor, 0)
-        if self._newest_ns and stamp > self._newest_ns + self._gap_ns:
+        if self._newest_ns and stamp > self._newest_ns + GAP_NS:
             return self._restart(reading, "gap_restarts")
-        if stamp <= last or stamp < self._newest_ns - self._late_ns:
+        if stamp <= last or stamp < self._newest_ns - LATE_NS:
             self._late_in_a_row += 1
             if self._late_in_a_row > LATE_LIMIT:
                 return self._restart(reading, "clock_back_restarts")
             self.counters["reading_duplicate" if stamp == last else "reading_late"] += 1
-            return Verdict.REFUSE
+            return Decision.REFUSE
         self._late_in_a_row = 0
         self._by_sensor[reading.sensor] = stamp
         self._newest_ns = max(self._newest_ns, stamp)
-        return Verdict.TAKE
+        return Decision.ACCEPT
 
-    def _restart(self, reading: Reading, reason: str) -> Verdict:
+    def _restart(self, reading: Reading, reason: str) -> Decision:
         self.counters[reason] += 1
         self._by_sensor = {reading.sensor: reading.stamp_ns}
         self._newest_ns, self._late_in_a_row = reading.stamp_ns, 0
-        return Verdict.RESTART
+        return Decision.RESTART

@@ -98,11 +98,11 @@ class Balancer:
 
     def _is_in_use(self, sensor: SensorConfig) -> bool:
         """Whether it is the first IMU on the rear frame that has an accelerometer."""
-        return sensor.frame == BASE and sensor.says("force") and self._sensor in (None, sensor.name)
+        return sensor.frame == BASE and sensor.provides("force") and self._sensor in (None, sensor.name)
 
     def _add_imu(self, imu: Imu, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> Balance | None:
         if imu.sensor not in self._rotation:
-            self._sensor, self._rotation[imu.sensor] = imu.sensor, sensor.mount.base_from_sensor()
+            self._sensor, self._rotation[imu.sensor] = imu.sensor, sensor.mount.frame_from_sensor()
             self._imu_ns = self._begin_ns = imu.stamp_ns
             return None
         dt_s, self._imu_ns = (imu.stamp_ns - self._imu_ns) * 1e-9, imu.stamp_ns
@@ -136,7 +136,7 @@ class Balancer:
             dt_s=dt_s,
             speed_mps=speed,
             accel_mps2=accel,
-            distance_m=dead_reckoning.way_m,
+            distance_m=dead_reckoning.distance_m,
             unbalanced=share
             - force / g
             + squat

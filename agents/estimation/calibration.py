@@ -135,7 +135,7 @@ class Calibrator:
         self._stretch.clear()
 
     def _end_stretch(self, dead_reckoning: DeadReckoning) -> _Stretch:
-        pose, n = dead_reckoning.now(), len(self._stretch)
+        pose, n = dead_reckoning.pose, len(self._stretch)
         newest = self._stretch[-1]
         half = newest.direction * 0.5 * STRETCH_M  # the middle of it lies behind
         x, y = pose.x_m - half * math.cos(pose.angle_rad), pose.y_m - half * math.sin(pose.angle_rad)

@@ -1,1 +1,1 @@
-"""Where the machine is, with an honest covariance: dead reckoning, alignment of the start heading, UKF."""
+"""Localisation: poses of the machine with their covariance, from GPS, IMUs and wheels."""

@@ -1,7 +1,8 @@
-"""Whether a filter believes what it should: the last innovations of each sensor against what it expected of them.
+"""Filter consistency: size and whiteness of the last innovations of a sensor.
 
-Of a consistent filter the normalised innovation squared, per component, is 1 on average, and successive innovations are
-not alike (white): Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4.
+Of a consistent filter the normalised innovation squared (NIS), per component, is 1 on average, and successive
+innovations are not correlated (white): Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
+Navigation, section 5.4.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import numpy as np
 from agents.localisation.filters.belief import Conditioned
 
 REMEMBERED = 150  # innovations: half a minute of a 5 Hz receiver
-ENOUGH = 50  # before anything is said
-MAX_GATED, MIN_NIS, MAX_NIS, MAX_ALIKE = 0.2, 0.2, 2.5, 0.6
+ENOUGH = 50  # fewer innovations show nothing
+MAX_GATED, MIN_NIS, MAX_NIS, MAX_CORRELATION = 0.2, 0.2, 2.5, 0.6
 
 
 @dataclass(frozen=True)
@@ -25,15 +26,15 @@ class Consistency:
 
     gated: float
     nis: float
-    alike: float
+    correlation: float
 
     @property
     def is_good(self) -> bool:
         """Whether the filter may be believed."""
-        return self.gated <= MAX_GATED and MIN_NIS <= self.nis <= MAX_NIS and abs(self.alike) <= MAX_ALIKE
+        return self.gated <= MAX_GATED and MIN_NIS <= self.nis <= MAX_NIS and abs(self.correlation) <= MAX_CORRELATION
 
 
-class Watch:
+class InnovationMonitor:
     """Remembers the last innovations of one sensor."""
 
     def __init__(self) -> None:
@@ -41,7 +42,7 @@ class Watch:
         self._last: deque[tuple[float, ...]] = deque(maxlen=REMEMBERED)
 
     def note(self, result: Conditioned) -> None:
-        """Remember what the filter made of a measurement; one that was no number at all says nothing of the filter."""
+        """Remember a result of the filter; one without a finite innovation shows nothing."""
         if not math.isfinite(result.nis):
             return
         self._gated.append(not result.accepted)
@@ -49,10 +50,10 @@ class Watch:
         self._last.append(tuple((result.innovation / std).tolist()))
 
     def consistency(self) -> Consistency | None:
-        """What the last innovations say; None as long as there are too few."""
+        """Consistency of the last innovations; None as long as there are too few."""
         if len(self._last) < ENOUGH:
             return None
         normalised = np.array(self._last)
         square = float((normalised**2).mean())
-        alike = float((normalised[1:] * normalised[:-1]).mean()) / max(square, 1e-12)
-        return Consistency(sum(self._gated) / len(self._gated), square, alike)
+        correlation = float((normalised[1:] * normalised[:-1]).mean()) / max(square, 1e-12)
+        return Consistency(sum(self._gated) / len(self._gated), square, correlation)

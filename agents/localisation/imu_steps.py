@@ -8,18 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.dead_reckoning import STALE_S, DeadReckoning, WheelTracker, turn_source
-from agents.localisation.modes import Told
+from agents.dead_reckoning import STALE_S, DeadReckonedPose, DeadReckoning, WheelTracker, turn_source
+from agents.localisation.sensor_modes import StampedValue
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, FRONT, MachineConfig, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
+from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
 
 NOTHING = (0.0,) * 7  # count and sums
-MIN_NORM = 0.5  # a reference that has not found itself yet sends a quaternion of zeros
+MIN_NORM = 0.5  # a reference that has not settled yet sends a quaternion of zeros
 
 
 @dataclass(frozen=True)
-class Felt:
+class ImuMean:
     """Mean angular rate and specific force of one IMU over a step, (3,) each, in `base_link`."""
 
     rates_radps: Floats
@@ -39,17 +40,18 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class Step:
-    """What fast sensors said up to a stamp.
+class FilterStep:
+    """Readings of fast sensors since the step before, up to a stamp.
 
-    orientations: the last roll, pitch, yaw (3,) of each attitude reference. rolled: whether the wheels spoke in this
-    step, else their speed is an old one. traction: drive force over weight; still_s: how long without travel. turn: of
-    a machine without IMU.
+    reckoned: the dead-reckoned pose at its end. orientations: the last roll, pitch, yaw (3,) of each attitude
+    reference. rolled: whether wheels were read in this step, else their speed is an old one. traction: drive force over
+    weight; still_s: how long without travel. turn: of a machine without IMU.
     """
 
     stamp_ns: int
-    felt: dict[str, Felt]
-    orientations: dict[str, Told]
+    reckoned: DeadReckonedPose
+    imu_means: dict[str, ImuMean]
+    orientations: dict[str, StampedValue]
     speed_mps: float
     rolled: bool
     traction: float
@@ -57,58 +59,58 @@ class Step:
     turn: Turn | None = None
 
 
-class Steps:
-    """Gathers readings; `take` returns a step whenever step_s have passed.
+class StepGatherer:
+    """Gathers readings into steps of step_s.
 
-    orients: whether absolute orientations are wanted; those of another mode always are.
+    orients: whether absolute orientations are used; those of another mode always are.
     """
 
     def __init__(self, machine: MachineConfig, step_s: float, *, orients: bool = True) -> None:
         self.counters: Counter[str] = Counter()
         self._step_ns = round(step_s * 1e9)
-        self._rotations = {s.name: s.mount.base_from_sensor() for s in machine.sensors}
+        self._rotations = {s.name: s.mount.frame_from_sensor() for s in machine.sensors}  # into base_link or front_link
         self._front = {s.name for s in machine.sensors if s.frame == FRONT}
         self._sums: dict[str, tuple[float, ...]] = {}
         self._orients = orients
         self._attitudes: dict[str, Attitude] = {}  # the last of each: only that is made into angles
         source = turn_source(machine)
-        self._turns = source.name if source else ""
+        self._turn_sensor = source.name if source else ""
         self._steers = source is not None and source.kind == "steering"
         self._wheelbase_m = machine.wheelbase_m
-        self._told: list[float] = []  # rates of odometry, or curvatures of steering
+        self._turn_values: list[float] = []  # rates of odometry, or curvatures of steering
         self._rolled_ns = 0
         self._begin_ns = 0
-        self._joint = WheelTracker()  # the angle of articulation, smoothed alike
+        self._joint = WheelTracker()  # the angle of articulation, smoothed in the same manner
         self._knows_joint = False
         self._rolled = False
         self._still_since = (0, math.nan)
 
-    def take(self, reading: Reading, sensor: SensorConfig, dead: DeadReckoning) -> Step | None:
-        """Take in one reading, after dead reckoning did; returns the step that it ends."""
+    def gather(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> FilterStep | None:
+        """Add one reading, after dead reckoning did; returns the step that it ends."""
         if isinstance(reading, Articulation):
             self._joint.update(reading.stamp_ns, reading.angle_rad)
             self._knows_joint = True
         elif isinstance(reading, Imu):
-            self._gather(reading, sensor)
+            self._add_imu(reading, sensor)
         elif isinstance(reading, Attitude) and (self._orients or sensor.mode != ABSOLUTE):
-            self._orient(reading, sensor)
-        elif isinstance(reading, Steering) and sensor.name == self._turns:
-            self._told.append(math.tan(reading.angle_rad) / self._wheelbase_m)
+            self._add_attitude(reading, sensor)
+        elif isinstance(reading, Steering) and sensor.name == self._turn_sensor:
+            self._turn_values.append(math.tan(reading.angle_rad) / self._wheelbase_m)
         elif isinstance(reading, Encoder | Odometry):
-            self._roll(reading, sensor)
+            self._add_wheels(reading, sensor)
         self._begin_ns = self._begin_ns or reading.stamp_ns
         if reading.stamp_ns - self._begin_ns < self._step_ns:
             return None
-        return self._finish(reading.stamp_ns, dead)
+        return self._finish(reading.stamp_ns, dead_reckoning)
 
-    def _roll(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
-        if sensor.says("speed"):
+    def _add_wheels(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
+        if sensor.provides("speed"):
             self._rolled, self._rolled_ns = True, reading.stamp_ns
-        if isinstance(reading, Odometry) and sensor.name == self._turns:
-            self._told.append(reading.rate_z_radps)
+        if isinstance(reading, Odometry) and sensor.name == self._turn_sensor:
+            self._turn_values.append(reading.rate_z_radps)
 
-    def _gather(self, imu: Imu, sensor: SensorConfig) -> None:
-        """Add up what an IMU says in its own axes: they are turned once per step, as turning is linear."""
+    def _add_imu(self, imu: Imu, sensor: SensorConfig) -> None:
+        """Sum up an IMU's readings in its own axes; their mean is turned once per step, as turning is linear."""
         if sensor.frame == FRONT and not self._knows_joint:
             self.counters["front_imu_without_articulation"] += 1
             return
@@ -123,14 +125,15 @@ class Steps:
             fz + imu.force_z_mps2,
         )
 
-    def _mean(self, name: str) -> Felt:
+    def _mean(self, name: str) -> ImuMean:
         """Mean of an IMU over the step, in `base_link`."""
         n, *total = self._sums[name]
-        rates, force = (np.array(total).reshape(2, 3) / n).dot(self._rotations[name].T)
-        return Felt(*(self._to_rear(rates, force) if name in self._front else (rates, force)))
+        frame_from_sensor = self._rotations[name]
+        rates, force = (np.array(total).reshape(2, 3) / n).dot(frame_from_sensor.T)
+        return ImuMean(*(self._to_base(rates, force) if name in self._front else (rates, force)))
 
-    def _orient(self, attitude: Attitude, sensor: SensorConfig) -> None:
-        """Keep an orientation that can be used. One on the front frame is left aside."""
+    def _add_attitude(self, attitude: Attitude, sensor: SensorConfig) -> None:
+        """Keep an orientation that can be used; one of the front frame cannot."""
         if sensor.frame == FRONT:
             self.counters["front_attitude_unused"] += 1
         elif math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw) < MIN_NORM:
@@ -138,56 +141,41 @@ class Steps:
         else:
             self._attitudes[attitude.sensor] = attitude
 
-    def _told_by(self, attitude: Attitude) -> Told:
-        """Orientation of `base_link`: map_from_sensor times sensor_from_base."""
-        rotation = _rotation(attitude).dot(self._rotations[attitude.sensor].T)
+    def _orientation(self, attitude: Attitude) -> StampedValue:
+        """Orientation of `base_link`: map_from_base = map_from_sensor sensor_from_base."""
+        map_from_sensor = matrix_from_quaternion((attitude.qx, attitude.qy, attitude.qz, attitude.qw))
+        map_from_base = map_from_sensor.dot(self._rotations[attitude.sensor].T)
         variances = np.array([attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2])
-        return Told(attitude.stamp_ns, _angles(rotation), variances)
+        return StampedValue(attitude.stamp_ns, rpy_from_matrix(map_from_base), variances)
 
-    def _to_rear(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
-        """Turn by the articulation in the middle of the step, and take its rate off."""
+    def _to_base(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
+        """Values of the front frame in `base_link`: turned by the articulation in mid-step, less its rate."""
         angle = self._joint.travel_m - 0.5e-9 * self._step_ns * self._joint.speed_mps
         c, s = math.cos(angle), math.sin(angle)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        rates = turn @ rates
+        base_from_front = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        rates = base_from_front @ rates
         rates[2] -= self._joint.speed_mps
-        return rates, turn @ force
+        return rates, base_from_front @ force
 
-    def _finish(self, stamp_ns: int, dead: DeadReckoning) -> Step:
-        felt = {name: self._mean(name) for name in self._sums}
-        orientations = {name: self._told_by(attitude) for name, attitude in self._attitudes.items()}
+    def _finish(self, stamp_ns: int, dead_reckoning: DeadReckoning) -> FilterStep:
+        imu_means = {name: self._mean(name) for name in self._sums}
+        orientations = {name: self._orientation(attitude) for name, attitude in self._attitudes.items()}
         self._attitudes.clear()
         self._sums.clear()
         self._begin_ns = stamp_ns
-        if dead.travel_m != self._still_since[1]:
-            self._still_since = (stamp_ns, dead.travel_m)
+        if dead_reckoning.travel_m != self._still_since[1]:
+            self._still_since = (stamp_ns, dead_reckoning.travel_m)
         still_s = (stamp_ns - self._still_since[0]) * 1e-9
         rolled, self._rolled = self._rolled, False
-        turn = self._turn(stamp_ns, dead.wheels.speed_mps) if self._told else None
-        return Step(stamp_ns, felt, orientations, dead.wheels.speed_mps, rolled, dead.traction, still_s, turn)
+        speed_mps, reckoned = dead_reckoning.wheels.speed_mps, dead_reckoning.pose
+        turn = self._turn(stamp_ns, speed_mps) if self._turn_values else None
+        traction = dead_reckoning.traction
+        return FilterStep(stamp_ns, reckoned, imu_means, orientations, speed_mps, rolled, traction, still_s, turn)
 
     def _turn(self, stamp_ns: int, speed_mps: float) -> Turn | None:
-        """Of the readings of this step; steering tells no turn without a speed."""
-        mean, self._told = sum(self._told) / len(self._told), []
+        """By the readings of this step; steering shows no turn without a speed."""
+        values, self._turn_values = self._turn_values, []
+        mean = sum(values) / len(values)
         if not self._steers:
             return Turn(mean, 1.0)
         return Turn(speed_mps * mean, speed_mps) if stamp_ns - self._rolled_ns < STALE_S * 1e9 else None
-
-
-def _rotation(attitude: Attitude) -> Floats:
-    """Matrix (3, 3) of the quaternion."""
-    norm = math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw)
-    x, y, z, w = attitude.qx / norm, attitude.qy / norm, attitude.qz / norm, attitude.qw / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _angles(rotation: Floats) -> Floats:
-    """Roll, pitch and yaw (3,) of map_from_base."""
-    (ahead, _, _), (aside, _, _), (down, left, up) = rotation.tolist()
-    return np.array([math.atan2(left, up), -math.asin(max(-1.0, min(1.0, down))), math.atan2(aside, ahead)])

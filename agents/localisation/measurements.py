@@ -1,61 +1,50 @@
-"""What sensors say of the state: each reading, or the mean of several, as a `Measurement` with its model and Jacobian.
+"""Measurement models z = h(x) of the sensors, with their Jacobians.
 
-Specific force: an accelerometer on a rigid body feels dv/dt + w x v + g up, all in the body's axes, and at a lever arm
-r also w x (w x r), together dv/dt + w x (v + w x r) + g up; so gravity is removed in the frame of the sensor's body, at
-any mounting. The lever arms of antennas turn with roll, pitch and yaw.
-
-States (m, n) come as rows; where a model takes more than a few operations it works on columns, whose values adjoin.
+x: the state (`filters.state`): position p, attitude (roll, pitch, yaw), velocity v, angular rate w, acceleration a.
+v, w and a are in `base_link`, R = map_from_base turns them into `map`, r is the lever arm of a sensor in `base_link`,
+and [.]_en are the components east and north. States (m, n) come as rows; where a model takes more than a few operations
+it works on columns, whose values adjoin. Angular rates and forces are turned into `base_link` before they come here.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from agents.localisation.filters.belief import Measurement
+from agents.localisation.filters.belief import Change, Measurement, Model
 from agents.localisation.filters.motion import EYE, map_from_base, turned_jacobian
 from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 
+# Standard deviations where neither a reading nor the sensor's configuration states one.
+RATE_RADPS = 0.005  # angular rate of an IMU, mean over a filter step
+FORCE_MPS2 = 2.0  # specific force of an IMU: its zero and mounting error do not average out, and are in it
+TURN_RADPS = 0.02  # turn rate of odometry or steering, and its lasting error at first; of steering per m/s
+SPEED_MPS = 0.04  # of wheels
+SIDE_MPS = 0.04  # how fast a machine slides sideways
+STILL_MPS = 0.005  # of a machine at rest
+GATE_SIGMA = 6.0  # measurements further off are refused; mounting and slip are not Gaussian
+
 ROLL, PITCH, YAW = range(ATTITUDE.start, ATTITUDE.stop)
 PLACE = slice(POSITION.start, POSITION.start + 2)
 
 
-@dataclass(frozen=True)
-class SensingConfig:
-    """Standard deviations of what sensors say, where readings do not state their own, and gates.
-
-    rate_radps, force_mps2: of an IMU, of the mean over one filter step; the force's has to cover its zero and mounting
-    error, which do not average out. turn_radps: of the turn rate that odometry or steering tell where there is no IMU,
-    and of its lasting error at first (per m/s for steering, whose error is one of the angle). speed_mps: of wheels;
-    side_mps: how fast a machine slides aside. still_mps: of a machine at rest. gate_sigma: of all but GPS.
-    min_fix_std_m: no receiver is believed to be better than this, if it says so itself. gps_gate_sigma: fixes further
-    off are refused.
-    """
-
-    rate_radps: float = 0.005
-    force_mps2: float = 2.0
-    turn_radps: float = 0.02
-    speed_mps: float = 0.04
-    side_mps: float = 0.04
-    still_mps: float = 0.005
-    gate_sigma: float = 6.0
-    min_fix_std_m: float = 0.3
-    gps_gate_sigma: float = 4.0
-
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: must be positive")
-
-
 def fix(
-    stamp_ns: int, sensor: str, position_m: Floats, R: Floats, lever_m: Floats, error: slice | None, gate: float
+    stamp_ns: int,
+    sensor: str,
+    position_m: Floats,
+    R: Floats,
+    lever_m: Floats,
+    error: slice | None,
+    gate: float,
+    change: Change | None = None,
 ) -> Measurement:
-    """A GPS fix (2,) in `map`; error: states of the receiver's slow error, if the filter has them."""
+    """A GPS fix (2,): z = [p + R r]_en + e.
+
+    error: states of the receiver's slow error e, None if the filter has none.
+    """
 
     def h(x: Floats) -> Floats:
         columns = x.T
@@ -73,11 +62,11 @@ def fix(
             H[:, error] = EYE[:2, :2]
         return H
 
-    return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=PLACE)
+    return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=PLACE, change=change)
 
 
 def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_m: Floats, gate: float) -> Measurement:
-    """Velocity (2,) of an antenna in `map`: that of base_link and w x r, turned."""
+    """Velocity (2,) of an antenna in `map`: z = [R (v + w x r)]_en."""
     by_rate = -_matrix(lever_m)  # w x r = -[r]x w
 
     def h(x: Floats) -> Floats:
@@ -95,16 +84,16 @@ def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_
 
 
 def inertial(
-    stamp_ns: int,
-    sensor: str,
-    rates_radps: Floats,
-    force_mps2: Floats,
-    R: Floats,
-    lever_m: Floats,
-    bias: int | None,
-    gate: float,
+    stamp_ns: int, sensor: str, z: Floats, R: Floats, lever_m: Floats, bias: int | None, gate: float
 ) -> Measurement:
-    """Angular rate (3,) and specific force (3,) of an IMU, turned into `base_link`; bias: state of its yaw rate's."""
+    """Angular rate and specific force (6,) of an IMU: z = (w + b e_z, f).
+
+    An accelerometer on a rigid body measures the acceleration of its place less that of gravity, in the body's axes:
+
+        f = a + w x (v + w x r) + g R^T e_z,    R^T e_z = (-sin pitch, cos pitch sin roll, cos pitch cos roll)
+
+    bias: state of the yaw gyro's bias b, None if the filter has none.
+    """
     by_rate = -_matrix(lever_m)  # w x r = -[r]x w
 
     def h(x: Floats) -> Floats:
@@ -114,15 +103,15 @@ def inertial(
         ahead, left, up = columns[VELOCITY] + by_rate.dot(w)
         (sr, sp), (cr, cp) = np.sin(tilt), np.cos(tilt)
         level = GRAVITY_MPS2 * cp
-        z = np.empty((6, len(x)))
-        z[:3] = w
+        rows = np.empty((6, len(x)))
+        rows[:3] = w
         if bias is not None:
-            z[2] += columns[bias]
-        z[3] = q * up - r * left - GRAVITY_MPS2 * sp
-        z[4] = r * ahead - p * up + level * sr
-        z[5] = p * left - q * ahead + level * cr
-        z[3:] += columns[ACCELERATION]
-        return z.T
+            rows[2] += columns[bias]
+        rows[3] = q * up - r * left - GRAVITY_MPS2 * sp
+        rows[4] = r * ahead - p * up + level * sr
+        rows[5] = p * left - q * ahead + level * cr
+        rows[3:] += columns[ACCELERATION]
+        return rows.T
 
     def jacobian(x: Floats) -> Floats:
         w, moving = x[RATE], x[VELOCITY] + by_rate.dot(x[RATE])
@@ -137,11 +126,14 @@ def inertial(
         H[3:, ROLL:YAW] = GRAVITY_MPS2 * np.array([(0.0, -cp), (cp * cr, -sp * sr), (-cp * sr, -sp * cr)])
         return H
 
-    return Measurement(sensor, stamp_ns, np.concatenate([rates_radps, force_mps2]), R, h, jacobian, gate_sigma=gate)
+    return Measurement(sensor, stamp_ns, z, R, h, jacobian, gate_sigma=gate)
 
 
 def wheels(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, scale: int | None, gate: float) -> Measurement:
-    """Velocity (3,) of `base_link`: ahead as the wheels have it, aside and up; scale: state of the wheels' scale."""
+    """Velocity (3,) of `base_link` by the wheels, none sideways and upwards: z = ((1 + s) v_x, v_y, v_z).
+
+    scale: state of the wheels' scale s, None if the filter has none.
+    """
 
     def h(x: Floats) -> Floats:
         z = x[:, VELOCITY].copy()
@@ -163,7 +155,10 @@ def wheels(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, scale: i
 def turn(
     stamp_ns: int, rate_radps: float, std_radps: float, error: int | None, per_error: float, gate: float
 ) -> Measurement:
-    """Turn rate (1,) about the vertical of `base_link`; error: state of its lasting error, each worth per_error."""
+    """Turn rate (1,) about the vertical of `base_link`: z = w_z + per_error e.
+
+    error: state of its lasting error e, None if the filter has none.
+    """
 
     def h(x: Floats) -> Floats:
         rate = x[:, YAW_RATE] if error is None else x[:, YAW_RATE] + per_error * x[:, error]
@@ -181,9 +176,18 @@ def turn(
 
 
 def orientation(
-    stamp_ns: int, sensor: str, rpy_rad: Floats, R: Floats, gate: float, error: int | None = None
+    stamp_ns: int,
+    sensor: str,
+    rpy_rad: Floats,
+    R: Floats,
+    gate: float,
+    error: int | None = None,
+    change: Change | None = None,
 ) -> Measurement:
-    """Roll, pitch and yaw (3,) of `base_link` in `map`; error: state of the yaw's, if the filter has one."""
+    """Attitude (3,) of `base_link` in `map`: z = (roll, pitch, yaw + e).
+
+    error: state of the error e of the heading's anchor, None if the filter has none.
+    """
 
     def h(x: Floats) -> Floats:
         if error is None:
@@ -199,39 +203,26 @@ def orientation(
             H[2, error] = 1.0
         return H
 
-    return Measurement(sensor, stamp_ns, rpy_rad, R, h, jacobian, angles=(0, 1, 2), gate_sigma=gate)
+    return Measurement(sensor, stamp_ns, rpy_rad, R, h, jacobian, (0, 1, 2), gate_sigma=gate, change=change)
 
 
 def rotation(stamp_ns: int, sensor: str, rates_radps: Floats, R: Floats, gate: float) -> Measurement:
-    """Angular rate (3,) of `base_link`, free of bias."""
-
-    def h(x: Floats) -> Floats:
-        return x[:, RATE]
-
-    def jacobian(x: Floats) -> Floats:
-        H = np.zeros((3, len(x)))
-        H[:, RATE] = EYE
-        return H
-
-    return Measurement(sensor, stamp_ns, rates_radps, R, h, jacobian, gate_sigma=gate)
+    """Angular rate (3,) of `base_link`, free of bias: z = w."""
+    return Measurement(sensor, stamp_ns, rates_radps, R, *_picked(RATE), gate_sigma=gate)
 
 
-def standstill(stamp_ns: int, config: SensingConfig) -> Measurement:
-    """A machine at rest: no velocity and no angular rate (ZUPT), so that gyros show their bias.
+def standstill(stamp_ns: int) -> Measurement:
+    """A machine at rest (zero velocity update), which shows the bias of gyros: 0 = (v, w).
 
-    Gated, for good: wheels that stand do not keep an articulated machine from turning its rear frame as it steers.
+    Gated without relocking: an articulated machine turns its rear frame as it steers, also while its wheels stand.
     """
-    R = np.diag([config.still_mps**2] * 3 + [(0.1 * config.rate_radps) ** 2] * 3)
+    R, model = np.diag([STILL_MPS**2] * 3 + [(0.1 * RATE_RADPS) ** 2] * 3), _picked(slice(VELOCITY.start, RATE.stop))
+    return Measurement("standstill", stamp_ns, np.zeros(6), R, *model, gate_sigma=GATE_SIGMA, relocks=False)
 
-    def h(x: Floats) -> Floats:
-        return np.concatenate([x[:, VELOCITY], x[:, RATE]], axis=1)
 
-    def jacobian(x: Floats) -> Floats:
-        H = np.zeros((6, len(x)))
-        H[:3, VELOCITY] = H[3:, RATE] = EYE
-        return H
-
-    return Measurement("standstill", stamp_ns, np.zeros(6), R, h, jacobian, gate_sigma=config.gate_sigma, relocks=False)
+def _picked(states: slice) -> tuple[Model, Model]:
+    """H and Jacobian of a measurement of some states as they are."""
+    return lambda x: x[:, states], lambda x: np.eye(len(x))[states]
 
 
 # --- rotations of many states ----------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ import numpy as np
 
 from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline, PipelineConfig
+from agents.sampling import LAG_S
 from evaluation.campaign.recordings import Drive, Recording, Setup, code_version, digest, track_file
 from evaluation.campaign.tasks import Progress, carry_out, check_name, loaded
 from evaluation.ground.score import Judged, by_border, c_rr_bias, figures, judge, pool, soils
@@ -221,7 +222,7 @@ def judge_task(task: Task) -> Outcome:
     found = read_run(run_file(task))
     way, ground = _truth(task.drive, task.cache)
     from_ns = int(way.stamp_ns[0]) + round(settle_s(task.drive.seconds) * 1e9)
-    judged = judge(found.samples, way, ground, task.row.options.sampling, from_ns)
+    judged = judge(found.samples, way, ground, LAG_S, from_ns)
     return Outcome(task, found, way, ground, from_ns, judged)
 
 

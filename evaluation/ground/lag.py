@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.sampling import SamplingConfig
 from evaluation.ground.truth import Ground, Way
 from protocol.arrays import Floats, Ints, Table
 from protocol.site.ground_classes import ZONES
@@ -29,9 +28,9 @@ class Crossing:
     end_ns: int
 
 
-def known_ns(samples: Table, sampling: SamplingConfig) -> Ints:
+def known_ns(samples: Table, lag_s: float) -> Ints:
     """When the machine knew what samples say: it dates them back by the time the ground takes to show."""
-    stamps: Ints = samples["stamp_ns"] + round(sampling.lag_s * 1e9)
+    stamps: Ints = samples["stamp_ns"] + round(lag_s * 1e9)
     return stamps
 
 
@@ -52,7 +51,7 @@ def crossings(way: Way, ground: Ground, from_ns: int) -> list[Crossing]:
     return found
 
 
-def lags(samples: Table, way: Way, found: list[Crossing], sampling: SamplingConfig) -> Floats:
+def lags(samples: Table, way: Way, found: list[Crossing], lag_s: float) -> Floats:
     """Lag of each change of zone (k, 3): time [s] and way [m] until the estimate knew, and how far off it was placed.
 
     The estimate knows once it is nearer to the new zone's value than to the old one's; infinite where it does not
@@ -60,7 +59,7 @@ def lags(samples: Table, way: Way, found: list[Crossing], sampling: SamplingConf
     Changes before which the estimate was not near to the old value say nothing, and are left out.
     """
     samples = samples[np.isfinite(samples["c_rr"])]
-    known = way.at(known_ns(samples, sampling))
+    known = way.at(known_ns(samples, lag_s))
     dated_m = way.at(samples["stamp_ns"]).driven_m
     rows = [_lag(samples["c_rr"].astype(float), known, dated_m, crossing) for crossing in found]
     return np.array([row for row in rows if row], float).reshape(-1, 3)

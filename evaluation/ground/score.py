@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from agents.sampling import SamplingConfig
 from evaluation.ground.lag import C_RR, crossings, lags
 from evaluation.ground.truth import CELL_M, Ground, Way
 from evaluation.maps.score import by_border_distance
@@ -105,7 +104,7 @@ class Judged:
     lags: Floats
 
 
-def judge(samples: Table, way: Way, ground: Ground, sampling: SamplingConfig, from_ns: int) -> Judged:
+def judge(samples: Table, way: Way, ground: Ground, lag_s: float, from_ns: int) -> Judged:
     """Compare the samples of one drive with the truth, from an instant on."""
     placed = place(samples, way, ground, from_ns)
     cells = gather(placed, ground)
@@ -130,7 +129,7 @@ def judge(samples: Table, way: Way, ground: Ground, sampling: SamplingConfig, fr
         along_deg=along[plain],
         across_deg=across[plain],
         edge=placed.is_edge[measured],
-        lags=lags(samples, way, crossings(way, ground, from_ns), sampling),
+        lags=lags(samples, way, crossings(way, ground, from_ns), lag_s),
     )
 
 

@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from agents.localisation.localiser import LocalisationConfig, Localiser
+from agents.dead_reckoning import DeadReckoning
+from agents.localisation.config import LocalisationConfig
+from agents.localisation.localiser import Localiser
 from evaluation.positions.real_logs import refitted
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.readings import Reading
@@ -71,11 +73,13 @@ def run(data: Path, on_progress: Callable[[str], None] = lambda _: None) -> dict
 
 
 def _final_position(log: LogFolder, readings: list[Reading], name: str) -> tuple[float, float, float]:
-    config = LocalisationConfig(filter=name, profile="paper", start=(0.0, 0.0, 0.0), step_s=STEP_S)
-    localiser = Localiser(log.machine, Projection(log.site), config)
+    config = LocalisationConfig(filter=name, profile="paper", start=(0.0, 0.0, 0.0))
+    dead_reckoning = DeadReckoning(log.machine, config.slip)
+    localiser = Localiser(log.machine, Projection(log.site), config, STEP_S)
     sensors = {sensor.name: sensor for sensor in log.machine.sensors}
     for reading in readings:
-        localiser.update(reading, sensors[reading.sensor])
+        dead_reckoning.update(reading, sensors[reading.sensor])
+        localiser.update(reading, sensors[reading.sensor], dead_reckoning)
     assert localiser.belief is not None
     x, y, z = localiser.belief.x[:3].tolist()
     return x, y, z

@@ -16,7 +16,7 @@ import numpy as np
 
 from agents.holdout import Holdout
 from agents.localisation.filters.belief import PoseBelief
-from agents.pipeline import Locates
+from agents.pipeline import PoseSource
 from evaluation.positions.consistency import normalised_square, summarise
 from protocol.arrays import Floats, Ints
 from protocol.machine.readings import Reading
@@ -85,7 +85,7 @@ class Score:
     us_per_second: float
 
 
-def replay(core: Locates, readings: Sequence[Reading], holdout: Holdout | None = None) -> Trace:
+def replay(core: PoseSource, readings: Sequence[Reading], holdout: Holdout | None = None) -> Trace:
     """Give readings to a pipeline or to its localising half, in the order of their stamps; holdout keeps fixes back."""
     poses: list[PoseBelief] = []
     cpu_s = 0.0

@@ -1,4 +1,4 @@
-"""What an agent knows of its machine: the body's nominal dimensions and the sensors with their mounting."""
+"""Description of a machine: the nominal dimensions of its body, and its sensors with their mounting."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from protocol.rotations import matrix_from_rpy
 from protocol.site.site_config import NAME
 
 BASE, FRONT = "base_link", "front_link"
-# What readings of a kind say of the motion, by name. A sensor may give a part of it: an IMU without an accelerometer,
-# an orientation whose heading is of no use.
-GIVES = {
+# What a kind of sensor measures of the motion, by name. A sensor may measure a part of it: an IMU without an
+# accelerometer, an orientation whose heading is of no use.
+QUANTITIES = {
     "gps": ("position",),
     "imu": ("rate", "force"),
     "attitude": ("tilt", "heading"),
@@ -36,13 +36,13 @@ WITH_MODE = ("gps", "attitude")
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a sensor sits: its origin in its frame [m] and roll, pitch, yaw [deg] of `frame_from_sensor`."""
+    """Where a sensor sits in the frame that carries it: its origin [m] and roll, pitch, yaw [deg]."""
 
     xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def base_from_sensor(self) -> Floats:
-        """Return the rotation matrix (3, 3) that turns vectors of the sensor into `base_link` (yaw @ pitch @ roll)."""
+    def frame_from_sensor(self) -> Floats:
+        """Rotation matrix (3, 3) from the sensor into the frame that carries it, `base_link` or `front_link`."""
         return matrix_from_rpy(*np.radians(self.rpy_deg))
 
 
@@ -50,8 +50,8 @@ class Mount:
 class SensorConfig:
     """One sensor of a machine.
 
-    name: as readings carry it. use: false leaves the sensor's readings aside. gives: what of its readings is meant, by
-    the names in GIVES; empty: all. std: standard deviations by these names, instead of what readings state or the
+    name: as readings carry it. use: false ignores the sensor's readings. measures: which of its quantities are used, by
+    the names in QUANTITIES; empty: all. std: standard deviations by these names, instead of what readings state or the
     filter's options say: `position` [m]; `tilt`, `heading` [rad]; `rate` [rad/s]; `force` [m/s2]; `speed` [m/s].
     mode: one of MODES, for GPS and attitude. delay_s: how much later than it was true a reading is stamped. gate_sigma:
     refused if further off than so many standard deviations; 0: as the filter's options say. frame: which frame of an
@@ -64,7 +64,7 @@ class SensorConfig:
     kind: str
     mount: Mount = field(default_factory=Mount)
     use: bool = True
-    gives: tuple[str, ...] = ()
+    measures: tuple[str, ...] = ()
     std: Mapping[str, float] = field(default_factory=dict, hash=False)
     mode: str = ABSOLUTE
     delay_s: float = 0.0
@@ -91,8 +91,8 @@ class SensorConfig:
 
     def _check_meaning(self) -> None:
         """Refuse names and modes that its kind does not have."""
-        known = GIVES.get(self.kind, ())
-        for option, names in (("gives", self.gives), ("std", self.std)):
+        known = QUANTITIES.get(self.kind, ())
+        for option, names in (("measures", self.measures), ("std", self.std)):
             if unknown := sorted(set(names) - set(known)):
                 instead = ", ".join(known) or "nothing"
                 raise ValueError(f"{option}: {self.name}: {self.kind} has no {unknown[0]!r}, but {instead}")
@@ -103,9 +103,13 @@ class SensorConfig:
         if self.mode not in modes:
             raise ValueError(f"mode: {self.name}: {self.kind} has no {self.mode!r}, but {', '.join(modes)}")
 
-    def says(self, name: str) -> bool:
-        """Whether its readings mean this, one of GIVES."""
-        return not self.gives or name in self.gives
+    def provides(self, quantity: str) -> bool:
+        """Whether its readings are used for this quantity, one of QUANTITIES."""
+        return not self.measures or quantity in self.measures
+
+    def gate(self, usual_sigma: float) -> float:
+        """Its own gate where it has one, else the usual one [standard deviations]."""
+        return self.gate_sigma or usual_sigma
 
 
 @dataclass(frozen=True)
@@ -182,5 +186,5 @@ def plain_lines(config: Any) -> list[str]:
     """The plain values of a dataclass as TOML keys."""
     values = {f.name: getattr(config, f.name) for f in fields(config)}
     plain = {name: value for name, value in values.items() if isinstance(value, bool | int | float | str)}
-    names = {name: list(value) for name, value in values.items() if name == "gives"}
+    names = {name: list(value) for name, value in values.items() if name == "measures"}
     return [f"{name} = {json.dumps(value)}" for name, value in {**plain, **names}.items()]

@@ -61,7 +61,7 @@ class ImuGroup(SensorGroup):
         self._zero = (np.repeat(np.array(turn_on).T, 3, axis=0) * start[:6])[:, None]
         self._scale = (1 + scale * start[6:12])[:, None]
         tilts = (mounting * start[12:15]).T
-        mounts = [unit.sensor.mount.base_from_sensor() for unit in units]
+        mounts = [unit.sensor.mount.frame_from_sensor() for unit in units]
         sensor_from_frame = [(m @ rotation(tilt)).T for m, tilt in zip(mounts, tilts, strict=True)]
         self._sensor_from_frame = np.ascontiguousarray(np.moveaxis(np.array(sensor_from_frame), 0, -1))
         sigma, time_s = np.repeat(np.array(drift).T, 3, axis=0), np.array([noise.drift_time_s for noise in noises])

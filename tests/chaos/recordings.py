@@ -22,10 +22,7 @@ AGENT = """
 linger_s = 20.0
 [pipeline.localisation]
 filter = "ekf"
-step_s = 0.1
-align_way_m = 4.0
-align_spread_m = 1.0
-"""  # a coarse filter: the suite needs many samples that are true to their form, not good ones
+"""  # the cheaper filter: the suite needs many samples that are true to their form, not good ones
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a filter believes, what it is told, and what it makes of that: the types between the parts of localisation.
+"""Beliefs, motions and measurements: the values between the parts of localisation.
 
 x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k), as in the filtering literature.
 """
@@ -16,13 +16,17 @@ from protocol.arrays import Floats
 class Belief:
     """Mean and covariance of the state at a stamp; neither is written to.
 
-    L: lower Cholesky factor of P, once it was needed; it is kept by `conditioning.root`, and no part of the value.
+    L: lower Cholesky factor of P, where it is known already; it saves computing it again.
     """
 
     stamp_ns: int
     x: Floats
     P: Floats
-    L: Floats | None = field(default=None, init=False, repr=False, compare=False)
+    L: Floats | None = field(default=None, repr=False, compare=False)
+
+
+Change = Callable[[Belief], Belief]
+Model = Callable[[Floats], Floats]  # of states
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,32 +37,34 @@ class Motion:
     Q: noise (n, n). angles: components of the state that are angles [rad]; a filter brings their mean into +-pi.
     """
 
-    f: Callable[[Floats], Floats]
-    jacobian: Callable[[Floats], Floats]
+    f: Model
+    jacobian: Model
     Q: Floats
     angles: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What a sensor says of the state.
+    """A value of a sensor, with the model of the sensor: z = h(x) + noise of covariance R.
 
     h: measurements (m, k) that states (m, n) would give. jacobian: dh/dx (k, n) at a state (n,). angles: components of
     z that are angles [rad]. gate_sigma: refused if the innovation is this many standard deviations off, 0 never.
-    relocks: believed again after too many refusals in a row; not so what is assumed rather than sensed. opens: states
-    (k,) that are made as unsure as it is off then; the others follow by themselves.
+    relocks: accepted again after too many refusals in a row; false for assumptions, which no sensor measures. opens:
+    states (k,) that become as unsure as the measurement is off then; the others follow by themselves. change: made to
+    the belief at its stamp before any measurement, as when a state that was unknown gets its first value.
     """
 
     sensor: str
     stamp_ns: int
     z: Floats
     R: Floats
-    h: Callable[[Floats], Floats]
-    jacobian: Callable[[Floats], Floats]
+    h: Model
+    jacobian: Model
     angles: tuple[int, ...] = ()
     gate_sigma: float = 0.0
     relocks: bool = True
     opens: slice | None = None
+    change: Change | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +72,7 @@ class Conditioned:
     """A belief after a measurement: the prior unchanged where that was refused.
 
     innovation: (k,), its covariance: (k, k), nis: normalised innovation squared [-], NaN where nothing could be
-    computed. accepted: whether the belief took the measurement in.
+    computed. accepted: whether the belief is conditioned on the measurement.
     """
 
     belief: Belief

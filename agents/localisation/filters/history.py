@@ -1,4 +1,4 @@
-"""Measurements in any order: a filter with a history, that goes back to where a late measurement belongs.
+"""Measurements in any order: a filter with a history, which goes back to the stamp of a late measurement.
 
 The history holds nodes: a stamp, the measurements of that stamp, and the belief after them. A measurement that comes
 late is put into its place, and everything after it is filtered again.
@@ -9,49 +9,45 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, Motion
-from protocol.config import require_positive
+from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement
+from agents.localisation.filters.motion import MotionModel, motion
 
-Motions = Callable[[Belief, float], Motion]  # how a belief moves on over so many seconds
-Change = Callable[[Belief], Belief]
-NOBODY: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True)
-class FusionConfig:
-    """window_s: how far back measurements may come. relock: so many refused in a row, and a sensor is believed."""
-
-    window_s: float = 1.0
-    relock: int = 15
-
-    def __post_init__(self) -> None:
-        require_positive(self, self.__dataclass_fields__)
+WINDOW_S = 1.0  # how far back measurements may come; receivers and networks are late by less
+RELOCK = 15  # refusals in a row after which a sensor is accepted again: the filter is lost, not the sensor
+NO_SENSOR: frozenset[str] = frozenset()
 
 
 @dataclass
 class _Node:
-    """One stamp. changes: made to the belief before its measurements. reopened: sensors that were believed again."""
+    """One stamp. reopened: sensors that were accepted again here after too many refusals."""
 
     stamp_ns: int
     measurements: list[Measurement] = field(default_factory=list)
     belief: Belief | None = None
-    changes: list[Change] = field(default_factory=list)
     reopened: set[str] = field(default_factory=set)
 
 
 class Fusion:
-    """Filters measurements into beliefs; `counters` tells what was used, gated and refused, by sensor."""
+    """Filters measurements into beliefs.
 
-    def __init__(self, engine: Filter, motions: Motions, start: Belief, config: FusionConfig) -> None:
+    model: how the machine moves; it is replaced as more is known, and holds for all that is filtered from then on.
+    counters: measurements used, gated and refused, by sensor. last: the newest result of each sensor. window_s, relock:
+    as WINDOW_S, RELOCK.
+    """
+
+    def __init__(
+        self, engine: Filter, model: MotionModel, start: Belief, window_s: float = WINDOW_S, relock: int = RELOCK
+    ) -> None:
         self.counters: Counter[str] = Counter()
-        self.last: dict[str, Conditioned] = {}  # of each sensor
-        self._engine, self._motions, self._config = engine, motions, config
-        self._window_ns = round(config.window_s * 1e9)
+        self.last: dict[str, Conditioned] = {}
+        self.model = model
+        self._engine, self._relock = engine, relock
+        self._window_ns = round(window_s * 1e9)
         self._nodes = [_Node(start.stamp_ns, [], start)]
         self._refused: Counter[str] = Counter()  # in a row
 
@@ -69,27 +65,22 @@ class Fusion:
         assert belief is not None
         return self._moved(belief, stamp_ns)
 
-    def add(self, measurements: Sequence[Measurement], change: Change | None = None) -> list[Belief]:
-        """Take in measurements of one stamp; returns the beliefs that they changed, oldest first, none if refused.
-
-        change: made to the belief before it, as when a state that was unknown gets its first value.
-        """
+    def add(self, measurements: Sequence[Measurement]) -> list[Belief]:
+        """Filter measurements of one stamp; returns the beliefs that they changed, oldest first, none if refused."""
         stamp_ns = measurements[0].stamp_ns
         if self._is_too_late(stamp_ns):
             self.counters["too_late"] += len(measurements)
             return []
         index = self._place(stamp_ns)
         node = self._nodes[index]
-        known = {m.sensor for m in node.measurements}
-        fresh = {m.sensor: m for m in measurements if m.sensor not in known}
+        present = {m.sensor for m in node.measurements}
+        fresh = {m.sensor: m for m in measurements if m.sensor not in present}
         self.counters["duplicate"] += len(measurements) - len(fresh)
         if not fresh:
             return []
         node.measurements += fresh.values()
-        changes = [change] if change else []
-        node.changes += changes
         if index == len(self._nodes) - 1 and node.belief is not None:  # more of the same stamp: nothing to do again
-            node.belief = self._condition(_changed(node.belief, changes), node, fresh.values(), fresh.keys())
+            node.belief = self._condition(_changed(node.belief, fresh.values()), node, fresh.values(), fresh.keys())
         else:
             self._filter_from(index, fresh.keys())
         changed = [n.belief for n in self._nodes[index:] if n.belief is not None]
@@ -114,12 +105,12 @@ class Fusion:
         for i in range(index, len(self._nodes)):
             before, node = self._nodes[i - 1].belief, self._nodes[i]
             assert before is not None
-            prior = _changed(self._moved(before, node.stamp_ns), node.changes)
-            node.belief = self._condition(prior, node, node.measurements, fresh if i == index else NOBODY)
+            prior = _changed(self._moved(before, node.stamp_ns), node.measurements)
+            node.belief = self._condition(prior, node, node.measurements, fresh if i == index else NO_SENSOR)
 
     def _moved(self, belief: Belief, stamp_ns: int) -> Belief:
         dt_s = (stamp_ns - belief.stamp_ns) * 1e-9
-        return self._engine.predict(belief, self._motions(belief, dt_s), stamp_ns) if dt_s > 0 else belief
+        return self._engine.predict(belief, motion(self.model, belief, dt_s), stamp_ns) if dt_s > 0 else belief
 
     def _condition(
         self, belief: Belief, node: _Node, measurements: Iterable[Measurement], fresh: Collection[str]
@@ -136,7 +127,7 @@ class Fusion:
         return belief
 
     def _judge(self, node: _Node, measurement: Measurement, result: Conditioned) -> None:
-        """Count, and believe a sensor again that was refused too often."""
+        """Count, and accept a sensor again that was refused too often."""
         sensor = measurement.sensor
         self.last[sensor] = result
         if result.accepted:
@@ -148,7 +139,7 @@ class Fusion:
             return
         self._refused[sensor] += 1
         self.counters[f"{sensor}_gated"] += 1
-        if measurement.relocks and self._refused[sensor] >= self._config.relock:
+        if measurement.relocks and self._refused[sensor] >= self._relock:
             self._refused[sensor] = 0
             self.counters[f"{sensor}_relocked"] += 1
             node.reopened.add(sensor)
@@ -159,9 +150,10 @@ class Fusion:
         del self._nodes[: max(bisect_right(self._nodes, oldest_ns, key=_stamp) - 1, 0)]
 
 
-def _changed(belief: Belief, changes: Iterable[Change]) -> Belief:
-    for change in changes:
-        belief = change(belief)
+def _changed(belief: Belief, measurements: Iterable[Measurement]) -> Belief:
+    for measurement in measurements:
+        if measurement.change:
+            belief = measurement.change(belief)
     return belief
 
 

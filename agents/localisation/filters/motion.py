@@ -8,8 +8,8 @@ Over a step dt, with R = map_from_base and E the matrix from body rates to the r
     GPS error *= exp(-dt / tau)
 
 `velocity` is that of base_link's origin in its own axes and `acceleration` its rate of change; what an accelerometer
-feels besides (rate x velocity, gravity) belongs to the measurement. On a plane (`two_d`) the states off the plane are
-zero before and after each step, with a small variance of their own so that the covariance stays definite.
+measures besides (rate x velocity, gravity) belongs to the measurement. On a plane (two_d_mode of robot_localization)
+the states off it are zero before and after each step, with a small variance so that the covariance stays definite.
 """
 
 from __future__ import annotations
@@ -22,40 +22,37 @@ from functools import lru_cache
 import numpy as np
 
 from agents.localisation.filters.belief import Belief, Motion
-from agents.localisation.filters.state import ACCELERATION, ATTITUDE, OFF_PLANE, POSITION, RATE, VELOCITY, Layout, Z
+from agents.localisation.filters.state import (
+    ACCELERATION,
+    ATTITUDE,
+    OFF_PLANE,
+    POSITION,
+    RATE,
+    SPEED,
+    VELOCITY,
+    Layout,
+    Z,
+)
 from protocol.arrays import Floats
-from protocol.config import require_positive
 
 OFF_PLANE_VARIANCE = 1e-6  # of states that are zero on a plane, as robot_localization measures them
 EYE = np.eye(3)
 MIN_COS_PITCH = 0.05  # Euler angles are singular at +-90 deg; no machine drives there, but a sigma point may
 
-
-@dataclass(frozen=True)
-class MotionConfig:
-    """What the model does not know, as noise.
-
-    slip_along, slip_across: standard deviation of the way driven along and across the body, over the square root of
-    the way [m/sqrt(m)]: none at a standstill. The others are random walks: height_walk [m/sqrt(s)]; tilt_walk (roll
-    and pitch), heading_walk [rad/sqrt(s)]; velocity_walk [m/s/sqrt(s)]; rate_walk [rad/s/sqrt(s)];
-    acceleration_walk [m/s2/sqrt(s)]; gyro_bias_walk [rad/s/sqrt(s)]; wheel_scale_walk [1/sqrt(s)].
-    two_d: the machine moves on a plane.
-    """
-
-    two_d: bool = False
-    slip_along: float = 0.02
-    slip_across: float = 0.03
-    height_walk: float = 0.02
-    tilt_walk: float = 5e-3
-    heading_walk: float = 1e-3
-    velocity_walk: float = 0.05
-    rate_walk: float = 0.3
-    acceleration_walk: float = 1.0
-    gyro_bias_walk: float = 5e-5
-    wheel_scale_walk: float = 2e-4
-
-    def __post_init__(self) -> None:
-        require_positive(self, (name for name in self.__dataclass_fields__ if name != "two_d"))
+# Standard deviations of what the model does not know. The distance driven along and across the body is unsure by its
+# square root [m/sqrt(m)], so a machine at rest does not slip; the others are random walks.
+SLIP_ALONG, SLIP_ACROSS = 0.02, 0.03
+HEIGHT_WALK = 0.02  # [m/sqrt(s)]
+TILT_WALK = 5e-3  # roll and pitch [rad/sqrt(s)]
+HEADING_WALK = 1e-3  # [rad/sqrt(s)], also of the heading that an attitude reference counts from
+VELOCITY_WALK = 0.05  # [m/s/sqrt(s)]
+RATE_WALK = 0.3  # angular rate [rad/s/sqrt(s)]
+ACCELERATION_WALK = 1.0  # [m/s2/sqrt(s)]
+GYRO_BIAS_WALK = 5e-5  # [rad/s/sqrt(s)]
+WHEEL_SCALE_WALK = 2e-4  # [1/sqrt(s)]
+SLIP_STD = 0.08  # of the wheels' slip per traction, which the speed is corrected by
+SLIP_TIME_S = 5.0  # how long a ground's slip stays the same
+BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a wrong scale makes another in every bend
 
 
 @dataclass(frozen=True)
@@ -70,33 +67,44 @@ class GpsError:
             raise ValueError("variance_m2 and time_s must be positive and finite")
 
 
-def motion(
-    layout: Layout,
-    config: MotionConfig,
-    belief: Belief,
-    dt_s: float,
-    gps_errors: Sequence[GpsError] = (),
-    slip_m2: float = 0.0,
-) -> Motion:
-    """The motion over dt_s from a belief, whose attitude and velocity direct the slip noise.
+@dataclass(frozen=True)
+class MotionModel:
+    """What the motion depends on besides the belief.
 
-    gps_errors: one per receiver of the layout. slip_m2: variance that slip adds along the body in this step, on top
-    of slip_along, where it is known better than that, e.g. from the drive torque.
+    on_plane: whether the machine moves on a plane. gps_errors: one per receiver of the layout. traction: drive force
+    over weight [-], 0 where it is not known. turn_error_radps: standard deviation of the lasting error of an odometry's
+    turn rate, 0 where the turn comes from another sensor.
     """
-    if len(gps_errors) != layout.receivers:
-        raise ValueError(f"{len(gps_errors)} GPS errors for {layout.receivers} receivers")
-    keep, walks, errors = _constants(layout, config)
+
+    layout: Layout
+    on_plane: bool = False
+    gps_errors: tuple[GpsError, ...] = ()
+    traction: float = 0.0
+    turn_error_radps: float = 0.0
+
+    def __post_init__(self) -> None:
+        if len(self.gps_errors) != self.layout.receivers:
+            raise ValueError(f"{len(self.gps_errors)} GPS errors for {self.layout.receivers} receivers")
+
+
+def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
+    """The motion over dt_s from a belief, whose attitude and velocity direct the slip noise."""
+    layout = model.layout
+    keep, walks, errors = _constants(layout, on_plane=model.on_plane)
     scale, Q = keep.copy(), walks * dt_s
-    if config.two_d:
+    if model.on_plane:
         Q[OFF_PLANE, OFF_PLANE] = OFF_PLANE_VARIANCE
-    for error, states in zip(gps_errors, errors, strict=True):
+    for error, states in zip(model.gps_errors, errors, strict=True):
         fading = math.exp(-dt_s / error.time_s)
         # exact for steps of any length: what fades is renewed, so that the variance stays
-        renewed = error.variance_m2 * -math.expm1(-2 * dt_s / error.time_s)
+        renewal = error.variance_m2 * -math.expm1(-2 * dt_s / error.time_s)
         for state in states:
-            scale[state], Q[state, state] = fading, renewed
+            scale[state], Q[state, state] = fading, renewal
     of_position = Q[POSITION, POSITION]
-    of_position += _slip(belief.x * scale, config, dt_s, slip_m2)
+    of_position += _slip(belief.x * scale, dt_s, _slip_variance_m2(model.traction * float(belief.x[SPEED]), dt_s))
+    if model.turn_error_radps:
+        error = layout.gyro_biases.stop - 1
+        Q[error, error] += 2 * model.turn_error_radps**2 * dt_s / BEND_S
 
     def f(states: Floats) -> Floats:
         return _moved(states, scale, dt_s)
@@ -149,19 +157,19 @@ def _moved(states: Floats, scale: Floats, dt_s: float) -> Floats:
     by_roll, by_pitch, by_yaw = np.exp(1j * rows[ATTITUDE])
     velocity, half = rows[VELOCITY], rows[ACCELERATION] * (dt_s / 2)
     velocity += half  # that of the middle of the step
-    steps = (rows[VELOCITY.start : RATE.stop] * dt_s).reshape(2, 3, -1)  # the way along the body, the turn about it
+    steps = (rows[VELOCITY.start : RATE.stop] * dt_s).reshape(2, 3, -1)  # shift along the body, turn about it
     velocity += half
     rolled = np.empty((2, len(by_roll)), complex)  # left + i up, of both: R and E begin with the roll
     rolled.real, rolled.imag = steps[:, 1], steps[:, 2]
     rolled *= by_roll
-    way, turn = rolled
-    pitched = np.empty_like(way)  # up + i ahead
-    pitched.real, pitched.imag = way.imag, steps[0, 0]
+    shift, turn = rolled
+    pitched = np.empty_like(shift)  # up + i ahead
+    pitched.real, pitched.imag = shift.imag, steps[0, 0]
     pitched *= by_pitch
-    level = np.empty_like(way)  # east + i north
-    level.real, level.imag = pitched.imag, way.real
+    level = np.empty_like(shift)  # east + i north
+    level.real, level.imag = pitched.imag, shift.real
     level *= by_yaw
-    change = np.empty((6, len(way)))  # of position and attitude
+    change = np.empty((6, len(shift)))  # of position and attitude
     change[0], change[1], change[2], change[4] = level.real, level.imag, pitched.real, turn.real
     yawed = np.multiply(turn.imag, _secant(by_pitch.real), out=change[5])
     np.multiply(by_pitch.imag, yawed, out=change[3])
@@ -201,10 +209,18 @@ def _jacobian(x: Floats, dt_s: float) -> Floats:
     return F
 
 
-def _slip(x: Floats, config: MotionConfig, dt_s: float, slip_m2: float) -> Floats:
-    """Variance (3, 3) in map of the way driven in a step [m2]."""
-    way_m = math.hypot(*x[VELOCITY][:2].tolist()) * dt_s
-    along, across = math.sqrt(config.slip_along**2 * way_m + slip_m2), config.slip_across * math.sqrt(way_m)
+def _slip_variance_m2(traction_mps: float, dt_s: float) -> float:
+    """Variance along the body of the distance that a wrong slip adds in a step; traction times speed.
+
+    The integral of a Gauss-Markov error of SLIP_STD and SLIP_TIME_S grows by 2 std^2 time per second.
+    """
+    return SLIP_STD**2 * 2 * SLIP_TIME_S * traction_mps**2 * dt_s
+
+
+def _slip(x: Floats, dt_s: float, along_m2: float) -> Floats:
+    """Variance (3, 3) in map of the distance driven in a step [m2]; along_m2: added along the body."""
+    distance_m = math.hypot(*x[VELOCITY][:2].tolist()) * dt_s
+    along, across = math.sqrt(SLIP_ALONG**2 * distance_m + along_m2), SLIP_ACROSS * math.sqrt(distance_m)
     forward, left, _ = _axes(x[ATTITUDE].tolist())
     deviation = np.array([[along * part for part in forward], [across * part for part in left]])
     slip: Floats = deviation.T.dot(deviation)
@@ -212,22 +228,23 @@ def _slip(x: Floats, config: MotionConfig, dt_s: float, slip_m2: float) -> Float
 
 
 @lru_cache
-def _constants(layout: Layout, config: MotionConfig) -> tuple[Floats, Floats, tuple[range, ...]]:
+def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats, tuple[range, ...]]:
     """What every motion of a layout begins with.
 
     Factor (n,) that sets the states off the plane to zero, covariance (n, n) of the random walks of a second, and the
     states of each GPS error.
     """
     keep, deviation = np.ones(layout.n), np.zeros(layout.n)
-    if config.two_d:
+    if on_plane:
         keep[OFF_PLANE] = 0.0
-    deviation[Z] = config.height_walk
-    deviation[ATTITUDE] = config.tilt_walk, config.tilt_walk, config.heading_walk
-    deviation[VELOCITY] = config.velocity_walk
-    deviation[RATE] = config.rate_walk
-    deviation[ACCELERATION] = config.acceleration_walk
-    deviation[layout.gyro_biases] = config.gyro_bias_walk
-    deviation[layout.wheel_scales] = config.wheel_scale_walk
+    deviation[Z] = HEIGHT_WALK
+    deviation[ATTITUDE] = TILT_WALK, TILT_WALK, HEADING_WALK
+    deviation[VELOCITY] = VELOCITY_WALK
+    deviation[RATE] = RATE_WALK
+    deviation[ACCELERATION] = ACCELERATION_WALK
+    deviation[layout.gyro_biases] = GYRO_BIAS_WALK
+    deviation[layout.wheel_scales] = WHEEL_SCALE_WALK
+    deviation[layout.heading_errors] = HEADING_WALK
     walks = np.diag(deviation**2)
     for shared in (keep, walks):
         shared.setflags(write=False)

@@ -51,11 +51,8 @@ def factor(P: Floats) -> Floats:
 
 
 def root(belief: Belief) -> Floats:
-    """Lower factor of the belief's covariance, computed once."""
-    if belief.L is None:
-        _keep(belief, factor(belief.P))
-    assert belief.L is not None
-    return belief.L
+    """Lower factor of the belief's covariance."""
+    return factor(belief.P) if belief.L is None else belief.L
 
 
 def definite(stamp_ns: int, x: Floats, P: Floats) -> Belief:
@@ -63,10 +60,9 @@ def definite(stamp_ns: int, x: Floats, P: Floats) -> Belief:
     L, failed = _cholesky(P)
     pivots = L.diagonal()
     if failed or P.diagonal().dot(np.reciprocal(pivots * pivots)) > MAX_INFLATION:
-        return Belief(stamp_ns, x, _repaired(P))
-    belief = Belief(stamp_ns, x, P)
-    _keep(belief, L)
-    return belief
+        P = _repaired(P)
+        L = factor(P)
+    return Belief(stamp_ns, x, P, L)
 
 
 def bounded(P: Floats, angles: tuple[int, ...]) -> Floats:
@@ -130,10 +126,6 @@ def _divided(rows: Floats, S: Floats) -> Floats:
         _, solved, _ = dposv(_repaired(S), rows.T, lower=1)
     quotients: Floats = solved.T
     return quotients
-
-
-def _keep(belief: Belief, L: Floats) -> None:
-    object.__setattr__(belief, "L", L)  # a belief is frozen, but this is no part of its value
 
 
 def _cholesky(P: Floats) -> tuple[Floats, bool]:

@@ -1,4 +1,4 @@
-"""The state: the 15 of robot_localization, and behind them the slow errors of the sensors that are estimated with it.
+"""The state: the 15 of robot_localization, followed by the slow errors of sensors that are estimated with it.
 
 Frames as in REP-103 and REP-105: `map` is east, north, up; `base_link` is forward, left, up.
 map_from_base = Rz(yaw) Ry(pitch) Rx(roll).
@@ -17,7 +17,7 @@ X, Y, Z, ROLL, PITCH, YAW, SPEED = range(7)  # SPEED: forward
 YAW_RATE = 11
 BASE_STATES = 15
 ANGLES = (ROLL, PITCH, YAW)
-# What a machine on a plane has not: height, tilt, and what changes them (two_d_mode of robot_localization).
+# Zero for a machine on a plane: height, tilt, and what changes them (two_d_mode of robot_localization).
 OFF_PLANE = [Z, ROLL, PITCH, 8, 9, 10, 14]
 
 
@@ -25,10 +25,10 @@ OFF_PLANE = [Z, ROLL, PITCH, 8, 9, 10, 14]
 class Layout:
     """Where in the state each error stands: of the turn rate, then of wheels, GPS receivers and heading references.
 
-    imus: with a yaw gyro bias each [rad/s]; without any, what tells the turn instead counts as one. wheel_scale:
-    whether there is one [-]: the wheels turn 1 + scale times the way. receivers: GPS receivers with an error east and
-    north each [m]. references: headings [rad] that count from a believed one, which may be off. Without any, the 15
-    states of the paper.
+    imus: with a yaw gyro bias each [rad/s], and one more where another sensor shows the turn. wheel_scale: whether
+    there is one [-]: wheels turn by 1 + scale times the distance. receivers: GPS receivers with an error east and north
+    each [m]. references: headings [rad] that count from an anchor, which may be off. Without any, the 15 states of the
+    paper.
     """
 
     imus: int = 0

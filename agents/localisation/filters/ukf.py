@@ -1,7 +1,8 @@
-"""The unscented Kalman filter: filterpy's, all sigma points at once, and in a form whose covariance cannot go negative.
+"""The unscented Kalman filter, all sigma points at once, in a form whose covariance cannot go negative.
 
-EVIDENCE: with filterpy 2.0 several `update()` after one `predict()` reuse stale sigma points, and the covariance goes
-negative. Here each step draws its own. x, P = L L^T: belief, L_i: column of the factor, Q, R: noise.
+Each step draws its own sigma points. filterpy is the reference in the tests, which find the same steps; it is not run
+here: with filterpy 2.0 several `update()` after one `predict()` reuse stale sigma points, and its covariance can go
+negative. x, P = L L^T: belief, L_i: column of the factor, Q, R: noise.
 
 The scaled unscented transform (van der Merwe 2004) takes a function g at x and at the sigma points x +- gamma L_i, with
 gamma^2 = alpha^2 (n + kappa). Put into the usual sums, the weights (W = 1 / (2 gamma^2), and large ones of either sign
@@ -25,7 +26,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
 from agents.localisation.filters.square_root import (
@@ -45,7 +45,7 @@ from protocol.arrays import Floats
 class Ukf:
     """Sees motion and measurement at points around the mean.
 
-    alpha, beta, kappa: as in filterpy, kappa None for 3 - n. beta must not be below alpha^2.
+    alpha, beta, kappa: of the scaled unscented transform, kappa None for 3 - n. beta must not be below alpha^2.
     """
 
     alpha: float = 1.0
@@ -62,9 +62,9 @@ class Ukf:
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
         """Move the belief through the motion."""
-        ukf = self._filter(len(belief.x), 0)
-        _, d, mean = ukf.deviations(belief, motion.f, ())
-        P = ukf.W * d.dot(d.T) + motion.Q
+        points = self._points(len(belief.x), 0)
+        _, d, mean = points.deviations(belief, motion.f, ())
+        P = points.W * d.dot(d.T) + motion.Q
         return definite(stamp_ns, wrapped_state(mean, motion.angles), bounded(P, motion.angles))
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
@@ -73,25 +73,22 @@ class Ukf:
         if noise is None:
             return refused(belief, measurement)
         k = len(noise)
-        ukf = self._filter(len(belief.x), k)
-        of_x, d, mean = ukf.deviations(belief, measurement.h, measurement.angles)
-        together = ukf.root_W * np.concatenate([d, of_x])
+        points = self._points(len(belief.x), k)
+        of_x, d, mean = points.deviations(belief, measurement.h, measurement.angles)
+        together = points.root_W * np.concatenate([d, of_x])
         together[:k, -k:] = noise
         return conclude(belief, measurement, mean, together)
 
-    def _filter(self, n: int, k: int) -> VectorisedUkf:
-        """A filter of filterpy's for n states and a measurement of k."""
-        return _made(n, k, self.alpha, self.beta, 3.0 - n if self.kappa is None else self.kappa)
+    def _points(self, n: int, k: int) -> SigmaPoints:
+        return _sigma_points(n, k, self.alpha, self.beta, 3.0 - n if self.kappa is None else self.kappa)
 
 
-class VectorisedUkf(UnscentedKalmanFilter):  # type: ignore[misc]
-    """filterpy's filter without its loops over sigma points. It holds no belief, so one serves every step."""
+class SigmaPoints:
+    """Where n states are sampled, and how the samples are weighted, for a measurement of k. It holds no belief."""
 
     def __init__(self, n: int, k: int, alpha: float, beta: float, kappa: float) -> None:
         if n + kappa <= 0:
             raise ValueError(f"kappa: {kappa} is too small for {n} states")
-        points = MerweScaledSigmaPoints(n, alpha=alpha, beta=beta, kappa=kappa)
-        super().__init__(dim_x=n, dim_z=k, dt=1.0, hx=None, fx=None, points=points)
         self.gamma = alpha * math.sqrt(n + kappa)
         self.W, self.root_W = 0.5 / self.gamma**2, math.sqrt(0.5) / self.gamma
         self.surplus = beta - alpha**2
@@ -115,5 +112,5 @@ class VectorisedUkf(UnscentedKalmanFilter):  # type: ignore[misc]
 
 
 @lru_cache
-def _made(n: int, k: int, alpha: float, beta: float, kappa: float) -> VectorisedUkf:
-    return VectorisedUkf(n, k, alpha, beta, kappa)
+def _sigma_points(n: int, k: int, alpha: float, beta: float, kappa: float) -> SigmaPoints:
+    return SigmaPoints(n, k, alpha, beta, kappa)

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
 
+from agents.dead_reckoning import DeadReckoning
 from agents.estimation.squat import front_share, squat_rad
-from agents.localisation.filters.belief import Belief
-from agents.localisation.localiser import Localiser
+from agents.localisation.config import LocalisationConfig
+from agents.localisation.filters.belief import Belief, PoseBelief
+from agents.localisation.localiser import STEP_S, Localiser
 from protocol.arrays import Floats, Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Articulation, Encoder, Gps, Imu, Payload, Reading, Torque
@@ -25,7 +27,7 @@ from sim.simulator import Simulator
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 PROJECTION = Projection(SITE)
 START_NS = 1_767_225_600_000_000_000
-STEP_S = 0.01
+TRUE_STEP_S = 0.01
 LEVER_M = (0.8, 0.3, 3.0)
 
 
@@ -39,8 +41,8 @@ def machine(mount: Mount | None = None, receivers: int = 1, **options: Any) -> M
     return MachineConfig("loader-1", sensors=tuple(sensors), **options)
 
 
-def changed_sensor(of: MachineConfig, name: str, **options: Any) -> MachineConfig:
-    return replace(of, sensors=tuple(replace(s, **options) if s.name == name else s for s in of.sensors))
+def changed_sensor(vehicle: MachineConfig, name: str, **options: Any) -> MachineConfig:
+    return replace(vehicle, sensors=tuple(replace(s, **options) if s.name == name else s for s in vehicle.sensors))
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Drive:
-    """What was true, at 100 Hz, and what the sensors said without any noise."""
+    """What was true, at 100 Hz, and the sensors' readings without any noise."""
 
     stamps_ns: list[int]
     x_m: Floats
@@ -83,91 +85,103 @@ class Drive:
     readings: list[Reading]
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
-        i = round((stamp_ns - START_NS) * 1e-9 / STEP_S) - 1
+        i = round((stamp_ns - START_NS) * 1e-9 / TRUE_STEP_S) - 1
         return float(self.x_m[i]), float(self.y_m[i]), float(self.heading_rad[i])
 
 
 def drive(
     legs: Iterable[Leg],
-    of: MachineConfig,
+    vehicle: MachineConfig,
     *,
     ground: Ground | None = None,
     heading_rad: float = 0.7,
     without: Sequence[str] = (),
 ) -> Drive:
     """Drive from (10, 20) at rest; gyro, force and torque at 100 Hz, wheels at 20 Hz, fixes at 5 Hz."""
-    ground = ground or Ground()
-    v, heading, x, y, way = 0.0, heading_rad, 10.0, 20.0, 0.0
+    return _drive(tuple(legs), vehicle, ground or Ground(), heading_rad, tuple(without))
+
+
+@lru_cache(maxsize=32)  # many tests share a drive
+def _drive(
+    legs: tuple[Leg, ...], vehicle: MachineConfig, ground: Ground, heading_rad: float, without: tuple[str, ...]
+) -> Drive:
+    v, heading, x, y, distance = 0.0, heading_rad, 10.0, 20.0, 0.0
     rows: list[tuple[float, ...]] = []
     readings: list[Reading] = []
     stamps: list[int] = []
     for leg in legs:
-        for _ in range(round(leg.seconds / STEP_S)):
-            step_m = v * STEP_S + 0.5 * leg.accel_mps2 * STEP_S**2
-            middle = heading + 0.5 * leg.turn_radps * STEP_S
-            x, y, way = x + step_m * math.cos(middle), y + step_m * math.sin(middle), way + step_m
-            v, heading = v + leg.accel_mps2 * STEP_S, heading + leg.turn_radps * STEP_S
+        for _ in range(round(leg.seconds / TRUE_STEP_S)):
+            step_m = v * TRUE_STEP_S + 0.5 * leg.accel_mps2 * TRUE_STEP_S**2
+            middle = heading + 0.5 * leg.turn_radps * TRUE_STEP_S
+            x, y, distance = x + step_m * math.cos(middle), y + step_m * math.sin(middle), distance + step_m
+            v, heading = v + leg.accel_mps2 * TRUE_STEP_S, heading + leg.turn_radps * TRUE_STEP_S
             rows.append((x, y, heading, v))
             stamps.append(START_NS + len(rows) * 10_000_000)
             here = ground.turned(heading - heading_rad)
-            readings += _readings(of, here, leg, rows[-1], way, stamps[-1], len(rows))
+            readings += _readings(vehicle, here, leg, rows[-1], distance, stamps[-1], len(rows))
     columns = np.array(rows).T
     seen = [r for r in readings if r.sensor not in without]
     return Drive(stamps, columns[0], columns[1], columns[2], columns[3], seen)
 
 
 def _readings(
-    of: MachineConfig, ground: Ground, leg: Leg, row: tuple[float, ...], way_m: float, stamp_ns: int, step: int
+    vehicle: MachineConfig,
+    ground: Ground,
+    leg: Leg,
+    row: tuple[float, ...],
+    distance_m: float,
+    stamp_ns: int,
+    step: int,
 ) -> list[Reading]:
     x, y, heading, v = row
-    found: list[Reading] = []
-    for sensor in of.sensors:
+    readings: list[Reading] = []
+    for sensor in vehicle.sensors:
         if sensor.kind == "imu":
-            found.append(_imu(sensor, of, ground, leg, v, stamp_ns))
+            readings.append(_imu(sensor, vehicle, ground, leg, v, stamp_ns))
         elif sensor.kind == "torque":
-            found.append(Torque(sensor.name, stamp_ns, drive_n(of, ground, leg, v) * of.wheel_radius_m))
+            readings.append(Torque(sensor.name, stamp_ns, drive_n(vehicle, ground, leg, v) * vehicle.wheel_radius_m))
         elif sensor.kind == "encoder" and step % 5 == 0:
-            ticks = way_m / (2 * math.pi * of.wheel_radius_m) * sensor.ticks_per_rev
-            found.append(Encoder(sensor.name, stamp_ns, ticks, ticks))
+            ticks = distance_m / (2 * math.pi * vehicle.wheel_radius_m) * sensor.ticks_per_rev
+            readings.append(Encoder(sensor.name, stamp_ns, ticks, ticks))
         elif sensor.kind == "articulation" and step % 5 == 0:
-            found.append(Articulation(sensor.name, stamp_ns, leg.bend_rad))
+            readings.append(Articulation(sensor.name, stamp_ns, leg.bend_rad))
         elif sensor.kind == "payload" and step % 50 == 0:
-            found.append(Payload(sensor.name, stamp_ns, leg.payload_kg))
+            readings.append(Payload(sensor.name, stamp_ns, leg.payload_kg))
         elif sensor.kind == "gps" and step % 20 == 0:
-            found.append(fix(sensor, stamp_ns, x, y, heading))
-    return found
+            readings.append(fix(sensor, stamp_ns, x, y, heading))
+    return readings
 
 
-def drive_n(of: MachineConfig, ground: Ground, leg: Leg, v: float) -> float:
+def drive_n(vehicle: MachineConfig, ground: Ground, leg: Leg, v: float) -> float:
     """Drive force that balances inertia, the wheels' inertia, the slope and the rolling resistance.
 
     A bent machine climbs with its front axle's share of the weight in another direction.
     """
-    mass = of.mass_kg + leg.payload_kg
+    mass = vehicle.mass_kg + leg.payload_kg
     rolling = ground.c_rr * math.cos(ground.ahead_rad) * float(np.sign(v))
     uphill = math.sin(ground.ahead_rad)
     if leg.bend_rad:
-        on_front = front_share(of, leg.payload_kg, leg.accel_mps2 + GRAVITY_MPS2 * uphill)
+        on_front = front_share(vehicle, leg.payload_kg, leg.accel_mps2 + GRAVITY_MPS2 * uphill)
         uphill += on_front * (math.sin(ground.turned(leg.bend_rad).ahead_rad) - uphill)
-    return mass * (of.rotating_mass_factor * leg.accel_mps2 + GRAVITY_MPS2 * (uphill + rolling))
+    return mass * (vehicle.rotating_mass_factor * leg.accel_mps2 + GRAVITY_MPS2 * (uphill + rolling))
 
 
-def _imu(sensor: SensorConfig, of: MachineConfig, ground: Ground, leg: Leg, v: float, stamp_ns: int) -> Imu:
+def _imu(sensor: SensorConfig, vehicle: MachineConfig, ground: Ground, leg: Leg, v: float, stamp_ns: int) -> Imu:
     """At its place on a body that sits on tyres."""
     up = GRAVITY_MPS2 * math.sqrt(1 - math.sin(ground.ahead_rad) ** 2 - math.sin(ground.left_rad) ** 2)
     ahead = leg.accel_mps2 + GRAVITY_MPS2 * math.sin(ground.ahead_rad)
     left = v * leg.turn_radps + GRAVITY_MPS2 * math.sin(ground.left_rad)
-    nose_up = squat_rad(of, leg.payload_kg, ahead)
+    nose_up = squat_rad(vehicle, leg.payload_kg, ahead)
     c, s = math.cos(nose_up), math.sin(nose_up)
     out_m = sensor.mount.xyz_m
-    felt = (
+    force = (
         c * ahead + s * up - leg.turn_radps**2 * out_m[0],
         left - leg.turn_radps**2 * out_m[1],
         c * up - s * ahead,
     )
-    sensor_from_base = sensor.mount.base_from_sensor().T
+    sensor_from_base = sensor.mount.frame_from_sensor().T
     gyro = sensor_from_base @ (0.0, 0.0, leg.turn_radps)
-    return Imu(sensor.name, stamp_ns, *gyro.tolist(), *(sensor_from_base @ felt).tolist())
+    return Imu(sensor.name, stamp_ns, *gyro.tolist(), *(sensor_from_base @ force).tolist())
 
 
 def fix(sensor: SensorConfig, stamp_ns: int, x: float, y: float, heading: float, variance_m2: float = 2.0) -> Gps:
@@ -179,14 +193,14 @@ def fix(sensor: SensorConfig, stamp_ns: int, x: float, y: float, heading: float,
 def noisy(readings: Iterable[Reading], seed: int, *, torque: float = 1.0, force_mps2: float = 0.0) -> list[Reading]:
     """Readings as bad sensors have them: torque times a scale, a zero of the accelerometer ahead, white noise."""
     rng = np.random.default_rng(seed)
-    found: list[Reading] = []
+    noised: list[Reading] = []
     for r in readings:
         if isinstance(r, Torque):
-            found.append(replace(r, torque_nm=torque * r.torque_nm + 1200 * rng.standard_normal()))
+            noised.append(replace(r, torque_nm=torque * r.torque_nm + 1200 * rng.standard_normal()))
         elif isinstance(r, Imu):
             ahead, left = 0.3 * rng.standard_normal(2)
             turns = 0.002 * rng.standard_normal(3)
-            found.append(
+            noised.append(
                 replace(
                     r,
                     force_x_mps2=r.force_x_mps2 + force_mps2 + ahead,
@@ -197,8 +211,8 @@ def noisy(readings: Iterable[Reading], seed: int, *, torque: float = 1.0, force_
                 )
             )
         else:
-            found.append(r)
-    return found
+            noised.append(r)
+    return noised
 
 
 S_BEND = (Leg(4, 0.5), Leg(5), Leg(4, 0, 0.25), Leg(5), Leg(4, 0, -0.3), Leg(8))
@@ -226,13 +240,44 @@ def made_up_samples(n: int, seed: int = 0) -> Table:
     return rows
 
 
-def beliefs_of(found: Localiser, of: MachineConfig, readings: Iterable[Reading]) -> list[Belief]:
-    """Run a localiser; its newest beliefs, as they were known."""
-    beliefs: list[Belief] = []
+def reckoned(vehicle: MachineConfig, readings: Iterable[Reading], slip: float = 0.0) -> DeadReckoning:
+    """Dead reckoning after all readings."""
+    dead_reckoning = DeadReckoning(vehicle, slip)
     for reading in readings:
-        sensor = of.sensor(reading.sensor)
+        sensor = vehicle.sensor(reading.sensor)
         assert sensor
-        found.update(reading, sensor)
-        if found.belief and (not beliefs or found.belief.stamp_ns > beliefs[-1].stamp_ns):
-            beliefs.append(found.belief)
-    return beliefs
+        dead_reckoning.update(reading, sensor)
+    return dead_reckoning
+
+
+class RunLocaliser(Localiser):
+    """A localiser with the dead reckoning that the pipeline runs for it."""
+
+    def __init__(self, vehicle: MachineConfig, projection: Projection, config: LocalisationConfig, **more: Any) -> None:
+        super().__init__(vehicle, projection, config, **more)
+        self.dead_reckoning = DeadReckoning(vehicle, config.slip)
+        self._vehicle = vehicle
+
+    def run(self, readings: Iterable[Reading]) -> list[PoseBelief]:
+        """Poses that readings made possible or changed."""
+        poses: list[PoseBelief] = []
+        for reading in readings:
+            sensor = self._vehicle.sensor(reading.sensor)
+            assert sensor
+            self.dead_reckoning.update(reading, sensor)
+            poses += self.update(reading, sensor, self.dead_reckoning)
+        return poses
+
+    def beliefs(self, readings: Iterable[Reading]) -> list[Belief]:
+        """The newest beliefs, as they were known after each reading."""
+        beliefs: list[Belief] = []
+        for reading in readings:
+            self.run([reading])
+            if self.belief and (not beliefs or self.belief.stamp_ns > beliefs[-1].stamp_ns):
+                beliefs.append(self.belief)
+        return beliefs
+
+
+def localiser(vehicle: MachineConfig, step_s: float = STEP_S, **options: Any) -> RunLocaliser:
+    """Of a made-up drive, whose wheels do not slip."""
+    return RunLocaliser(vehicle, PROJECTION, LocalisationConfig(slip=0.0, slip_soft=0.0, **options), step_s=step_s)

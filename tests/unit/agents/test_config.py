@@ -32,7 +32,7 @@ def unnamed(config: Any, named: dict[str, Any], place: str = "") -> list[str]:
     return missing
 
 
-def test_agent_file_gives_the_defaults_and_the_simulated_loader() -> None:
+def test_agent_file_holds_the_defaults_and_the_simulated_loader() -> None:
     assert load_agent(CONFIG / "agent.toml") == (load_scenario("paper_site").rigs()[0].machine, AgentConfig())
 
 
@@ -47,7 +47,7 @@ def test_agent_file_names_every_option_of_machine_and_sensor() -> None:
     assert {f.name for f in fields(Mount)} == set(named["sensor"][0]["mount"])
 
 
-def test_site_file_gives_the_paper_s_site_and_names_every_option() -> None:
+def test_site_file_is_the_paper_s_site_and_names_every_option() -> None:
     assert load_site(CONFIG / "site.toml") == load_scenario("paper_site").site
     assert {f.name for f in fields(SiteConfig)} == set(table("site.toml"))
 
@@ -56,9 +56,9 @@ def test_site_file_gives_the_paper_s_site_and_names_every_option() -> None:
 def test_every_option_has_a_comment_and_lines_are_short(name: str) -> None:
     lines = (CONFIG / name).read_text(encoding="utf-8").splitlines()
     assert max(map(len, lines)) <= 120
-    plain = ("wheel_radius_m", "use")  # their names and the words above them say it all
-    said = {line.split(" = ")[0] for line in lines if " = " in line and "#" in line} | set(plain) | {"mount"}
-    assert {line.split(" = ")[0] for line in lines if " = " in line and not line.startswith("#")} <= said
+    plain = ("wheel_radius_m", "use")  # their names are enough
+    commented = {line.split(" = ")[0] for line in lines if " = " in line and "#" in line} | set(plain) | {"mount"}
+    assert {line.split(" = ")[0] for line in lines if " = " in line and not line.startswith("#")} <= commented
 
 
 def written(folder: Path, text: str) -> Path:
@@ -68,22 +68,22 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
-    machine, config = load_agent(written(tmp_path, "linger_s = 1\n[pipeline.sampling]\nevery_m = 2\n"))
+    machine, config = load_agent(written(tmp_path, "linger_s = 1\n[pipeline.localisation]\nslip = 0.2\n"))
     assert machine is None
-    assert (config.linger_s, config.pipeline.sampling.every_m) == (1.0, 2.0)
+    assert (config.linger_s, config.pipeline.localisation.slip) == (1.0, 0.2)
 
 
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
         ("lingers = 1", "unknown key `lingers`"),
-        ("[pipeline.sampling]\nevery = 2", "unknown key `every`"),
-        ("[pipeline.sampling]\nevery_m = 0", "every_m"),
-        ("[pipeline.sampling]\nevery_m = nan", "every_m"),
-        ("[pipeline.estimation]\nmass = 'guessed'", "mass"),
-        ("[pipeline.localisation]\nrelock_fixes = 1.5", "relock_fixes"),
-        ("[pipeline]\ngap_s = -1", "gap_s"),
+        ("[pipeline]\nsampling = 2", "unknown key `sampling`"),
+        ("[pipeline.localisation]\nslip = nan", "slip"),
+        ("[pipeline.localisation]\nslip = 1", "slip"),
+        ("[pipeline.localisation]\nfilter = 'kf'", "filter"),
+        ("[pipeline.localisation]\nstep_s = 0.1", "unknown key `step_s`"),
         ("[uplink]\ntimeout_s = 0", "timeout_s"),
+        ("[pipeline.estimation]\nmass = 'guessed'", "mass"),
         ("[spool]\nmax_samples = 0", "max_samples"),
         ("[holdout]\noff_s = 11", "off_s"),
         ("linger_s = -1", "linger_s"),
@@ -112,8 +112,8 @@ def test_missing_file_is_a_config_error(tmp_path: Path) -> None:
 def test_page_of_ground_estimation_names_every_reason_and_none_else() -> None:
     page = (CONFIG.parent / "docs" / "ground-estimation.md").read_text(encoding="utf-8")
     modules = [*(CONFIG.parent / "agents" / "estimation").glob("*.py")]
-    said = set(re.findall(r"^\| ((?:`\w+`[ *,]*)+)\|", page[page.index("## Reasons") :], re.MULTILINE))
-    reasons = {name for names in said for name in re.findall(r"`(\w+)`", names)} - {"reason"}
+    rows = set(re.findall(r"^\| ((?:`\w+`[ *,]*)+)\|", page[page.index("## Reasons") :], re.MULTILINE))
+    reasons = {name for names in rows for name in re.findall(r"`(\w+)`", names)} - {"reason"}
     source = "".join(path.read_text(encoding="utf-8") for path in modules)
     assert not {reason for reason in reasons if f'"{reason}"' not in source}
     judged = (CONFIG.parent / "agents" / "estimation" / "plausibility.py").read_text(encoding="utf-8")

@@ -4,20 +4,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.dead_reckoning import DeadReckoning, WheelTracker, align, mean_std
+from agents.dead_reckoning import DeadReckoning, WheelTracker
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Odometry, Torque
 from protocol.units import GRAVITY_MPS2
-from tests.unit.agents.drives import START_NS, Drive, Leg, changed_sensor, drive, machine
-
-
-def reckon(of: MachineConfig, made: Drive, slip: float = 0.0) -> DeadReckoning:
-    dead = DeadReckoning(of, slip)
-    for reading in made.readings:
-        sensor = of.sensor(reading.sensor)
-        assert sensor
-        dead.update(reading, sensor)
-    return dead
+from tests.unit.agents.drives import START_NS, Leg, changed_sensor, drive, machine, reckoned
 
 
 @pytest.mark.parametrize("rate_hz", [10, 20, 100])
@@ -67,81 +58,83 @@ def test_tracker_starts_anew_after_a_pause_and_ignores_time_that_stands_still() 
 
 
 def test_dead_reckoning_closes_a_circle() -> None:
-    of = machine()
-    made = drive([Leg(5, 0.6), Leg(2 * math.pi / 0.2, 0.0, 0.2)], of, heading_rad=0.0, without=("gps-1",))
-    dead = reckon(of, made)
-    turned = dead.now()
+    vehicle = machine()
+    made = drive([Leg(5, 0.6), Leg(2 * math.pi / 0.2, 0.0, 0.2)], vehicle, heading_rad=0.0, without=("gps-1",))
+    reckoning = reckoned(vehicle, made.readings)
+    turned = reckoning.pose
     start = made.at(START_NS + 5_000_000_000)  # where the circle begins
     assert turned.angle_rad == pytest.approx(2 * math.pi, abs=0.01)
-    assert turned.travel_m == pytest.approx(dead.way_m)
+    assert turned.travel_m == pytest.approx(reckoning.distance_m)
     assert (turned.x_m, turned.y_m) == pytest.approx((start[0] - 10, start[1] - 20), abs=0.3)
 
 
 @pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 90.0), (180.0, 0.0, 0.0), (90.0, 0.0, -90.0), (20.0, -35.0, 110.0)])
 def test_mounted_imu_gives_the_right_turn(rpy_deg: tuple[float, float, float]) -> None:
-    of = machine(Mount((0.4, 0.2, 0.9), rpy_deg))
-    made = drive([Leg(2, 1.0), Leg(4, 0.0, 0.3)], of)
-    assert reckon(of, made).angle_rad == pytest.approx(1.2, abs=0.01)
+    vehicle = machine(Mount((0.4, 0.2, 0.9), rpy_deg))
+    made = drive([Leg(2, 1.0), Leg(4, 0.0, 0.3)], vehicle)
+    assert reckoned(vehicle, made.readings).angle_rad == pytest.approx(1.2, abs=0.01)
 
 
-def test_way_counts_up_in_reverse_and_travel_down() -> None:
-    of = machine()
-    dead = reckon(of, drive([Leg(4, 0.5), Leg(4, -0.5), Leg(4, -0.5), Leg(4, 0.5)], of))
-    assert dead.travel_m == pytest.approx(0.0, abs=0.05)
-    assert dead.way_m == pytest.approx(16.0, abs=0.1)
+def test_distance_counts_up_in_reverse_and_travel_down() -> None:
+    vehicle = machine()
+    reckoning = reckoned(vehicle, drive([Leg(4, 0.5), Leg(4, -0.5), Leg(4, -0.5), Leg(4, 0.5)], vehicle).readings)
+    assert reckoning.travel_m == pytest.approx(0.0, abs=0.05)
+    assert reckoning.distance_m == pytest.approx(16.0, abs=0.1)
 
 
 def test_odometry_is_integrated_over_time_and_a_pause_counts_one_second_at_most() -> None:
     sensor = SensorConfig("odom", "odometry")
-    dead = DeadReckoning(MachineConfig("cart", sensors=(sensor,)), 0.2)
+    reckoning = DeadReckoning(MachineConfig("cart", sensors=(sensor,)), 0.2)
     for i in range(1, 101):
-        dead.update(Odometry("odom", START_NS + i * 100_000_000, 2.0, 0.0, 0.0), sensor)
-    assert dead.travel_m == pytest.approx(2.0 * 9.9)
-    dead.update(Odometry("odom", START_NS + 14 * 10**9, 2.0, 0.0, 0.0), sensor)
-    assert dead.travel_m == pytest.approx(2.0 * 10.9)
+        reckoning.update(Odometry("odom", START_NS + i * 100_000_000, 2.0, 0.0, 0.0), sensor)
+    assert reckoning.travel_m == pytest.approx(2.0 * 9.9)
+    reckoning.update(Odometry("odom", START_NS + 14 * 10**9, 2.0, 0.0, 0.0), sensor)
+    assert reckoning.travel_m == pytest.approx(2.0 * 10.9)
 
 
 @pytest.mark.parametrize("direction", [1, -1])
 def test_slip_is_taken_off_where_torque_drives(direction: int) -> None:
-    """At a drive force of a tenth of the weight and slip 0.2 per traction, two per cent of the way are lost."""
-    of = machine()
-    wheels, torque = of.sensor("wheels"), of.sensor("torque")
+    """At a drive force of a tenth of the weight and slip 0.2 per traction, two per cent of the distance are lost."""
+    vehicle = machine()
+    wheels, torque = vehicle.sensor("wheels"), vehicle.sensor("torque")
     assert wheels
     assert torque
-    dead = DeadReckoning(of, slip=0.2)
-    force_n = 0.1 * of.mass_kg * GRAVITY_MPS2 * direction
-    dead.update(Torque("torque", START_NS, force_n * of.wheel_radius_m), torque)
+    reckoning = DeadReckoning(vehicle, slip=0.2)
+    force_n = 0.1 * vehicle.mass_kg * GRAVITY_MPS2 * direction
+    reckoning.update(Torque("torque", START_NS, force_n * vehicle.wheel_radius_m), torque)
     for i in range(101):
-        dead.update(Encoder("wheels", START_NS + i * 50_000_000, i * direction, i * direction), wheels)
-    rolled_m = 2 * math.pi * of.wheel_radius_m
-    assert dead.travel_m == pytest.approx(direction * 0.98 * rolled_m)
-    assert dead.way_m == pytest.approx(0.98 * rolled_m)
-    assert dead.traction == pytest.approx(direction * 0.1)
-    now = dead.now()
-    assert (now.stamp_ns, now.travel_m, now.x_m) == (START_NS + 5 * 10**9, dead.travel_m, dead.travel_m)
+        reckoning.update(Encoder("wheels", START_NS + i * 50_000_000, i * direction, i * direction), wheels)
+    rolled_m = 2 * math.pi * vehicle.wheel_radius_m
+    assert reckoning.travel_m == pytest.approx(direction * 0.98 * rolled_m)
+    assert reckoning.distance_m == pytest.approx(0.98 * rolled_m)
+    assert reckoning.traction == pytest.approx(direction * 0.1)
+    now = reckoning.pose
+    assert (now.stamp_ns, now.travel_m, now.x_m) == (START_NS + 5 * 10**9, reckoning.travel_m, reckoning.travel_m)
 
 
 def test_braking_makes_the_wheels_slower_than_the_machine() -> None:
-    of = machine()
-    made = drive([Leg(4, 0.5), Leg(3, -0.6)], of)
-    with_slip, without = reckon(of, made, slip=0.2), reckon(of, made)
+    vehicle = machine()
+    made = drive([Leg(4, 0.5), Leg(3, -0.6)], vehicle)
+    with_slip, without = reckoned(vehicle, made.readings, slip=0.2), reckoned(vehicle, made.readings)
     driven = replace(made, readings=[r for r in made.readings if r.stamp_ns <= START_NS + 4 * 10**9])
-    driven_with_slip, driven_without = reckon(of, driven, slip=0.2), reckon(of, driven)
+    driven_with_slip, driven_without = reckoned(vehicle, driven.readings, slip=0.2), reckoned(vehicle, driven.readings)
     assert driven_with_slip.travel_m < driven_without.travel_m
     assert with_slip.travel_m - driven_with_slip.travel_m > without.travel_m - driven_without.travel_m
 
 
 def test_second_imu_and_second_wheel_sensor_do_not_count_twice() -> None:
-    of = machine()
-    more = replace(of, sensors=(*of.sensors, SensorConfig("imu-2", "imu"), SensorConfig("wheels-2", "encoder")))
+    vehicle = machine()
+    more = replace(
+        vehicle, sensors=(*vehicle.sensors, SensorConfig("imu-2", "imu"), SensorConfig("wheels-2", "encoder"))
+    )
     legs = [Leg(4, 0.5), Leg(2, 0.0, 0.2)]
-    one, two = reckon(of, drive(legs, of)), reckon(more, drive(legs, more))
+    one, two = reckoned(vehicle, drive(legs, vehicle).readings), reckoned(more, drive(legs, more).readings)
     assert (two.travel_m, two.angle_rad) == (one.travel_m, one.angle_rad)
 
 
 def test_restarted_tick_counter_moves_nothing() -> None:
-    of = machine()
-    made = drive([Leg(4, 0.5), Leg(6)], of)
+    vehicle = machine()
+    made = drive([Leg(4, 0.5), Leg(6)], vehicle)
     restart_ns = START_NS + 6 * 10**9
     readings = [
         replace(r, left_ticks=r.left_ticks - 1e6, right_ticks=r.right_ticks - 1e6)
@@ -149,36 +142,14 @@ def test_restarted_tick_counter_moves_nothing() -> None:
         else r
         for r in made.readings
     ]
-    before, after = reckon(of, made), reckon(of, replace(made, readings=readings))
+    before, after = reckoned(vehicle, made.readings), reckoned(vehicle, readings)
     assert after.travel_m == pytest.approx(before.travel_m, abs=0.15)  # what was driven between two counts
-    assert after.way_m == pytest.approx(before.way_m, abs=0.15)
+    assert after.distance_m == pytest.approx(before.distance_m, abs=0.15)
     assert after.wheels.speed_mps == pytest.approx(before.wheels.speed_mps, abs=0.1)
 
 
-def test_more_ticks_per_turn_are_less_way() -> None:
-    of = machine()
-    made = drive([Leg(4, 0.5)], of)
-    finer = reckon(changed_sensor(of, "wheels", ticks_per_rev=200), made)
-    assert finer.travel_m == pytest.approx(reckon(of, made).travel_m / 2)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_align_recovers_rotation_and_shift(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    dead = rng.uniform(-20, 20, (30, 2))
-    rotation, shift = rng.uniform(-math.pi, math.pi), rng.uniform(-500, 500, 2)
-    c, s = math.cos(rotation), math.sin(rotation)
-    found = align(dead, dead @ np.array([[c, s], [-s, c]]) + shift, 2.0)
-    assert found
-    assert found.rotation_rad == pytest.approx(rotation), f"seed={seed}"
-    assert found.origin_m == pytest.approx(tuple(shift)), f"seed={seed}"
-    spread_m = float(np.sqrt(dead.var(axis=0).sum()))
-    assert found.std_rad == pytest.approx(2.0 / (2 * spread_m))
-
-
-def test_align_finds_nothing_where_all_positions_coincide() -> None:
-    assert align(np.full((9, 2), 3.0), np.random.default_rng(0).normal(size=(9, 2)), 1.0) is None
-
-
-def test_mean_std_is_the_root_of_the_mean_variance() -> None:
-    assert mean_std([1.0, 3.0]) == math.sqrt(2)
+def test_more_ticks_per_turn_are_less_distance() -> None:
+    vehicle = machine()
+    made = drive([Leg(4, 0.5)], vehicle)
+    finer = reckoned(changed_sensor(vehicle, "wheels", ticks_per_rev=200), made.readings)
+    assert finer.travel_m == pytest.approx(reckoned(vehicle, made.readings).travel_m / 2)

@@ -6,7 +6,7 @@ import pytest
 
 from agents.estimation.ground import NOTHING_KNOWN, GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
-from agents.sampling import PoseHistory, Sampler, SamplingConfig, Way
+from agents.sampling import EVERY_M, HISTORY_S, LAG_S, Odometer, PoseHistory, Sampler
 from protocol.arrays import Table
 from protocol.machine.readings import Encoder, Imu, Odometry, Reading
 from protocol.machine.samples import check_samples
@@ -35,44 +35,50 @@ class Asked:
         return self._estimate
 
 
-def drive(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, metres: float = 10.0, speed: float = 2.0) -> Table:
-    """Drive east at constant speed from x = 0, with a pose and a look at the wheels every 50 ms."""
+class PlacedSampler(Sampler):
+    """A sampler and its poses."""
+
+    def __init__(self, load_centre_m: float = 0.0) -> None:
+        self.poses = PoseHistory()
+        super().__init__(self.poses, load_centre_m)
+
+
+def drive(sampler: PlacedSampler, estimate: GroundEstimate = ESTIMATE, **options: float) -> Table:
+    """Drive 10 m east at 2 m/s from x = 0, with a pose and a look at the wheels every 50 ms; then wait for the lag."""
     rows = []
-    for i in range(round(metres / speed / 0.05) + 1):
-        t = i * 0.05
-        sampler.poses.append(pose(t, speed * t))
-        if sampler.is_due(speed * t):
-            sampler.mark(ns(t), speed * t)
-        rows.append(sampler.take(ns(t), Asked(estimate)))
-    return np.concatenate(rows)
+    for i in range(101):
+        sampler.poses.append(pose(i * 0.05, 0.1 * i, **options))
+        sampler.mark(ns(i * 0.05), 0.1 * i)
+        rows.append(sampler.due_samples(ns(i * 0.05), Asked(estimate)))
+    return np.concatenate([*rows, sampled(sampler, estimate, now_s=5.0)])
 
 
-def sampled(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, now_s: float = 0.0, *, waits: bool = True) -> Table:
-    return sampler.take(ns(now_s), Asked(estimate), waits=waits)
+def sampled(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, now_s: float = 0.0) -> Table:
+    """What is due once the lag has passed."""
+    return sampler.due_samples(ns(now_s + LAG_S), Asked(estimate))
 
 
 # --- one per stretch, where the machine was --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("every_m", [0.5, 2.0])
-def test_one_sample_per_stretch_that_says_how_long_it_is(every_m: float) -> None:
-    rows = drive(Sampler(1.5, SamplingConfig(every_m=every_m, lag_s=0.0)))
-    assert len(rows) == 10 / every_m
-    assert rows["distance_m"] == pytest.approx(every_m)
-    assert rows["x_m"] == pytest.approx(1.5 + every_m * np.arange(1, len(rows) + 1))
+def test_one_sample_per_stretch_that_says_how_long_it_is() -> None:
+    rows = drive(PlacedSampler(1.5))
+    assert len(rows) == 10 / EVERY_M
+    assert rows["distance_m"] == pytest.approx(EVERY_M)
+    assert rows["x_m"] == pytest.approx(1.5 + EVERY_M * np.arange(1, len(rows) + 1))
     check_samples(rows, 1e4)
 
 
-def test_distance_of_a_stretch_is_at_most_twice_every_m() -> None:
-    sampler = Sampler(0.0, SamplingConfig(every_m=0.5, lag_s=0.0))
+def test_distance_of_a_stretch_is_at_most_twice_that_of_a_sample() -> None:
+    sampler = PlacedSampler()
     sampler.poses.append(pose(0))
     sampler.mark(ns(0), 30.0)
-    assert sampled(sampler)["distance_m"].tolist() == [1.0]
+    assert sampled(sampler)["distance_m"].tolist() == [2 * EVERY_M]
 
 
 def test_load_centre_lies_ahead() -> None:
     for heading, place in ((0.0, (1.5, 5.0)), (math.pi / 2, (0.0, 6.5)), (math.pi, (-1.5, 5.0))):
-        sampler = Sampler(1.5, SamplingConfig(lag_s=0.0))
+        sampler = PlacedSampler(1.5)
         sampler.poses.append(pose(0, heading_rad=heading))
         sampler.mark(ns(0), 0.5)
         (row,) = sampled(sampler)
@@ -81,7 +87,7 @@ def test_load_centre_lies_ahead() -> None:
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])
 def test_gradient_is_turned_into_the_map(heading: float) -> None:
-    sampler = Sampler(1.5, SamplingConfig(lag_s=0.0))
+    sampler = PlacedSampler(1.5)
     sampler.poses.append(pose(0, heading_rad=heading))
     sampler.mark(ns(0), 0.5)
     (row,) = sampled(sampler)
@@ -95,55 +101,43 @@ def test_gradient_is_turned_into_the_map(heading: float) -> None:
 # --- later than the machine was there --------------------------------------------------------------------------------
 
 
-def test_lag_delays_samples_and_moves_none() -> None:
-    """The estimator looks ahead for lag_s; sample, stamp and pose are those of the mark."""
-    now, lagged = (drive(Sampler(0.0, SamplingConfig(lag_s=lag_s))) for lag_s in (0.0, 1.0))
-    assert now["x_m"] == pytest.approx(np.arange(1, 21) * 0.5)
-    assert len(lagged) == 16  # the last second, 2 m, still waits
-    assert lagged.tobytes() == now[:16].tobytes()
-
-
-def test_estimator_is_asked_for_the_stamp_of_the_mark_once_it_is_lag_s_old() -> None:
-    sampler, asked = Sampler(0.0, SamplingConfig(lag_s=1.0)), Asked(ESTIMATE)
-    for t in (0.0, 0.5, 0.999, 1.0, 1.2):
+def test_estimator_is_asked_for_the_stamp_of_the_mark_once_the_lag_has_passed() -> None:
+    sampler, asked = PlacedSampler(), Asked(ESTIMATE)
+    for t in (0.0, 0.5, LAG_S - 0.001, LAG_S, LAG_S + 0.2):
         sampler.poses.append(pose(t))
         if t == 0.0:
             sampler.mark(ns(0), 0.5)
-        rows = sampler.take(ns(t), asked)
-        assert (len(rows), sampler.waiting) == ((1, 0) if t == 1.0 else (0, int(t < 1)))
+        rows = sampler.due_samples(ns(t), asked)
+        assert (len(rows), sampler.waiting) == ((1, 0) if t == LAG_S else (0, int(t < LAG_S)))
     assert asked.stamps_ns == [ns(0)]
 
 
 def test_an_estimate_is_asked_in_time_even_if_no_pose_is_known_yet() -> None:
     """An estimator remembers seconds, a late alignment takes minutes."""
-    sampler, asked = Sampler(0.0, SamplingConfig(lag_s=1.0)), Asked(ESTIMATE)
+    sampler, asked = PlacedSampler(), Asked(ESTIMATE)
     for i in range(1, 400):
         sampler.mark(ns(i * 0.25), i * 0.5)
-        assert not len(sampler.take(ns(i * 0.25), asked))
-    assert asked.stamps_ns == [ns(i * 0.25) for i in range(1, 396)]
+        assert not len(sampler.due_samples(ns(i * 0.25), asked))
+    assert asked.stamps_ns == [ns(i * 0.25) for i in range(1, 392)]
 
 
-def test_samples_come_in_the_order_of_their_stamps() -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.3))
-    rows = drive(sampler)
-    rest = sampled(sampler, now_s=99)
-    stamps = np.concatenate([rows, rest])["stamp_ns"]
-    assert (np.diff(stamps) > 0).all()
-    assert len(stamps) == 20
-
-
-def test_what_still_waits_is_taken_without_waiting() -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=1.0))
-    rows = drive(sampler)
-    rest = sampled(sampler, now_s=5.0, waits=False)
-    assert len(rows) + len(rest) == 20
+def test_what_still_waits_is_sampled_without_waiting_and_all_in_the_order_of_stamps() -> None:
+    sampler, rows = PlacedSampler(), []
+    for i in range(101):
+        sampler.poses.append(pose(i * 0.05, 0.1 * i))
+        sampler.mark(ns(i * 0.05), 0.1 * i)
+        rows.append(sampler.due_samples(ns(i * 0.05), Asked(ESTIMATE)))
+    in_time = np.concatenate(rows)
+    rest = sampler.due_samples(ns(5.0), Asked(ESTIMATE), waits=False)
+    assert (len(in_time), len(rest)) == (12, 8)  # the lag of 2 s is 4 m
+    assert (np.diff(np.concatenate([in_time, rest])["stamp_ns"]) > 0).all()
     assert sampler.waiting == 0
     assert not sampler.withheld
 
 
 def test_nothing_is_lost_while_no_pose_is_known() -> None:
     """The heading is found late: the poses then come all at once, from the beginning of the drive on."""
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    sampler = PlacedSampler()
     for i in range(1, 21):
         sampler.mark(ns(i * 0.25), i * 0.5)
         assert not len(sampled(sampler, now_s=i * 0.25))
@@ -158,9 +152,9 @@ def test_nothing_is_lost_while_no_pose_is_known() -> None:
 
 
 def test_marks_before_the_first_pose_are_counted() -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    sampler = PlacedSampler()
     for t in (-1.0, -0.5, 0.5):
-        sampler.mark(ns(t), 0.5 * (t + 2))
+        sampler.mark(ns(t), t + 2)
     sampler.poses.append(pose(0))
     sampler.poses.append(pose(1))
     assert len(sampled(sampler, now_s=1.0)) == 1
@@ -169,7 +163,7 @@ def test_marks_before_the_first_pose_are_counted() -> None:
 
 @pytest.mark.parametrize("reason", ["pitch_transient", "accelerometer"])
 def test_samples_whose_slope_is_blurred_are_withheld_and_counted(reason: str) -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    sampler = PlacedSampler()
     assert not len(drive(sampler, replace(ESTIMATE, c_rr=math.nan, c_rr_var=math.nan, reason=reason)))
     assert sampler.withheld == {reason: 20}
     assert not sampler.without_resistance
@@ -177,7 +171,7 @@ def test_samples_whose_slope_is_blurred_are_withheld_and_counted(reason: str) ->
 
 @pytest.mark.parametrize("reason", ["braking", "no_torque", "torque_frozen", "standstill", "settling"])
 def test_position_and_slope_are_sampled_without_resistance_and_counted(reason: str) -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    sampler = PlacedSampler()
     rows = drive(sampler, replace(ESTIMATE, c_rr=math.nan, c_rr_var=math.nan, reason=reason))
     assert len(rows) == 20
     assert np.isnan(rows["c_rr"]).all()
@@ -189,7 +183,7 @@ def test_position_and_slope_are_sampled_without_resistance_and_counted(reason: s
 
 
 def test_where_nothing_is_known_of_the_ground_the_place_is_sampled() -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    sampler = PlacedSampler()
     rows = drive(sampler, NOTHING_KNOWN)
     assert len(rows) == 20
     assert np.isnan(rows["grade_e"]).all()
@@ -197,19 +191,19 @@ def test_where_nothing_is_known_of_the_ground_the_place_is_sampled() -> None:
 
 
 def test_samples_of_an_unsure_place_are_withheld_and_counted() -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0, max_std_m=1.2))
-    assert not len(drive(sampler))  # the variance north is 2 m2
+    sampler = PlacedSampler()
+    assert not len(drive(sampler, variance_m2=201.0))  # that north is twice as much, a deviation of 20.05 m
     assert sampler.withheld == {"unsure_position": 20}
 
 
 def test_good_samples_are_counted_nowhere() -> None:
-    sampler = Sampler(0.0, SamplingConfig(lag_s=0.0))
+    sampler = PlacedSampler()
     drive(sampler)
     assert not sampler.withheld
     assert not sampler.without_resistance
 
 
-# --- the way ---------------------------------------------------------------------------------------------------------
+# --- the odometer ----------------------------------------------------------------------------------------------------
 
 
 def imu(seconds: float) -> Reading:
@@ -220,52 +214,52 @@ def wheels(seconds: float) -> Reading:
     return Encoder("wheels", ns(seconds), 0.0, 0.0)
 
 
-def test_way_is_that_of_the_wheels_while_they_speak() -> None:
-    way = Way()
+def test_distance_is_that_of_the_wheels_while_they_are_read() -> None:
+    odometer = Odometer()
     for i in range(100):
         reading = wheels(i * 0.05) if i % 2 else Odometry("wheels", ns(i * 0.05), 0.0, 0.0, 0.0)
-        assert way.update(reading, 0.1 * i, 7.0) == pytest.approx(0.1 * i)  # the filter's speed is not asked
+        assert odometer.update(reading, 0.1 * i, 7.0) == pytest.approx(0.1 * i)  # the filter's speed is not asked
 
 
 @pytest.mark.parametrize("speed_mps", [2.0, -2.0], ids=["forwards", "reverse"])
-def test_way_goes_on_by_the_filter_s_speed_when_wheels_fall_silent(speed_mps: float) -> None:
+def test_distance_goes_on_by_the_filter_s_speed_when_wheels_fall_silent(speed_mps: float) -> None:
     """From when they fell silent, which is noticed half a second later; up in reverse too."""
-    way = Way()
-    way.update(wheels(0.0), 5.0, speed_mps)
-    found = [way.update(imu(i * 0.01), 5.0, speed_mps) for i in range(1, 1001)]
-    assert found[49] == 5.0
-    assert found[-1] == pytest.approx(5.0 + 2.0 * 10.0, abs=1.1)
-    assert (np.diff(found) >= 0).all()
+    odometer = Odometer()
+    odometer.update(wheels(0.0), 5.0, speed_mps)
+    distances = [odometer.update(imu(i * 0.01), 5.0, speed_mps) for i in range(1, 1001)]
+    assert distances[49] == 5.0
+    assert distances[-1] == pytest.approx(5.0 + 2.0 * 10.0, abs=1.1)
+    assert (np.diff(distances) >= 0).all()
 
 
-def test_wheels_that_speak_again_count_on_and_nothing_twice() -> None:
-    way = Way()
-    way.update(wheels(0.0), 5.0, 2.0)
+def test_wheels_that_are_read_again_count_on_and_nothing_twice() -> None:
+    odometer = Odometer()
+    odometer.update(wheels(0.0), 5.0, 2.0)
     for i in range(1, 301):
-        before = way.update(imu(i * 0.01), 5.0, 2.0)
-    assert way.update(wheels(3.01), 5.0, 2.0) == pytest.approx(before)  # counted from where they were
+        before = odometer.update(imu(i * 0.01), 5.0, 2.0)
+    assert odometer.update(wheels(3.01), 5.0, 2.0) == pytest.approx(before)  # counted from where they were
     for i in range(302, 400):
-        after = way.update(imu(i * 0.01) if i % 5 else wheels(i * 0.01), 5.0 + 0.02 * (i - 301), 2.0)
+        after = odometer.update(imu(i * 0.01) if i % 5 else wheels(i * 0.01), 5.0 + 0.02 * (i - 301), 2.0)
     assert after == pytest.approx(before + 0.02 * 98, abs=0.05)
 
 
-def test_a_machine_without_wheels_has_a_way() -> None:
-    way = Way()
-    found = [way.update(imu(i * 0.01), 0.0, 2.0) for i in range(101)]
-    assert found[-1] - found[0] == pytest.approx(2.0)
+def test_a_machine_without_wheels_has_a_distance() -> None:
+    odometer = Odometer()
+    distances = [odometer.update(imu(i * 0.01), 0.0, 2.0) for i in range(101)]
+    assert distances[-1] - distances[0] == pytest.approx(2.0)
 
 
-def test_noise_of_the_filter_s_speed_at_a_standstill_is_no_way() -> None:
-    way = Way()
-    start = way.update(imu(0.0), 0.0, 0.0)
-    assert [way.update(imu(i * 0.01), 0.0, 0.29 * (-1) ** i) for i in range(1, 1000)] == [start] * 999
+def test_noise_of_the_filter_s_speed_at_a_standstill_is_no_distance() -> None:
+    odometer = Odometer()
+    start = odometer.update(imu(0.0), 0.0, 0.0)
+    assert [odometer.update(imu(i * 0.01), 0.0, 0.29 * (-1) ** i) for i in range(1, 1000)] == [start] * 999
 
 
 # --- where the machine was -------------------------------------------------------------------------------------------
 
 
 def test_interpolation_takes_the_short_way_across_the_back_heading() -> None:
-    history = PoseHistory(30)
+    history = PoseHistory()
     history.append(pose(0, 0.0, math.pi - 0.1))
     history.append(pose(1, 4.0, -math.pi + 0.3, variance_m2=3.0))
     middle = history.at(100 * S + S // 2)
@@ -276,7 +270,7 @@ def test_interpolation_takes_the_short_way_across_the_back_heading() -> None:
 
 
 def test_history_knows_its_ends_and_nothing_beyond() -> None:
-    history = PoseHistory(30)
+    history = PoseHistory()
     assert history.newest is None
     assert history.at(100 * S) is None
     history.append(pose(0, 1.0))
@@ -290,28 +284,17 @@ def test_history_knows_its_ends_and_nothing_beyond() -> None:
 
 
 def test_pose_of_the_same_stamp_replaces_the_last() -> None:
-    history = PoseHistory(30)
+    history = PoseHistory()
     history.append(pose(0, 1.0))
     history.append(pose(0, 2.0))
     assert history.newest
     assert history.newest.x_m == 2.0
 
 
-def test_history_forgets_but_never_what_history_s_asks_for() -> None:
-    history = PoseHistory(2.0)
+def test_history_forgets_but_never_what_it_has_to_keep() -> None:
+    history = PoseHistory()
     for i in range(1000):
         history.append(pose(i * 0.1, float(i)))
-        if i >= 20:
-            assert history.at(round((100 + i * 0.1 - 2.0) * S) + 1)
-    assert len(history._poses) <= 42
-
-
-@pytest.mark.parametrize("name", list(SamplingConfig.__dataclass_fields__))
-def test_bad_sampling_option_is_refused_by_name(name: str) -> None:
-    with pytest.raises(ValueError, match=name):
-        SamplingConfig(**{name: -1.0})
-
-
-def test_lag_must_lie_within_the_history() -> None:
-    with pytest.raises(ValueError, match="lag_s"):
-        SamplingConfig(lag_s=30.0, history_s=30.0)
+        if i >= 10 * HISTORY_S:
+            assert history.at(round((100 + i * 0.1 - HISTORY_S) * S) + 1)
+    assert len(history._poses) <= 20 * HISTORY_S + 2

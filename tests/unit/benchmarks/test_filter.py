@@ -41,7 +41,7 @@ def test_filter_prints_two_tables(monkeypatch, capsys) -> None:
 def test_own_and_stock_move_alike() -> None:
     """What is compared is the same work."""
     start = filters._start()
-    moves = filters.motion(filters.LAYOUT, filters.CONFIG, start, 0.3)
+    moves = filters.motion(filters.MODEL, start, 0.3)
     np.testing.assert_allclose(filters._stock_motion(start.x, 0.3), moves.f(start.x[None])[0], atol=1e-14)
 
 

@@ -11,7 +11,7 @@ import pytest
 from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.machine.log_folder import open_log
-from protocol.machine.machine_config import GIVES, MODES
+from protocol.machine.machine_config import MODES, QUANTITIES
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, columns
 from protocol.machine.samples import COLUMNS
 from protocol.queries import commands, parameters, requests
@@ -98,7 +98,7 @@ def test_fields_of_an_answer_are_the_documented_ones(title, record):
 
 def test_every_part_of_a_sensor_is_documented():
     table = LOGS[LOGS.index("## What a sensor measures") : LOGS.index("## Modes")]
-    for kind, parts in GIVES.items():
+    for kind, parts in QUANTITIES.items():
         rows = table[table.index(f"| `{kind}` |") :].splitlines()
         own = [rows[0], *itertools.takewhile(lambda row: row.startswith("| |"), rows[1:])]
         assert [row.split("|")[2].split("`")[1] for row in own] == [*parts], kind

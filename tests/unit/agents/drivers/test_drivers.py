@@ -91,7 +91,7 @@ def test_replay_never_waits_longer_than_a_read_may_take(folder: Path) -> None:
     assert max(replay(folder, 1.0)[2].waits) <= 0.2
 
 
-def test_replay_counts_rows_that_were_left_out(folder: Path, tmp_path: Path) -> None:
+def test_replay_counts_rows_that_were_refused(folder: Path, tmp_path: Path) -> None:
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     with (tmp_path / "torque.csv").open("a") as file:
@@ -189,7 +189,7 @@ def test_malformed_bundles_and_those_of_others_are_counted(stream: Stream) -> No
     assert stream.driver.counters() == {"refused_bundle_not_msgpack": 2, "refused_bundle_wrong_machine": 1}
 
 
-def test_implausible_reading_is_left_out_and_counted(stream: Stream) -> None:
+def test_implausible_reading_is_refused_and_counted(stream: Stream) -> None:
     readings = (reading(1), Articulation("articulation", START_NS + 2, 99.0))
     stream.put(encode_bundle(SensorBundle("loader-1", 1, readings)))
     assert list(stream.read()) == [reading(1)]
@@ -267,19 +267,19 @@ def test_calibration_is_kept_across_restarts(sessions: tuple[Any, Any], tmp_path
     """Whoever drives out and back learns the accelerometer's zero, and the next agent starts with it."""
     zero_mps2, made = 0.05, drive(OUT_AND_BACK, OF)
     readings = [replace(r, force_x_mps2=r.force_x_mps2 + zero_mps2) if isinstance(r, Imu) else r for r in made.readings]
-    found = []
+    reports = []
     for spans in ([readings], [readings[:500]]):
         time_, places = Time(), Places(tmp_path / "spool.db", calibration=tmp_path / "c.json")
         agent = Agent(sessions[1], SITE, OF, AgentConfig(linger_s=0.0), places)
         try:
-            found.append(agent.run(Given(*spans), lambda: False, time_.clock, time_.wait))
+            reports.append(agent.run(Given(*spans), lambda: False, time_.clock, time_.wait))
         finally:
             agent.close()
-    before, after = (report["pipeline"]["ground"]["calibration"] for report in found)
+    before, after = (report["pipeline"]["ground"]["calibration"] for report in reports)
     assert before["passages"] > 20
     assert after["passages"] == before["passages"]
     assert after["zero"] == pytest.approx(-zero_mps2 / GRAVITY_MPS2, abs=5e-4)
-    assert found[0]["calibration_problem"] == ""
+    assert reports[0]["calibration_problem"] == ""
 
 
 def test_calibration_file_that_makes_no_sense_is_reported_and_replaced(

@@ -222,7 +222,9 @@ def test_odometry_counts_as_wheels() -> None:
     assert last.unbalanced == pytest.approx(0.04, abs=1e-3)
 
 
-@pytest.mark.parametrize("options", [{"frame": FRONT}, {"gives": ("rate",)}], ids=["front frame", "no accelerometer"])
+@pytest.mark.parametrize(
+    "options", [{"frame": FRONT}, {"measures": ("rate",)}], ids=["front frame", "no accelerometer"]
+)
 def test_only_an_accelerometer_on_the_rear_frame_counts(options: dict[str, object]) -> None:
     vehicle = machine()
     made: Drive = drive(FORWARDS, vehicle)

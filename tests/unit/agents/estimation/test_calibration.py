@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from agents.dead_reckoning import Dead, DeadReckoning
+from agents.dead_reckoning import DeadReckonedPose, DeadReckoning
 from agents.estimation import calibration as module
 from agents.estimation.balance import Balance
 from agents.estimation.calibration import (
@@ -37,8 +37,9 @@ class Place:
     y_m: float = 0.0
     angle_rad: float = 0.0
 
-    def now(self) -> Dead:
-        return Dead(0, 0.0, self.angle_rad, self.x_m, self.y_m)
+    @property
+    def pose(self) -> DeadReckonedPose:
+        return DeadReckonedPose(0, 0.0, self.angle_rad, self.x_m, self.y_m)
 
 
 class Course:

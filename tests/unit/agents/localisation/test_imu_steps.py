@@ -6,7 +6,7 @@ import pytest
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.filters.motion import map_from_base
-from agents.localisation.imu_steps import Step, Steps
+from agents.localisation.imu_steps import FilterStep, StepGatherer
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Torque
@@ -18,18 +18,20 @@ WHEELS, TORQUE = SensorConfig("wheels", "encoder"), SensorConfig("torque", "torq
 MOUNTS = [(0.0, 0.0, 0.0), (180.0, 0.0, 0.0), (0.0, 0.0, 90.0), (20.0, -35.0, 110.0)]
 
 
-def gather(steps: Steps, of: MachineConfig, readings: Iterable[Reading]) -> list[Step]:
-    dead, found = DeadReckoning(of, 0.0), []
+def gather(gatherer: StepGatherer, vehicle: MachineConfig, readings: Iterable[Reading]) -> list[FilterStep]:
+    dead_reckoning, steps = DeadReckoning(vehicle, 0.0), []
     for reading in readings:
-        sensor = of.sensor(reading.sensor)
+        sensor = vehicle.sensor(reading.sensor)
         assert sensor
-        dead.update(reading, sensor)
-        step = steps.take(reading, sensor, dead)
-        found += [step] if step else []
-    return found
+        dead_reckoning.update(reading, sensor)
+        step = gatherer.gather(reading, sensor, dead_reckoning)
+        steps += [step] if step else []
+    return steps
 
 
-def of_imu(mount: Mount | None = None, frame: str = "base_link", more: tuple[SensorConfig, ...] = ()) -> MachineConfig:
+def with_imu(
+    mount: Mount | None = None, frame: str = "base_link", more: tuple[SensorConfig, ...] = ()
+) -> MachineConfig:
     return MachineConfig("loader-1", sensors=(SensorConfig("imu", "imu", mount or Mount(), frame=frame), *more))
 
 
@@ -37,43 +39,45 @@ def imu(ms: float, rates: Iterable[float], force: Iterable[float] = (0.0, 0.0, G
     return Imu(name, START_NS + round(ms * MS), *map(float, rates), *map(float, force))
 
 
-def one(of: MachineConfig, readings: Iterable[Reading], step_s: float = 0.1) -> Step:
-    (step,) = gather(Steps(of, step_s), of, readings)
+def one(vehicle: MachineConfig, readings: Iterable[Reading], step_s: float = 0.1) -> FilterStep:
+    (step,) = gather(StepGatherer(vehicle, step_s), vehicle, readings)
     return step
 
 
-def test_a_step_tells_the_means_since_the_one_before() -> None:
-    of, seed = of_imu(), 3
+def test_a_step_holds_the_means_since_the_one_before() -> None:
+    vehicle, seed = with_imu(), 3
     values = np.random.default_rng(seed).normal(size=(21, 6))
-    first, second = gather(Steps(of, 0.1), of, [imu(10 * i, v[:3], v[3:]) for i, v in enumerate(values)])
+    first, second = gather(
+        StepGatherer(vehicle, 0.1), vehicle, [imu(10 * i, v[:3], v[3:]) for i, v in enumerate(values)]
+    )
     for step, part in ((first, values[:11]), (second, values[11:])):
-        assert step.felt["imu"].rates_radps == pytest.approx(part[:, :3].mean(axis=0)), f"seed={seed}"
-        assert step.felt["imu"].force_mps2 == pytest.approx(part[:, 3:].mean(axis=0)), f"seed={seed}"
+        assert step.imu_means["imu"].rates_radps == pytest.approx(part[:, :3].mean(axis=0)), f"seed={seed}"
+        assert step.imu_means["imu"].force_mps2 == pytest.approx(part[:, 3:].mean(axis=0)), f"seed={seed}"
     assert [first.stamp_ns, second.stamp_ns] == [START_NS + 100 * MS, START_NS + 200 * MS]
 
 
-def test_two_imus_are_told_apart_and_a_silent_one_is_not_told() -> None:
-    of = of_imu(more=(SensorConfig("imu-2", "imu"),))
+def test_two_imus_stay_apart_and_a_silent_one_is_missing() -> None:
+    vehicle = with_imu(more=(SensorConfig("imu-2", "imu"),))
     pair = [imu(0, (1, 0, 0)), imu(0, (2, 0, 0), name="imu-2"), imu(100, (1, 0, 0)), imu(200, (1, 0, 0))]
-    first, second = gather(Steps(of, 0.1), of, pair)
-    assert {name: felt.rates_radps[0] for name, felt in first.felt.items()} == {"imu": 1, "imu-2": 2}
-    assert list(second.felt) == ["imu"]
+    first, second = gather(StepGatherer(vehicle, 0.1), vehicle, pair)
+    assert {name: mean.rates_radps[0] for name, mean in first.imu_means.items()} == {"imu": 1, "imu-2": 2}
+    assert list(second.imu_means) == ["imu"]
 
 
 @pytest.mark.parametrize("rpy_deg", MOUNTS)
 def test_a_mounted_imu_is_turned_into_base_link(rpy_deg: tuple[float, float, float]) -> None:
     mount = Mount((0.4, 0.0, 0.9), rpy_deg)
     rates, force = np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 9.0])
-    raw = mount.base_from_sensor().T
-    step = one(of_imu(mount), [imu(t, raw @ rates, raw @ force) for t in (0, 100)])
-    assert step.felt["imu"].rates_radps == pytest.approx(rates)
-    assert step.felt["imu"].force_mps2 == pytest.approx(force)
+    raw = mount.frame_from_sensor().T
+    step = one(with_imu(mount), [imu(t, raw @ rates, raw @ force) for t in (0, 100)])
+    assert step.imu_means["imu"].rates_radps == pytest.approx(rates)
+    assert step.imu_means["imu"].force_mps2 == pytest.approx(force)
 
 
 @pytest.mark.parametrize("step_s", [0.02, 0.05, 0.2])
 def test_steps_are_step_s_apart(step_s: float) -> None:
-    of = machine(receivers=0)
-    steps = gather(Steps(of, step_s), of, drive([Leg(2, 0.5)], of).readings)
+    vehicle = machine(receivers=0)
+    steps = gather(StepGatherer(vehicle, step_s), vehicle, drive([Leg(2, 0.5)], vehicle).readings)
     assert set(np.diff([s.stamp_ns for s in steps])) == {round(step_s * 1e9)}
     assert len(steps) == round(1.99 / step_s - 0.49)
 
@@ -81,37 +85,37 @@ def test_steps_are_step_s_apart(step_s: float) -> None:
 # --- the front frame of an articulated machine -----------------------------------------------------------------------
 
 
-def articulated(angle_rad: float, rate_radps: float, seconds: float, frame: str = FRONT) -> list[Step]:
+def articulated(angle_rad: float, rate_radps: float, seconds: float, frame: str = FRONT) -> list[FilterStep]:
     """The rear frame turns at 0.2 rad/s and is pulled ahead by 1 m/s2; the IMU rides on the front frame."""
-    of = of_imu(Mount((1.0, 0.0, 0.5), (0.0, 0.0, 90.0)), frame, (SensorConfig("joint", "articulation"),))
+    vehicle = with_imu(Mount((1.0, 0.0, 0.5), (0.0, 0.0, 90.0)), frame, (SensorConfig("joint", "articulation"),))
     readings: list[Reading] = []
     for i in range(round(seconds * 100)):
         angle = angle_rad + rate_radps * i / 100
-        rear_from_sensor = map_from_base(np.array([0.0, 0.0, angle])) @ of.sensors[0].mount.base_from_sensor()
+        rear_from_sensor = map_from_base(np.array([0.0, 0.0, angle])) @ vehicle.sensors[0].mount.frame_from_sensor()
         rates, force = np.array([0.05, 0.02, 0.2]), np.array([1.0, 0.0, GRAVITY_MPS2])
         readings.append(Articulation("joint", START_NS + i * 10 * MS, angle))
         raw = rear_from_sensor.T @ (rates + np.array([0.0, 0.0, rate_radps])), rear_from_sensor.T @ force
         readings.append(imu(10 * i, *raw))
-    return gather(Steps(of, 0.1), of, readings)
+    return gather(StepGatherer(vehicle, 0.1), vehicle, readings)
 
 
 @pytest.mark.parametrize(("angle_rad", "rate_radps"), [(0.0, 0.0), (0.6, 0.0), (-0.5, 0.0), (-0.4, 0.2)])
 def test_front_imu_is_turned_by_the_articulation_and_its_rate_taken_off(angle_rad: float, rate_radps: float) -> None:
-    felt = articulated(angle_rad, rate_radps, 4.0)[-1].felt["imu"]
-    assert felt.rates_radps == pytest.approx([0.05, 0.02, 0.2], abs=1e-3)
-    assert felt.force_mps2 == pytest.approx([1.0, 0.0, GRAVITY_MPS2], abs=1e-3)
+    mean = articulated(angle_rad, rate_radps, 4.0)[-1].imu_means["imu"]
+    assert mean.rates_radps == pytest.approx([0.05, 0.02, 0.2], abs=1e-3)
+    assert mean.force_mps2 == pytest.approx([1.0, 0.0, GRAVITY_MPS2], abs=1e-3)
 
 
 def test_imu_on_the_rear_frame_does_not_care_for_the_articulation() -> None:
-    felt = articulated(0.5, 0.0, 1.0, frame="base_link")[-1].felt["imu"]
-    assert felt.force_mps2[0] == pytest.approx(math.cos(0.5))
-    assert felt.rates_radps[2] == pytest.approx(0.2)
+    mean = articulated(0.5, 0.0, 1.0, frame="base_link")[-1].imu_means["imu"]
+    assert mean.force_mps2[0] == pytest.approx(math.cos(0.5))
+    assert mean.rates_radps[2] == pytest.approx(0.2)
 
 
-def test_front_imu_without_articulation_is_counted_and_left_aside() -> None:
-    of = of_imu(frame=FRONT)
-    steps = Steps(of, 0.1)
-    assert [step.felt for step in gather(steps, of, [imu(t, (0, 0, 1)) for t in range(0, 101, 10)])] == [{}]
+def test_front_imu_without_articulation_is_counted_and_not_used() -> None:
+    vehicle = with_imu(frame=FRONT)
+    steps = StepGatherer(vehicle, 0.1)
+    assert [step.imu_means for step in gather(steps, vehicle, [imu(t, (0, 0, 1)) for t in range(0, 101, 10)])] == [{}]
     assert steps.counters == {"front_imu_without_articulation": 11}
 
 
@@ -129,48 +133,48 @@ def quaternion(rotation: Floats) -> tuple[float, ...]:
 
 
 def attitude(rpy: Iterable[float], mount: Mount, ms: float = 0.0, scale: float = 1.0) -> Attitude:
-    q = quaternion(map_from_base(np.array([*rpy])) @ mount.base_from_sensor())
+    q = quaternion(map_from_base(np.array([*rpy])) @ mount.frame_from_sensor())
     return Attitude("ahrs", START_NS + round(ms * MS), *(scale * v for v in q), 0.01, 0.02, 0.03)
 
 
-def of_ahrs(mount: Mount, frame: str = "base_link") -> MachineConfig:
+def with_ahrs(mount: Mount, frame: str = "base_link") -> MachineConfig:
     return MachineConfig("loader-1", sensors=(SensorConfig("ahrs", "attitude", mount, frame=frame), WHEELS))
 
 
 @pytest.mark.parametrize("rpy_deg", MOUNTS)
 @pytest.mark.parametrize("rpy", [(0.1, -0.2, 3.0), (-0.3, 0.4, -1.2), (0.0, 0.0, 0.5)])
-def test_an_attitude_is_told_as_roll_pitch_yaw_at_any_mount(
+def test_an_attitude_becomes_roll_pitch_yaw_at_any_mount(
     rpy: tuple[float, float, float], rpy_deg: tuple[float, float, float]
 ) -> None:
     mount = Mount((0.0, 0.0, 1.0), rpy_deg)
-    step = one(of_ahrs(mount), [attitude(rpy, mount), attitude(rpy, mount, 100, scale=-1.0005)])
-    told = step.orientations["ahrs"]
-    assert told.values == pytest.approx(rpy, abs=1e-9)
-    assert told.variances.tolist() == [0.01, 0.02, 0.03]
-    assert told.stamp_ns == step.stamp_ns
+    step = one(with_ahrs(mount), [attitude(rpy, mount), attitude(rpy, mount, 100, scale=-1.0005)])
+    value = step.orientations["ahrs"]
+    assert value.values == pytest.approx(rpy, abs=1e-9)
+    assert value.variances.tolist() == [0.01, 0.02, 0.03]
+    assert value.stamp_ns == step.stamp_ns
 
 
-def test_the_last_attitude_of_a_step_is_told_and_once_only() -> None:
-    of = of_ahrs(Mount())
+def test_the_last_attitude_of_a_step_counts_once() -> None:
+    vehicle = with_ahrs(Mount())
     readings: list[Reading] = [attitude((0, 0, t / 100), Mount(), t) for t in (0, 50, 100)]
     readings.append(Encoder("wheels", START_NS + 200 * MS, 0.0, 0.0))
-    first, second = gather(Steps(of, 0.1), of, readings)
+    first, second = gather(StepGatherer(vehicle, 0.1), vehicle, readings)
     assert first.orientations["ahrs"].values[2] == pytest.approx(1.0)
     assert second.orientations == {}
 
 
-def test_an_attitude_of_the_front_frame_is_counted_and_left_aside() -> None:
-    of = of_ahrs(Mount(), FRONT)
-    steps = Steps(of, 0.1)
-    (step,) = gather(steps, of, [attitude((0, 0, 1), Mount(), t) for t in (0, 100)])
+def test_an_attitude_of_the_front_frame_is_counted_and_not_used() -> None:
+    vehicle = with_ahrs(Mount(), FRONT)
+    steps = StepGatherer(vehicle, 0.1)
+    (step,) = gather(steps, vehicle, [attitude((0, 0, 1), Mount(), t) for t in (0, 100)])
     assert step.orientations == {}
     assert steps.counters == {"front_attitude_unused": 2}
 
 
-def test_an_attitude_of_zeros_is_counted_and_left_aside() -> None:
-    of = of_ahrs(Mount())
-    steps = Steps(of, 0.1)
-    (step,) = gather(steps, of, [attitude((0, 0, 1), Mount(), t, scale=0.0) for t in (0, 100)])
+def test_an_attitude_of_zeros_is_counted_and_not_used() -> None:
+    vehicle = with_ahrs(Mount())
+    steps = StepGatherer(vehicle, 0.1)
+    (step,) = gather(steps, vehicle, [attitude((0, 0, 1), Mount(), t, scale=0.0) for t in (0, 100)])
     assert step.orientations == {}
     assert steps.counters == {"attitude_without_direction": 2}
 
@@ -178,37 +182,44 @@ def test_an_attitude_of_zeros_is_counted_and_left_aside() -> None:
 # --- wheels ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_step_tells_speed_and_traction() -> None:
-    of = MachineConfig("cart", sensors=(WHEELS, TORQUE))
-    torque = 0.2 * of.mass_kg * GRAVITY_MPS2 * of.wheel_radius_m
-    turn_m = 2 * math.pi * of.wheel_radius_m
+def test_a_step_holds_speed_and_traction() -> None:
+    vehicle = MachineConfig("cart", sensors=(WHEELS, TORQUE))
+    torque = 0.2 * vehicle.mass_kg * GRAVITY_MPS2 * vehicle.wheel_radius_m
+    turn_m = 2 * math.pi * vehicle.wheel_radius_m
     readings: list[Reading] = [Torque("torque", START_NS, torque)]
     readings += [Encoder("wheels", START_NS + i * 50 * MS, 2.0 * i, 2.0 * i) for i in range(60)]
-    step = gather(Steps(of, 0.1), of, readings)[-1]
+    step = gather(StepGatherer(vehicle, 0.1), vehicle, readings)[-1]
     assert step.speed_mps == pytest.approx(turn_m * 2.0 / 100 / 0.05, abs=1e-4)
     assert step.traction == pytest.approx(0.2)
 
 
 def test_still_since_the_last_travel() -> None:
-    of = MachineConfig("cart", sensors=(WHEELS,))
+    vehicle = MachineConfig("cart", sensors=(WHEELS,))
     ticks = [*range(20), *[20] * 40, *range(21, 31)]  # a second of driving, two of standing, half of driving
     readings = [Encoder("wheels", START_NS + i * 50 * MS, float(t), float(t)) for i, t in enumerate(ticks)]
-    still = [step.still_s for step in gather(Steps(of, 0.1), of, readings)]
+    still = [step.still_s for step in gather(StepGatherer(vehicle, 0.1), vehicle, readings)]
     assert still[:10] == [0.0] * 10
     assert still[10:29] == pytest.approx(np.arange(1, 20) / 10)
     assert still[30:] == [0.0] * len(still[30:])
 
 
 @pytest.mark.parametrize("kind", ["encoder", "odometry"])
-def test_a_step_tells_whether_the_wheels_spoke(kind: str) -> None:
+def test_a_step_shows_whether_wheels_were_read(kind: str) -> None:
     """Silent wheels have no speed, and stand for nothing."""
-    of = of_imu(more=(SensorConfig("w", kind),))
+    vehicle = with_imu(more=(SensorConfig("w", kind),))
 
-    def said(ms: int) -> Reading:
+    def wheels(ms: int) -> Reading:
         stamp_ns = START_NS + ms * MS
         return Encoder("w", stamp_ns, 0.0, 0.0) if kind == "encoder" else Odometry("w", stamp_ns, 0.0, 0.0, 0.0)
 
     readings: list[Reading] = [imu(t, (0, 0, 0)) for t in range(0, 601, 50)]
-    readings += [said(t) for t in (20, 120, 420)]
+    readings += [wheels(t) for t in (20, 120, 420)]
     readings.sort(key=lambda r: r.stamp_ns)
-    assert [s.rolled for s in gather(Steps(of, 0.1), of, readings)] == [True, True, False, False, True, False]
+    assert [s.rolled for s in gather(StepGatherer(vehicle, 0.1), vehicle, readings)] == [
+        True,
+        True,
+        False,
+        False,
+        True,
+        False,
+    ]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agents.sampling import LAG_S
 from evaluation.campaign import recordings, tasks
 from evaluation.campaign.recordings import Setup
 from evaluation.ground import experiment
@@ -143,8 +144,8 @@ def test_a_tour_without_samples_still_has_rows_and_pictures(plan: experiment.Pla
     ground_plots = pytest.importorskip("evaluation.ground.plots", reason="needs the extra `eval`")
     _, outcomes = experiment.run(plan)
     nothing = replace(outcomes[0].run, samples=outcomes[0].run.samples[:0])
-    way, here, task = outcomes[0].way, outcomes[0].ground, outcomes[0].task
-    judged = experiment.judge(nothing.samples, way, here, task.row.options.sampling, outcomes[0].from_ns)
+    way, here = outcomes[0].way, outcomes[0].ground
+    judged = experiment.judge(nothing.samples, way, here, LAG_S, outcomes[0].from_ns)
     silent = replace(outcomes[0], run=nothing, judged=judged)
     row = experiment.summarise(CALIBRATED, [silent, silent])
     assert row["cells"] == 0

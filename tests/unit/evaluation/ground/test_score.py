@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.sampling import SamplingConfig
 from evaluation.ground.lag import crossings, known_ns, lags
 from evaluation.ground.score import Judged, c_rr_bias, figures, gather, judge, place, pool, soils
 from evaluation.ground.truth import Ground, Way, border_distance, lay_ground, read_way
@@ -17,7 +16,7 @@ from sim.scenario.ground import GroundConfig, RampConfig, ZoneConfig
 SPEED_MPS, EVERY_M = 2.0, 0.5
 BORDER_M = 20.0
 START_NS = 10**15
-LAG = SamplingConfig(lag_s=0.5)
+LAG_S = 0.5
 WET = ZoneConfig("wet dirt", ((BORDER_M, 0.0), (60.0, 0.0), (60.0, 20.0), (BORDER_M, 20.0)))
 
 
@@ -51,7 +50,7 @@ def steps_at(border_m: float):
 
 def test_a_right_estimate_has_right_figures():
     way, here = drive_east(), ground(WET)
-    found = figures(judge(samples_of(way, steps_at(BORDER_M)), way, here, LAG, START_NS))
+    found = figures(judge(samples_of(way, steps_at(BORDER_M)), way, here, LAG_S, START_NS))
     assert found["right_class_pct"] == found["dirt_flat_right_pct"] == 100.0
     assert found["wrong_cells_pct"] == found["wrong_cells_interior_pct"] == found["wrong_slope_cells_pct"] == 0.0
     assert (found["cells"], found["judged_samples"], found["changes"]) == (40, 80, 1)
@@ -62,21 +61,21 @@ def test_a_right_estimate_has_right_figures():
 def test_an_estimate_that_comes_late_is_wrong_right_behind_the_border():
     """Placed 3 m too far: six samples and three cells of forty; one of them is more than 2 m inside."""
     way, here = drive_east(), ground(WET)
-    judged = judge(samples_of(way, steps_at(BORDER_M + 3.0)), way, here, LAG, START_NS)
+    judged = judge(samples_of(way, steps_at(BORDER_M + 3.0)), way, here, LAG_S, START_NS)
     found = figures(judged)
     assert found["right_class_pct"] == pytest.approx(100 * 74 / 80)
     assert found["wrong_cells_pct"] == pytest.approx(100 * 3 / 40)
     assert found["wrong_cells_interior_pct"] == pytest.approx(100 * 1 / 36)
     assert found["place_off_m"] == pytest.approx(3.25, abs=0.03)  # of the first sample behind, in its stretch's middle
-    assert found["lag_m"] == pytest.approx(3.25 + LAG.lag_s * SPEED_MPS, abs=0.03)
-    assert found["lag_s"] == pytest.approx((3.25 + LAG.lag_s * SPEED_MPS) / SPEED_MPS, abs=0.02)
+    assert found["lag_m"] == pytest.approx(3.25 + LAG_S * SPEED_MPS, abs=0.03)
+    assert found["lag_s"] == pytest.approx((3.25 + LAG_S * SPEED_MPS) / SPEED_MPS, abs=0.02)
     wet = next(soil for soil in soils(judged) if soil["name"] == "wet dirt")
     assert (wet["cells"], wet["right_pct"], wet["taken_for"]) == (20, 85.0, {"dry dirt": 3})
 
 
 def test_samples_that_are_dated_back_too_far_lie_before_the_border():
     way, here = drive_east(), ground(WET)
-    found = figures(judge(samples_of(way, steps_at(BORDER_M - 0.5)), way, here, LAG, START_NS))
+    found = figures(judge(samples_of(way, steps_at(BORDER_M - 0.5)), way, here, LAG_S, START_NS))
     assert found["place_off_m"] == pytest.approx(-0.25, abs=0.03)
     assert found["lag_m"] == pytest.approx(0.75, abs=0.03)
 
@@ -86,9 +85,9 @@ def test_a_change_that_is_never_noticed_has_no_lag_and_one_that_is_noticed_befor
     changes = crossings(way, here, START_NS)
     assert [(c.old, c.new) for c in changes] == [(0.04, 0.06)]
     assert changes[0].driven_m == pytest.approx(BORDER_M, abs=0.03)
-    assert np.isinf(lags(samples_of(way, 0.04), way, changes, LAG)).all()
-    assert lags(samples_of(way, 0.06), way, changes, LAG).shape == (0, 3)
-    assert np.isnan(figures(judge(samples_of(way, 0.04), way, here, LAG, START_NS))["lag_s"])
+    assert np.isinf(lags(samples_of(way, 0.04), way, changes, LAG_S)).all()
+    assert lags(samples_of(way, 0.06), way, changes, LAG_S).shape == (0, 3)
+    assert np.isnan(figures(judge(samples_of(way, 0.04), way, here, LAG_S, START_NS))["lag_s"])
 
 
 @pytest.mark.parametrize(("soil", "width_m", "count"), [("wet dirt", 3.0, 0), ("wet dirt", 5.0, 2), ("gravel", 5.0, 2)])
@@ -99,19 +98,19 @@ def test_only_zones_that_last_have_a_lag(soil, width_m, count):
 
 def test_samples_are_known_when_the_lag_has_passed():
     rows = samples_of(drive_east())
-    assert (known_ns(rows, LAG) - rows["stamp_ns"] == 500_000_000).all()
+    assert (known_ns(rows, LAG_S) - rows["stamp_ns"] == 500_000_000).all()
 
 
 def test_nothing_is_judged_before_the_machine_has_settled():
     way, here = drive_east(), ground(WET)
     wrong_at_first = samples_of(way, lambda x: np.where(x < 10, 0.25, np.where(x < BORDER_M, 0.04, 0.06)))
-    found = figures(judge(wrong_at_first, way, here, LAG, START_NS + 5_000_000_000))
+    found = figures(judge(wrong_at_first, way, here, LAG_S, START_NS + 5_000_000_000))
     assert (found["right_class_pct"], found["cells"]) == (100.0, 30)
 
 
 def test_a_bias_is_found_on_flat_ground_away_from_borders():
     way, here = drive_east(), ground(WET)
-    judged = judge(samples_of(way, lambda x: steps_at(BORDER_M)(x) + 0.004), way, here, LAG, START_NS)
+    judged = judge(samples_of(way, lambda x: steps_at(BORDER_M)(x) + 0.004), way, here, LAG_S, START_NS)
     assert c_rr_bias(judged) == pytest.approx(0.004, abs=1e-6)
     assert figures(judged)["normalised_error"] == pytest.approx(2.0, abs=1e-3)
 
@@ -119,7 +118,7 @@ def test_a_bias_is_found_on_flat_ground_away_from_borders():
 def test_unknown_resistance_does_not_count_but_its_slope_does():
     way = drive_east()
     rows = samples_of(way, lambda x: np.where(x < 20, 0.04, np.nan), c_rr_var=lambda x: np.where(x < 20, 1e-6, np.nan))
-    judged = judge(rows, way, ground(), LAG, START_NS)
+    judged = judge(rows, way, ground(), LAG_S, START_NS)
     assert (len(judged.class_right), len(judged.cell_found), len(judged.slope_found)) == (40, 20, 40)
 
 
@@ -137,7 +136,7 @@ def test_gradients_are_compared_along_the_true_heading():
     """Facing north, 1 degree too steep ahead and 2 degrees to the left, which is west."""
     way = replace(drive_east(), yaw_rad=np.full(201, np.pi / 2))
     one, two = np.tan(np.radians([1.0, 2.0]))
-    found = figures(judge(samples_of(way, grade_n=one, grade_e=-two), way, ground(), LAG, START_NS))
+    found = figures(judge(samples_of(way, grade_n=one, grade_e=-two), way, ground(), LAG_S, START_NS))
     assert found["grade_bias_deg"] == pytest.approx(1.0, abs=1e-4)
     assert found["across_bias_deg"] == pytest.approx(2.0, abs=1e-4)
     assert found["grade_std_deg"] == pytest.approx(0.0, abs=1e-4)
@@ -151,30 +150,30 @@ def test_slopes_have_cells_and_edges_of_their_own():
     way = replace(way, gradient=ramped.slope(way.place_m))
     seen = ramped.slope(way.place_m)[:, 0]
     rows = samples_of(way, grade_e=lambda x: np.interp(x, way.driven_m, seen))
-    found = figures(judge(rows, way, ramped, LAG, START_NS))
+    found = figures(judge(rows, way, ramped, LAG_S, START_NS))
     assert found["wrong_slope_cells_pct"] == 0.0
     assert found["grade_left_out_pct"] == pytest.approx(100 * 2 * 6 / 40, abs=3)
     assert found["grade_std_deg"] == pytest.approx(0.0, abs=0.05)
-    flat = figures(judge(samples_of(way), way, ramped, LAG, START_NS))
+    flat = figures(judge(samples_of(way), way, ramped, LAG_S, START_NS))
     assert flat["wrong_slope_cells_pct"] == pytest.approx(100 * 10 / 40)
 
 
 def test_unevenness_is_no_edge_of_a_ramp_and_leaves_ground_flat():
-    judged = judge(samples_of(drive_east()), drive_east(), ground(roughness_m=0.03), LAG, START_NS)
+    judged = judge(samples_of(drive_east()), drive_east(), ground(roughness_m=0.03), LAG_S, START_NS)
     assert not judged.edge.any()
     assert judged.is_flat.all()
 
 
 def test_pooled_tours_weigh_by_their_samples():
     way, here = drive_east(), ground()
-    right, wrong = (judge(samples_of(way, c), way, here, LAG, START_NS) for c in (0.04, 0.06))
+    right, wrong = (judge(samples_of(way, c), way, here, LAG_S, START_NS) for c in (0.04, 0.06))
     assert figures(pool([right, wrong, wrong]))["right_class_pct"] == pytest.approx(100 / 3)
     assert isinstance(pool([right]), Judged)
 
 
 def test_nothing_judged_is_nothing_known():
     way, here = drive_east(), ground(WET)
-    judged = judge(samples_of(way)[:0], way, here, LAG, START_NS)
+    judged = judge(samples_of(way)[:0], way, here, LAG_S, START_NS)
     found = figures(judged)
     assert found["cells"] == found["judged_samples"] == 0
     assert np.isnan([found["right_class_pct"], found["wrong_cells_pct"], found["lag_s"], c_rr_bias(judged)]).all()

@@ -9,7 +9,7 @@ import pytest
 
 from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.filters.belief import PoseBelief
-from agents.pipeline import Locates, Pipeline, PipelineConfig, Positioning
+from agents.pipeline import Pipeline, PipelineConfig, PoseSource, Positioning
 from evaluation.positions.replay import STEP_NS, Trace, Truth, read_track, replay, score
 from protocol.machine.readings import Articulation, Reading
 from sim.config import SimConfig
@@ -99,8 +99,8 @@ def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipel
     site, machine = simulator.site, simulator.machines[0]
     traces, judged = [], []
     for kind in (Pipeline, Positioning):
-        core: Locates = kind(site, machine, PipelineConfig())
-        holdout = Holdout(site, machine, HoldoutConfig(settle_s=5.0))
+        core: PoseSource = kind(site, machine, PipelineConfig())
+        holdout = Holdout(site, machine, HoldoutConfig(), settle_s=5.0)
         traces.append(replay(core, readings, holdout))
         judged.append(holdout.report())
     whole, half = traces

@@ -7,7 +7,7 @@ import pytest
 
 from protocol.config import from_table
 from protocol.errors import ConfigError
-from protocol.machine.machine_config import GIVES, MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
+from protocol.machine.machine_config import QUANTITIES, MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
 from protocol.machine.readings import KINDS
 
 GPS = SensorConfig("gps-1", "gps", Mount((1.5, -0.5, 3.25), (0.0, 0.0, 180.0)), drift_share=0.5, use=False)
@@ -33,11 +33,11 @@ def test_machine_as_toml_reads_back():
     ],
 )
 def test_mount_turns_axes(rpy_deg, axis, expected):
-    assert Mount(rpy_deg=rpy_deg).base_from_sensor() @ axis == pytest.approx(expected, abs=1e-12)
+    assert Mount(rpy_deg=rpy_deg).frame_from_sensor() @ axis == pytest.approx(expected, abs=1e-12)
 
 
 def test_mount_is_a_rotation():
-    rotation = Mount(rpy_deg=(10.0, -20.0, 130.0)).base_from_sensor()
+    rotation = Mount(rpy_deg=(10.0, -20.0, 130.0)).frame_from_sensor()
     assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
     assert math.isclose(np.linalg.det(rotation), 1.0)
 
@@ -60,7 +60,7 @@ def test_impossible_machine_is_refused(change):
         {"drift_time_s": 0.0},
         {"ticks_per_rev": 0},
         {"frame": "bucket_link"},
-        {"gives": ("force",)},
+        {"measures": ("force",)},
         {"std": {"force": 1.0}},
         {"mode": "total"},
         {"delay_s": -0.1},
@@ -73,12 +73,12 @@ def test_impossible_sensor_is_refused(change):
         dataclasses.replace(GPS, **change)
 
 
-def test_a_sensor_may_give_a_part_of_what_its_kind_does():
-    imu = SensorConfig("imu", "imu", gives=("rate",))
-    assert (imu.says("rate"), imu.says("force")) == (True, False)
-    assert SensorConfig("imu", "imu").says("force")
-    with pytest.raises(ValueError, match="gives: imu: imu has no 'tilt', but rate, force"):
-        SensorConfig("imu", "imu", gives=("tilt",))
+def test_a_sensor_may_measure_a_part_of_what_its_kind_does():
+    imu = SensorConfig("imu", "imu", measures=("rate",))
+    assert (imu.provides("rate"), imu.provides("force")) == (True, False)
+    assert SensorConfig("imu", "imu").provides("force")
+    with pytest.raises(ValueError, match="measures: imu: imu has no 'tilt', but rate, force"):
+        SensorConfig("imu", "imu", measures=("tilt",))
 
 
 def test_every_option_of_a_machine_is_written_and_read_back():
@@ -90,7 +90,7 @@ def test_every_option_of_a_machine_is_written_and_read_back():
 
 
 @pytest.mark.parametrize("name", ["wheelbase_m", "axle_stiffness_npm", "cog_height_m", "payload_z_m"])
-def test_what_a_maker_may_not_tell_is_0_or_positive(name):
+def test_what_a_maker_may_not_state_is_0_or_positive(name):
     assert getattr(MACHINE, name) == 0.0
     for bad in (-0.1, math.nan, math.inf):
         with pytest.raises(ValueError, match=name):
@@ -100,7 +100,7 @@ def test_what_a_maker_may_not_tell_is_0_or_positive(name):
 def test_every_option_of_a_sensor_is_written_and_read_back():
     std = {"rate": 1e-5, "force": 1.5}
     imu = SensorConfig(
-        "imu", "imu", use=False, gives=("rate",), delay_s=0.2, gate_sigma=5.0, frame="front_link", std=std
+        "imu", "imu", use=False, measures=("rate",), delay_s=0.2, gate_sigma=5.0, frame="front_link", std=std
     )
     gps = dataclasses.replace(GPS, mode="relative")
     table = tomllib.loads(machine_toml(MachineConfig("a", sensors=(imu, gps))))
@@ -109,8 +109,8 @@ def test_every_option_of_a_sensor_is_written_and_read_back():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_standard_deviation_goes_by_what_the_kind_gives(kind):
-    for name in GIVES.get(kind, ()):
+def test_a_standard_deviation_goes_by_a_quantity_of_the_kind(kind):
+    for name in QUANTITIES.get(kind, ()):
         assert SensorConfig("a", kind, std={name: 0.5}).std[name] == 0.5
         for bad in (0.0, -1.0, math.nan, math.inf):
             with pytest.raises(ValueError, match=f"std: a: {name} must be positive and finite"):

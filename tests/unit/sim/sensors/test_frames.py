@@ -10,7 +10,7 @@ VECTOR = np.array([0.3, -0.5, 0.9])
 
 
 def matrix(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    return Mount(rpy_deg=tuple(np.degrees([roll, pitch, yaw]))).base_from_sensor()
+    return Mount(rpy_deg=tuple(np.degrees([roll, pitch, yaw]))).frame_from_sensor()
 
 
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -92,7 +92,7 @@ def test_imu_off_the_frames_origin_feels_the_rotation() -> None:
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    return Mount(rpy_deg=tuple(np.degrees([roll, pitch, yaw]))).base_from_sensor()
+    return Mount(rpy_deg=tuple(np.degrees([roll, pitch, yaw]))).frame_from_sensor()
 
 
 def place(t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +110,7 @@ def sensor_place(t: float, number: int) -> tuple[np.ndarray, np.ndarray]:
     at, turn = place(t)
     if frame == FRONT:
         at, turn = at + turn @ LOADER.robot.place(FRONT, BASE).xyz_m, turn @ rotation(0, 0, angle(t))
-    return at + turn @ mount.xyz_m, turn @ mount.base_from_sensor()
+    return at + turn @ mount.xyz_m, turn @ mount.frame_from_sensor()
 
 
 def rate_and_force(pose: object, t: float, h: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +154,7 @@ def test_attitude_turns_vectors_of_the_sensor_into_map(number: int) -> None:
     state = {"yaw_rad": yaw, "pitch_rad": pitch, "roll_rad": roll, "articulation_rad": bend}
     q = values(rig(perfect(), attitude=(number,), only="attitude"), "attitude", 0.02, **state)[0, 0, :4]
     map_from_sensor = rotation(roll, pitch, yaw) @ rotation(0, 0, bend if frame == FRONT else 0)
-    map_from_sensor = map_from_sensor @ mount.base_from_sensor()
+    map_from_sensor = map_from_sensor @ mount.frame_from_sensor()
     for vector in np.eye(3):
         np.testing.assert_allclose(turned(q, vector), map_from_sensor @ vector, atol=1e-8)
     assert np.linalg.norm(q) == pytest.approx(1.0)

@@ -141,7 +141,7 @@ def test_rates_are_those_of_the_turning_frame() -> None:
     matrices = []
     for state in states:
         angles = np.degrees([state.roll_rad[0], state.pitch_rad[0], state.yaw_rad[0]])
-        matrices.append(Mount(rpy_deg=tuple(angles)).base_from_sensor())
+        matrices.append(Mount(rpy_deg=tuple(angles)).frame_from_sensor())
     turn = matrices[0].T @ (matrices[1] - matrices[0]) / STEP_S
     expected = [turn[2, 1], turn[0, 2], turn[1, 0]]
     assert abs(expected[2]) > 0.1

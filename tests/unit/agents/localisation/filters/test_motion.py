@@ -1,10 +1,22 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from agents.localisation.filters.belief import Belief
-from agents.localisation.filters.motion import OFF_PLANE_VARIANCE, GpsError, MotionConfig, map_from_base, motion
+from agents.localisation.filters.motion import (
+    HEIGHT_WALK,
+    OFF_PLANE_VARIANCE,
+    SLIP_ACROSS,
+    SLIP_ALONG,
+    SLIP_STD,
+    SLIP_TIME_S,
+    GpsError,
+    MotionModel,
+    map_from_base,
+    motion,
+)
 from agents.localisation.filters.state import (
     ACCELERATION,
     ANGLES,
@@ -22,7 +34,8 @@ from protocol.machine.machine_config import Mount
 
 PAPER, FULL = Layout(), Layout(imus=2, wheel_scale=True, receivers=2)
 ERRORS = (GpsError(3.0, 45.0), GpsError(1.5, 20.0))
-CONFIG, PLANE = MotionConfig(), MotionConfig(two_d=True)
+SPACE, PLANE = MotionModel(FULL, gps_errors=ERRORS), MotionModel(FULL, on_plane=True, gps_errors=ERRORS)
+PLAIN = MotionModel(PAPER)
 
 
 def at(x: Floats) -> Belief:
@@ -35,9 +48,9 @@ def somewhere(seed: int, n: int, pitch: float) -> Floats:
     return x
 
 
-def driven(x: Floats, seconds: float, steps: int, config: MotionConfig = CONFIG) -> Floats:
+def driven(x: Floats, seconds: float, steps: int) -> Floats:
     for _ in range(steps):
-        x = motion(PAPER, config, at(x), seconds / steps).f(x[None])[0]
+        x = motion(PLAIN, at(x), seconds / steps).f(x[None])[0]
     return x
 
 
@@ -98,15 +111,15 @@ def test_attitude_follows_the_bodys_rates(pitch: float) -> None:
 def test_rotation_equals_that_of_a_mount() -> None:
     attitude = np.array([0.3, -0.7, 2.1])
     mount = Mount(rpy_deg=tuple(np.degrees(attitude).tolist()))
-    np.testing.assert_allclose(map_from_base(attitude), mount.base_from_sensor(), atol=1e-15)
+    np.testing.assert_allclose(map_from_base(attitude), mount.frame_from_sensor(), atol=1e-15)
 
 
-@pytest.mark.parametrize("config", [CONFIG, PLANE])
+@pytest.mark.parametrize("model", [SPACE, PLANE], ids=["space", "plane"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("pitch", [-1.0, 0.2, 1.0])
-def test_jacobian_is_that_of_finite_differences(config: MotionConfig, seed: int, pitch: float) -> None:
+def test_jacobian_is_that_of_finite_differences(model: MotionModel, seed: int, pitch: float) -> None:
     x = somewhere(seed, FULL.n, pitch)
-    moves = motion(FULL, config, at(x), 0.1, ERRORS)
+    moves = motion(model, at(x), 0.1)
     h = 1e-6
     numeric = (moves.f(x + h * np.eye(FULL.n)) - moves.f(x - h * np.eye(FULL.n))).T / (2 * h)
     np.testing.assert_allclose(moves.jacobian(x), numeric, atol=1e-8)
@@ -115,7 +128,7 @@ def test_jacobian_is_that_of_finite_differences(config: MotionConfig, seed: int,
 def test_many_states_move_as_each_alone() -> None:
     states = np.random.default_rng(5).normal(size=(7, FULL.n))
     before = states.copy()
-    moves = motion(FULL, CONFIG, at(states[0]), 0.05, ERRORS)
+    moves = motion(SPACE, at(states[0]), 0.05)
     np.testing.assert_allclose(moves.f(states), [moves.f(state[None])[0] for state in states], rtol=0, atol=1e-14)
     np.testing.assert_array_equal(states, before)
 
@@ -123,21 +136,21 @@ def test_many_states_move_as_each_alone() -> None:
 @pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2, math.pi / 2 + 1e-9])
 def test_straight_up_is_survived(pitch: float) -> None:
     x = somewhere(1, 15, pitch)
-    moves = motion(PAPER, CONFIG, at(x), 0.01)
+    moves = motion(PLAIN, at(x), 0.01)
     assert np.abs(moves.f(x[None])).max() < 10
     assert np.isfinite(moves.jacobian(x)).all()
 
 
 def test_on_a_plane_nothing_leaves_it() -> None:
     x = somewhere(2, FULL.n, 0.5)
-    moves = motion(FULL, PLANE, at(x), 0.1, ERRORS)
+    moves = motion(PLANE, at(x), 0.1)
     assert not moves.f(x[None])[0, OFF_PLANE].any()
     F = moves.jacobian(x)
     assert not F[OFF_PLANE].any()
     assert not F[:, OFF_PLANE].any()
     assert (np.diag(moves.Q)[OFF_PLANE] == OFF_PLANE_VARIANCE).all()
     x[OFF_PLANE] = 0.0
-    np.testing.assert_allclose(moves.f(x[None])[0], motion(FULL, CONFIG, at(x), 0.1, ERRORS).f(x[None])[0], atol=1e-15)
+    np.testing.assert_allclose(moves.f(x[None])[0], motion(SPACE, at(x), 0.1).f(x[None])[0], atol=1e-15)
 
 
 # --- noise -----------------------------------------------------------------------------------------------------------
@@ -146,8 +159,8 @@ def test_on_a_plane_nothing_leaves_it() -> None:
 def test_gps_errors_fade_exactly_and_keep_their_variance() -> None:
     """Ten short steps equal a long one, and a stationary process stays as wide as it is."""
     x = np.ones(FULL.n)
-    one = motion(FULL, CONFIG, at(x), 5.0, ERRORS)
-    part = motion(FULL, CONFIG, at(x), 0.5, ERRORS)
+    one = motion(SPACE, at(x), 5.0)
+    part = motion(SPACE, at(x), 0.5)
     errors = FULL.gps_errors
     decay, short = (np.diag(m.jacobian(x))[errors] for m in (one, part))
     np.testing.assert_allclose(decay, np.exp(-5.0 / np.array([45.0, 45.0, 20.0, 20.0])))
@@ -160,40 +173,43 @@ def test_gps_errors_fade_exactly_and_keep_their_variance() -> None:
 def test_at_a_standstill_nothing_slips() -> None:
     x = np.zeros(15)
     x[YAW] = 0.8
-    Q = motion(PAPER, CONFIG, at(x), 0.1).Q[POSITION, POSITION]
-    np.testing.assert_allclose(Q, np.diag([0.0, 0.0, CONFIG.height_walk**2 * 0.1]))
+    Q = motion(PLAIN, at(x), 0.1).Q[POSITION, POSITION]
+    np.testing.assert_allclose(Q, np.diag([0.0, 0.0, HEIGHT_WALK**2 * 0.1]))
 
 
 def test_slip_lies_along_and_across_the_body() -> None:
     x = np.zeros(15)
     x[ATTITUDE], x[VELOCITY] = (0.1, -0.2, 2.5), (-3.0, 0.0, 0.0)
-    moves = motion(PAPER, CONFIG, at(x), 0.5, slip_m2=0.25)
+    moves = motion(replace(PLAIN, traction=0.3), at(x), 0.5)
     R = map_from_base(x[ATTITUDE])
-    height = np.diag([0.0, 0.0, CONFIG.height_walk**2 * 0.5])
-    along, across = CONFIG.slip_along**2 * 1.5 + 0.25, CONFIG.slip_across**2 * 1.5
+    height = np.diag([0.0, 0.0, HEIGHT_WALK**2 * 0.5])
+    wrong_slip_m2 = SLIP_STD**2 * 2 * SLIP_TIME_S * (0.3 * 3.0) ** 2 * 0.5
+    along, across = SLIP_ALONG**2 * 1.5 + wrong_slip_m2, SLIP_ACROSS**2 * 1.5
     expected = np.diag([along, across, 0.0])
     np.testing.assert_allclose(R.T @ (moves.Q[POSITION, POSITION] - height) @ R, expected, atol=1e-15)
 
 
 def test_noise_is_symmetric_and_not_handed_out_twice() -> None:
     x = somewhere(4, FULL.n, 0.3)
-    first = motion(FULL, CONFIG, at(x), 0.1, ERRORS).Q
+    first = motion(SPACE, at(x), 0.1).Q
     np.testing.assert_allclose(first, first.T, rtol=0, atol=1e-18)
     kept = first.copy()
     first[:] = 99.0
-    np.testing.assert_array_equal(motion(FULL, CONFIG, at(x), 0.1, ERRORS).Q, kept)
+    np.testing.assert_array_equal(motion(SPACE, at(x), 0.1).Q, kept)
+
+
+@pytest.mark.parametrize(("dt_s", "std_radps"), [(0.1, 0.02), (2.0, 0.1)])
+def test_error_of_an_odometrys_turn_changes_in_a_minute(dt_s: float, std_radps: float) -> None:
+    x = np.zeros(FULL.n)
+    turning = motion(replace(SPACE, turn_error_radps=std_radps), at(x), dt_s)
+    added = np.diag(turning.Q - motion(SPACE, at(x), dt_s).Q)
+    assert np.flatnonzero(added).tolist() == [FULL.gyro_biases.stop - 1]
+    assert added[FULL.gyro_biases.stop - 1] == pytest.approx(2 * std_radps**2 * dt_s / 60)
 
 
 def test_errors_and_receivers_must_be_as_many() -> None:
     with pytest.raises(ValueError, match="1 GPS errors for 2 receivers"):
-        motion(FULL, CONFIG, at(np.zeros(FULL.n)), 0.1, ERRORS[:1])
-
-
-@pytest.mark.parametrize("name", [name for name in MotionConfig.__dataclass_fields__ if name != "two_d"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_bad_noise_is_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
-        MotionConfig(**{name: value})
+        MotionModel(FULL, gps_errors=ERRORS[:1])
 
 
 @pytest.mark.parametrize(("variance_m2", "time_s"), [(0.0, 1.0), (1.0, 0.0), (math.nan, 1.0), (1.0, math.inf)])

@@ -1,0 +1,101 @@
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.dead_reckoning import DeadReckonedPose
+from agents.localisation.alignment import DISTANCE_M, align, align_fixes, align_start, start_belief
+from agents.localisation.filters.state import ATTITUDE, SPEED, YAW, Layout
+from agents.localisation.gps import Fix
+from agents.localisation.imu_steps import FilterStep
+from protocol.machine.machine_config import Mount, SensorConfig
+from protocol.units import GRAVITY_MPS2
+
+
+def test_no_alignment_where_all_positions_coincide() -> None:
+    assert align(np.full((9, 2), 3.0), np.random.default_rng(0).normal(size=(9, 2)), 1.0) is None
+
+
+def fixes(length_m: float, turn_rad: float, n: int = 8, **options: Any) -> list[Fix]:
+    """Of a straight drive ahead in dead reckoning, that leads from (5, 7) in a direction of the map; 1 and 3 m2."""
+    sensor = SensorConfig("gps", "gps", Mount((1.0, 0.0, 3.0)), **options)
+    along = np.linspace(0.0, length_m, n)
+    c, s = math.cos(turn_rad), math.sin(turn_rad)
+    return [
+        Fix(i, sensor, np.array([5 + c * (x + 1), 7 + s * (x + 1)]), np.array([1.0, 3.0]), reckoned(x))
+        for i, x in enumerate(along.tolist())
+    ]
+
+
+def reckoned(x_m: float = 0.0) -> DeadReckonedPose:
+    return DeadReckonedPose(0, x_m, 0.0, x_m, 0.0)
+
+
+def test_fixes_show_how_the_reckoned_frame_lies() -> None:
+    alignment = align_fixes(fixes(20.0, 0.9), 20.0)
+    assert alignment
+    assert alignment.rotation_rad == pytest.approx(0.9)
+    assert alignment.origin_m == pytest.approx((5.0, 7.0))
+    assert alignment.fix_std_m == pytest.approx(math.sqrt(2.0))
+
+
+@pytest.mark.parametrize(
+    ("collected", "distance_m"),
+    [
+        (fixes(20.0, 0.9), DISTANCE_M - 0.1),  # too short a way
+        (fixes(20.0, 0.9, n=3), 20.0),  # too few
+        (fixes(2.0, 0.9), 20.0),  # there and back, in one place
+        (fixes(20.0, 0.9, mode="relative"), 20.0),  # nothing absolute
+    ],
+)
+def test_heading_is_not_taken_from_too_little(collected: list[Fix], distance_m: float) -> None:
+    assert align_fixes(collected, distance_m) is None
+
+
+def step(force: tuple[float, float, float] | None = None) -> tuple[FilterStep, list[Any]]:
+    first = FilterStep(9, DeadReckonedPose(9, 0.0, 0.3, 0.0, 0.0), {}, {}, 1.5, True, 0.0, 0.0)
+    return first, [np.array(force)] if force else []
+
+
+def test_start_lies_where_it_is_given_and_as_the_forces_show() -> None:
+    """0.1 rad to its right side and 0.2 rad nose up."""
+    force = (GRAVITY_MPS2 * math.sin(0.2), GRAVITY_MPS2 * math.sin(0.1), 9.0)
+    alignment = align_start((50.0, 60.0, 3.0), step()[0].reckoned)
+    belief = start_belief(alignment, *step(force), Layout(imus=1, wheel_scale=True), 0.0)
+    assert belief.x[:2] == pytest.approx((50.0, 60.0))
+    assert belief.x[ATTITUDE] == pytest.approx((0.1, -0.2, 3.0))
+    assert (belief.stamp_ns, belief.x[SPEED]) == (9, 1.5)
+    assert np.linalg.eigvalsh(belief.P).min() > 0
+    unforced = start_belief(alignment, *step(), Layout(), 0.0)
+    assert unforced.x[ATTITUDE][:2].tolist() == [0.0, 0.0]
+
+
+def test_a_spread_twice_as_large_makes_the_heading_surer() -> None:
+    stds = []
+    for length_m in (20.0, 40.0):
+        alignment = align_fixes(fixes(length_m, 0.9), length_m)
+        assert alignment
+        stds.append(math.sqrt(start_belief(alignment, *step(), Layout(), 0.0).P[YAW, YAW]))
+    assert stds[1] < 0.75 * stds[0]
+
+
+def test_lasting_error_of_a_turn_has_its_own_deviation() -> None:
+    alignment = align_start((0.0, 0.0, 0.0), step()[0].reckoned)
+    layout = Layout(imus=2)
+    variances = np.diag(start_belief(alignment, *step(), layout, 0.02).P)[layout.gyro_biases]
+    assert variances == pytest.approx([5e-3**2, 0.02**2])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_align_recovers_rotation_and_shift(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    reckoned = rng.uniform(-20, 20, (30, 2))
+    rotation, shift = rng.uniform(-math.pi, math.pi), rng.uniform(-500, 500, 2)
+    c, s = math.cos(rotation), math.sin(rotation)
+    alignment = align(reckoned, reckoned @ np.array([[c, s], [-s, c]]) + shift, 2.0)
+    assert alignment
+    assert alignment.rotation_rad == pytest.approx(rotation), f"seed={seed}"
+    assert alignment.origin_m == pytest.approx(tuple(shift)), f"seed={seed}"
+    spread_m = float(np.sqrt(reckoned.var(axis=0).sum()))
+    assert alignment.std_rad == pytest.approx(2.0 / (2 * spread_m))
