@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from agents.sampling import SamplingConfig
 from evaluation.ground.lag import C_RR, crossings, lags
 from evaluation.ground.truth import CELL_M, LoadTrack, TrueGround
 from protocol.arrays import Bools, Floats, Ints, Table
-from protocol.site.ground_classes import UNKNOWN, resistance_class, slope_class
+from protocol.site.ground_classes import resistance_class, slope_class
 
 FLAT_SLOPE = math.tan(math.radians(2.0))
 EDGE_M, EDGE_DEG = 2.0, 0.5  # at the edge of a ramp the gradient changes by more than this, this far around
@@ -42,9 +43,19 @@ class PlacedSamples:
         return np.asarray(self.samples["c_rr"], np.float64)
 
     @property
-    def true_c_rr(self) -> Floats:
-        """That of the zone (n,)."""
-        return np.asarray(C_RR[self.zone], np.float64)
+    def c_rr_error(self) -> Floats:
+        """Estimate minus the value of the zone (n,)."""
+        return self.c_rr - C_RR[self.zone]
+
+    @property
+    def normalised_error(self) -> Floats:
+        """The error over its stated standard deviation (n,)."""
+        return self.c_rr_error / np.sqrt(np.asarray(self.samples["c_rr_var"], np.float64))
+
+    @property
+    def is_right(self) -> Bools:
+        """Whether the estimate is in the class of the zone (n,)."""
+        return resistance_class(self.c_rr) == resistance_class(C_RR[self.zone])
 
     @property
     def gradient(self) -> Floats:
@@ -60,8 +71,6 @@ class CellMeans:
     over the cell without unevenness (k, 2).
     """
 
-    column: Ints
-    row: Ints
     estimated: Ints
     true: Ints
     border_m: Floats
@@ -72,62 +81,32 @@ class CellMeans:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Estimates against the truth, from which figures are made; those of several tours can be pooled.
+    """Estimates against the truth, from which figures are made. lags: see `evaluation.ground.lag.lags`."""
 
-    class_right: of samples with an estimate. cell_*: by cells with an estimate. slope_*: by cells with a gradient.
-    c_rr_error, c_rr_std, border_m, is_flat: of samples with an estimate. along_deg, across_deg: errors of the gradient
-    away from the edges of ramps. edge: of all samples with a gradient. lags: see `evaluation.ground.lag.lags`.
-    """
-
-    class_right: Bools
-    cell_estimated: Ints
-    cell_true: Ints
-    cell_border_m: Floats
-    cell_flat: Bools
-    slope_estimated: Ints
-    slope_true: Ints
-    c_rr_error: Floats
-    c_rr_std: Floats
-    border_m: Floats
-    is_flat: Bools
-    along_deg: Floats
-    across_deg: Floats
-    edge: Bools
+    placed: PlacedSamples
+    cells: CellMeans
     lags: Floats
 
 
 def compare(samples: Table, track: LoadTrack, ground: TrueGround, sampling: SamplingConfig, from_ns: int) -> Comparison:
     """Compare the samples of one drive with the truth, from an instant on."""
     placed = place(samples, track, ground, from_ns)
-    cells = cell_means(placed, ground)
-    known = np.isfinite(placed.c_rr)
-    cell = cells.estimated != UNKNOWN
-    sloped = cells.estimated_slope != UNKNOWN
-    measured = np.isfinite(placed.gradient).all(axis=1)
-    along, across = grade_errors(placed)
-    plain = measured & ~placed.is_edge
-    return Comparison(
-        class_right=(resistance_class(placed.c_rr) == resistance_class(placed.true_c_rr))[known],
-        cell_estimated=cells.estimated[cell],
-        cell_true=cells.true[cell],
-        cell_border_m=cells.border_m[cell],
-        cell_flat=_is_flat(cells.slope)[cell],
-        slope_estimated=cells.estimated_slope[sloped],
-        slope_true=cells.true_slope[sloped],
-        c_rr_error=(placed.c_rr - placed.true_c_rr)[known],
-        c_rr_std=np.sqrt(np.asarray(placed.samples["c_rr_var"], np.float64))[known],
-        border_m=placed.border_m[known],
-        is_flat=_is_flat(placed.slope)[known],
-        along_deg=along[plain],
-        across_deg=across[plain],
-        edge=placed.is_edge[measured],
-        lags=lags(samples, track, crossings(track, ground, from_ns), sampling),
-    )
+    changes = crossings(track, ground, from_ns)
+    return Comparison(placed, cell_means(placed, ground), lags(samples, track, changes, sampling))
 
 
-def pool(several: Sequence[Comparison]) -> Comparison:
-    """All of them as one."""
-    return Comparison(**{f.name: np.concatenate([getattr(one, f.name) for one in several]) for f in fields(Comparison)})
+def pool(several: Sequence[Any]) -> Any:
+    """Arrays, or dataclasses of arrays, of several drives one after the other."""
+    first = several[0]
+    if isinstance(first, np.ndarray):
+        return np.concatenate(several)
+    return type(first)(*(pool([getattr(one, field.name) for one in several]) for field in fields(first)))
+
+
+def is_flat(slope: Floats) -> Bools:
+    """Whether gradients (n, 2) are those of level ground (n,)."""
+    flat: Bools = np.hypot(*slope.T) < FLAT_SLOPE
+    return flat
 
 
 def place(samples: Table, track: LoadTrack, ground: TrueGround, from_ns: int = 0) -> PlacedSamples:
@@ -156,8 +135,6 @@ def cell_means(placed: PlacedSamples, ground: TrueGround) -> CellMeans:
     east, north = (_means(values, weight, which, len(unique)) for values in placed.gradient.T)
     survey = ground.surveyed(column, row)
     return CellMeans(
-        column=column,
-        row=row,
         estimated=resistance_class(_means(placed.c_rr, weight, which, len(unique))),
         true=resistance_class(C_RR[ground.zone(centre)]),
         border_m=ground.border_m(centre),
@@ -187,11 +164,6 @@ def _edges(track: LoadTrack, ground: TrueGround, driven_m: Floats) -> Bools:
 def _angle_deg(gradient: Floats, direction: Floats) -> Floats:
     angle: Floats = np.degrees(np.arctan((gradient * direction).sum(axis=-1)))
     return angle
-
-
-def _is_flat(slope: Floats) -> Bools:
-    flat: Bools = np.hypot(*slope.T) < FLAT_SLOPE
-    return flat
 
 
 def _means(values: Floats, weight: Floats, which: Ints, count: int) -> Floats:

@@ -171,7 +171,7 @@ def summarise(row: GroundConfiguration, outcomes: Sequence[GroundOutcome]) -> Gr
     """One row of the table, with intervals over the seeds."""
     by_seed = [figures(outcome.comparison) for outcome in outcomes]
     wrong_by_seed = [seed.wrong_cells_pct for seed in by_seed]
-    pooled = pool([outcome.comparison for outcome in outcomes])
+    pooled: Comparison = pool([outcome.comparison for outcome in outcomes])
     outputs = [outcome.output for outcome in outcomes]
     withheld: Counter[str] = Counter()
     for output in outputs:
@@ -183,9 +183,9 @@ def summarise(row: GroundConfiguration, outcomes: Sequence[GroundOutcome]) -> Gr
         wrong_cells_ci95=_interval(wrong_by_seed),
         samples=sum(len(output.samples) for output in outputs),
         us_per_second=round(sum(output.us_per_second for output in outputs) / len(outputs)),
-        soils=soils(pooled),
-        by_border=by_border(pooled),
-        c_rr_bias_by_seed=[c_rr_bias(outcome.comparison) for outcome in outcomes],
+        soils=soils(pooled.cells),
+        by_border=by_border(pooled.cells),
+        c_rr_bias_by_seed=[c_rr_bias(outcome.comparison.placed) for outcome in outcomes],
         wrong_cells_by_seed_pct=wrong_by_seed,
         withheld=dict(sorted(withheld.items())),
     )

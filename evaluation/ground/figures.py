@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from evaluation.campaign.figures import root_mean_square
-from evaluation.ground.comparison import Comparison
+from evaluation.ground.comparison import CellMeans, Comparison, PlacedSamples, grade_errors, is_flat
 from evaluation.maps.borders import BorderBin, by_border_distance
 from protocol.arrays import Bools, Floats
-from protocol.site.ground_classes import ZONES, wrong_percent
+from protocol.site.ground_classes import UNKNOWN, ZONES, wrong_percent
 
 INTERIOR_M = 2.0  # the load centre this far from a border has all wheels on one kind of ground
 EVERY = slice(None)
@@ -55,58 +55,60 @@ class SoilRow:
 
 def figures(comparison: Comparison) -> GroundFigures:
     """The figures of a comparison."""
-    interior, inside = comparison.cell_border_m > INTERIOR_M, comparison.border_m > INTERIOR_M
-    normalised = comparison.c_rr_error / comparison.c_rr_std
+    placed, cells = comparison.placed, comparison.cells
+    known, inside = np.isfinite(placed.c_rr), placed.border_m > INTERIOR_M
+    measured, interior = np.isfinite(placed.gradient).all(axis=1), cells.border_m > INTERIOR_M
+    along_deg, across_deg = (errors[measured & ~placed.is_edge] for errors in grade_errors(placed))
+    dirt = np.isin(cells.true, DIRT) & is_flat(cells.slope)
     lag_s, lag_m, place_off_m = (_median(column) for column in comparison.lags.T)
-    dirt = np.isin(comparison.cell_true, DIRT) & comparison.cell_flat
     return GroundFigures(
-        right_class_pct=_share(comparison.class_right),
-        wrong_cells_pct=_wrong(comparison),
-        wrong_cells_interior_pct=_wrong(comparison, interior),
-        dirt_flat_right_pct=100 - _wrong(comparison, dirt),
-        dirt_flat_interior_right_pct=100 - _wrong(comparison, dirt & interior),
+        right_class_pct=_share(placed.is_right[known]),
+        wrong_cells_pct=_wrong(cells),
+        wrong_cells_interior_pct=_wrong(cells, interior),
+        dirt_flat_right_pct=100 - _wrong(cells, dirt),
+        dirt_flat_interior_right_pct=100 - _wrong(cells, dirt & interior),
         lag_s=lag_s,
         lag_m=lag_m,
         place_off_m=place_off_m,
         changes=len(comparison.lags),
-        grade_bias_deg=_mean(comparison.along_deg),
-        grade_std_deg=_std(comparison.along_deg),
-        across_bias_deg=_mean(comparison.across_deg),
-        across_std_deg=_std(comparison.across_deg),
-        grade_excluded_pct=_share(comparison.edge),
-        wrong_slope_cells_pct=wrong_percent(comparison.slope_estimated, comparison.slope_true),
-        normalised_error=root_mean_square(normalised[inside]),
-        normalised_error_all=root_mean_square(normalised),
-        cells=len(comparison.cell_estimated),
-        judged_samples=len(comparison.class_right),
+        grade_bias_deg=_mean(along_deg),
+        grade_std_deg=_std(along_deg),
+        across_bias_deg=_mean(across_deg),
+        across_std_deg=_std(across_deg),
+        grade_excluded_pct=_share(placed.is_edge[measured]),
+        wrong_slope_cells_pct=wrong_percent(cells.estimated_slope, cells.true_slope),
+        normalised_error=root_mean_square(placed.normalised_error[known & inside]),
+        normalised_error_all=root_mean_square(placed.normalised_error[known]),
+        cells=int((cells.estimated != UNKNOWN).sum()),
+        judged_samples=int(known.sum()),
     )
 
 
-def soils(comparison: Comparison) -> list[SoilRow]:
+def soils(cells: CellMeans) -> list[SoilRow]:
     """One row per kind of ground."""
     rows = []
     for i, zone in enumerate(ZONES):
-        here = (comparison.cell_true == i) & (comparison.cell_flat | (i not in DIRT))
-        estimated = comparison.cell_estimated[here]
-        counts = {other.name: int((estimated == k).sum()) for k, other in enumerate(ZONES) if k != i}
+        here = (cells.true == i) & (cells.estimated != UNKNOWN) & (is_flat(cells.slope) | (i not in DIRT))
+        counts = {other.name: int((cells.estimated[here] == k).sum()) for k, other in enumerate(ZONES) if k != i}
         wrong = {name: count for name, count in counts.items() if count}
-        rows.append(SoilRow(zone.name, int(here.sum()), 100 - _wrong(comparison, here), wrong))
+        rows.append(SoilRow(zone.name, int(here.sum()), 100 - _wrong(cells, here), wrong))
     return rows
 
 
-def c_rr_bias(comparison: Comparison) -> float:
+def c_rr_bias(placed: PlacedSamples) -> float:
     """Mean error of c_rr on flat ground away from borders: what calibration should have removed."""
-    return _mean(comparison.c_rr_error[comparison.is_flat & (comparison.border_m > INTERIOR_M)])
+    return _mean(placed.c_rr_error[np.isfinite(placed.c_rr) & is_flat(placed.slope) & (placed.border_m > INTERIOR_M)])
 
 
-def by_border(comparison: Comparison) -> list[BorderBin]:
+def by_border(cells: CellMeans) -> list[BorderBin]:
     """Wrong cells by distance from the nearest border."""
-    return by_border_distance(comparison.cell_estimated, comparison.cell_true, comparison.cell_border_m)
+    known = cells.estimated != UNKNOWN
+    return by_border_distance(cells.estimated[known], cells.true[known], cells.border_m[known])
 
 
-def _wrong(comparison: Comparison, which: Bools | slice = EVERY) -> float:
+def _wrong(cells: CellMeans, which: Bools | slice = EVERY) -> float:
     """Share [%] of these cells that is in another class than the truth."""
-    return wrong_percent(comparison.cell_estimated[which], comparison.cell_true[which])
+    return wrong_percent(cells.estimated[which], cells.true[which])
 
 
 def _share(flags: Bools) -> float:

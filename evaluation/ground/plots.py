@@ -18,13 +18,13 @@ from matplotlib.patches import Patch
 
 from evaluation.campaign.experiment import Runner
 from evaluation.campaign.pictures import WIDTH_IN, draw_all
-from evaluation.ground.comparison import Comparison, PlacedSamples, place, pool
+from evaluation.ground.comparison import CellMeans, Comparison, PlacedSamples, pool
 from evaluation.ground.experiment import GOAL_ROW, ROWS, GroundConfiguration, GroundOutcome, GroundReport
 from evaluation.ground.figures import INTERIOR_M, by_border
 from evaluation.ground.lag import C_RR
 from evaluation.ground.truth import LoadTrack
 from protocol.arrays import AnyArray, Bools, Floats, Ints
-from protocol.site.ground_classes import ZONES, resistance_class
+from protocol.site.ground_classes import ZONES
 
 PICTURED = ("nominal", "calibrated")  # of GOAL_ROW's estimator, along the track and over the site
 SEEDS = 4  # one of each route has pictures of its own
@@ -50,15 +50,11 @@ def draw(_: GroundReport, outcomes: Sequence[GroundOutcome], __: Runner, folder:
     pictures: dict[str, Callable[[], Figure]] = {}
     rows = [GroundConfiguration(GOAL_ROW.estimator, preset) for preset in PICTURED]
     for seed in sorted({o.drive.seed for o in outcomes})[:SEEDS]:
-        pictured = [(o, _placed(o)) for o in outcomes if o.drive.seed == seed and o.row in rows]
-        if shown := [(outcome, placed) for outcome, placed in pictured if len(placed.samples)]:
+        pictured = [o for o in outcomes if o.drive.seed == seed and o.row in rows]
+        if shown := [(o, o.comparison.placed) for o in pictured if len(o.comparison.placed.samples)]:
             pictures[f"along_seed{seed}"] = partial(draw_along, shown)
             pictures[f"places_seed{seed}"] = partial(draw_places, shown)
     return draw_all({**pictures, "summary": partial(draw_summary, outcomes)}, folder)
-
-
-def _placed(outcome: GroundOutcome) -> PlacedSamples:
-    return place(outcome.output.samples, outcome.track, outcome.ground, outcome.from_ns)
 
 
 # --- along the track -------------------------------------------------------------------------------------------------
@@ -218,8 +214,7 @@ def _draw_site(axes: Axes, outcome: GroundOutcome, placed: PlacedSamples) -> Any
     )  # fmt: skip
     known = np.isfinite(placed.c_rr)
     x, y = placed.track.place_m[known].T
-    error = (placed.c_rr - placed.true_c_rr)[known]
-    wrong = (resistance_class(placed.c_rr) != resistance_class(placed.true_c_rr))[known]
+    error, wrong = placed.c_rr_error[known], ~placed.is_right[known]
     axes.scatter(x, y, color="#333333", s=34, lw=0, zorder=2)  # sets small errors off from the ground
     dots = axes.scatter(x, y, c=error, cmap="coolwarm", vmin=-ERROR, vmax=ERROR, s=14, lw=0, zorder=3)
     axes.scatter(x[wrong], y[wrong], color="magenta", marker="x", s=16, lw=0.9, zorder=4)
@@ -237,9 +232,9 @@ def draw_summary(outcomes: Sequence[GroundOutcome]) -> Figure:
     figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH_IN + 2, 4.4), constrained_layout=True)
     drawn = {outcome.row for outcome in outcomes}
     for row in [row for row in ROWS if row in drawn]:
-        comparison = pool([o.comparison for o in outcomes if o.row == row])
-        _draw_by_border(left, row, comparison)
-        _draw_normalised(right, row, comparison)
+        comparison: Comparison = pool([o.comparison for o in outcomes if o.row == row])
+        _draw_by_border(left, row, comparison.cells)
+        _draw_normalised(right, row, comparison.placed)
     left.set_xlabel("distance of the cell from the nearest border [m]")
     left.set_ylabel("cells of a wrong class [%]")
     left.set_ylim(0, 1.3 * left.get_ylim()[1])
@@ -259,8 +254,8 @@ def draw_summary(outcomes: Sequence[GroundOutcome]) -> Figure:
     return figure
 
 
-def _draw_by_border(axes: Axes, row: GroundConfiguration, comparison: Comparison) -> None:
-    parts = by_border(comparison)
+def _draw_by_border(axes: Axes, row: GroundConfiguration, cells: CellMeans) -> None:
+    parts = by_border(cells)
     starts = [part.from_m for part in parts]
     ticks = [*(f"{a:g} to {b:g}" for a, b in itertools.pairwise(starts)), f"over {starts[-1]:g}"]
     wrong = [part.wrong_pct for part in parts]
@@ -269,9 +264,8 @@ def _draw_by_border(axes: Axes, row: GroundConfiguration, comparison: Comparison
     axes.set_xticks(range(len(ticks)), ticks)
 
 
-def _draw_normalised(axes: Axes, row: GroundConfiguration, comparison: Comparison) -> None:
-    inside = comparison.border_m > INTERIOR_M
-    errors = (comparison.c_rr_error / comparison.c_rr_std)[inside]
+def _draw_normalised(axes: Axes, row: GroundConfiguration, placed: PlacedSamples) -> None:
+    errors = placed.normalised_error[np.isfinite(placed.c_rr) & (placed.border_m > INTERIOR_M)]
     if not len(errors):
         return
     edges = np.linspace(-SIGMAS, SIGMAS, BINS + 1)
