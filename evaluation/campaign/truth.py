@@ -44,8 +44,8 @@ def position_rmse(poses: Mapping[str, Sequence[Pose]], truth: Path) -> dict[str,
     rmse = {}
     for name, track in poses.items():
         true = np.genfromtxt(truth / "tracks" / f"{name}.csv", delimiter=",", names=True)
-        stamps = np.array([p.stamp_ns for p in track], np.float64)
-        dx = np.interp(stamps, true["stamp_ns"], true["x"]) - [p.x_m for p in track]
-        dy = np.interp(stamps, true["stamp_ns"], true["y"]) - [p.y_m for p in track]
+        stamps = np.array([pose.stamp_ns for pose in track], np.float64)
+        dx, dy = (np.interp(stamps, true["stamp_ns"], true[axis]) for axis in ("x", "y"))
+        dx, dy = dx - [pose.x_m for pose in track], dy - [pose.y_m for pose in track]
         rmse[name] = math.sqrt(float((dx**2 + dy**2).mean()))
     return rmse

@@ -45,7 +45,7 @@ class PlacedSamples:
     @property
     def c_rr_error(self) -> Floats:
         """Estimate minus the value of the zone (n,)."""
-        return self.c_rr - C_RR[self.zone]
+        return np.asarray(self.c_rr - C_RR[self.zone], np.float64)
 
     @property
     def normalised_error(self) -> Floats:
@@ -55,7 +55,7 @@ class PlacedSamples:
     @property
     def is_right(self) -> Bools:
         """Whether the estimate is in the class of the zone (n,)."""
-        return resistance_class(self.c_rr) == resistance_class(C_RR[self.zone])
+        return np.asarray(resistance_class(self.c_rr) == resistance_class(C_RR[self.zone]), np.bool_)
 
     @property
     def gradient(self) -> Floats:

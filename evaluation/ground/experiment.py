@@ -136,16 +136,8 @@ def run(
     outputs = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
     outcomes = [judged(*pair, output, runner.cache) for pair, output in zip(pairs, outputs, strict=True)]
     table = [summarise(row, [outcome for outcome in outcomes if outcome.row == row]) for row in rows]
-    report = GroundReport(
-        scenario=setup.scenario,
-        routes=list(setup.routes),
-        seeds=list(seeds),
-        seconds=seconds,
-        judged_from_s=settle_s(seconds),
-        rows=table,
-        goals=judge(GOALS, table),
-    )
-    return report, outcomes
+    drives = (setup.scenario, list(setup.routes), list(seeds), seconds)
+    return GroundReport(*drives, settle_s(seconds), table, judge(GOALS, table)), outcomes
 
 
 def settle_s(seconds: float) -> float:

@@ -51,7 +51,7 @@ def draw(_: GroundReport, outcomes: Sequence[GroundOutcome], __: Runner, folder:
     rows = [GroundConfiguration(GOAL_ROW.estimator, preset) for preset in PICTURED]
     for seed in sorted({o.drive.seed for o in outcomes})[:SEEDS]:
         pictured = [o for o in outcomes if o.drive.seed == seed and o.row in rows]
-        if shown := [(o, o.comparison.placed) for o in pictured if len(o.comparison.placed.samples)]:
+        if shown := [o for o in pictured if len(o.comparison.placed.samples)]:
             pictures[f"along_seed{seed}"] = partial(draw_along, shown)
             pictures[f"places_seed{seed}"] = partial(draw_places, shown)
     return draw_all({**pictures, "summary": partial(draw_summary, outcomes)}, folder)
@@ -60,9 +60,9 @@ def draw(_: GroundReport, outcomes: Sequence[GroundOutcome], __: Runner, folder:
 # --- along the track -------------------------------------------------------------------------------------------------
 
 
-def draw_along(shown: Sequence[tuple[GroundOutcome, PlacedSamples]]) -> Figure:
+def draw_along(shown: Sequence[GroundOutcome]) -> Figure:
     """Resistance and slope over the distance driven: truth, estimates, and the bands that they state."""
-    outcome = shown[0][0]
+    outcome = shown[0]
     figure, panels = plt.subplots(
         3, figsize=(WIDTH_IN + 2, 7.6), sharex=True, height_ratios=(2.2, 1, 0.8), constrained_layout=True
     )
@@ -77,8 +77,8 @@ def draw_along(shown: Sequence[tuple[GroundOutcome, PlacedSamples]]) -> Figure:
     resistance.plot(track.driven_m, C_RR[zone], drawstyle="steps-mid", **TRUTH)
     slope.plot(track.driven_m, _slope_deg(track.gradient, track.yaw_rad), **TRUTH)
     error.axhline(0, **TRUTH)
-    for each, placed in shown:
-        _draw_estimate(panels, each.row.preset, _within(placed, track))
+    for each in shown:
+        _draw_estimate(panels, each.row.preset, _within(each.comparison.placed, track))
     resistance.set_yscale("function", functions=(_pressed, _stretched))
     resistance.set_ylim(-0.012, 0.32)
     resistance.set_yticks(C_RR, ZONE_TICKS)
@@ -128,9 +128,9 @@ def _draw_estimate(panels: Sequence[Axes], preset: str, placed: PlacedSamples) -
         axes.plot(x, mean, color=colour, lw=1.1, zorder=3 + 2 * (preset == GOAL_ROW.preset))
 
 
-def _along_handles(shown: Sequence[tuple[GroundOutcome, PlacedSamples]]) -> list[Any]:
+def _along_handles(shown: Sequence[GroundOutcome]) -> list[Any]:
     handles: list[Any] = [Line2D([], [], label="truth", **TRUTH)]
-    handles += [Line2D([], [], color=COLOUR[o.row.preset], label=o.row.preset) for o, _ in shown]
+    handles += [Line2D([], [], color=COLOUR[o.row.preset], label=o.row.preset) for o in shown]
     handles.append(Patch(color="grey", alpha=0.3, lw=0, label="two standard deviations"))
     handles.append(Patch(color="black", alpha=0.55, lw=0, label="in reverse"))
     return handles
@@ -184,14 +184,14 @@ def _stretched(values: AnyArray) -> AnyArray:
 # --- over the site ---------------------------------------------------------------------------------------------------
 
 
-def draw_places(shown: Sequence[tuple[GroundOutcome, PlacedSamples]]) -> Figure:
+def draw_places(shown: Sequence[GroundOutcome]) -> Figure:
     """The site from above: samples by their error, those of a wrong class marked."""
-    outcome = shown[0][0]
+    outcome = shown[0]
     figure, panels = plt.subplots(
         1, len(shown), figsize=(WIDTH_IN + 2, 5.3), sharex=True, sharey=True, squeeze=False, constrained_layout=True
     )
-    for axes, (each, placed) in zip(panels[0], shown, strict=True):
-        dots = _draw_site(axes, each, placed)
+    for axes, each in zip(panels[0], shown, strict=True):
+        dots = _draw_site(axes, each)
         axes.set_xlabel("east [m]")
     panels[0, 0].set_ylabel("north [m]")
     figure.colorbar(dots, ax=panels, shrink=0.8, pad=0.01, extend="both", label="error of $c_{rr}$ [-]")
@@ -204,8 +204,8 @@ def draw_places(shown: Sequence[tuple[GroundOutcome, PlacedSamples]]) -> Figure:
     return figure
 
 
-def _draw_site(axes: Axes, outcome: GroundOutcome, placed: PlacedSamples) -> Any:
-    terrain = outcome.ground.terrain
+def _draw_site(axes: Axes, outcome: GroundOutcome) -> Any:
+    terrain, placed = outcome.ground.terrain, outcome.comparison.placed
     rows, columns = terrain.zones.shape
     extent = (0.0, columns * terrain.zone_cell_m, 0.0, rows * terrain.zone_cell_m)
     axes.imshow(

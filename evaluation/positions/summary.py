@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from evaluation.campaign.figures import half_width, rounded
 from evaluation.positions.configurations import Configuration
 from evaluation.positions.replay import Score
 from protocol.arrays import Floats
+
+MEANS = ("rmse_x_m", "rmse_y_m", "net_m", "nees", "coverage95", "covered")
 
 
 @dataclass(frozen=True)
@@ -48,22 +51,17 @@ class RatioRow(Configuration):
 
 def summarise(row: Configuration, scores: Sequence[Score]) -> TableRow:
     """One row of the table."""
-    net = values(scores, "net_m")
-    paper = row.published_net_m
+    net, paper = values(scores, "net_m"), row.published_net_m
+    means: dict[str, Any] = {name: float(values(scores, name).mean()) for name in MEANS}
     summary = TableRow(
         **vars(row),
-        rmse_x_m=mean(scores, "rmse_x_m"),
-        rmse_y_m=mean(scores, "rmse_y_m"),
-        net_m=mean(scores, "net_m"),
+        **means,
         ci95_m=half_width(net),
         max_m=float(values(scores, "max_m").max()),
-        nees=mean(scores, "nees"),
         nees_95=nees_interval(scores),
-        coverage95=mean(scores, "coverage95"),
-        covered=mean(scores, "covered"),
-        us_per_second=round(mean(scores, "us_per_second")),
+        us_per_second=round(float(values(scores, "us_per_second").mean())),
         paper_net_m=paper,
-        difference_m=None if paper is None else mean(scores, "net_m") - paper,
+        difference_m=None if paper is None else means["net_m"] - paper,
         net_by_seed_m=net.tolist(),
     )
     return rounded(summary, 4, max_m=3, nees=3, nees_95=3)
@@ -99,8 +97,3 @@ def nees_interval(scores: Sequence[Score]) -> list[float]:
 def values(scores: Sequence[Score], name: str) -> Floats:
     """One field of scores (n,)."""
     return np.array([getattr(score, name) for score in scores], float)
-
-
-def mean(scores: Sequence[Score], name: str) -> float:
-    """Mean of one field over the runs."""
-    return float(values(scores, name).mean())

@@ -82,16 +82,9 @@ def run(
     runs = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
     outcomes = [Outcome(*pair, run) for pair, run in zip(pairs, runs, strict=True)]
     scores = {row: [o.run for o in outcomes if o.row == row] for row in runnable}
-    report = TableReport(
-        scenario=setup.scenario,
-        gps_error=gps_error(drives[0].preset),
-        seeds=list(seeds),
-        seconds=seconds,
-        rows=[summarise(row, several) for row, several in scores.items()],
-        ratios=ratios(scores),
-        missing=missing,
-    )
-    return report, outcomes
+    table = [summarise(row, several) for row, several in scores.items()]
+    error = gps_error(drives[0].preset)
+    return TableReport(setup.scenario, error, list(seeds), seconds, table, ratios(scores), missing), outcomes
 
 
 def gps_error(preset: str) -> dict[str, Any]:

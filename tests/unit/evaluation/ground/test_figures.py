@@ -128,7 +128,7 @@ def test_unknown_resistance_does_not_count_but_its_slope_does():
     assert (row.judged_samples, row.cells, (judged.cells.estimated_slope != UNKNOWN).sum()) == (40, 20, 40)
 
 
-def test_cells_take_the_mean_over_the_way_that_samples_stand_for():
+def test_cells_take_the_mean_over_the_distance_that_samples_stand_for():
     """1 m at 0.03 and 3 m at 0.06 are 0.0525: wet dirt, where plain means would say dry."""
     track = drive_east()
     rows = samples_of(track)[:2]
@@ -193,7 +193,7 @@ def test_borders_are_as_far_as_the_other_zone_is():
     np.testing.assert_allclose(distances, [7.9, 0.1, 0.1, 5.1], atol=0.13)
 
 
-def test_a_track_is_read_as_the_way_of_the_load_centre(tmp_path: Path):
+def test_a_track_is_read_as_that_of_the_load_centre(tmp_path: Path):
     (tmp_path / "a.csv").write_text(
         f"stamp_ns,x,y,yaw,grade_e,grade_n\n{START_NS},0.0,0.0,3.1,0.1,0.2\n{START_NS + 10**8},1.0,0.0,-3.1,0.1,0.4\n"
     )
