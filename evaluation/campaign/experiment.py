@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, Protocol, TypeVar
 
@@ -54,7 +53,7 @@ class Task(Generic[Variant]):
     def recording(self, cache: Path) -> RecordedDrive:
         """The recording; cache: folder of recordings."""
         assert self.drive
-        return loaded(self.drive, cache)
+        return load(self.drive.folder(cache))
 
 
 def replay_task(variant: Variant, drive: PlannedDrive) -> Task[Variant]:
@@ -107,12 +106,6 @@ class Runner:
             done_s += task.seconds
             self.on_progress(done_s, total_s, task.name)
         return [read_result(experiment.result, file) for file in files]
-
-
-@lru_cache(maxsize=1)  # tasks come recording by recording
-def loaded(drive: PlannedDrive, cache: Path) -> RecordedDrive:
-    """A recording, kept in this process for the task that comes next."""
-    return load(drive.folder(cache))
 
 
 def write_result(result: Any, file: BinaryIO) -> None:

@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +117,7 @@ def make(drive: PlannedDrive, cache_dir: Path) -> Path:
     return folder
 
 
+@lru_cache(maxsize=1)  # tasks come recording by recording
 def load(folder: Path) -> RecordedDrive:
     """Read what `make` wrote, all sensors of it."""
     log = open_log(folder / "logs" / MACHINE)

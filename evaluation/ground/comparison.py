@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from agents.sampling import SamplingConfig
 from evaluation.ground.lag import C_RR, crossings, lags
 from evaluation.ground.truth import CELL_M, LoadTrack, TrueGround
 from protocol.arrays import Bools, Floats, Ints, Table
@@ -88,11 +87,11 @@ class Comparison:
     lags: Floats
 
 
-def compare(samples: Table, track: LoadTrack, ground: TrueGround, sampling: SamplingConfig, from_ns: int) -> Comparison:
-    """Compare the samples of one drive with the truth, from an instant on."""
+def compare(samples: Table, track: LoadTrack, ground: TrueGround, lag_s: float, from_ns: int) -> Comparison:
+    """Compare the samples of one drive with the truth, from an instant on; lag_s: by which samples are dated back."""
     placed = place(samples, track, ground, from_ns)
     changes = crossings(track, ground, from_ns)
-    return Comparison(placed, cell_means(placed, ground), lags(samples, track, changes, sampling))
+    return Comparison(placed, cell_means(placed, ground), lags(samples, track, changes, lag_s))
 
 
 def pool(several: Sequence[Any]) -> Any:

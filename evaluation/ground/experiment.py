@@ -149,7 +149,7 @@ def judged(drive: PlannedDrive, row: GroundConfiguration, output: PipelineOutput
     """Compare the samples of one row on one recording with the truth."""
     track, ground = _truth(drive, cache)
     from_ns = int(track.stamp_ns[0]) + round(settle_s(drive.seconds) * 1e9)
-    comparison = compare(output.samples, track, ground, row.options.sampling, from_ns)
+    comparison = compare(output.samples, track, ground, row.options.sampling.lag_s, from_ns)
     return GroundOutcome(drive, row, output, track, ground, from_ns, comparison)
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.sampling import SamplingConfig
 from evaluation.ground.truth import LoadTrack, TrueGround
 from protocol.arrays import Floats, Ints, Table
 from protocol.site.ground_classes import ZONES
@@ -29,9 +28,9 @@ class Crossing:
     end_ns: int
 
 
-def known_ns(samples: Table, sampling: SamplingConfig) -> Ints:
+def known_ns(samples: Table, lag_s: float) -> Ints:
     """When the machine knew its samples: it dates them back by the time that a change of the ground takes to show."""
-    stamps: Ints = samples["stamp_ns"] + round(sampling.lag_s * 1e9)
+    stamps: Ints = samples["stamp_ns"] + round(lag_s * 1e9)
     return stamps
 
 
@@ -52,7 +51,7 @@ def crossings(track: LoadTrack, ground: TrueGround, from_ns: int) -> list[Crossi
     return changes
 
 
-def lags(samples: Table, track: LoadTrack, changes: list[Crossing], sampling: SamplingConfig) -> Floats:
+def lags(samples: Table, track: LoadTrack, changes: list[Crossing], lag_s: float) -> Floats:
     """Lag of each change of zone (k, 3): time [s] and distance [m] until the estimate knew it, and its place error [m].
 
     The estimate knows the change once it is nearer to the new zone's value than to the old one's; infinite where it is
@@ -60,7 +59,7 @@ def lags(samples: Table, track: LoadTrack, changes: list[Crossing], sampling: Sa
     border. Changes before which the estimate was not near to the old value are excluded.
     """
     samples = samples[np.isfinite(samples["c_rr"])]
-    known = track.at(known_ns(samples, sampling))
+    known = track.at(known_ns(samples, lag_s))
     dated_m = track.at(samples["stamp_ns"]).driven_m
     rows = [_lag(samples["c_rr"].astype(float), known, dated_m, crossing) for crossing in changes]
     return np.array([row for row in rows if row], float).reshape(-1, 3)

@@ -17,13 +17,12 @@ What only an evaluation may know stands in `evaluation.toml` beside the manifest
 from __future__ import annotations
 
 import csv
-import gzip
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from evaluation.positions.configurations import Configuration, pipeline_options
 from evaluation.positions.replay import Trace, errors, replay, score
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError, LogFolderError
-from protocol.machine.log_folder import MANIFEST, LogFolder, open_log
+from protocol.machine.log_folder import MANIFEST, LogFolder, open_log, open_text
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection
@@ -235,13 +234,7 @@ def _against_truth(trace: Trace, truth: Truth, pattern: tuple[float, float]) -> 
 def _read(path: Path) -> list[dict[str, str]]:
     """Rows of a CSV file, by column."""
     try:
-        with _text(path) as text:
+        with open_text(path) as text:
             return list(csv.DictReader(text))
     except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
         raise LogFolderError(path, f"cannot be read: {error}") from None
-
-
-def _text(path: Path) -> IO[str]:
-    if path.suffix == ".gz":
-        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
-    return path.open(encoding="utf-8-sig", newline="")

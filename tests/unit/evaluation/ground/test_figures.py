@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.sampling import SamplingConfig
 from evaluation.ground.comparison import Comparison, cell_means, compare, is_flat, place, pool
 from evaluation.ground.figures import c_rr_bias, figures, soils
 from evaluation.ground.lag import crossings, known_ns, lags
@@ -19,7 +18,7 @@ from sim.scenario.ground import GroundConfig, RampConfig, ZoneConfig
 SPEED_MPS, EVERY_M = 2.0, 0.5
 BORDER_M = 20.0
 START_NS = 10**15
-LAG = SamplingConfig(lag_s=0.5)
+LAG_S = 0.5
 WET = ZoneConfig("wet dirt", ((BORDER_M, 0.0), (60.0, 0.0), (60.0, 20.0), (BORDER_M, 20.0)))
 
 
@@ -53,7 +52,7 @@ def steps_at(border_m: float):
 
 def test_a_right_estimate_has_right_figures():
     track, here = drive_east(), ground(WET)
-    row = figures(compare(samples_of(track, steps_at(BORDER_M)), track, here, LAG, START_NS))
+    row = figures(compare(samples_of(track, steps_at(BORDER_M)), track, here, LAG_S, START_NS))
     assert row.right_class_pct == row.dirt_flat_right_pct == 100.0
     assert row.wrong_cells_pct == row.wrong_cells_interior_pct == row.wrong_slope_cells_pct == 0.0
     assert (row.cells, row.judged_samples, row.changes) == (40, 80, 1)
@@ -64,21 +63,21 @@ def test_a_right_estimate_has_right_figures():
 def test_an_estimate_that_comes_late_is_wrong_right_behind_the_border():
     """Placed 3 m too far: six samples and three cells of forty; one of them is more than 2 m inside."""
     track, here = drive_east(), ground(WET)
-    judged = compare(samples_of(track, steps_at(BORDER_M + 3.0)), track, here, LAG, START_NS)
+    judged = compare(samples_of(track, steps_at(BORDER_M + 3.0)), track, here, LAG_S, START_NS)
     row = figures(judged)
     assert row.right_class_pct == pytest.approx(100 * 74 / 80)
     assert row.wrong_cells_pct == pytest.approx(100 * 3 / 40)
     assert row.wrong_cells_interior_pct == pytest.approx(100 * 1 / 36)
     assert row.place_off_m == pytest.approx(3.25, abs=0.03)  # of the first sample behind, in its stretch's middle
-    assert row.lag_m == pytest.approx(3.25 + LAG.lag_s * SPEED_MPS, abs=0.03)
-    assert row.lag_s == pytest.approx((3.25 + LAG.lag_s * SPEED_MPS) / SPEED_MPS, abs=0.02)
+    assert row.lag_m == pytest.approx(3.25 + LAG_S * SPEED_MPS, abs=0.03)
+    assert row.lag_s == pytest.approx((3.25 + LAG_S * SPEED_MPS) / SPEED_MPS, abs=0.02)
     wet = next(soil for soil in soils(judged.cells) if soil.name == "wet dirt")
     assert (wet.cells, wet.right_pct, wet.taken_for) == (20, 85.0, {"dry dirt": 3})
 
 
 def test_samples_that_are_dated_back_too_far_lie_before_the_border():
     track, here = drive_east(), ground(WET)
-    row = figures(compare(samples_of(track, steps_at(BORDER_M - 0.5)), track, here, LAG, START_NS))
+    row = figures(compare(samples_of(track, steps_at(BORDER_M - 0.5)), track, here, LAG_S, START_NS))
     assert row.place_off_m == pytest.approx(-0.25, abs=0.03)
     assert row.lag_m == pytest.approx(0.75, abs=0.03)
 
@@ -88,9 +87,9 @@ def test_a_change_that_is_never_noticed_has_no_lag_and_one_that_is_noticed_befor
     changes = crossings(track, here, START_NS)
     assert [(c.old, c.new) for c in changes] == [(0.04, 0.06)]
     assert changes[0].driven_m == pytest.approx(BORDER_M, abs=0.03)
-    assert np.isinf(lags(samples_of(track, 0.04), track, changes, LAG)).all()
-    assert lags(samples_of(track, 0.06), track, changes, LAG).shape == (0, 3)
-    assert np.isnan(figures(compare(samples_of(track, 0.04), track, here, LAG, START_NS)).lag_s)
+    assert np.isinf(lags(samples_of(track, 0.04), track, changes, LAG_S)).all()
+    assert lags(samples_of(track, 0.06), track, changes, LAG_S).shape == (0, 3)
+    assert np.isnan(figures(compare(samples_of(track, 0.04), track, here, LAG_S, START_NS)).lag_s)
 
 
 @pytest.mark.parametrize(("soil", "width_m", "count"), [("wet dirt", 3.0, 0), ("wet dirt", 5.0, 2), ("gravel", 5.0, 2)])
@@ -101,19 +100,19 @@ def test_only_zones_that_last_have_a_lag(soil, width_m, count):
 
 def test_samples_are_known_when_the_lag_has_passed():
     rows = samples_of(drive_east())
-    assert (known_ns(rows, LAG) - rows["stamp_ns"] == 500_000_000).all()
+    assert (known_ns(rows, LAG_S) - rows["stamp_ns"] == 500_000_000).all()
 
 
 def test_nothing_is_judged_before_the_machine_has_settled():
     track, here = drive_east(), ground(WET)
     wrong_at_first = samples_of(track, lambda x: np.where(x < 10, 0.25, np.where(x < BORDER_M, 0.04, 0.06)))
-    row = figures(compare(wrong_at_first, track, here, LAG, START_NS + 5_000_000_000))
+    row = figures(compare(wrong_at_first, track, here, LAG_S, START_NS + 5_000_000_000))
     assert (row.right_class_pct, row.cells) == (100.0, 30)
 
 
 def test_a_bias_is_found_on_flat_ground_away_from_borders():
     track, here = drive_east(), ground(WET)
-    judged = compare(samples_of(track, lambda x: steps_at(BORDER_M)(x) + 0.004), track, here, LAG, START_NS)
+    judged = compare(samples_of(track, lambda x: steps_at(BORDER_M)(x) + 0.004), track, here, LAG_S, START_NS)
     assert c_rr_bias(judged.placed) == pytest.approx(0.004, abs=1e-6)
     assert figures(judged).normalised_error == pytest.approx(2.0, abs=1e-3)
 
@@ -123,7 +122,7 @@ def test_unknown_resistance_does_not_count_but_its_slope_does():
     rows = samples_of(
         track, lambda x: np.where(x < 20, 0.04, np.nan), c_rr_var=lambda x: np.where(x < 20, 1e-6, np.nan)
     )
-    judged = compare(rows, track, ground(), LAG, START_NS)
+    judged = compare(rows, track, ground(), LAG_S, START_NS)
     row = figures(judged)
     assert (row.judged_samples, row.cells, (judged.cells.estimated_slope != UNKNOWN).sum()) == (40, 20, 40)
 
@@ -141,7 +140,7 @@ def test_gradients_are_compared_along_the_true_heading():
     """Facing north, 1 degree too steep ahead and 2 degrees to the left, which is west."""
     track = replace(drive_east(), yaw_rad=np.full(201, np.pi / 2))
     one, two = np.tan(np.radians([1.0, 2.0]))
-    row = figures(compare(samples_of(track, grade_n=one, grade_e=-two), track, ground(), LAG, START_NS))
+    row = figures(compare(samples_of(track, grade_n=one, grade_e=-two), track, ground(), LAG_S, START_NS))
     assert row.grade_bias_deg == pytest.approx(1.0, abs=1e-4)
     assert row.across_bias_deg == pytest.approx(2.0, abs=1e-4)
     assert row.grade_std_deg == pytest.approx(0.0, abs=1e-4)
@@ -155,30 +154,30 @@ def test_slopes_have_cells_and_edges_of_their_own():
     track = replace(track, gradient=ramped.slope(track.place_m))
     seen = ramped.slope(track.place_m)[:, 0]
     rows = samples_of(track, grade_e=lambda x: np.interp(x, track.driven_m, seen))
-    row = figures(compare(rows, track, ramped, LAG, START_NS))
+    row = figures(compare(rows, track, ramped, LAG_S, START_NS))
     assert row.wrong_slope_cells_pct == 0.0
     assert row.grade_excluded_pct == pytest.approx(100 * 2 * 6 / 40, abs=3)
     assert row.grade_std_deg == pytest.approx(0.0, abs=0.05)
-    flat = figures(compare(samples_of(track), track, ramped, LAG, START_NS))
+    flat = figures(compare(samples_of(track), track, ramped, LAG_S, START_NS))
     assert flat.wrong_slope_cells_pct == pytest.approx(100 * 10 / 40)
 
 
 def test_unevenness_is_no_edge_of_a_ramp_and_leaves_ground_flat():
-    judged = compare(samples_of(drive_east()), drive_east(), ground(roughness_m=0.03), LAG, START_NS)
+    judged = compare(samples_of(drive_east()), drive_east(), ground(roughness_m=0.03), LAG_S, START_NS)
     assert not judged.placed.is_edge.any()
     assert is_flat(judged.placed.slope).all()
 
 
 def test_pooled_tours_weigh_by_their_samples():
     track, here = drive_east(), ground()
-    right, wrong = (compare(samples_of(track, c), track, here, LAG, START_NS) for c in (0.04, 0.06))
+    right, wrong = (compare(samples_of(track, c), track, here, LAG_S, START_NS) for c in (0.04, 0.06))
     assert figures(pool([right, wrong, wrong])).right_class_pct == pytest.approx(100 / 3)
     assert isinstance(pool([right]), Comparison)
 
 
 def test_nothing_judged_is_nothing_known():
     track, here = drive_east(), ground(WET)
-    judged = compare(samples_of(track)[:0], track, here, LAG, START_NS)
+    judged = compare(samples_of(track)[:0], track, here, LAG_S, START_NS)
     row = figures(judged)
     assert row.cells == row.judged_samples == 0
     assert np.isnan([row.right_class_pct, row.wrong_cells_pct, row.lag_s, c_rr_bias(judged.placed)]).all()
