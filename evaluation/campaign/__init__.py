@@ -1,1 +1,1 @@
-"""Experiments as tasks on recordings, worked off on all cores, each result kept."""
+"""What all experiments share: recordings, tasks on all cores whose results are kept, figures, goals and pictures."""

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from evaluation.positions.replay import Truth, read_track
+from evaluation.campaign.truth import Truth, read_track
+from evaluation.campaign.versions import code_version, digest
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
@@ -22,9 +22,7 @@ from sim.config import SimConfig
 from sim.recorder import record
 from sim.scenario.file import load_scenario
 from sim.scenario.tables import FleetConfig, Scenario
-from sim.sensors.presets import load_preset
 
-ROOT = Path(__file__).parents[2]
 MACHINE = "loader"
 
 
@@ -48,8 +46,8 @@ PAPER = Setup("paper_site", ("west", "east", "middle"), gps=(1, 2, 3), imu=(3, 4
 
 
 @dataclass(frozen=True)
-class Drive:
-    """What is recorded: one machine on one route."""
+class PlannedDrive:
+    """What is to be recorded: one machine on one route."""
 
     seed: int
     seconds: float
@@ -93,7 +91,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedDrive:
     """A recording in memory: what the agent may know and read, and the truth."""
 
     site: SiteConfig
@@ -103,7 +101,7 @@ class Recording:
     start: tuple[float, float, float]  # where it begins: x, y [m], heading [rad]
 
 
-def make(drive: Drive, cache_dir: Path) -> Path:
+def make(drive: PlannedDrive, cache_dir: Path) -> Path:
     """Record a drive unless that has been done; returns its folder, which is whole or not there."""
     folder = drive.folder(cache_dir)
     if folder.exists():
@@ -119,46 +117,19 @@ def make(drive: Drive, cache_dir: Path) -> Path:
     return folder
 
 
-def load(folder: Path) -> Recording:
+@lru_cache(maxsize=1)  # tasks come recording by recording
+def load(folder: Path) -> RecordedDrive:
     """Read what `make` wrote, all sensors of it."""
     log = open_log(folder / "logs" / MACHINE)
     track = track_file(folder)
     first = np.genfromtxt(track, delimiter=",", names=True, max_rows=1)
     start = (float(first["x"]), float(first["y"]), float(first["yaw"]))
-    return Recording(log.site, log.machine, tuple(log.readings()), read_track(track), start)
+    return RecordedDrive(log.site, log.machine, tuple(log.readings()), read_track(track), start)
 
 
 def track_file(folder: Path) -> Path:
-    """Where a recording keeps the machine's true way."""
+    """Where a recording keeps the machine's true track."""
     return folder / "truth" / "tracks" / f"{MACHINE}.csv"
-
-
-def gps_error(preset: str) -> dict[str, Any]:
-    """How slow the GPS errors of a preset are: on white noise every filter looks wonderful."""
-    gps = load_preset(preset).gps
-    slow, white = gps.drift_std_m**2, gps.white_std_m**2
-    return {
-        "preset": preset,
-        "rms_2d_m": round((2 * (slow + white)) ** 0.5 * gps.scale, 3),
-        "slow_variance_share": round(slow / (slow + white), 3),
-        "correlation_time_s": gps.drift_time_s,
-        "rate_hz": gps.rate_hz,
-        "shared": gps.shared,
-        "outage_s": gps.outage_s,
-        "outage_period_s": gps.outage_period_s,
-    }
-
-
-@cache
-def code_version(*names: str) -> str:
-    """Hash of the sources of packages or modules, as paths from the project's root."""
-    files = sorted(path for name in names for path in _sources(ROOT / name))
-    return digest(*(f"{path.relative_to(ROOT)}\n{path.read_text(encoding='utf-8')}" for path in files))
-
-
-def digest(*texts: str) -> str:
-    """Ten hex digits that tell texts apart."""
-    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:10]
 
 
 @cache
@@ -167,11 +138,5 @@ def _scenario(name: str) -> Scenario:
 
 
 def _toml(values: Mapping[str, Any]) -> str:
-    """Plain values as TOML keys, those that are None left out."""
+    """Plain values as TOML keys; None is none."""
     return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items() if value is not None)
-
-
-def _sources(path: Path) -> Iterable[Path]:
-    if path.is_file():
-        return [path]
-    return (p for p in path.rglob("*") if p.suffix in (".py", ".toml", ".urdf"))

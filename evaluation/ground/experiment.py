@@ -1,31 +1,33 @@
 """How well rolling resistance and gradient are estimated: loaders at work, every row on the same recordings.
 
-Readings of a recording become samples in the whole pipeline; samples are kept beside the recording, named by everything
-that they depend on, so that an interrupted run goes on where it was. Judging them takes a moment and is done anew.
+The whole pipeline makes samples of the readings of a recording. Those are kept; comparing them with the truth takes a
+moment and is done anew.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from agents.sampling import LAG_S
-from evaluation.campaign.recordings import Drive, Recording, Setup, code_version, digest, track_file
-from evaluation.campaign.tasks import Progress, carry_out, check_name, loaded
-from evaluation.ground.score import Judged, by_border, c_rr_bias, figures, judge, pool, soils
-from evaluation.ground.truth import Ground, Way, lay_ground, read_way
-from evaluation.positions.summary import half_width, rounded
-from protocol.arrays import Floats, Table
+from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
+from evaluation.campaign.figures import half_width, rounded
+from evaluation.campaign.goals import Goal, GoalResult, Relation, judge
+from evaluation.campaign.recordings import PlannedDrive, RecordedDrive, Setup, track_file
+from evaluation.ground.comparison import Comparison, compare, pool
+from evaluation.ground.figures import GroundFigures, SoilRow, by_border, c_rr_bias, figures, soils
+from evaluation.ground.truth import LoadTrack, TrueGround, read_load_track, true_ground
+from evaluation.maps.borders import BorderBin
+from protocol.arrays import Table
 
 LOADING = Setup("loading", ("west", "east", "middle", "yard"), gps=(1, 2), imu=(3,))
 ESTIMATORS = ("kalman", "rls")
@@ -35,23 +37,13 @@ PRESETS = {"nominal": ("dgps", False), "calibrated": ("dgps", True), "harsh": ("
 # ground both ways, which is what calibration needs. Runs that are shorter than 600 s settle for the same share of them.
 SETTLE_S, SETTLE_SHARE = 240.0, 0.4
 CHUNK = 5000  # readings that the pipeline gets at a time
-SOURCES = ("agents", "protocol")  # what samples depend on, beside their recording
-# Of `kalman`, `calibrated`: the goals of the issue. A bias counts by its size.
-GOALS = (
-    ("right_class_pct", ">=", 96.0),
-    ("wrong_cells_pct", "<=", 3.5),
-    ("wrong_cells_interior_pct", "<=", 1.0),
-    ("dirt_flat_right_pct", ">=", 97.0),
-    ("grade_bias_deg", "<=", 0.1),
-    ("grade_std_deg", "<=", 0.35),
-    ("wrong_slope_cells_pct", "<=", 0.2),
-)
+SOURCES = ("agents", "protocol", "evaluation/ground/experiment.py")
 DIGITS = 3
 
 
 @dataclass(frozen=True)
-class Row:
-    """One row of the table."""
+class GroundConfiguration:
+    """What one row of the table compares."""
 
     estimator: str
     preset: str
@@ -64,45 +56,26 @@ class Row:
     @property
     def options(self) -> PipelineConfig:
         """The agent's."""
-        return options(self.estimator, calibrate=PRESETS[self.preset][1])
+        calibrate = PRESETS[self.preset][1]
+        return PipelineConfig(estimation=EstimationConfig(estimator=self.estimator, calibrate=calibrate))
 
 
-ROWS = tuple(Row(estimator, preset) for estimator in ESTIMATORS for preset in PRESETS)
-GOAL_ROW = Row("kalman", "calibrated")
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What to run. cache: folder of recordings and samples. processes: how many at a time."""
-
-    seeds: tuple[int, ...]
-    seconds: float
-    cache: Path
-    processes: int
-    rows: tuple[Row, ...] = ROWS
-    setup: Setup = LOADING
-
-    def task(self, seed: int, row: Row) -> Task:
-        """One row on one recording."""
-        return Task(Drive(seed, self.seconds, PRESETS[row.preset][0], self.setup), row, self.cache)
+ROWS = tuple(GroundConfiguration(estimator, preset) for estimator in ESTIMATORS for preset in PRESETS)
+GOAL_ROW = GroundConfiguration("kalman", "calibrated")
+LIMITS: tuple[tuple[str, Relation, float], ...] = (
+    ("right_class_pct", ">=", 96.0),
+    ("wrong_cells_pct", "<=", 3.5),
+    ("wrong_cells_interior_pct", "<=", 1.0),
+    ("dirt_flat_right_pct", ">=", 97.0),
+    ("grade_bias_deg", "<=", 0.1),
+    ("grade_std_deg", "<=", 0.35),
+    ("wrong_slope_cells_pct", "<=", 0.2),
+)
+GOALS = tuple(Goal(vars(GOAL_ROW), *limit) for limit in LIMITS)  # what was reached: docs/results/ground-estimation.md
 
 
 @dataclass(frozen=True)
-class Task:
-    """One row on one recording."""
-
-    drive: Drive
-    row: Row
-    cache: Path
-
-    @property
-    def folder(self) -> Path:
-        """Of the recording."""
-        return self.drive.folder(self.cache)
-
-
-@dataclass(frozen=True)
-class Run:
+class PipelineOutput:
     """What the pipeline made of a recording: samples, what it withheld by reason, and its processor time."""
 
     samples: Table
@@ -111,39 +84,61 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """One row on one recording, with the truth, and judged from an instant on."""
+class GroundOutcome:
+    """One row on one recording: what the pipeline made of it, the truth, and their comparison from an instant on."""
 
-    task: Task
-    run: Run
-    way: Way
-    ground: Ground
+    drive: PlannedDrive
+    row: GroundConfiguration
+    output: PipelineOutput
+    track: LoadTrack
+    ground: TrueGround
     from_ns: int
-    judged: Judged
+    comparison: Comparison
 
 
-def options(estimator: str, *, calibrate: bool) -> PipelineConfig:
-    """The agent's options of a row."""
-    return PipelineConfig(estimation=EstimationConfig(estimator=estimator, calibrate=calibrate))
+@dataclass(frozen=True)
+class GroundRow(GroundFigures, GroundConfiguration):
+    """One row of the table: figures of all samples and cells together. docs/evaluation.md explains each."""
+
+    right_class_ci95: float | None
+    wrong_cells_ci95: float | None
+    samples: int
+    us_per_second: int
+    soils: list[SoilRow]
+    by_border: list[BorderBin]
+    c_rr_bias_by_seed: list[float]
+    wrong_cells_by_seed_pct: list[float]
+    withheld: dict[str, int]
 
 
-def run(plan: Plan, on_progress: Progress = lambda *_: None) -> tuple[dict[str, Any], list[Outcome]]:
-    """Record, estimate and judge everything of a plan; returns the report in plain values, and the outcomes.
+@dataclass(frozen=True)
+class GroundReport:
+    """One row per estimator and preset, and what the goals say of them."""
 
-    The report has `rows`, one per estimator and preset, and `goals`.
-    """
-    outcomes = _outcomes(plan, on_progress)
-    rows = [summarise(row, [o for o in outcomes if o.task.row == row]) for row in plan.rows]
-    report = {
-        "scenario": plan.setup.scenario,
-        "routes": list(plan.setup.routes),
-        "seeds": list(plan.seeds),
-        "seconds": plan.seconds,
-        "judged_from_s": settle_s(plan.seconds),
-        "rows": rows,
-        "goals": [goal for row in rows if Row(row["estimator"], row["preset"]) == GOAL_ROW for goal in goals(row)],
-    }
-    return report, outcomes
+    scenario: str
+    routes: list[str]
+    seeds: list[int]
+    seconds: float
+    judged_from_s: float
+    rows: list[GroundRow]
+    goals: list[GoalResult]
+
+
+def run(
+    runner: Runner,
+    seeds: Sequence[int],
+    seconds: float,
+    rows: Sequence[GroundConfiguration] = ROWS,
+    setup: Setup = LOADING,
+) -> tuple[GroundReport, list[GroundOutcome]]:
+    """Record, estimate and judge all rows with all seeds."""
+    pairs = [(PlannedDrive(seed, seconds, PRESETS[row.preset][0], setup), row) for seed in seeds for row in rows]
+    pairs.sort(key=lambda pair: (pair[0].seed, pair[0].preset))  # a worker loads each recording once
+    outputs = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
+    outcomes = [judged(*pair, output, runner.cache) for pair, output in zip(pairs, outputs, strict=True)]
+    table = [summarise(row, [outcome for outcome in outcomes if outcome.row == row]) for row in rows]
+    drives = (setup.scenario, list(setup.routes), list(seeds), seconds)
+    return GroundReport(*drives, settle_s(seconds), table, judge(GOALS, table)), outcomes
 
 
 def settle_s(seconds: float) -> float:
@@ -151,112 +146,68 @@ def settle_s(seconds: float) -> float:
     return min(SETTLE_S, SETTLE_SHARE * seconds)
 
 
-def summarise(row: Row, outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """One row: figures of all samples and cells together, with intervals over seeds where they are wanted."""
-    each_seed = [figures(outcome.judged) for outcome in outcomes]
-    judged = pool([outcome.judged for outcome in outcomes])
-    runs = [outcome.run for outcome in outcomes]
-    found = figures(judged)
-    for name in ("right_class", "wrong_cells"):
-        found[f"{name}_ci95"] = half_width(_finite([seed[f"{name}_pct"] for seed in each_seed]))
-    reasons = sorted({reason for one in runs for reason in one.withheld})
-    return {
-        "estimator": row.estimator,
-        "preset": row.preset,
-        **{name: _round(value) for name, value in found.items()},
-        "samples": sum(len(one.samples) for one in runs),
-        "us_per_second": round(sum(one.us_per_second for one in runs) / len(runs)),
-        "soils": [{name: _round(value) for name, value in soil.items()} for soil in soils(judged)],
-        "by_border": [{name: _round(value) for name, value in part.items()} for part in by_border(judged)],
-        "c_rr_bias_by_seed": [round(c_rr_bias(outcome.judged), 5) for outcome in outcomes],
-        "wrong_cells_by_seed_pct": [_round(seed["wrong_cells_pct"]) for seed in each_seed],
-        "withheld": {reason: sum(one.withheld.get(reason, 0) for one in runs) for reason in reasons},
-    }
-
-
-def goals(row: dict[str, Any]) -> list[dict[str, Any]]:
-    """What the issue wants of a row, and whether it is so; what is not known is not met."""
-    listed = []
-    for name, relation, limit in GOALS:
-        found = row[name]
-        met = abs(found) <= limit if relation == "<=" else found >= limit
-        label = f"{row['estimator']} {row['preset']}"
-        listed.append({"row": label, "name": name, "goal": f"{relation} {limit:g}", "found": found, "met": bool(met)})
-    return listed
-
-
-def _finite(numbers: Sequence[float]) -> Floats:
-    found: Floats = np.array([number for number in numbers if math.isfinite(number)], float)
-    return found
-
-
-def _round(value: Any) -> Any:
-    return rounded(value, DIGITS) if isinstance(value, float) else value
-
-
-# --- recordings and runs, kept ---------------------------------------------------------------------------------------
-
-
-def _outcomes(plan: Plan, on_progress: Progress) -> list[Outcome]:
-    """Outcomes of all tasks by seeds and rows, from the cache where they are there."""
-    tasks = [plan.task(seed, row) for seed in plan.seeds for row in plan.rows]
-    tasks.sort(key=lambda task: (task.drive.seed, task.drive.preset))  # a worker loads each recording once
-    carry_out(tasks, run_file, _estimate, plan.processes, on_progress)
-    return [judge_task(task) for task in tasks]
-
-
-def run_file(task: Task) -> Path:
-    """Where the samples of a task are kept."""
-    key = digest(repr(task.row.options), repr(task.drive.machine), code_version(*SOURCES))
-    return task.folder / "ground" / f"{task.row.name}-{key}.npz"
-
-
-def read_run(path: Path) -> Run:
-    """Read what a worker wrote."""
-    with np.load(path) as kept:
-        return Run(kept["samples"], json.loads(str(kept["withheld"])), float(kept["us_per_second"]))
-
-
-def judge_task(task: Task) -> Outcome:
-    """Compare what a worker kept with the truth."""
-    found = read_run(run_file(task))
-    way, ground = _truth(task.drive, task.cache)
-    from_ns = int(way.stamp_ns[0]) + round(settle_s(task.drive.seconds) * 1e9)
-    judged = judge(found.samples, way, ground, LAG_S, from_ns)
-    return Outcome(task, found, way, ground, from_ns, judged)
+def judged(drive: PlannedDrive, row: GroundConfiguration, output: PipelineOutput, cache: Path) -> GroundOutcome:
+    """Compare the samples of one row on one recording with the truth."""
+    track, ground = _truth(drive, cache)
+    from_ns = int(track.stamp_ns[0]) + round(settle_s(drive.seconds) * 1e9)
+    comparison = compare(output.samples, track, ground, LAG_S, from_ns)
+    return GroundOutcome(drive, row, output, track, ground, from_ns, comparison)
 
 
 @lru_cache(maxsize=2)  # tasks come recording by recording
-def _truth(drive: Drive, cache: Path) -> tuple[Way, Ground]:
-    way = read_way(track_file(drive.folder(cache)), drive.machine.load_centre_m)
-    return way, lay_ground(drive.scenario.ground, drive.seed)
+def _truth(drive: PlannedDrive, cache: Path) -> tuple[LoadTrack, TrueGround]:
+    track = read_load_track(track_file(drive.folder(cache)), drive.machine.load_centre_m)
+    return track, true_ground(drive.scenario.ground, drive.seed)
+
+
+def summarise(row: GroundConfiguration, outcomes: Sequence[GroundOutcome]) -> GroundRow:
+    """One row of the table, with intervals over the seeds."""
+    by_seed = [figures(outcome.comparison) for outcome in outcomes]
+    wrong_by_seed = [seed.wrong_cells_pct for seed in by_seed]
+    pooled: Comparison = pool([outcome.comparison for outcome in outcomes])
+    outputs = [outcome.output for outcome in outcomes]
+    withheld: Counter[str] = Counter()
+    for output in outputs:
+        withheld.update(output.withheld)
+    summary = GroundRow(
+        **vars(row),
+        **vars(figures(pooled)),
+        right_class_ci95=_interval([seed.right_class_pct for seed in by_seed]),
+        wrong_cells_ci95=_interval(wrong_by_seed),
+        samples=sum(len(output.samples) for output in outputs),
+        us_per_second=round(sum(output.us_per_second for output in outputs) / len(outputs)),
+        soils=soils(pooled.cells),
+        by_border=by_border(pooled.cells),
+        c_rr_bias_by_seed=[c_rr_bias(outcome.comparison.placed) for outcome in outcomes],
+        wrong_cells_by_seed_pct=wrong_by_seed,
+        withheld=dict(sorted(withheld.items())),
+    )
+    return rounded(summary, DIGITS, c_rr_bias_by_seed=5)
+
+
+def _interval(numbers: Sequence[float]) -> float | None:
+    """Half-width of the interval of the seeds that have a figure."""
+    return half_width(np.array([number for number in numbers if math.isfinite(number)]))
 
 
 # --- in the worker processes -----------------------------------------------------------------------------------------
 
 
-def _estimate(job: tuple[Task, Path]) -> None:
-    """Run one row on one recording, and keep its samples, whole or not at all."""
-    task, file = job
-    check_name(file, run_file(task))
-    recording = loaded(task.drive, task.cache)
-    pipeline = Pipeline(recording.site, recording.machine, task.row.options)
+def _estimate(task: Task[GroundConfiguration], cache: Path) -> PipelineOutput:
+    """Run one row on one recording."""
+    recording = task.recording(cache)
+    pipeline = Pipeline(recording.site, recording.machine, task.variant.options)
     samples, cpu_s = sample(pipeline, recording)
     seconds = (recording.readings[-1].stamp_ns - recording.readings[0].stamp_ns) * 1e-9
-    kept: dict[str, Any] = {
-        "samples": samples,
-        "withheld": json.dumps(pipeline.health()["withheld"]),
-        "us_per_second": cpu_s * 1e6 / seconds if seconds else math.nan,
-    }
-    file.parent.mkdir(exist_ok=True)
-    part = file.with_name(f"{file.stem}.part.npz")
-    np.savez_compressed(part, **kept)
-    part.rename(file)
+    return PipelineOutput(samples, pipeline.health()["withheld"], cpu_s * 1e6 / seconds if seconds else math.nan)
 
 
-def sample(pipeline: Pipeline, recording: Recording) -> tuple[Table, float]:
+def sample(pipeline: Pipeline, recording: RecordedDrive) -> tuple[Table, float]:
     """All samples that a pipeline makes of a recording, and the processor time [s] that it took."""
     began_s = time.process_time()
     readings = recording.readings
     made = [pipeline.step(readings[i : i + CHUNK]) for i in range(0, len(readings), CHUNK)]
     return np.concatenate(made), time.process_time() - began_s
+
+
+EXPERIMENT = Experiment("ground", PipelineOutput, SOURCES, _estimate)

@@ -1,35 +1,34 @@
-"""Pictures of the ground's estimate: along the way, over the site, and all rows together."""
+"""Pictures of the ground's estimate: along the track, over the site, and all rows together."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-import numpy as np
-
-mpl.use("Agg")  # no screen is needed
-
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from evaluation.ground.experiment import GOAL_ROW, ROWS, Outcome, Row
+from evaluation.campaign.experiment import Runner
+from evaluation.campaign.pictures import WIDTH_IN, draw_all
+from evaluation.ground.comparison import CellMeans, Comparison, PlacedSamples, pool
+from evaluation.ground.experiment import GOAL_ROW, ROWS, GroundConfiguration, GroundOutcome, GroundReport
+from evaluation.ground.figures import INTERIOR_M, by_border
 from evaluation.ground.lag import C_RR
-from evaluation.ground.score import INTERIOR_M, Judged, Placed, by_border, place, pool
-from evaluation.ground.truth import Way
-from evaluation.positions.plots import DPI, STYLE, WIDTH_IN
+from evaluation.ground.truth import LoadTrack
 from protocol.arrays import AnyArray, Bools, Floats, Ints
-from protocol.site.ground_classes import ZONES, resistance_class
+from protocol.site.ground_classes import ZONES
 
-PICTURED = ("nominal", "calibrated")  # of GOAL_ROW's estimator, along the way and over the site
+PICTURED = ("nominal", "calibrated")  # of GOAL_ROW's estimator, along the track and over the site
 SEEDS = 4  # one of each route has pictures of its own
-WINDOW_M = 520.0  # of the way; more is too dense to read
+WINDOW_M = 520.0  # of the track; more is too dense to read
 NAMED_M = 22.0  # a stripe that has room for the name of its ground
 GAP_M = 3.0  # lines do not bridge a longer stretch without samples
 SIGMAS, BINS = 5.0, 50  # of the histogram; what lies further out is not drawn
@@ -44,56 +43,42 @@ PRESS_FROM, PRESS = 0.08, 5.0  # c_rr above the first is drawn that much smaller
 ZONE_TICKS = [f"{zone.name}  {zone.c_rr:g}" for zone in ZONES]
 
 
-def draw(outcomes: Sequence[Outcome], folder: Path) -> list[Path]:
+def draw(_: GroundReport, outcomes: Sequence[GroundOutcome], __: Runner, folder: Path) -> list[Path]:
     """Draw all pictures of a run into a folder; returns their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    with mpl.rc_context(STYLE):
-        for name, figure in _pictures(outcomes).items():
-            paths.append(folder / f"{name}.png")
-            figure.savefig(paths[-1], dpi=DPI)
-            plt.close(figure)
-    return paths
+    if not outcomes:
+        return []
+    pictures: dict[str, Callable[[], Figure]] = {}
+    rows = [GroundConfiguration(GOAL_ROW.estimator, preset) for preset in PICTURED]
+    for seed in sorted({o.drive.seed for o in outcomes})[:SEEDS]:
+        pictured = [o for o in outcomes if o.drive.seed == seed and o.row in rows]
+        if shown := [o for o in pictured if len(o.comparison.placed.samples)]:
+            pictures[f"along_seed{seed}"] = partial(draw_along, shown)
+            pictures[f"places_seed{seed}"] = partial(draw_places, shown)
+    return draw_all({**pictures, "summary": partial(draw_summary, outcomes)}, folder)
 
 
-def _pictures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
-    pictures = {}
-    rows = [Row(GOAL_ROW.estimator, preset) for preset in PICTURED]
-    for seed in sorted({o.task.drive.seed for o in outcomes})[:SEEDS]:
-        found = [o for o in outcomes if o.task.drive.seed == seed and o.task.row in rows]
-        shown = [(o, placed) for o in found if len((placed := _placed(o)).samples)]
-        if shown:
-            pictures[f"along_seed{seed}"] = draw_along(shown)
-            pictures[f"places_seed{seed}"] = draw_places(shown)
-    return {**pictures, "summary": draw_summary(outcomes)} if outcomes else pictures
+# --- along the track -------------------------------------------------------------------------------------------------
 
 
-def _placed(outcome: Outcome) -> Placed:
-    return place(outcome.run.samples, outcome.way, outcome.ground, outcome.from_ns)
-
-
-# --- along the way ---------------------------------------------------------------------------------------------------
-
-
-def draw_along(shown: Sequence[tuple[Outcome, Placed]]) -> Figure:
-    """Resistance and slope over the way driven: truth, estimates, and the bands that they state."""
-    outcome = shown[0][0]
+def draw_along(shown: Sequence[GroundOutcome]) -> Figure:
+    """Resistance and slope over the distance driven: truth, estimates, and the bands that they state."""
+    outcome = shown[0]
     figure, panels = plt.subplots(
         3, figsize=(WIDTH_IN + 2, 7.6), sharex=True, height_ratios=(2.2, 1, 0.8), constrained_layout=True
     )
-    way = _window(outcome)
-    zone = outcome.ground.zone(way.place_m)
+    track = _window(outcome)
+    zone = outcome.ground.zone(track.place_m)
     for axes in panels:
-        _draw_zones(axes, way, zone)
+        _draw_zones(axes, track, zone)
         axes.grid(visible=False, axis="x")
-        axes.set_xlim(way.driven_m[0], way.driven_m[-1])
+        axes.set_xlim(track.driven_m[0], track.driven_m[-1])
     resistance, slope, error = panels
-    _name_zones(resistance, way, zone)
-    resistance.plot(way.driven_m, C_RR[zone], drawstyle="steps-mid", **TRUTH)
-    slope.plot(way.driven_m, _slope_deg(way.gradient, way.yaw_rad), **TRUTH)
+    _name_zones(resistance, track, zone)
+    resistance.plot(track.driven_m, C_RR[zone], drawstyle="steps-mid", **TRUTH)
+    slope.plot(track.driven_m, _slope_deg(track.gradient, track.yaw_rad), **TRUTH)
     error.axhline(0, **TRUTH)
-    for each, placed in shown:
-        _draw_estimate(panels, each.task.row.preset, _within(placed, way))
+    for each in shown:
+        _draw_estimate(panels, each.row.preset, _within(each.comparison.placed, track))
     resistance.set_yscale("function", functions=(_pressed, _stretched))
     resistance.set_ylim(-0.012, 0.32)
     resistance.set_yticks(C_RR, ZONE_TICKS)
@@ -101,76 +86,77 @@ def draw_along(shown: Sequence[tuple[Outcome, Placed]]) -> Figure:
     slope.set_ylabel("slope ahead [deg]")
     error.set_ylabel("its error [deg]")
     error.set_ylim(-1.5, 1.5)
-    error.set_xlabel("true way driven [m]")
+    error.set_xlabel("true distance driven [m]")
     figure.legend(handles=_along_handles(shown), loc="outside lower center", ncols=6)
-    drive = outcome.task.drive
+    drive = outcome.drive
     title = f"Seed {drive.seed}, route {drive.tour}: the estimate at the true place of each sample"
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, weight="bold")
     return figure
 
 
-def _draw_zones(axes: Axes, way: Way, zone: Ints) -> None:
+def _draw_zones(axes: Axes, track: LoadTrack, zone: Ints) -> None:
     """Kinds of ground as pale stripes, and stretches driven in reverse as a bar at the foot."""
     for first, last in _runs(zone):
-        axes.axvspan(way.driven_m[first], way.driven_m[last], color=PALE[zone[first]], lw=0, zorder=0)
-    backwards = _backwards(way)
+        axes.axvspan(track.driven_m[first], track.driven_m[last], color=PALE[zone[first]], lw=0, zorder=0)
+    backwards = _backwards(track)
     for first, last in _runs(backwards.astype(int)):
-        span = (way.driven_m[first], way.driven_m[last])
+        span = (track.driven_m[first], track.driven_m[last])
         if backwards[first] and span[1] - span[0] > 1:
             axes.axvspan(*span, ymin=0, ymax=0.03, color="black", lw=0, alpha=0.55, zorder=1)
 
 
-def _name_zones(axes: Axes, way: Way, zone: Ints) -> None:
+def _name_zones(axes: Axes, track: LoadTrack, zone: Ints) -> None:
     for first, last in _runs(zone):
-        west, east = way.driven_m[first], way.driven_m[last]
+        west, east = track.driven_m[first], track.driven_m[last]
         if east - west > NAMED_M:
             place: Any = {"ha": "center", "va": "top", "transform": axes.get_xaxis_transform()}
             axes.text((west + east) / 2, 0.985, ZONES[zone[first]].name, fontsize=8, color="#444444", **place)
 
 
-def _draw_estimate(panels: Sequence[Axes], preset: str, placed: Placed) -> None:
+def _draw_estimate(panels: Sequence[Axes], preset: str, placed: PlacedSamples) -> None:
     """Estimates as lines, with two standard deviations to each side."""
-    colour, way = COLOUR[preset], placed.way
-    slopes = _slope_deg(placed.gradient, way.yaw_rad)
+    colour, track = COLOUR[preset], placed.track
+    slopes = _slope_deg(placed.gradient, track.yaw_rad)
     slope_std = np.degrees(np.sqrt(placed.samples["grade_var"].astype(float)))
     c_rr_std = np.sqrt(placed.samples["c_rr_var"].astype(float))
-    gaps = np.flatnonzero(np.diff(way.driven_m, prepend=way.driven_m[:1]) > GAP_M)
-    errors = slopes - _slope_deg(way.gradient, way.yaw_rad)
+    gaps = np.flatnonzero(np.diff(track.driven_m, prepend=track.driven_m[:1]) > GAP_M)
+    errors = slopes - _slope_deg(track.gradient, track.yaw_rad)
     columns = ((placed.c_rr, c_rr_std), (slopes, slope_std), (errors, slope_std))
     for axes, (values, std) in zip(panels, columns, strict=True):
-        x, mean, half = (np.insert(column, gaps, np.nan) for column in (way.driven_m, values, 2 * std))
+        x, mean, half = (np.insert(column, gaps, np.nan) for column in (track.driven_m, values, 2 * std))
         axes.fill_between(x, mean - half, mean + half, color=colour, alpha=0.22, lw=0, zorder=2)
         axes.plot(x, mean, color=colour, lw=1.1, zorder=3 + 2 * (preset == GOAL_ROW.preset))
 
 
-def _along_handles(shown: Sequence[tuple[Outcome, Placed]]) -> list[Any]:
+def _along_handles(shown: Sequence[GroundOutcome]) -> list[Any]:
     handles: list[Any] = [Line2D([], [], label="truth", **TRUTH)]
-    handles += [Line2D([], [], color=COLOUR[o.task.row.preset], label=o.task.row.preset) for o, _ in shown]
+    handles += [Line2D([], [], color=COLOUR[o.row.preset], label=o.row.preset) for o in shown]
     handles.append(Patch(color="grey", alpha=0.3, lw=0, label="two standard deviations"))
     handles.append(Patch(color="black", alpha=0.55, lw=0, label="in reverse"))
     return handles
 
 
-def _window(outcome: Outcome) -> Way:
-    """The first stretch of the way that is judged, as far as a picture can show it."""
-    way = outcome.way
-    first = int(np.searchsorted(way.stamp_ns, outcome.from_ns))
-    last = int(np.searchsorted(way.driven_m, way.driven_m[min(first, len(way.driven_m) - 1)] + WINDOW_M, side="right"))
-    return way.at(way.stamp_ns[first:last])
+def _window(outcome: GroundOutcome) -> LoadTrack:
+    """The first stretch of the track that is judged, as far as a picture can show it."""
+    track = outcome.track
+    first = int(np.searchsorted(track.stamp_ns, outcome.from_ns))
+    begin_m = track.driven_m[min(first, len(track.driven_m) - 1)]
+    last = int(np.searchsorted(track.driven_m, begin_m + WINDOW_M, side="right"))
+    return track.at(track.stamp_ns[first:last])
 
 
-def _within(placed: Placed, way: Way) -> Placed:
+def _within(placed: PlacedSamples, track: LoadTrack) -> PlacedSamples:
     """The samples of a stretch."""
-    here = (placed.way.stamp_ns >= way.stamp_ns[0]) & (placed.way.stamp_ns <= way.stamp_ns[-1])
-    there = placed.way.at(placed.way.stamp_ns[here]) if here.any() else placed.way.at(placed.way.stamp_ns[:0])
+    here = (placed.track.stamp_ns >= track.stamp_ns[0]) & (placed.track.stamp_ns <= track.stamp_ns[-1])
+    there = placed.track.at(placed.track.stamp_ns[here])
     columns = (placed.zone[here], placed.border_m[here], placed.slope[here], placed.is_edge[here])
-    return Placed(placed.samples[here], there, *columns)
+    return PlacedSamples(placed.samples[here], there, *columns)
 
 
-def _backwards(way: Way) -> Bools:
+def _backwards(track: LoadTrack) -> Bools:
     """Where the load centre moves against the heading."""
-    step = np.gradient(way.place_m, axis=0)
-    against: Bools = (step * np.stack([np.cos(way.yaw_rad), np.sin(way.yaw_rad)], axis=-1)).sum(axis=-1) < -0.01
+    step = np.gradient(track.place_m, axis=0)
+    against: Bools = (step * np.stack([np.cos(track.yaw_rad), np.sin(track.yaw_rad)], axis=-1)).sum(axis=-1) < -0.01
     return against
 
 
@@ -198,28 +184,28 @@ def _stretched(values: AnyArray) -> AnyArray:
 # --- over the site ---------------------------------------------------------------------------------------------------
 
 
-def draw_places(shown: Sequence[tuple[Outcome, Placed]]) -> Figure:
+def draw_places(shown: Sequence[GroundOutcome]) -> Figure:
     """The site from above: samples by their error, those of a wrong class marked."""
-    outcome = shown[0][0]
+    outcome = shown[0]
     figure, panels = plt.subplots(
         1, len(shown), figsize=(WIDTH_IN + 2, 5.3), sharex=True, sharey=True, squeeze=False, constrained_layout=True
     )
-    for axes, (each, placed) in zip(panels[0], shown, strict=True):
-        dots = _draw_site(axes, each, placed)
+    for axes, each in zip(panels[0], shown, strict=True):
+        dots = _draw_site(axes, each)
         axes.set_xlabel("east [m]")
     panels[0, 0].set_ylabel("north [m]")
     figure.colorbar(dots, ax=panels, shrink=0.8, pad=0.01, extend="both", label="error of $c_{rr}$ [-]")
     handles: list[Any] = [Patch(color=colour, label=zone.name) for colour, zone in zip(PALE, ZONES, strict=True)]
     handles.append(Line2D([], [], color="magenta", marker="x", ls="", mew=1.3, label="wrong class"))
     figure.legend(handles=handles, loc="outside lower center", ncols=6)
-    drive = outcome.task.drive
+    drive = outcome.drive
     title = f"Seed {drive.seed}, route {drive.tour}: samples where the machine truly was"
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, weight="bold")
     return figure
 
 
-def _draw_site(axes: Axes, outcome: Outcome, placed: Placed) -> Any:
-    terrain = outcome.ground.terrain
+def _draw_site(axes: Axes, outcome: GroundOutcome) -> Any:
+    terrain, placed = outcome.ground.terrain, outcome.comparison.placed
     rows, columns = terrain.zones.shape
     extent = (0.0, columns * terrain.zone_cell_m, 0.0, rows * terrain.zone_cell_m)
     axes.imshow(
@@ -227,14 +213,13 @@ def _draw_site(axes: Axes, outcome: Outcome, placed: Placed) -> Any:
         interpolation="nearest",
     )  # fmt: skip
     known = np.isfinite(placed.c_rr)
-    x, y = placed.way.place_m[known].T
-    error = (placed.c_rr - placed.true_c_rr)[known]
-    wrong = (resistance_class(placed.c_rr) != resistance_class(placed.true_c_rr))[known]
+    x, y = placed.track.place_m[known].T
+    error, wrong = placed.c_rr_error[known], ~placed.is_right[known]
     axes.scatter(x, y, color="#333333", s=34, lw=0, zorder=2)  # sets small errors off from the ground
     dots = axes.scatter(x, y, c=error, cmap="coolwarm", vmin=-ERROR, vmax=ERROR, s=14, lw=0, zorder=3)
     axes.scatter(x[wrong], y[wrong], color="magenta", marker="x", s=16, lw=0.9, zorder=4)
     share = 100 * wrong.mean() if len(wrong) else np.nan
-    axes.set_title(f"{outcome.task.row.preset}: {share:.1f} % of samples wrong", loc="left", fontsize=9, weight="bold")
+    axes.set_title(f"{outcome.row.preset}: {share:.1f} % of samples wrong", loc="left", fontsize=9, weight="bold")
     axes.grid(visible=False)
     return dots
 
@@ -242,14 +227,14 @@ def _draw_site(axes: Axes, outcome: Outcome, placed: Placed) -> Any:
 # --- all rows --------------------------------------------------------------------------------------------------------
 
 
-def draw_summary(outcomes: Sequence[Outcome]) -> Figure:
+def draw_summary(outcomes: Sequence[GroundOutcome]) -> Figure:
     """Wrong cells by distance to a border, and how large errors are beside what the estimate states."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH_IN + 2, 4.4), constrained_layout=True)
-    drawn = {outcome.task.row for outcome in outcomes}
+    drawn = {outcome.row for outcome in outcomes}
     for row in [row for row in ROWS if row in drawn]:
-        judged = pool([o.judged for o in outcomes if o.task.row == row])
-        _draw_by_border(left, row, judged)
-        _draw_normalised(right, row, judged)
+        comparison: Comparison = pool([o.comparison for o in outcomes if o.row == row])
+        _draw_by_border(left, row, comparison.cells)
+        _draw_normalised(right, row, comparison.placed)
     left.set_xlabel("distance of the cell from the nearest border [m]")
     left.set_ylabel("cells of a wrong class [%]")
     left.set_ylim(0, 1.3 * left.get_ylim()[1])
@@ -262,26 +247,25 @@ def draw_summary(outcomes: Sequence[Outcome]) -> Figure:
     left.legend(ncols=2, loc="upper right")
     right.set_ylim(top=1.5 * right.get_ylim()[1])
     right.legend(title="and root mean square", alignment="left", ncols=2, loc="upper left")
-    drive = outcomes[0].task.drive
-    seeds = len({o.task.drive.seed for o in outcomes})
+    drive = outcomes[0].drive
+    seeds = len({o.drive.seed for o in outcomes})
     title = f"{seeds} seeds of {drive.seconds:g} s, every row on the same recordings"
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, weight="bold")
     return figure
 
 
-def _draw_by_border(axes: Axes, row: Row, judged: Judged) -> None:
-    parts = by_border(judged)
-    starts = [part["from_m"] for part in parts]
+def _draw_by_border(axes: Axes, row: GroundConfiguration, cells: CellMeans) -> None:
+    parts = by_border(cells)
+    starts = [part.from_m for part in parts]
     ticks = [*(f"{a:g} to {b:g}" for a, b in itertools.pairwise(starts)), f"over {starts[-1]:g}"]
-    wrong = [part["wrong_pct"] for part in parts]
+    wrong = [part.wrong_pct for part in parts]
     label = f"{row.estimator}, {row.preset}"
     axes.plot(wrong, DASHES[row.estimator], color=COLOUR[row.preset], marker="o", ms=4, lw=1.3, label=label)
     axes.set_xticks(range(len(ticks)), ticks)
 
 
-def _draw_normalised(axes: Axes, row: Row, judged: Judged) -> None:
-    inside = judged.border_m > INTERIOR_M
-    errors = (judged.c_rr_error / judged.c_rr_std)[inside]
+def _draw_normalised(axes: Axes, row: GroundConfiguration, placed: PlacedSamples) -> None:
+    errors = placed.normalised_error[np.isfinite(placed.c_rr) & (placed.border_m > INTERIOR_M)]
     if not len(errors):
         return
     edges = np.linspace(-SIGMAS, SIGMAS, BINS + 1)

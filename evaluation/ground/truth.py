@@ -1,4 +1,4 @@
-"""What is true where a machine drove: the way of its load centre, and the soil, border and slope at any place."""
+"""What is true where a machine drove: the track of its load centre, and the soil, border and slope at any place."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
+from evaluation.campaign.truth import interpolate
+from evaluation.maps.borders import border_distance
 from protocol.arrays import Floats, Ints
-from protocol.site.ground_classes import UNKNOWN
 from sim.scenario.ground import GroundConfig, build_terrain
 from sim.terrain.terrain import Terrain
 from sim.truth import TruthMap, truth_map
@@ -19,10 +19,10 @@ CELL_M = 1.0  # of the cells that are judged, as a site's map has them
 
 
 @dataclass(frozen=True)
-class Way:
-    """True way of a machine, n instants.
+class LoadTrack:
+    """True track of a machine's load centre, n instants.
 
-    stamp_ns: (n,). place_m: its load centre (n, 2) in `map`. yaw_rad: (n,), without jumps. gradient: of the plane
+    stamp_ns: (n,). place_m: (n, 2) in `map`. yaw_rad: of the machine (n,), without jumps. gradient: of the plane
     through its wheels, east and north (n, 2) [m/m]. driven_m: how far the load centre has moved so far (n,).
     """
 
@@ -32,19 +32,14 @@ class Way:
     gradient: Floats
     driven_m: Floats
 
-    def at(self, stamp_ns: Ints) -> Way:
+    def at(self, stamp_ns: Ints) -> LoadTrack:
         """The same at other instants (m,); NaN before the first and after the last that is known."""
-        t, known = (np.asarray(s - self.stamp_ns[0], float) * 1e-9 for s in (stamp_ns, self.stamp_ns))
-
-        def each(values: Floats) -> Floats:
-            return np.interp(t, known, values, np.nan, np.nan)
-
-        place, gradient = (np.stack([each(c) for c in two.T], axis=-1) for two in (self.place_m, self.gradient))
-        return Way(stamp_ns, place, each(self.yaw_rad), gradient, each(self.driven_m))
+        columns = (self.place_m, self.yaw_rad, self.gradient, self.driven_m)
+        return LoadTrack(stamp_ns, *(interpolate(stamp_ns, self.stamp_ns, values) for values in columns))
 
 
 @dataclass(frozen=True)
-class Ground:
+class TrueGround:
     """True ground of a drive. terrain: as it is; profile: without its unevenness; truth: surveyed by cells."""
 
     terrain: Terrain
@@ -59,8 +54,8 @@ class Ground:
         """How far places (n, 2) are from the nearest other kind of ground (n,)."""
         column, row = np.floor(place_m.T / self.terrain.zone_cell_m).astype(int)
         rows, columns = self._borders_m.shape
-        found: Floats = self._borders_m[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-        return found
+        distance: Floats = self._borders_m[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+        return distance
 
     def slope(self, place_m: Floats) -> Floats:
         """Gradient (n, 2) [m/m] of the ground without its unevenness."""
@@ -77,32 +72,18 @@ class Ground:
         return border_distance(self.terrain.zones, self.terrain.zone_cell_m)
 
 
-def lay_ground(config: GroundConfig, seed: int, cell_m: float = CELL_M) -> Ground:
+def true_ground(config: GroundConfig, seed: int, cell_m: float = CELL_M) -> TrueGround:
     """The ground that a simulation of this seed drives on."""
     terrain = build_terrain(config, seed)
     profile = build_terrain(replace(config, roughness_m=0.0), seed)
-    return Ground(terrain, profile, truth_map(terrain, config.width_m, config.depth_m, cell_m))
+    return TrueGround(terrain, profile, truth_map(terrain, config.width_m, config.depth_m, cell_m))
 
 
-def read_way(path: Path, load_centre_m: float) -> Way:
+def read_load_track(path: Path, load_centre_m: float) -> LoadTrack:
     """The truth that a simulation wrote: `tracks/<machine>.csv`."""
     table = np.genfromtxt(path, delimiter=",", names=True, dtype=None)
     base, yaw = np.stack([table["x"], table["y"]], axis=-1), np.unwrap(table["yaw"])
     place = base + load_centre_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
-    steps = np.hypot(*np.diff(place, axis=0).T)
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(place, axis=0).T))])
     gradient = np.stack([table["grade_e"], table["grade_n"]], axis=-1)
-    return Way(table["stamp_ns"].astype(np.int64), place, yaw, gradient, np.concatenate([[0.0], np.cumsum(steps)]))
-
-
-def border_distance(classes: Ints, cell_m: float) -> Floats:
-    """Distance [m] of the cells' centres (rows, columns) from the nearest cell of another class.
-
-    Cells of class UNKNOWN border on nothing; infinite where there is no other class.
-    """
-    found = np.full(classes.shape, np.inf)
-    for kind in np.unique(classes[classes != UNKNOWN]).tolist():
-        others = (classes != kind) & (classes != UNKNOWN)
-        if others.any():
-            here = classes == kind
-            found[here] = (distance_transform_edt(~others)[here] - 0.5) * cell_m  # to its edge, not to its centre
-    return found
+    return LoadTrack(table["stamp_ns"].astype(np.int64), place, yaw, gradient, driven)

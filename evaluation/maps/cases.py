@@ -27,8 +27,8 @@ PASSES_BEFORE = 4  # of `repaved`; the site is repaved while the last of them go
 
 
 @dataclass(frozen=True)
-class Machine:
-    """One machine. It states its own covariance truly, and knows neither of its gain nor of its offset.
+class CaseMachine:
+    """One machine. The covariance that it states is right; its gain and its offset are not known to it.
 
     first: number of its first pass; even ones go along the site, odd ones across. std_m: of its position error, per
     axis. gain: factor of its c_rr. offset_m: of its positions, east. parked: stands in the dry dirt and sends all the
@@ -44,15 +44,15 @@ class Machine:
 
 
 @dataclass(frozen=True)
-class Case:
+class MapCase:
     """What is driven, on what, and what of the map is judged.
 
-    gradients: of the zones. passes_after: how many whole passes follow upon a repaving. width_m: of a road across wet
+    gradients: of the zones. passes_after: how many whole passes follow a repaving. width_m: of a road across wet
     dirt, whose cells alone are judged. columns, rows: size of the site in cells.
     """
 
-    name: str
-    machines: tuple[Machine, ...]
+    kind: str
+    machines: tuple[CaseMachine, ...]
     gradients: Sequence[tuple[float, float]] = FLAT
     judges_grade: bool = False
     passes_after: int | None = None
@@ -62,15 +62,15 @@ class Case:
 
     @property
     def title(self) -> str:
-        """Name, and what tells variants of it apart."""
-        parts = [self.name]
+        """Kind, and what tells variants of it apart."""
+        parts = [self.kind]
         parts += [f"{self.passes_after} after"] if self.passes_after is not None else []
         parts += [f"{self.width_m} m"] if self.width_m is not None else []
         return ", ".join(parts)
 
     @property
-    def file_name(self) -> str:
-        """The title without blanks."""
+    def name(self) -> str:
+        """The title without blanks, for files."""
         return self.title.replace(", ", "-").replace(" ", "_")
 
 
@@ -89,7 +89,7 @@ class Site:
     judged: Bools
 
 
-def lay(case: Case) -> Site:
+def build_site(case: MapCase) -> Site:
     """The site of a case."""
     zone = zones(case.columns, case.rows)
     repaved = np.zeros(zone.shape, np.bool_)
@@ -116,33 +116,33 @@ def zones(columns: int, rows: int) -> Ints:
     return zone
 
 
-def parking_place(case: Case) -> tuple[float, float]:
+def parking_place(case: MapCase) -> tuple[float, float]:
     """Where a machine is parked [m]: in the middle of the dry dirt, which a gain of 1.6 makes wet."""
     return 0.75 * case.columns * CELL_M, 0.25 * case.rows * CELL_M
 
 
-def _fleet(machines: int, passes: int) -> tuple[Machine, ...]:
-    return tuple(Machine(passes, first) for first in range(machines))
+def _fleet(machines: int, passes: int) -> tuple[CaseMachine, ...]:
+    return tuple(CaseMachine(passes, first) for first in range(machines))
 
 
-_RTK = Machine(std_m=0.05)
+_RTK = CaseMachine(std_m=0.05)
 CASES = (
-    Case("1x1", _fleet(1, 1)),
-    Case("1x4", _fleet(1, 4)),
-    Case("4x4", _fleet(4, 4)),
-    Case("bad_machine", (*_fleet(3, 4), Machine(4, 3, gain=1.6, offset_m=3.0))),
-    Case("mixed_receivers", (_RTK, *(Machine(first=first, std_m=2.5) for first in (1, 2, 3)))),
-    Case("parked_bad_machine", (*_fleet(4, 1), Machine(gain=1.6, offset_m=3.0, parked=True))),
-    *(Case("repaved", _fleet(1, PASSES_BEFORE + after), passes_after=after) for after in (1, 2)),
-    *(Case("narrow_road", _fleet(1, 4), width_m=width) for width in (3, 6)),
-    Case("grade_both_ways", _fleet(1, 4), GENTLE, judges_grade=True),
-    Case("slope_15", _fleet(1, 4), SLOPES, judges_grade=True),
+    MapCase("1x1", _fleet(1, 1)),
+    MapCase("1x4", _fleet(1, 4)),
+    MapCase("4x4", _fleet(4, 4)),
+    MapCase("bad_machine", (*_fleet(3, 4), CaseMachine(4, 3, gain=1.6, offset_m=3.0))),
+    MapCase("mixed_receivers", (_RTK, *(CaseMachine(first=first, std_m=2.5) for first in (1, 2, 3)))),
+    MapCase("parked_bad_machine", (*_fleet(4, 1), CaseMachine(gain=1.6, offset_m=3.0, parked=True))),
+    *(MapCase("repaved", _fleet(1, PASSES_BEFORE + after), passes_after=after) for after in (1, 2)),
+    *(MapCase("narrow_road", _fleet(1, 4), width_m=width) for width in (3, 6)),
+    MapCase("grade_both_ways", _fleet(1, 4), GENTLE, judges_grade=True),
+    MapCase("slope_15", _fleet(1, 4), SLOPES, judges_grade=True),
 )
 
 
-def select(names: Sequence[str]) -> tuple[Case, ...]:
-    """The cases of these names, in the order of the table; none means all. Raises ConfigError."""
-    known = list(dict.fromkeys(case.name for case in CASES))
+def select(names: Sequence[str]) -> tuple[MapCase, ...]:
+    """The cases of these kinds, in the order of the table; none means all. Raises ConfigError."""
+    known = list(dict.fromkeys(case.kind for case in CASES))
     if unknown := [name for name in names if name not in known]:
         raise ConfigError("--cases", f"`{unknown[0][:40]}` is not known; known: {', '.join(known)}")
-    return tuple(case for case in CASES if not names or case.name in names)
+    return tuple(case for case in CASES if not names or case.kind in names)

@@ -1,4 +1,4 @@
-"""Ways to make one map of the samples of many machines: the map server's own, and what is usual elsewhere.
+"""Methods that make one map of the samples of many machines: the map server's own, and what is usual elsewhere.
 
 The others assign a sample to the one cell that its stated position lies in, and know nothing of its covariance.
 """
@@ -29,14 +29,13 @@ COLUMN = {
     "grade_north": ("grade_n", "grade_var"),
 }
 GATE_SIGMA = 2.5  # of the Kalman filter
-OUTLIER_VARIANCES = (
-    10.0  # of the measurement, which a rejected one adds to a cell's variance, so that change comes through
-)
+# A rejected value adds so many of its own variances to its cell's, so that a change of the ground is accepted at last.
+OUTLIER_VARIANCES = 10.0
 
 
 @dataclass(frozen=True)
 class ServerMap:
-    """The map server's layers, and the machines that it found to contradict all others and left out."""
+    """The map server's layers, and the machines that it excluded because they contradict all others."""
 
     layers: Layers
     distrusted: tuple[str, ...]

@@ -4,38 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-import numpy as np
-
-mpl.use("Agg")  # no screen is needed
-
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
+from evaluation.campaign.experiment import Runner
+from evaluation.campaign.goals import select
+from evaluation.campaign.pictures import WIDTH_IN, draw_all
 from evaluation.campaign.workers import each
-from evaluation.maps.cases import CELL_M, Case, parking_place
-from evaluation.maps.experiment import (
-    GOALS,
-    GRADE_TOLERANCE,
-    NEAR_M,
-    SERVER,
-    Maps,
-    Plan,
-    Row,
-    Task,
-    classes,
-    figures,
-    solve,
-)
+from evaluation.maps.cases import CELL_M, MapCase, parking_place
+from evaluation.maps.experiment import GOALS, SERVER, Maps, MergeReport, MergeRow, solve
+from evaluation.maps.figures import GRADE_TOLERANCE, NEAR_M, MapFigures, classes, figures
 from evaluation.maps.methods import METHODS, Layers
-from evaluation.positions.plots import DPI, STYLE, WIDTH_IN
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.ground_classes import UNKNOWN, ZONES, resistance_class
 
@@ -51,7 +39,7 @@ LOWEST_PCT = 0.005  # bottom of the bars' scale: three cells of the site
 LABEL_ROOM = 1.6  # a goal that is less than so many times higher would cross the value above a bar
 
 # Groups of bars: what a row is, its figure, and the words below.
-BARS: tuple[tuple[Row, str, str], ...] = (
+BARS: tuple[tuple[dict[str, Any], str, str], ...] = (
     ({"case": "1x1"}, "wrong_pct", "1 machine\n1 pass"),
     ({"case": "1x4"}, "wrong_pct", "1 machine\n4 passes"),
     ({"case": "4x4"}, "wrong_pct", "4 machines\n4 passes"),
@@ -69,32 +57,23 @@ BARS: tuple[tuple[Row, str, str], ...] = (
 )
 
 
-def draw(report: Row, plan: Plan, folder: Path) -> list[Path]:
+def draw(report: MergeReport, cases: Sequence[MapCase], runner: Runner, folder: Path) -> list[Path]:
     """Draw the table, and the maps of each case with the first seed, into a folder; returns the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    jobs = [(plan.tasks(case)[0], folder / f"{case.file_name}.png") for case in plan.cases]
-    paths = {task.case: path for (task, path), _ in each(_draw_task, jobs, plan.processes)}
-    table = folder / "table.png"
-    with mpl.rc_context(STYLE):
-        _save(draw_table(report), table)
-    return [table, *(paths[case] for case in plan.cases)]
+    jobs = [(case, report.seeds[0], folder) for case in cases]
+    paths = {case: path for (case, _, _), path in each(_draw_case, jobs, runner.processes)}
+    return [*draw_all({"table": partial(draw_table, report)}, folder), *(paths[case] for case in cases)]
 
 
-def _draw_task(job: tuple[Task, Path]) -> None:
-    task, path = job
-    with mpl.rc_context(STYLE):
-        _save(draw_maps(task.case, task.seed, solve(task.case, task.seed)), path)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=DPI)
-    plt.close(figure)
+def _draw_case(job: tuple[MapCase, int, Path]) -> Path:
+    case, seed, folder = job
+    (path,) = draw_all({case.name: partial(draw_maps, case, seed, solve(case, seed))}, folder)
+    return path
 
 
 # --- maps of one case ------------------------------------------------------------------------------------------------
 
 
-def draw_maps(case: Case, seed: int, maps: Maps) -> Figure:
+def draw_maps(case: MapCase, seed: int, maps: Maps) -> Figure:
     """Truth and two merges in the upper row; below, how sure the server is (or a key), and their wrong cells."""
     figure, panels = plt.subplots(2, 3, figsize=(WIDTH_IN + 3, 8.6), constrained_layout=True)
     true = _true_layers(maps)
@@ -103,8 +82,9 @@ def draw_maps(case: Case, seed: int, maps: Maps) -> Figure:
         axes.set_title(name, loc="left", weight="bold", fontsize=10)
     for axes, (name, layers) in zip(panels[1, 1:], _shown(maps), strict=True):
         _draw_wrong(axes, case, maps, layers)
-        found = figures(case, maps.scene, layers)
-        title = f"{name}: {found.get('wrong_pct', math.nan):.2f} % wrong{_parts(found)}"
+        judged = figures(case, maps.scene, layers)
+        wrong = math.nan if judged.wrong_pct is None else judged.wrong_pct
+        title = f"{name}: {wrong:.2f} % wrong{_parts(judged)}"
         axes.set_title(title, loc="left", weight="bold", fontsize=10)
         axes.set_xlabel("east [m]")
     if case.judges_grade:
@@ -130,14 +110,15 @@ def _true_layers(maps: Maps) -> Layers:
     return {"resistance": site.c_rr_later, "grade_east": east, "grade_north": north}
 
 
-def _parts(found: dict[str, float]) -> str:
+def _parts(judged: MapFigures) -> str:
     """Figures of a case's own, for a title."""
     words = {"changed_wrong_pct": "changed", "unchanged_wrong_pct": "unchanged", "near_wrong_pct": "beside the machine"}
-    parts = [f"{word} {found[name]:.2f}" for name, word in words.items() if name in found]
+    values = {word: getattr(judged, name) for name, word in words.items()}
+    parts = [f"{word} {value:.2f}" for word, value in values.items() if value is not None]
     return f"\n{', '.join(parts)}" if parts else ""
 
 
-def _image(axes: Axes, case: Case, rgb: Any, **options: Any) -> Any:
+def _image(axes: Axes, case: MapCase, rgb: Any, **options: Any) -> Any:
     extent = (0.0, case.columns * CELL_M, 0.0, case.rows * CELL_M)
     axes.grid(visible=False)
     image = axes.imshow(rgb, origin="lower", extent=extent, interpolation="nearest", **options)
@@ -148,7 +129,7 @@ def _image(axes: Axes, case: Case, rgb: Any, **options: Any) -> Any:
     return image
 
 
-def _picture(case: Case, layers: Layers) -> Floats:
+def _picture(case: MapCase, layers: Layers) -> Floats:
     """Colours (rows, columns, 3) of a map."""
     if case.judges_grade:
         return _gradient_rgb(layers["grade_east"], layers["grade_north"], _steepest(case))
@@ -169,22 +150,22 @@ def _gradient_rgb(east: Floats, north: Floats, steepest: float) -> Floats:
     return np.where(known[..., None], rgb, UNKNOWN_RGB)
 
 
-def _steepest(case: Case) -> float:
+def _steepest(case: MapCase) -> float:
     return max(math.hypot(*gradient) for gradient in case.gradients)
 
 
-def _draw_wrong(axes: Axes, case: Case, maps: Maps, layers: Layers) -> None:
+def _draw_wrong(axes: Axes, case: MapCase, maps: Maps, layers: Layers) -> None:
     """Wrong cells over the pale truth; what is not judged is white."""
-    found, true = classes(case, maps.scene, layers)
+    estimated, true = classes(case, maps.scene, layers)
     judged = maps.scene.driven & maps.scene.site.judged
     rgb = 1 - PALENESS * (1 - _picture(case, _true_layers(maps)))
-    rgb[judged & (found == UNKNOWN)] = UNKNOWN_RGB
+    rgb[judged & (estimated == UNKNOWN)] = UNKNOWN_RGB
     rgb[~judged] = 1.0
-    rgb[judged & (found != UNKNOWN) & (found != true)] = WRONG_RGB
+    rgb[judged & (estimated != UNKNOWN) & (estimated != true)] = WRONG_RGB
     _image(axes, case, rgb)
 
 
-def _draw_confidence(figure: Figure, axes: Axes, case: Case, confidence: Floats) -> None:
+def _draw_confidence(figure: Figure, axes: Axes, case: MapCase, confidence: Floats) -> None:
     image = _image(axes, case, confidence, cmap="viridis", vmin=0.3, vmax=1.0)
     axes.set_title(f"{SERVER}: confidence", loc="left", weight="bold", fontsize=10)
     axes.set_xlabel("east [m]")
@@ -194,7 +175,7 @@ def _draw_confidence(figure: Figure, axes: Axes, case: Case, confidence: Floats)
     figure.colorbar(image, cax=bar, orientation="horizontal", label=label)
 
 
-def _draw_wheel(axes: Axes, case: Case) -> None:
+def _draw_wheel(axes: Axes, case: MapCase) -> None:
     """Key of the colours of gradients."""
     steepest = 100 * _steepest(case)
     east, north = np.meshgrid(*[np.linspace(-steepest, steepest, 201)] * 2)
@@ -208,7 +189,7 @@ def _draw_wheel(axes: Axes, case: Case) -> None:
     axes.set_ylabel("grade to the north [%]")
 
 
-def _draw_marks(axes: Axes, case: Case, maps: Maps) -> None:
+def _draw_marks(axes: Axes, case: MapCase, maps: Maps) -> None:
     """Outline of what was repaved, and the ring that a parked machine reaches."""
     if maps.scene.site.repaved.any():
         _outline(axes, case, maps.scene.site.repaved)
@@ -218,12 +199,12 @@ def _draw_marks(axes: Axes, case: Case, maps: Maps) -> None:
         axes.add_patch(Circle((x_m + machine.offset_m, y_m), 3 * NEAR_M, fill=False, color="black", lw=1.2))
 
 
-def _outline(axes: Axes, case: Case, cells: Bools) -> None:
+def _outline(axes: Axes, case: MapCase, cells: Bools) -> None:
     x, y = ((np.arange(count) + 0.5) * CELL_M for count in (case.columns, case.rows))
     axes.contour(x, y, cells, levels=[0.5], colors="black", linewidths=1.2, linestyles="--")
 
 
-def _handles(case: Case) -> list[Any]:
+def _handles(case: MapCase) -> list[Any]:
     handles: list[Any] = []
     if not case.judges_grade:
         handles += [Patch(color=rgb, label=f"{z.name} {z.c_rr:g}") for rgb, z in zip(ZONE_RGB, ZONES, strict=True)]
@@ -239,17 +220,16 @@ def _handles(case: Case) -> list[Any]:
 # --- all cases -------------------------------------------------------------------------------------------------------
 
 
-def draw_table(report: Row) -> Figure:
+def draw_table(report: MergeReport) -> Figure:
     """Wrong cells of all cases by method, on a logarithmic scale: medians, ranges over the seeds, and goals."""
-    groups = [(wanted, name, words) for wanted, name, words in BARS if _found(report, {**wanted, "method": SERVER})]
+    groups = [group for group in BARS if select(report.rows, group[0])]
     figure, axes = plt.subplots(figsize=(max(6.0, 1.05 * len(groups) + 1.5), 5.0), constrained_layout=True)
     wide = 0.84 / len(COLOUR)
-    for x, (wanted, name, _) in enumerate(groups):
+    for x, (values, name, _) in enumerate(groups):
         for i, method in enumerate((SERVER, *METHODS)):
-            row = _found(report, {**wanted, "method": method})
-            if row and row[name] is not None:
-                limits = _limits(wanted, name) if method == SERVER else []
-                _draw_bar(axes, x + (i - (len(COLOUR) - 1) / 2) * wide, wide, row, name, limits)
+            (row,) = select(report.rows, {**values, "method": method})
+            if getattr(row, name) is not None:
+                _draw_bar(axes, x + (i - (len(COLOUR) - 1) / 2) * wide, wide, row, name)
     axes.set_yscale("log")
     axes.set_ylim(LOWEST_PCT, 250.0)
     axes.set_yticks([0.01, 0.1, 1, 10, 100], ["0.01", "0.1", "1", "10", "100"])
@@ -260,34 +240,32 @@ def draw_table(report: Row) -> Figure:
     handles: list[Any] = [Patch(color=colour, label=name) for name, colour in COLOUR.items()]
     handles.append(Line2D([], [], color="black", lw=2, label=f"goal of {SERVER}"))
     axes.legend(handles=handles, ncols=6, loc="upper left")
-    title = f"Medians of {_count(len(report['seeds']), 'seed')}, whiskers from the best to the worst"
+    title = f"Medians of {_count(len(report.seeds), 'seed')}, whiskers from the best to the worst"
     axes.set_title(title, loc="left", weight="bold", fontsize=10)
     return figure
 
 
-def _draw_bar(axes: Axes, x: float, wide: float, row: Row, name: str, limits: Sequence[float]) -> None:
+def _draw_bar(axes: Axes, x: float, wide: float, row: MergeRow, name: str) -> None:
     """One bar; above that of the server its value, free of whisker and goal."""
-    top = max(row[name], LOWEST_PCT)
-    axes.bar(x, top, wide * 0.92, color=COLOUR[row["method"]])
+    value = getattr(row, name)
+    top = max(value, LOWEST_PCT)
+    axes.bar(x, top, wide * 0.92, color=COLOUR[row.method])
     if name == "wrong_pct":
-        low, high = (max(row[f"wrong_{end}_pct"], LOWEST_PCT) for end in ("min", "max"))
+        low, high = (max(end or 0.0, LOWEST_PCT) for end in (row.wrong_min_pct, row.wrong_max_pct))
         axes.plot([x, x], [low, high], color="black", lw=1)
         top = max(top, high)
-    for limit in limits:
+    for limit in _limits(row, name):
         axes.plot([x - 0.7 * wide, x + 0.7 * wide], [limit, limit], color="black", lw=2, zorder=4)
         top = limit if top < limit < LABEL_ROOM * top else top
-    if row["method"] == SERVER:
-        axes.text(x, top * 1.12, f"{row[name]:.2g}", ha="center", va="bottom", fontsize=7, weight="bold")
+    if row.method == SERVER:
+        axes.text(x, top * 1.12, f"{value:.2g}", ha="center", va="bottom", fontsize=7, weight="bold")
 
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _found(report: Row, wanted: Row) -> Row | None:
-    return next((row for row in report["rows"] if wanted.items() <= row.items()), None)
-
-
-def _limits(wanted: Row, name: str) -> list[float]:
-    goal = {**wanted, "method": SERVER}
-    return [limit for row, figure, relation, limit in GOALS if (row, figure, relation) == (goal, name, "<=")]
+def _limits(row: MergeRow, name: str) -> list[float]:
+    """The goals of the server's bar."""
+    goals = [goal for goal in GOALS if (goal.figure, goal.relation) == (name, "<=") and row.method == SERVER]
+    return [goal.limit for goal in goals if select([row], goal.row)]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from evaluation.maps.cases import CELL_M, PASSES_BEFORE, Case, Machine, Site, lay, parking_place
+from evaluation.maps.cases import CELL_M, PASSES_BEFORE, CaseMachine, MapCase, Site, build_site, parking_place
 from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.machine.samples import empty
@@ -41,8 +41,8 @@ class Delivery(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Way:
-    """True way of a machine, one entry per sample: place [m], heading [rad], and number of the pass from 0."""
+class Sweep:
+    """True track of a machine, one entry per sample: place [m], heading [rad], and number of the pass from 0."""
 
     x_m: Floats
     y_m: Floats
@@ -51,8 +51,8 @@ class Way:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A case as it came to be.
+class MapScene:
+    """A simulated case: what machines sent, and what was true.
 
     deliveries: of all machines, as they arrived. site: the true ground; `c_rr_later` is how it was left.
     repaved_ns: when, None where it was not. driven: cells (rows, columns) that a machine truly passed.
@@ -69,47 +69,47 @@ class Scene:
         return sum(len(delivery.rows) for delivery in self.deliveries)
 
 
-def simulate(case: Case, seed: int) -> Scene:
+def simulate(case: MapCase, seed: int) -> MapScene:
     """All that the machines of a case send; the same seed gives the same bytes."""
-    site = lay(case)
+    site = build_site(case)
     draw, *draws = np.random.default_rng(seed).spawn(1 + len(case.machines))
     start_ns = START_NS + int(draw.integers(START_WITHIN_NS))
-    ways = _ways(case, draws)
+    sweeps = _sweeps(case, draws)
     stamps = [
-        start_ns + int(rng.integers(PERIOD_NS)) + PERIOD_NS * np.arange(len(way.x_m))
-        for way, rng in zip(ways, draws, strict=True)
+        start_ns + int(rng.integers(PERIOD_NS)) + PERIOD_NS * np.arange(len(sweep.x_m))
+        for sweep, rng in zip(sweeps, draws, strict=True)
     ]
-    repaved_ns = _repaved_ns(site, ways[0], stamps[0], draw) if case.passes_after is not None else None
+    repaved_ns = _repaved_ns(site, sweeps[0], stamps[0], draw) if case.passes_after is not None else None
     sent: list[Delivery] = []
     driven = np.zeros(site.c_rr.shape, np.bool_)
-    for i, (machine, way, stamp_ns, rng) in enumerate(zip(case.machines, ways, stamps, draws, strict=True)):
-        sent += batches(f"machine{i + 1}", sense(machine, way, stamp_ns, site, repaved_ns, rng))
+    for i, (machine, sweep, stamp_ns, rng) in enumerate(zip(case.machines, sweeps, stamps, draws, strict=True)):
+        sent += batches(f"machine{i + 1}", sense(machine, sweep, stamp_ns, site, repaved_ns, rng))
         if not machine.parked:
-            driven |= passed(way, site)
-    return Scene(tuple(sorted(sent, key=lambda delivery: delivery.received_ns)), site, repaved_ns, driven)
+            driven |= passed(sweep, site)
+    return MapScene(tuple(sorted(sent, key=lambda delivery: delivery.received_ns)), site, repaved_ns, driven)
 
 
-# --- ways ------------------------------------------------------------------------------------------------------------
+# --- sweeps ----------------------------------------------------------------------------------------------------------
 
 
-def sweep(case: Case, machine: Machine, draw: np.random.Generator) -> Way:
-    """All passes of a machine, one upon the other; turns between lanes take place outside and are left out."""
+def sweep_lanes(case: MapCase, machine: CaseMachine, draw: np.random.Generator) -> Sweep:
+    """All passes of a machine, one after the other; turns between lanes lie outside of the site and are not sampled."""
     passes = [_pass(case, machine.first + i, float(draw.uniform(0, LANE_M))) for i in range(machine.passes)]
     number = np.repeat(np.arange(len(passes)), [len(x) for x, _, _ in passes])
     x, y, heading = (np.concatenate(parts) for parts in zip(*passes, strict=True))
-    return Way(x, y, heading, number)
+    return Sweep(x, y, heading, number)
 
 
-def _ways(case: Case, draws: list[np.random.Generator]) -> list[Way]:
-    """Ways of all machines; those that are parked stand until the last of the others is done."""
-    ways = [None if m.parked else sweep(case, m, rng) for m, rng in zip(case.machines, draws, strict=True)]
-    longest = max(len(way.x_m) for way in ways if way)
+def _sweeps(case: MapCase, draws: list[np.random.Generator]) -> list[Sweep]:
+    """Sweeps of all machines; those that are parked stand until the last of the others is done."""
+    sweeps = [None if m.parked else sweep_lanes(case, m, rng) for m, rng in zip(case.machines, draws, strict=True)]
+    longest = max(len(sweep.x_m) for sweep in sweeps if sweep)
     x_m, y_m = (np.full(longest, place_m) for place_m in parking_place(case))
-    stands = Way(x_m, y_m, np.zeros(longest), np.zeros(longest, np.int64))
-    return [way or stands for way in ways]
+    stands = Sweep(x_m, y_m, np.zeros(longest), np.zeros(longest, np.int64))
+    return [sweep or stands for sweep in sweeps]
 
 
-def _pass(case: Case, number: int, offset_m: float) -> tuple[Floats, Floats, Floats]:
+def _pass(case: MapCase, number: int, offset_m: float) -> tuple[Floats, Floats, Floats]:
     """East, north [m] and heading [rad] of one pass: lane after lane, there and back."""
     across = number % 2 == 1
     length, width = (case.rows, case.columns) if across else (case.columns, case.rows)
@@ -124,13 +124,12 @@ def _pass(case: Case, number: int, offset_m: float) -> tuple[Floats, Floats, Flo
     return forward, sideways, heading
 
 
-def passed(way: Way, site: Site) -> Bools:
-    """Cells (rows, columns) that a way passes: a step is shorter than a cell, so its two ends say it all."""
+def passed(sweep: Sweep, site: Site) -> Bools:
+    """Cells (rows, columns) that a sweep passes: a step is shorter than a cell, so its two ends say it all."""
     cells = np.zeros(site.c_rr.shape, np.bool_)
     for end_m in (-STEP_M / 2, STEP_M / 2):
-        cells[cell_of(way.x_m + end_m * np.cos(way.heading_rad), way.y_m + end_m * np.sin(way.heading_rad), site)] = (
-            True
-        )
+        x_m, y_m = sweep.x_m + end_m * np.cos(sweep.heading_rad), sweep.y_m + end_m * np.sin(sweep.heading_rad)
+        cells[cell_of(x_m, y_m, site)] = True
     return cells
 
 
@@ -141,9 +140,9 @@ def cell_of(x_m: Floats, y_m: Floats, site: Site) -> tuple[Ints, Ints]:
     return np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
 
 
-def _repaved_ns(site: Site, way: Way, stamp_ns: Ints, draw: np.random.Generator) -> int:
+def _repaved_ns(site: Site, sweep: Sweep, stamp_ns: Ints, draw: np.random.Generator) -> int:
     """An instant while the machine drives in the zone, well inside a time bucket."""
-    there = site.repaved[cell_of(way.x_m, way.y_m, site)] & (way.number == PASSES_BEFORE - 1)
+    there = site.repaved[cell_of(sweep.x_m, sweep.y_m, site)] & (sweep.number == PASSES_BEFORE - 1)
     about_ns = int(stamp_ns[there][int(draw.uniform(0.1, 0.9) * there.sum())])
     return about_ns // BUCKET_NS * BUCKET_NS + int(draw.uniform(0.2, 0.8) * BUCKET_NS)
 
@@ -152,20 +151,20 @@ def _repaved_ns(site: Site, way: Way, stamp_ns: Ints, draw: np.random.Generator)
 
 
 def sense(
-    machine: Machine, way: Way, stamp_ns: Ints, site: Site, repaved_ns: int | None, draw: np.random.Generator
+    machine: CaseMachine, sweep: Sweep, stamp_ns: Ints, site: Site, repaved_ns: int | None, draw: np.random.Generator
 ) -> Table:
-    """The samples of a machine on its way."""
+    """The samples of a machine along its sweep."""
     n = len(stamp_ns)
-    at = cell_of(way.x_m, way.y_m, site)
+    at = cell_of(sweep.x_m, sweep.y_m, site)
     later = np.zeros(n, np.bool_) if repaved_ns is None else stamp_ns >= repaved_ns
     c_rr = machine.gain * np.where(later, site.c_rr_later[at], site.c_rr[at])
-    gradient = site.gradient[at] + _gradient_error(way.heading_rad, draw)
+    gradient = site.gradient[at] + _gradient_error(sweep.heading_rad, draw)
     rows = empty(n)
     rows["stamp_ns"] = stamp_ns
-    rows["x_m"] = way.x_m + machine.offset_m + gauss_markov(n, machine.std_m, draw)
-    rows["y_m"] = way.y_m + gauss_markov(n, machine.std_m, draw)
+    rows["x_m"] = sweep.x_m + machine.offset_m + gauss_markov(n, machine.std_m, draw)
+    rows["y_m"] = sweep.y_m + gauss_markov(n, machine.std_m, draw)
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = machine.std_m**2
-    rows["heading_rad"] = way.heading_rad
+    rows["heading_rad"] = sweep.heading_rad
     rows["speed_mps"], rows["distance_m"] = (0.0, 0.0) if machine.parked else (SPEED_MPS, STEP_M)
     rows["c_rr"], rows["c_rr_var"] = c_rr + draw.normal(0.0, C_RR_STD, n), C_RR_STD**2
     rows["grade_e"], rows["grade_n"] = gradient.T

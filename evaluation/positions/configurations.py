@@ -16,23 +16,12 @@ SENSORS = ((0, 1), (1, 1), (1, 2), (1, 3), (2, 1), (2, 2), (2, 3), (3, 3), (3, 1
 HEADLINE = ((1, 1), (2, 1), (3, 1))
 
 # The paper's tables 1 and 2: net RMSE [m] by filter, GPS receivers and IMUs.
+PAPER = {
+    "ekf": (75.3671, 3.7363, 3.2963, 3.7660, 2.7474, 2.6517, 2.4747, 2.2980),
+    "ukf": (65.4774, 2.3234, 2.2781, 2.5742, 1.7217, 1.5460, 1.4024, 1.2458),
+}
 PAPER_NET_M = {
-    ("ekf", 0, 1): 75.3671,
-    ("ekf", 1, 1): 3.7363,
-    ("ekf", 1, 2): 3.2963,
-    ("ekf", 1, 3): 3.7660,
-    ("ekf", 2, 1): 2.7474,
-    ("ekf", 2, 2): 2.6517,
-    ("ekf", 2, 3): 2.4747,
-    ("ekf", 3, 3): 2.2980,
-    ("ukf", 0, 1): 65.4774,
-    ("ukf", 1, 1): 2.3234,
-    ("ukf", 1, 2): 2.2781,
-    ("ukf", 1, 3): 2.5742,
-    ("ukf", 2, 1): 1.7217,
-    ("ukf", 2, 2): 1.5460,
-    ("ukf", 2, 3): 1.4024,
-    ("ukf", 3, 3): 1.2458,
+    (name, *sensors): net for name, nets in PAPER.items() for sensors, net in zip(SENSORS[:-1], nets, strict=True)
 }
 
 
@@ -55,8 +44,13 @@ class Configuration:
         return f"{self.filter}-{self.profile}-{self.gps}gps-{self.imu}imu"
 
     @property
-    def paper_net_m(self) -> float | None:
-        """Net RMSE [m] that the paper reports; None where it has no such row. It knows one profile, `paper`."""
+    def sensors(self) -> tuple[int, int]:
+        """Number of GPS receivers and of IMUs."""
+        return self.gps, self.imu
+
+    @property
+    def published_net_m(self) -> float | None:
+        """Net RMSE [m] that the paper reports, with either profile; None where it has no such row."""
         return PAPER_NET_M.get((self.filter, self.gps, self.imu))
 
 
@@ -71,12 +65,12 @@ def configure(machine: MachineConfig, row: Configuration) -> tuple[MachineConfig
 
 
 def pipeline_options(row: Configuration) -> PipelineConfig:
-    """Options of the pipeline for a row. The only place that knows how filters and profiles are asked for."""
+    """Options of the pipeline for a row."""
     return PipelineConfig(localisation=LocalisationConfig(filter=row.filter, profile=row.profile))
 
 
 def started_at(options: PipelineConfig, pose: tuple[float, float, float]) -> PipelineConfig:
-    """The options of a machine without GPS, which is told where it starts: x, y [m] and heading [rad]."""
+    """The options of a machine without GPS, with its start: x, y [m] and heading [rad] in `map`."""
     return replace(options, localisation=replace(options.localisation, start=pose))
 
 

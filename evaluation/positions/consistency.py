@@ -13,14 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from evaluation.campaign.figures import CONFIDENCE
 from protocol.arrays import Floats
-
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
-class Consistency:
-    """What a series of NEES or NIS says.
+class ConsistencySummary:
+    """Figures of a series of NEES or NIS.
 
     mean: [-], of a consistent filter close to `dof`, above it where the covariance is too small. low, high: interval
     that holds the mean of a consistent filter in 95 of 100 cases. coverage: share inside of the 95 % ellipse.
@@ -34,11 +33,6 @@ class Consistency:
     coverage: float
     independent: float
 
-    @property
-    def is_consistent(self) -> bool:
-        """Whether the mean lies in its interval."""
-        return self.low <= self.mean <= self.high
-
 
 def normalised_square(vectors: Floats, covariances: Floats) -> Floats:
     """NEES of errors, or NIS of innovations: vectors (n, k), covariances (n, k, k) -> (n,)."""
@@ -47,18 +41,18 @@ def normalised_square(vectors: Floats, covariances: Floats) -> Floats:
     return squares
 
 
-def summarise(squares: Floats, dof: int, independent: float | None = None) -> Consistency:
+def summarise(squares: Floats, dof: int, independent: float | None = None) -> ConsistencySummary:
     """Summarise a series (n,) of NEES or NIS in the order of time.
 
-    independent: how many independent values it is worth; left out, its autocorrelation tells. The interval takes their
-    sum as chi-square distributed.
+    independent: how many independent values it is worth; by default its autocorrelation says so. The interval takes
+    their sum as chi-square distributed.
     """
     if not len(squares):
-        return Consistency(dof, math.nan, math.nan, math.nan, math.nan, 0.0)
+        return ConsistencySummary(dof, math.nan, math.nan, math.nan, math.nan, 0.0)
     worth = independent or independent_values(squares)
     low, high = mean_interval(dof, worth)
     inside = squares <= ellipse_limit(dof)
-    return Consistency(dof, float(squares.mean()), low, high, float(inside.mean()), worth)
+    return ConsistencySummary(dof, float(squares.mean()), low, high, float(inside.mean()), worth)
 
 
 def mean_interval(dof: int, independent: float) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """Parity with robot_localization: the final poses that its own tests assert, on its own recorded data.
 
 Its tests fuse wheel velocity, orientation, angular rate and acceleration; no GPS. Here the profile `paper` does the
-same from a told start at the origin, with a filter step for every reading (step_s 0.02 s).
+same from a given start at the origin, with a filter step for every reading (step_s 0.02 s).
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.config import LocalisationConfig
 from agents.localisation.localiser import Localiser
+from evaluation.campaign.figures import rounded
 from evaluation.positions.real_logs import refitted
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.readings import Reading
@@ -33,6 +33,20 @@ class Asserted:
     tolerance_m: dict[str, float]
 
 
+@dataclass(frozen=True)
+class ParityRow:
+    """Final position of one filter on one log [m], and its distance from the asserted one."""
+
+    log: str
+    filter: str
+    x_m: float
+    y_m: float
+    z_m: float
+    off_m: float
+    tolerance_m: float
+    within: bool
+
+
 ASSERTED = (
     Asserted(
         "rl_test1_husky",
@@ -47,7 +61,7 @@ ASSERTED = (
 )
 
 
-def run(data: Path, on_progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def run(data: Path, on_progress: Callable[[str], None] = lambda _: None) -> list[ParityRow]:
     """Run both filters on both logs; data: the folder that holds a folder of each log's name."""
     rows = []
     for asserted in ASSERTED:
@@ -55,21 +69,10 @@ def run(data: Path, on_progress: Callable[[str], None] = lambda _: None) -> dict
         readings = list(log.readings())
         for name, expected in asserted.position_m.items():
             on_progress(f"{asserted.log}: {name}")
-            found = _final_position(log, readings, name)
-            off = math.dist(found, expected)
-            rows.append(
-                {
-                    "log": asserted.log,
-                    "filter": name,
-                    "x_m": round(found[0], 4),
-                    "y_m": round(found[1], 4),
-                    "z_m": round(found[2], 4),
-                    "off_m": round(off, 4),
-                    "tolerance_m": asserted.tolerance_m[name],
-                    "within": off <= asserted.tolerance_m[name],
-                }
-            )
-    return {"rows": rows}
+            position, tolerance = _final_position(log, readings, name), asserted.tolerance_m[name]
+            off = math.dist(position, expected)
+            rows.append(rounded(ParityRow(asserted.log, name, *position, off, tolerance, off <= tolerance), 4))
+    return rows
 
 
 def _final_position(log: LogFolder, readings: list[Reading], name: str) -> tuple[float, float, float]:
@@ -86,6 +89,6 @@ def _final_position(log: LogFolder, readings: list[Reading], name: str) -> tuple
 
 
 def _without_gps(log: LogFolder) -> LogFolder:
-    """Every sensor of the log in use but GPS, also those that the manifest leaves aside."""
+    """Every sensor of the log in use but GPS, also those that the manifest does not use."""
     sensors = tuple(replace(sensor, use=sensor.kind != "gps") for sensor in log.machine.sensors)
     return refitted(log, replace(log.machine, sensors=sensors))

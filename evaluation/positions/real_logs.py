@@ -2,7 +2,7 @@
 
 What only an evaluation may know stands in `evaluation.toml` beside the manifest; agents never read that file:
 
-    [truth]                    # the true way of base_link, metres in `map`
+    [truth]                    # the true track of base_link, metres in `map`
     file = "truth.csv.gz"      # in the data folder; stamp counts as in the manifest
     stamp = "t"
     x_m = "x"
@@ -17,35 +17,38 @@ What only an evaluation may know stands in `evaluation.toml` beside the manifest
 from __future__ import annotations
 
 import csv
-import gzip
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from agents.holdout import Holdout, HoldoutConfig
 from agents.pipeline import Pipeline
+from evaluation.campaign.figures import root_mean_square
+from evaluation.campaign.truth import Truth
 from evaluation.positions.configurations import Configuration, pipeline_options
-from evaluation.positions.replay import Trace, Truth, errors, replay, root_mean_square, score
+from evaluation.positions.replay import Trace, errors, replay, score
 from protocol.config import from_table, load_toml
 from protocol.errors import ConfigError, LogFolderError
-from protocol.machine.log_folder import MANIFEST, LogFolder, open_log
+from protocol.machine.log_folder import MANIFEST, LogFolder, open_log, open_text
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection
 from protocol.units import stamp_ns, stamp_scale
 
 SIDE_FILE = "evaluation.toml"
+NOTHING_WITHHELD = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None}
+TRUTH_FIGURES = ("rmse_x_m", "rmse_y_m", "net_m", "max_m", "nees", "coverage95", "covered")
 WITHHOLD = ((0.0, 1.0), (1.0, 10.0), (10.0, 30.0), (30.0, 60.0))  # seconds off, of every so many; the first is nothing
 
 
 @dataclass(frozen=True)
 class TruthFile:
-    """Where the true way of `base_link` lies: a CSV file of the data folder, and its columns."""
+    """A CSV file of the data folder with the true track of `base_link`, and its columns."""
 
     file: str
     stamp: str
@@ -84,6 +87,47 @@ class RealLog:
         return self.log.machine
 
 
+@dataclass(frozen=True)
+class LogRow:
+    """One pattern of withheld GPS: errors against the withheld fixes, from `HoldoutConfig.settle_s` on."""
+
+    withhold: str
+    fixes: int
+    rms_m: float | None
+    median_m: float | None
+    max_m: float | None
+    us_per_second: int | None
+    counters: dict[str, int]
+    consistency: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class LogRowWithTruth(LogRow):
+    """The same with errors against the truth from the first pose on; truth_withheld_m: of the times without GPS."""
+
+    truth_rmse_x_m: float
+    truth_rmse_y_m: float
+    truth_net_m: float
+    truth_max_m: float
+    truth_nees: float
+    truth_coverage95: float
+    truth_covered: float
+    truth_withheld_m: float
+
+
+@dataclass(frozen=True)
+class LogReport:
+    """A log with one row per pattern of withheld GPS. refused: readings by reason."""
+
+    log: str
+    filter: str
+    profile: str
+    gps: int
+    readings: int
+    refused: dict[str, int]
+    rows: list[LogRow]
+
+
 @contextmanager
 def opened(manifest: Path, data: Path | None = None) -> Iterator[RealLog]:
     """Open a log with its side file; planar fixes are converted into a folder that lasts as long as the context."""
@@ -105,27 +149,15 @@ def run(
     row: Configuration,
     patterns: Sequence[tuple[float, float]] = WITHHOLD,
     on_progress: Callable[[str], None] = lambda _: None,
-) -> dict[str, Any]:
-    """Replay a log once per pattern of withheld GPS, (seconds off, period); returns the report in plain values.
-
-    `rows`: rms_m, median_m, max_m against the withheld fixes after the first 40 s; truth_* against the truth from the
-    first pose on, truth_withheld_m of the times without GPS alone.
-    """
+) -> LogReport:
+    """Replay a log once per pattern of withheld GPS: (seconds off, period)."""
     log = refitted(real.log, machine)
     readings = list(log.readings())
     rows = []
     for off_s, period_s in patterns:
         on_progress(f"{log.name}: {withheld_name(off_s, period_s)}")
         rows.append(_row(real, Pipeline(log.site, machine, pipeline_options(row)), readings, (off_s, period_s)))
-    return {
-        "log": log.name,
-        "filter": row.filter,
-        "profile": row.profile,
-        "gps": row.gps,
-        "readings": len(readings),
-        "refused": dict(log.refused),
-        "rows": rows,
-    }
+    return LogReport(log.name, row.filter, row.profile, row.gps, len(readings), dict(log.refused), rows)
 
 
 def refitted(log: LogFolder, machine: MachineConfig) -> LogFolder:
@@ -146,7 +178,7 @@ def withheld_name(off_s: float, period_s: float) -> str:
 
 
 def read_truth(log: LogFolder, described: TruthFile) -> Truth:
-    """The true way that a log's side file names."""
+    """The true track that a log's side file names."""
     rows, scale = _read(log.data / described.file), stamp_scale(described.stamp_unit)
     try:
         stamps = [log.start_ns + stamp_ns(row[described.stamp], scale) for row in rows]
@@ -174,41 +206,35 @@ def convert(log: LogFolder, planar: PlanarFile, folder: Path) -> Path:
     return path
 
 
-def _row(
-    real: RealLog, pipeline: Pipeline, readings: Sequence[Reading], pattern: tuple[float, float]
-) -> dict[str, Any]:
+def _row(real: RealLog, pipeline: Pipeline, readings: Sequence[Reading], pattern: tuple[float, float]) -> LogRow:
     off_s, period_s = pattern
     config = HoldoutConfig(period_s=period_s, off_s=off_s) if off_s else None
     holdout = Holdout(real.log.site, real.machine, config) if config else None
     trace = replay(pipeline, readings, holdout)
-    against_fixes = holdout.report() if holdout else {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None}
-    row = {"withhold": withheld_name(off_s, period_s), **against_fixes}
-    if real.truth:
-        row |= _against_truth(trace, real.truth, pattern)
-    row["us_per_second"] = round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None
+    against_fixes: dict[str, Any] = holdout.report() if holdout else NOTHING_WITHHELD
     health = pipeline.health()
-    return {**row, "counters": health["counters"], "consistency": health["consistency"]}
+    row = LogRow(
+        withhold=withheld_name(off_s, period_s),
+        **against_fixes,
+        us_per_second=round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None,
+        counters=health["counters"],
+        consistency=health["consistency"],
+    )
+    return LogRowWithTruth(**vars(row), **_against_truth(trace, real.truth, pattern)) if real.truth else row
 
 
-def _against_truth(trace: Trace, truth: Truth, pattern: tuple[float, float]) -> dict[str, float]:
-    found = asdict(score(trace, truth))
+def _against_truth(trace: Trace, truth: Truth, pattern: tuple[float, float]) -> dict[str, Any]:
+    overall = vars(score(trace, truth))
     off = np.hypot(*errors(trace, truth).T)
     dark = np.isfinite(off) & (trace.since_start_s % pattern[1] < pattern[0])
-    shown = ("rmse_x_m", "rmse_y_m", "net_m", "max_m", "nees", "coverage95", "covered")
-    values = {f"truth_{name}": found[name] for name in shown} | {"truth_withheld_m": root_mean_square(off[dark])}
-    return {name: round(value, 4) for name, value in values.items()}
+    values = {name: overall[name] for name in TRUTH_FIGURES} | {"withheld_m": root_mean_square(off[dark])}
+    return {f"truth_{name}": round(value, 4) for name, value in values.items()}
 
 
 def _read(path: Path) -> list[dict[str, str]]:
     """Rows of a CSV file, by column."""
     try:
-        with _text(path) as text:
+        with open_text(path) as text:
             return list(csv.DictReader(text))
     except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
         raise LogFolderError(path, f"cannot be read: {error}") from None
-
-
-def _text(path: Path) -> IO[str]:
-    if path.suffix == ".gz":
-        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
-    return path.open(encoding="utf-8-sig", newline="")

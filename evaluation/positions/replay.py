@@ -1,7 +1,6 @@
-"""Run the pure pipeline, or its half that localises, over readings, and compare what it believed with the truth.
+"""Replay readings through the pipeline, or through its localising half, and compare its poses with the truth.
 
-A belief is compared at its own stamp, as it was known after the readings of that 100 ms: nothing that came later
-helps it.
+A pose is compared at its own stamp, as it was known after the readings of that 100 ms: no later reading improves it.
 """
 
 from __future__ import annotations
@@ -10,32 +9,19 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from agents.holdout import Holdout
 from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import PoseSource
+from evaluation.campaign.figures import root_mean_square
+from evaluation.campaign.truth import Truth
 from evaluation.positions.consistency import normalised_square, summarise
 from protocol.arrays import Floats, Ints
 from protocol.machine.readings import Reading
 
 STEP_NS = 100_000_000
-
-
-@dataclass(frozen=True)
-class Truth:
-    """True way of `base_link`: stamps (n,), positions (n, 2) in `map` [m]."""
-
-    stamp_ns: Ints
-    position_m: Floats
-
-    def at(self, stamp_ns: Ints) -> Floats:
-        """True positions (m, 2); NaN before the first and after the last that is known."""
-        t, known = (np.asarray(s - self.stamp_ns[0], float) * 1e-9 for s in (stamp_ns, self.stamp_ns))
-        columns = [np.interp(t, known, column, math.nan, math.nan) for column in self.position_m.T]
-        return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True)
@@ -134,17 +120,6 @@ def score(trace: Trace, truth: Truth) -> Score:
         covered=min(1.0, len(trace.stamp_ns) / steps),
         us_per_second=trace.cpu_s * 1e6 / trace.seconds if trace.seconds else math.nan,
     )
-
-
-def root_mean_square(values: Floats) -> float:
-    """Root mean square, NaN of nothing."""
-    return float(np.sqrt((values**2).mean())) if len(values) else math.nan
-
-
-def read_track(path: Path) -> Truth:
-    """The truth that a simulation wrote: `tracks/<machine>.csv`."""
-    table = np.genfromtxt(path, delimiter=",", names=True, dtype=None)
-    return Truth(table["stamp_ns"].astype(np.int64), np.stack([table["x"], table["y"]], axis=1))
 
 
 def _spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:

@@ -2,61 +2,81 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
+from evaluation.campaign.figures import half_width, rounded
 from evaluation.positions.configurations import Configuration
-from evaluation.positions.consistency import CONFIDENCE
 from evaluation.positions.replay import Score
 from protocol.arrays import Floats
 
-Row = dict[str, Any]
-MEANS = ("rmse_x_m", "rmse_y_m", "net_m", "nees", "coverage95", "covered", "us_per_second")
+MEANS = ("rmse_x_m", "rmse_y_m", "net_m", "nees", "coverage95", "covered")
 
 
-def summarise(row: Configuration, scores: Sequence[Score]) -> Row:
-    """One row of the table: means over the seeds, the largest error of all, the paper's figure and the difference.
+@dataclass(frozen=True)
+class TableRow(Configuration):
+    """One row of the table: means over the seeds.
 
-    ci95_m: half-width of the interval of the mean net error over seeds, None of a single one. nees_95: where the mean
-    NEES of a right covariance would lie.
+    ci95_m: half-width of the interval of the mean net error over seeds, None of a single one. max_m: the largest error
+    of all seeds. nees_95: interval of the mean NEES if the covariance is right. paper_net_m: the paper's figure, None
+    where it has no such row; difference_m: ours minus that.
     """
-    found = {name: mean(scores, name) for name in MEANS}
-    net = values(scores, "net_m")
-    paper = row.paper_net_m
-    return {
-        **asdict(row),
-        "rmse_x_m": round(found["rmse_x_m"], 4),
-        "rmse_y_m": round(found["rmse_y_m"], 4),
-        "net_m": round(found["net_m"], 4),
-        "ci95_m": rounded(half_width(net), 4),
-        "max_m": round(float(values(scores, "max_m").max()), 3),
-        "nees": round(found["nees"], 3),
-        "nees_95": nees_interval(scores),
-        "coverage95": round(found["coverage95"], 4),
-        "covered": round(found["covered"], 4),
-        "us_per_second": round(found["us_per_second"]),
-        "paper_net_m": paper,
-        "difference_m": rounded(found["net_m"] - paper if paper is not None else None, 4),
-        "net_by_seed_m": [round(float(v), 4) for v in net],
-    }
+
+    rmse_x_m: float
+    rmse_y_m: float
+    net_m: float
+    ci95_m: float | None
+    max_m: float
+    nees: float
+    nees_95: list[float]
+    coverage95: float
+    covered: float
+    us_per_second: int
+    paper_net_m: float | None
+    difference_m: float | None
+    net_by_seed_m: list[float]
 
 
-def ratios(scores: Mapping[Configuration, Sequence[Score]]) -> list[Row]:
+@dataclass(frozen=True)
+class RatioRow(Configuration):
+    """A configuration's net error over that of another on the same recordings, with the half-width of its interval."""
+
+    ratio: str
+    net: float
+    ci95: float | None
+
+
+def summarise(row: Configuration, scores: Sequence[Score]) -> TableRow:
+    """One row of the table."""
+    net, paper = values(scores, "net_m"), row.published_net_m
+    means: dict[str, Any] = {name: float(values(scores, name).mean()) for name in MEANS}
+    summary = TableRow(
+        **vars(row),
+        **means,
+        ci95_m=half_width(net),
+        max_m=float(values(scores, "max_m").max()),
+        nees_95=nees_interval(scores),
+        us_per_second=round(float(values(scores, "us_per_second").mean())),
+        paper_net_m=paper,
+        difference_m=None if paper is None else means["net_m"] - paper,
+        net_by_seed_m=net.tolist(),
+    )
+    return rounded(summary, 4, max_m=3, nees=3, nees_95=3)
+
+
+def ratios(scores: Mapping[Configuration, Sequence[Score]]) -> list[RatioRow]:
     """Net errors of `default` over `paper`, and of EKF over UKF, where both were run on the same recordings."""
-    found = []
+    rows = []
     for row in scores:
         others = {"default/paper": replace(row, profile="paper"), "ekf/ukf": replace(row, filter="ukf")}
         for name, other in others.items():
             if other != row and other in scores:
                 ratio, half = paired_ratio(values(scores[row], "net_m"), values(scores[other], "net_m"))
-                pair = {**asdict(row), "ratio": name, "net": round(ratio, 4), "ci95": rounded(half, 4)}
-                found.append(pair)
-    return found
+                rows.append(rounded(RatioRow(**vars(row), ratio=name, net=ratio, ci95=half), 4))
+    return rows
 
 
 def paired_ratio(a: Floats, b: Floats) -> tuple[float, float | None]:
@@ -66,33 +86,14 @@ def paired_ratio(a: Floats, b: Floats) -> tuple[float, float | None]:
     return ratio, half
 
 
-def half_width(sample: Floats) -> float | None:
-    """Half-width of the 95 % interval of a mean, by Student's t; None of a single value."""
-    n = len(sample)
-    if n < 2:
-        return None
-    quantile = float(stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1))
-    return quantile * float(sample.std(ddof=1)) / math.sqrt(n)
-
-
 def nees_interval(scores: Sequence[Score]) -> list[float]:
-    """Where the mean NEES over independent runs would lie: their intervals' half-widths add as squares."""
+    """Interval of the mean NEES over independent runs: the half-widths of their intervals add as squares."""
     low, high = values(scores, "nees_low"), values(scores, "nees_high")
     middle, half = (low + high) / 2, (high - low) / 2
     width = float(np.sqrt((half**2).sum())) / len(scores)
-    return [round(float(middle.mean()) - width, 3), round(float(middle.mean()) + width, 3)]
+    return [float(middle.mean()) - width, float(middle.mean()) + width]
 
 
 def values(scores: Sequence[Score], name: str) -> Floats:
     """One field of scores (n,)."""
     return np.array([getattr(score, name) for score in scores], float)
-
-
-def mean(scores: Sequence[Score], name: str) -> float:
-    """Mean of one field over the runs."""
-    return float(values(scores, name).mean())
-
-
-def rounded(value: float | None, digits: int) -> float | None:
-    """Round, where there is a value."""
-    return None if value is None else round(value, digits)

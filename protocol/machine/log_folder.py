@@ -66,7 +66,7 @@ class LogFolder:
     def _read(self, source: SensorFile) -> Iterator[Reading]:
         path = self.data / source.file
         try:
-            with _open_text(path) as text:
+            with open_text(path) as text:
                 yield from self._parse(csv.DictReader(_lines(text, path)), source, path)
         except (OSError, EOFError, zlib.error, ValueError, csv.Error) as error:  # ValueError: no UTF-8, or no path
             raise LogFolderError(path, f"cannot be read: {error}") from None
@@ -179,7 +179,8 @@ def _require(column: str, rows: csv.DictReader[str], path: Path) -> str:
     return column
 
 
-def _open_text(path: Path) -> IO[str]:
+def open_text(path: Path) -> IO[str]:
+    """Open a text file for reading, compressed if its name ends in .gz; raises OSError."""
     if path.suffix == ".gz":
         return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
     return path.open(encoding="utf-8-sig", newline="")  # with or without the mark that spreadsheets write

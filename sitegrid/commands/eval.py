@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sitegrid.options.groups import Subparsers, add_action
 from sitegrid.options.values import count, positive, seed, withhold
 from sitegrid.process.lifetime import note, plain, say
 from sitegrid.process.progress import Display
 
+if TYPE_CHECKING:
+    from evaluation.campaign.experiment import Runner
+
 HELP = "run the accuracy experiments"
-Tables = dict[str, Any]
+Report = dict[str, Any]  # plain values by name; lists of rows are tables
 MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side
 SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
@@ -37,7 +43,7 @@ def add_options(parser: ArgumentParser) -> None:
         experiments, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work"
     )
     _add_recorded(ground, 600.0)
-    ground.add_argument("--plots", type=Path, help="folder to draw estimates along the way, errors by place into")
+    ground.add_argument("--plots", type=Path, help="folder to draw estimates along the track, errors by place into")
     merge = add_action(experiments, "merge", "compare this map merge with other methods")
     _add_kept(merge)
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
@@ -86,8 +92,8 @@ def _add_seeds(parser: ArgumentParser, usual: int) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Run one evaluation and print what it found."""
-    asks = {
+    """Run one evaluation and print its report."""
+    evaluations = {
         "physics": _physics,
         "localisation": _localisation,
         "ground": _ground,
@@ -95,106 +101,86 @@ def run(arguments: Namespace) -> int:
         "log": _log,
         "parity": _parity,
     }
-    result = asks[arguments.what](arguments)
+    report = evaluations[arguments.what](arguments)
     if arguments.json:
-        say(plain(result))
+        say(plain(report))
     else:
-        print("\n\n".join(_lines(result)))
+        print("\n\n".join(_lines(report)))
     return 0
 
 
-def _physics(arguments: Namespace) -> Tables:
+def _physics(arguments: Namespace) -> Report:
     from evaluation import physics
 
     return physics.run(_seeds(arguments), on_progress=note)
 
 
-def _localisation(arguments: Namespace) -> Tables:
-    from evaluation.campaign.workers import cores
+def _localisation(arguments: Namespace) -> Report:
     from evaluation.positions import table
     from evaluation.positions.configurations import HEADLINE, SENSORS, configurations
 
-    plan = table.Plan(
-        seeds=tuple(_seeds(arguments)),
-        seconds=arguments.seconds,
-        rows=tuple(configurations(HEADLINE if arguments.rows == "headline" else SENSORS)),
-        cache=arguments.out,
-        processes=arguments.processes or cores(),
-    )
-    with Display("machines drive, filters follow", headless=arguments.json) as display:
-        result, outcomes = table.run(plan, display.show)
-    if arguments.plots:
-        from evaluation.positions import plots  # imported here: only pictures need matplotlib
-
-        result["plots"] = [str(path) for path in plots.draw(result, outcomes, arguments.plots)]
-    return result
+    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS)
+    work = partial(table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows)
+    return _experiment(arguments, "machines drive, filters follow", work, "evaluation.positions.plots")
 
 
-def _ground(arguments: Namespace) -> Tables:
-    from evaluation.campaign.workers import cores
+def _ground(arguments: Namespace) -> Report:
     from evaluation.ground import experiment
 
-    plan = experiment.Plan(
-        seeds=tuple(_seeds(arguments)),
-        seconds=arguments.seconds,
-        cache=arguments.out,
-        processes=arguments.processes or cores(),
-    )
-    with Display("loaders work, estimators follow", headless=arguments.json) as display:
-        result, outcomes = experiment.run(plan, display.show)
-    if arguments.plots:
-        from evaluation.ground import plots  # imported here: only pictures need matplotlib
-
-        result["plots"] = [str(path) for path in plots.draw(outcomes, arguments.plots)]
-    return result
+    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    return _experiment(arguments, "loaders work, estimators follow", work, "evaluation.ground.plots")
 
 
-def _merge(arguments: Namespace) -> Tables:
-    from evaluation.campaign.workers import cores
+def _merge(arguments: Namespace) -> Report:
     from evaluation.maps import experiment
     from evaluation.maps.cases import select
 
-    plan = experiment.Plan(
-        seeds=tuple(_seeds(arguments)),
-        cache=arguments.out,
-        processes=arguments.processes or cores(),
-        cases=select([name for name in arguments.cases.split(",") if name]),
-    )
-    with Display("machines drive, their samples are merged", headless=arguments.json) as display:
-        result = experiment.run(plan, display.show)
+    cases = select([name for name in arguments.cases.split(",") if name])
+    work = partial(experiment.run, seeds=_seeds(arguments), cases=cases)
+    return _experiment(arguments, "machines drive, their samples are merged", work, "evaluation.maps.plots")
+
+
+def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Any, Any]], plots: str) -> Report:
+    """Run an experiment with its progress shown, and draw its pictures where they are asked for."""
+    from evaluation.campaign.experiment import Runner
+    from evaluation.campaign.workers import cores
+
+    with Display(title, headless=arguments.json) as display:
+        runner = Runner(arguments.out, arguments.processes or cores(), display.show)
+        report, outcomes = work(runner)
+    plain_report = asdict(report)
     if arguments.plots:
-        from evaluation.maps import plots  # imported here: only pictures need matplotlib
+        pictures = import_module(plots)  # imported here: only pictures need matplotlib
+        plain_report["plots"] = list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))
+    return plain_report
 
-        result["plots"] = [str(path) for path in plots.draw(result, plan, arguments.plots)]
-    return result
 
-
-def _log(arguments: Namespace) -> Tables:
+def _log(arguments: Namespace) -> Report:
     from evaluation.positions import real_logs
     from evaluation.positions.configurations import Configuration, select
 
     with real_logs.opened(arguments.manifest, arguments.data) as log:
         machine = select(log.machine, gps=arguments.gps)
         row = Configuration(arguments.filter, real_logs.receivers(machine), 1, arguments.profile)
-        return real_logs.run(log, machine, row, arguments.withhold or real_logs.WITHHOLD, on_progress=note)
+        return asdict(real_logs.run(log, machine, row, arguments.withhold or real_logs.WITHHOLD, on_progress=note))
 
 
-def _parity(arguments: Namespace) -> Tables:
+def _parity(arguments: Namespace) -> Report:
     from evaluation.positions import parity
 
-    return parity.run(arguments.data, on_progress=note)
+    return {"rows": [asdict(row) for row in parity.run(arguments.data, on_progress=note)]}
 
 
 def _seeds(arguments: Namespace) -> range:
     return range(arguments.first_seed, arguments.first_seed + arguments.seeds)
 
 
-def _lines(result: Tables) -> list[str]:
+def _lines(report: Report) -> list[str]:
     """For people: values on a line of their own, rows as tables."""
     from benchmarks.measure import table
 
     lines = []
-    for name, value in result.items():
+    for name, value in report.items():
         if isinstance(value, list) and value and isinstance(value[0], dict):
             shown = [k for k in value[0] if not any(isinstance(row[k], SHOWN) for row in value)]
             rows = [{k: row[k] for k in shown} for row in value]
@@ -204,7 +190,7 @@ def _lines(result: Tables) -> list[str]:
     return lines
 
 
-def _turned(rows: Sequence[Tables]) -> list[Tables]:
+def _turned(rows: Sequence[Report]) -> list[Report]:
     """Rows as columns, under their first values."""
     named = {f"{next(iter(row.values()))} {list(row.values())[1]}": row for row in rows}
     return [{"": name, **{title: row[name] for title, row in named.items()}} for name in list(rows[0])[2:]]

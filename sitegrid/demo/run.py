@@ -8,9 +8,9 @@ from argparse import Namespace
 from typing import Any
 
 from evaluation.audit import audit_store
-from evaluation.ground.truth import read_way
+from evaluation.campaign.truth import position_rmse
+from evaluation.ground.truth import read_load_track
 from evaluation.maps.score import score, score_driven
-from evaluation.positions.live_error import position_rmse
 from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
@@ -71,7 +71,8 @@ def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: D
     audit = audit_store(audits, plan.work / "store", load_site(plan.site_file), ServerConfig())
     truth = truth_layers(TruthMap.load(plan.true_map), region)
     machines = [rig.machine for rig in plan.scenario.rigs()]
-    driven = [read_way(plan.truth / TRACKS_FOLDER / f"{m.name}.csv", m.load_centre_m).place_m for m in machines]
+    folder = plan.truth / TRACKS_FOLDER
+    driven = [read_load_track(folder / f"{m.name}.csv", m.load_centre_m).place_m for m in machines]
     scores = score(region, truth), score_driven(region, truth, driven)
     return make_report(plan, audit, scores, rmse_m, pictures, log_report)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation.maps.cases import CASES, CELL_M, Case, Machine, lay, parking_place, select
+from evaluation.maps.cases import CASES, CELL_M, CaseMachine, MapCase, build_site, parking_place, select
 from evaluation.maps.samples import (
     BATCH_ROWS,
     BUCKET_NS,
@@ -20,12 +20,12 @@ from evaluation.maps.samples import (
     cell_of,
     gauss_markov,
     simulate,
-    sweep,
+    sweep_lanes,
 )
 from protocol.machine.samples import SAMPLE_DTYPE, check_samples
 
 
-def case(name: str, columns: int = 60, rows: int = 40, index: int = 0) -> Case:
+def case(name: str, columns: int = 60, rows: int = 40, index: int = 0) -> MapCase:
     return replace(select([name])[index], columns=columns, rows=rows)
 
 
@@ -36,7 +36,7 @@ def rows_of(scene, machine: str):
 def test_cases_come_in_the_order_of_the_table_and_by_name():
     assert select([]) == CASES
     assert [c.title for c in select(["slope_15", "repaved"])] == ["repaved, 1 after", "repaved, 2 after", "slope_15"]
-    assert len({c.file_name for c in CASES}) == len(CASES) == 12
+    assert len({c.name for c in CASES}) == len(CASES) == 12
 
 
 def test_position_errors_last_and_have_the_deviation_that_is_stated():
@@ -54,26 +54,26 @@ def test_position_errors_are_stationary_from_the_first_sample_on():
 
 
 def test_a_pass_goes_along_in_lanes_of_1_m_and_the_next_across():
-    way = sweep(case("1x1"), Machine(passes=2), np.random.default_rng(3))
-    along, across = way.number == 0, way.number == 1
+    sweep = sweep_lanes(case("1x1"), CaseMachine(passes=2), np.random.default_rng(3))
+    along, across = sweep.number == 0, sweep.number == 1
     assert along.sum() == 40 * 100
     assert across.sum() == 60 * 67
-    assert np.unique(np.round(np.diff(np.unique(way.y_m[along])), 9)).tolist() == [1.0]
-    assert np.unique(np.round(np.diff(np.unique(way.x_m[across])), 9)).tolist() == [1.0]
-    step = np.diff(way.x_m[along][:100])
+    assert np.unique(np.round(np.diff(np.unique(sweep.y_m[along])), 9)).tolist() == [1.0]
+    assert np.unique(np.round(np.diff(np.unique(sweep.x_m[across])), 9)).tolist() == [1.0]
+    step = np.diff(sweep.x_m[along][:100])
     np.testing.assert_allclose(step, STEP_M)
-    assert (np.diff(way.x_m[along][100:200]) < 0).all()  # and back
+    assert (np.diff(sweep.x_m[along][100:200]) < 0).all()  # and back
     for part, sign in ((along, np.cos), (across, np.sin)):
-        assert np.abs(sign(way.heading_rad[part])).min() == pytest.approx(1.0)
-    first_across = sweep(case("1x1"), Machine(first=1), np.random.default_rng(3))
+        assert np.abs(sign(sweep.heading_rad[part])).min() == pytest.approx(1.0)
+    first_across = sweep_lanes(case("1x1"), CaseMachine(first=1), np.random.default_rng(3))
     assert np.abs(np.sin(first_across.heading_rad)).min() == pytest.approx(1.0)
 
 
-def test_headings_point_the_way_that_is_driven():
-    way = sweep(case("1x1"), Machine(passes=2), np.random.default_rng(3))
-    moved = np.stack([np.diff(way.x_m), np.diff(way.y_m)])
+def test_headings_point_ahead():
+    sweep = sweep_lanes(case("1x1"), CaseMachine(passes=2), np.random.default_rng(3))
+    moved = np.stack([np.diff(sweep.x_m), np.diff(sweep.y_m)])
     on_a_lane = np.hypot(*moved) < STEP_M + 1e-6
-    ahead = moved[0] * np.cos(way.heading_rad[1:]) + moved[1] * np.sin(way.heading_rad[1:])
+    ahead = moved[0] * np.cos(sweep.heading_rad[1:]) + moved[1] * np.sin(sweep.heading_rad[1:])
     np.testing.assert_allclose(ahead[on_a_lane], STEP_M)
     assert on_a_lane.mean() > 0.95
 
@@ -134,10 +134,10 @@ def test_the_bad_machine_measures_too_much_and_is_off_to_the_east_and_knows_neit
 def test_receivers_state_what_they_are():
     scene = simulate(case("mixed_receivers"), 3)
     assert [rows_of(scene, f"machine{i}")["cov_xx_m2"][0] for i in (1, 2, 3, 4)] == pytest.approx([0.0025, *[6.25] * 3])
-    way = sweep(case("mixed_receivers"), Machine(), np.random.default_rng(0))
+    sweep = sweep_lanes(case("mixed_receivers"), CaseMachine(), np.random.default_rng(0))
     rtk = rows_of(scene, "machine1")
     across = rtk["y_m"] - np.round(rtk["y_m"])  # a lane's offset, and the error
-    assert len(rtk) == len(way.x_m)
+    assert len(rtk) == len(sweep.x_m)
     assert np.abs(across - np.median(across)).max() < 0.4
 
 
@@ -151,7 +151,7 @@ def test_the_parked_machine_stands_sends_all_the_time_and_drives_nothing():
     assert parked["x_m"].mean() == pytest.approx(x_m + 3, abs=1.5)
     assert parked["y_m"].mean() == pytest.approx(y_m, abs=1.5)
     assert parked["c_rr"].mean() == pytest.approx(1.6 * 0.04, abs=0.001)
-    alone = replace(parked_case, machines=(Machine(passes=1), Machine(parked=True)))
+    alone = replace(parked_case, machines=(CaseMachine(passes=1), CaseMachine(parked=True)))
     assert simulate(alone, 4).driven.sum() == simulate(case("1x1"), 4).driven.sum()
 
 
@@ -161,15 +161,15 @@ def test_the_zone_is_repaved_inside_a_bucket_while_the_fourth_pass_is_in_it(seed
     assert scene.repaved_ns is not None
     assert 0.15 * BUCKET_NS < scene.repaved_ns % BUCKET_NS < 0.85 * BUCKET_NS
     rows = rows_of(scene, "machine1")
-    way = sweep(case("repaved", columns=150, rows=100), Machine(passes=5), np.random.default_rng(0))
-    number = way.number[np.searchsorted(rows["stamp_ns"], scene.repaved_ns)]
+    sweep = sweep_lanes(case("repaved", columns=150, rows=100), CaseMachine(passes=5), np.random.default_rng(0))
+    number = sweep.number[np.searchsorted(rows["stamp_ns"], scene.repaved_ns)]
     assert number == 3
-    there = scene.site.repaved[cell_of(way.x_m, way.y_m, scene.site)]
+    there = scene.site.repaved[cell_of(sweep.x_m, sweep.y_m, scene.site)]
     late = rows["stamp_ns"] >= scene.repaved_ns
     assert np.median(rows["c_rr"][there & ~late]) == pytest.approx(0.06, abs=0.001)
     assert np.median(rows["c_rr"][there & late]) == pytest.approx(0.02, abs=0.001)
-    assert (late & there & (way.number == 3)).any()
-    assert (~late & there & (way.number == 3)).any()
+    assert (late & there & (sweep.number == 3)).any()
+    assert (~late & there & (sweep.number == 3)).any()
 
 
 def test_how_many_passes_follow_is_the_cases_own():
@@ -184,14 +184,14 @@ def test_how_many_passes_follow_is_the_cases_own():
 
 @pytest.mark.parametrize(("index", "width"), [(0, 3), (1, 6)])
 def test_a_narrow_road_lies_across_wet_dirt_and_alone_is_judged(index: int, width: int):
-    site = lay(case("narrow_road", index=index))
+    site = build_site(case("narrow_road", index=index))
     assert site.judged.sum() * CELL_M**2 == width * 60
     assert set(site.c_rr[site.judged]) == {0.008}
     assert set(site.c_rr[~site.judged]) == {0.06}
 
 
 def test_the_site_has_the_five_zones():
-    site = lay(CASES[0])
+    site = build_site(CASES[0])
     assert site.c_rr.shape == (200, 300)
     places = [site.c_rr[row, column] for row, column in ((0, 149), (99, 150), (100, 99), (100, 100), (199, 200))]
     assert places == [0.008, 0.04, 0.02, 0.25, 0.06]
@@ -202,16 +202,18 @@ def test_the_site_has_the_five_zones():
 
 def test_gradients_are_measured_along_and_across_with_a_bias_that_turns():
     slope = case("slope_15")
-    assert np.hypot(*lay(slope).gradient[39, 0]) == pytest.approx(np.tan(np.radians(15)))
+    assert np.hypot(*build_site(slope).gradient[39, 0]) == pytest.approx(np.tan(np.radians(15)))
     biases, deviations = [], []
     for seed in range(12):
         scene = simulate(slope, seed)
-        way = sweep(slope, slope.machines[0], np.random.default_rng(0))
+        sweep = sweep_lanes(slope, slope.machines[0], np.random.default_rng(0))
         rows = rows_of(scene, "machine1")
-        true = scene.site.gradient[cell_of(way.x_m, way.y_m, scene.site)]
+        true = scene.site.gradient[cell_of(sweep.x_m, sweep.y_m, scene.site)]
         error = np.stack([rows["grade_e"], rows["grade_n"]], axis=-1) - true
-        inside = np.abs(error).max(axis=1) < 0.05  # its lanes are not quite this way's
-        along = error[inside, 0] * np.cos(way.heading_rad[inside]) + error[inside, 1] * np.sin(way.heading_rad[inside])
+        inside = np.abs(error).max(axis=1) < 0.05  # its lanes are not quite this sweep's
+        along = error[inside, 0] * np.cos(sweep.heading_rad[inside]) + error[inside, 1] * np.sin(
+            sweep.heading_rad[inside]
+        )
         biases.append(along.mean())
         deviations.append(along.std())
         assert rows["grade_var"][0] == pytest.approx(GRADE_STD**2 + GRADE_BIAS_STD**2)

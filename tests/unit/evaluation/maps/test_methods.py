@@ -46,8 +46,8 @@ def test_the_mean_is_of_all():
 
 
 def test_the_median_stands_outliers():
-    found = median(hits([0, 0, 0, 2, 2, 0, 0], [1, 2, 90, 4, 6, 3, 80]))
-    np.testing.assert_array_equal(found, [3, NAN, 5])
+    result = median(hits([0, 0, 0, 2, 2, 0, 0], [1, 2, 90, 4, 6, 3, 80]))
+    np.testing.assert_array_equal(result, [3, NAN, 5])
 
 
 def test_a_kalman_filter_of_equal_values_is_their_mean():
@@ -57,8 +57,8 @@ def test_a_kalman_filter_of_equal_values_is_their_mean():
 
 
 def test_a_kalman_filter_weighs_by_variance():
-    found = kalman(Hits(np.array([0, 0]), np.array([0.0, 1.0]), np.array([1.0, 3.0]), 1))
-    assert found[0] == pytest.approx(0.25)
+    result = kalman(Hits(np.array([0, 0]), np.array([0.0, 1.0]), np.array([1.0, 3.0]), 1))
+    assert result[0] == pytest.approx(0.25)
 
 
 def test_a_kalman_filter_rejects_an_outlier_and_gives_in_to_many():
@@ -86,9 +86,9 @@ def test_nothing_makes_an_empty_map(method):
 def test_samples_fall_into_the_cell_of_their_stated_position():
     rows = samples([1, 2, 3, 4], [0.99, 1.0, -0.1, 20.0], [0.5, 2.5, 0.5, 0.5], [0.02, NAN, 0.02, 0.02])
     assert hits_of(rows, "resistance", WINDOW).cell.tolist() == [0]
-    found = hits_of(rows, "grade_north", WINDOW)
-    assert found.cell.tolist() == [0, 41]
-    assert found.value == pytest.approx([-0.1, -0.1])
+    result = hits_of(rows, "grade_north", WINDOW)
+    assert result.cell.tolist() == [0, 41]
+    assert result.value == pytest.approx([-0.1, -0.1])
     assert hits_of(rows, "grade_east", CellWindow(1, 2, 3, 3)).cell.tolist() == [0]
 
 
@@ -113,15 +113,15 @@ def deliveries():
 def test_the_server_makes_its_own_map():
     server = soft_votes(deliveries(), WINDOW)
     assert server.distrusted == ()
-    found = server.layers
-    assert set(found) == {"resistance", "grade_east", "grade_north", "confidence"}
+    result = server.layers
+    assert set(result) == {"resistance", "grade_east", "grade_north", "confidence"}
     driven = np.s_[16, 10:20]
-    assert found["resistance"].shape == (18, 20)
-    np.testing.assert_allclose(found["resistance"][driven], 0.02, rtol=0.01)
-    np.testing.assert_allclose(found["grade_east"][driven], 0.05, atol=1e-3)
-    np.testing.assert_allclose(found["grade_north"][driven], -0.1, atol=1e-3)
-    assert (found["confidence"][driven] > 0.9).all()
-    assert np.isnan(found["resistance"][10]).all()
+    assert result["resistance"].shape == (18, 20)
+    np.testing.assert_allclose(result["resistance"][driven], 0.02, rtol=0.01)
+    np.testing.assert_allclose(result["grade_east"][driven], 0.05, atol=1e-3)
+    np.testing.assert_allclose(result["grade_north"][driven], -0.1, atol=1e-3)
+    assert (result["confidence"][driven] > 0.9).all()
+    assert np.isnan(result["resistance"][10]).all()
 
 
 def test_a_window_is_cut_out_of_the_servers_blocks():

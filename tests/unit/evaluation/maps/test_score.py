@@ -16,13 +16,15 @@ def region(resistance, east, north) -> Region:
 
 
 def test_wrong_cells_are_counted_among_the_known():
-    found = region([[0.008, 0.02, 0.04], [0.25, 0.06, NAN]], [[0.0] * 3, [0.3, 0.0, NAN]], [[0.0] * 3, [0.0, 0.3, NAN]])
+    estimated = region(
+        [[0.008, 0.02, 0.04], [0.25, 0.06, NAN]], [[0.0] * 3, [0.3, 0.0, NAN]], [[0.0] * 3, [0.0, 0.3, NAN]]
+    )
     truth = {
         "resistance": np.array([[0.012, 0.02, 0.06], [0.25, 0.06, 0.008]]),
         "grade_east": np.array([[0.0, 0.0, 0.0], [0.3, 0.3, 0.0]]),
         "grade_north": np.array([[0.0, 0.3, 0.0], [0.0, 0.0, 0.0]]),
     }
-    result = score(found, truth)
+    result = score(estimated, truth)
     assert result.cells == 5
     assert result.wrong_resistance_pct == pytest.approx(20.0)  # 0.04 is dry dirt, 0.06 wet dirt
     assert result.wrong_grade_pct == pytest.approx(20.0)  # a slope missed; one turned round is still a slope
@@ -42,13 +44,13 @@ def test_an_unknown_map_has_no_score():
 
 
 def test_cells_without_truth_do_not_count():
-    found = region([[0.008, 0.25]], [[0.0, 0.0]], [[0.0, 0.0]])
-    result = score(found, region([[0.008, NAN]], [[0.0, NAN]], [[0.0, 0.0]]))
+    estimated = region([[0.008, 0.25]], [[0.0, 0.0]], [[0.0, 0.0]])
+    result = score(estimated, region([[0.008, NAN]], [[0.0, NAN]], [[0.0, 0.0]]))
     assert (result.wrong_resistance_pct, result.wrong_grade_pct) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(0.99, 100.0), (1.01, 0.0)])
 def test_slope_begins_at_the_papers_limit(share, wrong):
-    found = region([[0.02]], [[SLOPE_LIMIT * share]], [[0.0]])
+    estimated = region([[0.02]], [[SLOPE_LIMIT * share]], [[0.0]])
     truth = region([[0.02]], [[0.27]], [[0.0]])
-    assert score(found, truth).wrong_grade_pct == wrong
+    assert score(estimated, truth).wrong_grade_pct == wrong

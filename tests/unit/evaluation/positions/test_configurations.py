@@ -3,7 +3,7 @@
 import pytest
 
 from agents.pipeline import PipelineConfig
-from evaluation.campaign.recordings import Drive
+from evaluation.campaign.recordings import PlannedDrive
 from evaluation.positions.configurations import (
     FILTERS,
     HEADLINE,
@@ -32,11 +32,11 @@ def test_the_table_has_every_configuration_of_the_paper_in_both_profiles_and_one
     assert {(r.filter, r.gps, r.imu) for r in rows} == set(PAPER_NET_M) | {("ekf", 3, 1), ("ukf", 3, 1)}
     assert len(PAPER_NET_M) == 16
     assert {(r.gps, r.imu) for r in configurations(HEADLINE)} == {(1, 1), (2, 1), (3, 1)}
-    assert Configuration("ukf", 3, 1, "paper").paper_net_m is None
+    assert Configuration("ukf", 3, 1, "paper").published_net_m is None
 
 
 def test_sensors_of_a_row_are_in_use_and_no_others():
-    machine = Drive(0, 1.0).machine
+    machine = PlannedDrive(0, 1.0).machine
     rest = {"torque", "wheels", "articulation"}
     assert set(used(select(machine, 2, 1))) == rest | {"imu-3", "attitude-3", "gps-1", "gps-2"}
     assert set(used(select(machine, 0, 3))) == rest | {f"{k}-{i}" for k in ("imu", "attitude") for i in (1, 3, 4)}
@@ -45,10 +45,10 @@ def test_sensors_of_a_row_are_in_use_and_no_others():
 
 def test_more_receivers_than_there_are_is_refused():
     with pytest.raises(UnsupportedError, match="3 GPS receivers, not 4"):
-        select(Drive(0, 1.0).machine, gps=4)
+        select(PlannedDrive(0, 1.0).machine, gps=4)
 
 
-def test_without_gps_the_start_is_told():
+def test_without_gps_the_start_is_given():
     options = started_at(pipeline_options(Configuration("ukf", 0, 1, "default")), (1.0, 2.0, 0.5))
     assert options.localisation.start == (1.0, 2.0, 0.5)
     assert options.localisation.filter == "ukf"
@@ -62,6 +62,6 @@ def test_filter_and_profile_reach_the_pipeline(filter_: str, profile: str):
 
 
 def test_a_row_becomes_a_machine_and_options():
-    machine, options = configure(Drive(0, 1.0).machine, ROW)
+    machine, options = configure(PlannedDrive(0, 1.0).machine, ROW)
     assert isinstance(options, PipelineConfig)
     assert {s.name for s in machine.sensors if s.kind == "gps" and s.use} == {"gps-1", "gps-2"}

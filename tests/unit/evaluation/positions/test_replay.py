@@ -10,7 +10,8 @@ import pytest
 from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import Pipeline, PipelineConfig, PoseSource, Positioning
-from evaluation.positions.replay import STEP_NS, Trace, Truth, read_track, replay, score
+from evaluation.campaign.truth import Truth
+from evaluation.positions.replay import STEP_NS, Trace, replay, score
 from protocol.machine.readings import Articulation, Reading
 from sim.config import SimConfig
 from sim.simulator import Simulator
@@ -43,14 +44,14 @@ class Scripted:
 
 
 def test_errors_per_axis_and_their_net():
-    found = score(*trace_of([(3.0, 0.0), (0.0, 4.0)]))
-    assert found.rmse_x_m == pytest.approx(math.sqrt(4.5))
-    assert found.rmse_y_m == pytest.approx(math.sqrt(8.0))
-    assert found.net_m == pytest.approx(math.sqrt(12.5))
-    assert found.max_m == pytest.approx(4.0)
-    assert found.nees == pytest.approx(12.5)
-    assert found.coverage95 == 0.0
-    assert found.us_per_second == pytest.approx(0.01e6 / 0.2)
+    result = score(*trace_of([(3.0, 0.0), (0.0, 4.0)]))
+    assert result.rmse_x_m == pytest.approx(math.sqrt(4.5))
+    assert result.rmse_y_m == pytest.approx(math.sqrt(8.0))
+    assert result.net_m == pytest.approx(math.sqrt(12.5))
+    assert result.max_m == pytest.approx(4.0)
+    assert result.nees == pytest.approx(12.5)
+    assert result.coverage95 == 0.0
+    assert result.us_per_second == pytest.approx(0.01e6 / 0.2)
 
 
 def test_coverage_and_nees_follow_the_stated_sigma():
@@ -62,25 +63,18 @@ def test_coverage_and_nees_follow_the_stated_sigma():
     assert vain.nees == pytest.approx(8.0, rel=0.05)
 
 
-def test_time_without_a_pose_is_told_and_not_counted_as_error():
-    found = score(*trace_of([(1.0, 0.0)] * 30, before=10))
-    assert found.covered == pytest.approx(0.75)
-    assert found.net_m == pytest.approx(1.0)
+def test_time_without_a_pose_is_stated_and_not_counted_as_error():
+    result = score(*trace_of([(1.0, 0.0)] * 30, before=10))
+    assert result.covered == pytest.approx(0.75)
+    assert result.net_m == pytest.approx(1.0)
 
 
 def test_no_pose_is_no_error_but_nan():
     trace, truth = trace_of([(0.0, 0.0)])
     none = Trace(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)), trace.first_ns, trace.last_ns, 0.0)
-    found = score(none, truth)
-    assert found.covered == 0.0
-    assert all(math.isnan(v) for v in (found.net_m, found.max_m, found.nees, found.coverage95))
-
-
-def test_truth_is_interpolated_and_unknown_beyond_its_ends():
-    truth = Truth(START_NS + np.array([0, 10**9]), np.array([[0.0, 5.0], [4.0, 5.0]]))
-    places = truth.at(START_NS + np.array([-1, 0, 250_000_000, 10**9, 10**9 + 1]))
-    assert places[1:4] == pytest.approx(np.array([[0.0, 5.0], [1.0, 5.0], [4.0, 5.0]]))
-    assert np.isnan(places[[0, 4]]).all()
+    result = score(none, truth)
+    assert result.covered == 0.0
+    assert all(math.isnan(v) for v in (result.net_m, result.max_m, result.nees, result.coverage95))
 
 
 def test_a_belief_is_taken_once_per_step_with_nothing_that_came_later():
@@ -93,8 +87,9 @@ def test_a_belief_is_taken_once_per_step_with_nothing_that_came_later():
     assert trace.seconds == pytest.approx(0.275)
 
 
+@pytest.mark.slow
 def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipeline():
-    simulator = Simulator(SimConfig(world="fast", machines=1, seed=3, seconds=30.0), bundle_ms=1000)
+    simulator = Simulator(SimConfig(world="fast", machines=1, seed=3, seconds=16.0), bundle_ms=1000)
     readings = [r for _ in range(simulator.bundles or 0) for r in simulator.advance()["loader-1"]]
     site, machine = simulator.site, simulator.machines[0]
     traces, judged = [], []
@@ -104,7 +99,7 @@ def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipel
         traces.append(replay(core, readings, holdout))
         judged.append(holdout.report())
     whole, half = traces
-    assert len(whole.stamp_ns) > 100
+    assert len(whole.stamp_ns) > 50
     assert judged[0] == judged[1]
     assert judged[0]["fixes"]
     for name in ("stamp_ns", "position_m", "covariance_m2"):
@@ -114,10 +109,3 @@ def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipel
 def test_replay_of_nothing_is_empty():
     pipeline: Any = Scripted()
     assert replay(pipeline, []).position_m.shape == (0, 2)
-
-
-def test_track_of_a_simulation_keeps_exact_stamps(tmp_path):
-    (tmp_path / "a.csv").write_text(f"stamp_ns,x,y,z\n{START_NS + 1},1.5,2.5,0\n{START_NS + 100_000_001},2.5,3.5,0\n")
-    truth = read_track(tmp_path / "a.csv")
-    assert truth.stamp_ns.tolist() == [START_NS + 1, START_NS + 100_000_001]
-    assert truth.position_m.tolist() == [[1.5, 2.5], [2.5, 3.5]]

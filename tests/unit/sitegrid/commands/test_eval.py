@@ -1,13 +1,14 @@
-"""`sitegrid eval`: options become a plan, results become JSON or tables."""
+"""`sitegrid eval`: options reach the experiment, reports become JSON or tables."""
 
 import argparse
 import json
+import math
 from pathlib import Path
 
 import pytest
 
-from benchmarks.measure import table
 from sitegrid import cli
+from sitegrid.commands import eval as command
 
 MANIFEST = """
 [log]
@@ -31,22 +32,24 @@ def parse(*words: str) -> argparse.Namespace:
     return cli.build_parser().parse_args(["eval", *words])
 
 
-def test_options_of_the_table_become_a_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_options_of_an_experiment_reach_it(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     from evaluation.positions import table
 
-    plans = []
-    nan = float("nan")
-    report = {"rows": [{"net_m": nan, "net_by_seed_m": [1.0]}], "missing": []}
-    monkeypatch.setattr(table, "run", lambda plan, _: (plans.append(plan), (report, []))[1])
+    asked = []
+    report = table.TableReport("paper_site", {}, [1], math.nan, [], [], [])
+    monkeypatch.setattr(table, "run", lambda runner, **options: (asked.append((runner, options)), (report, []))[1])
     words = ["eval", "localisation", "--seeds", "2", "--first-seed", "1000", "--rows", "headline", "--seconds", "60"]
     assert cli.main([*words, "--out", "x", "--processes", "3", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"rows": [{"net_m": None, "net_by_seed_m": [1.0]}], "missing": []}
-    (plan,) = plans
-    assert (plan.seeds, plan.seconds, plan.cache, plan.processes) == ((1000, 1001), 60.0, Path("x"), 3)
-    assert len(plan.rows) == 12
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["scenario"], printed["seconds"], printed["rows"]) == ("paper_site", None, [])
     assert cli.main(["eval", "localisation"]) == 0
-    assert "net_by_seed_m" not in capsys.readouterr().out
-    assert (len(plans[1].seeds), plans[1].seconds, len(plans[1].rows)) == (12, 1200.0, 36)
+    assert capsys.readouterr().out.startswith("scenario: paper_site")
+    (runner, options), (default, default_options) = asked
+    assert (runner.cache, runner.processes) == (Path("x"), 3)
+    assert default.processes > 0
+    assert (list(options["seeds"]), options["seconds"], len(options["rows"])) == ([1000, 1001], 60.0, 12)
+    assert [len(default_options[name]) for name in ("seeds", "rows")] == [12, 36]
+    assert default_options["seconds"] == 1200.0
 
 
 @pytest.mark.parametrize("words", [("--json", "physics"), ("physics", "--json")])
@@ -85,8 +88,9 @@ def test_a_log_that_the_pipeline_cannot_run_is_one_line(tmp_path: Path, capsys: 
     assert "no such file" in json.loads(capsys.readouterr().err)["error"]
 
 
-def test_tables_for_people_line_up():
-    text = table([{"a": 1, "bb": None}, {"a": 22.5, "bb": "x"}])
+def test_tables_for_people_line_up_without_lists():
+    rows = [{"a": 1, "bb": None, "by_seed": [1]}, {"a": 22.5, "bb": "x", "by_seed": [2]}]
+    (text,) = command._lines({"rows": rows, "missing": []})
     assert text.splitlines() == ["   a  bb", "   1   -", "22.5   x"]
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from evaluation.maps.score import by_border_distance, driven_cells, score_driven
+from evaluation.maps.borders import BorderBin, by_border_distance
+from evaluation.maps.score import driven_cells, score_driven
 from protocol.queries.answers import Region
 from protocol.site.ground_classes import UNKNOWN
 
@@ -26,38 +27,38 @@ def truth(resistance):
 TRUE = truth([[0.04, 0.04, 0.04, 0.06, 0.06, 0.06]] * 2)
 
 
-def test_a_way_passes_cells_between_its_points():
-    way = np.array([[100.5, 0.5], [103.5, 0.5], [103.5, 1.5]])
-    passed = driven_cells(region([[NAN] * 6] * 2), [way])
+def test_a_track_passes_cells_between_its_points():
+    track = np.array([[100.5, 0.5], [103.5, 0.5], [103.5, 1.5]])
+    passed = driven_cells(region([[NAN] * 6] * 2), [track])
     assert passed.tolist() == [[True, True, True, True, False, False], [False, False, False, True, False, False]]
 
 
-def test_ways_beyond_the_region_are_cut_and_those_of_all_machines_count():
-    ways = [np.array([[98.0, 0.5], [101.5, 0.5]]), np.array([[105.5, 1.5]]), np.empty((0, 2))]
-    passed = driven_cells(region([[NAN] * 6] * 2), ways)
+def test_tracks_beyond_the_region_are_cut_and_those_of_all_machines_count():
+    tracks = [np.array([[98.0, 0.5], [101.5, 0.5]]), np.array([[105.5, 1.5]]), np.empty((0, 2))]
+    passed = driven_cells(region([[NAN] * 6] * 2), tracks)
     assert passed.sum() == 3
     assert passed[1, 5]
 
 
 def test_only_cells_that_were_truly_driven_count():
     """Row 1 was never driven: its wrong cells are the position's fault."""
-    found = region([[0.04, 0.04, 0.06, 0.06, NAN, 0.06], [0.25] * 6])
-    score = score_driven(found, TRUE, [np.array([[100.5, 0.5], [105.5, 0.5]])])
+    estimated = region([[0.04, 0.04, 0.06, 0.06, NAN, 0.06], [0.25] * 6])
+    score = score_driven(estimated, TRUE, [np.array([[100.5, 0.5], [105.5, 0.5]])])
     assert score.cells == 6
     assert score.known_pct == pytest.approx(100 * 5 / 6)
     assert score.wrong_resistance_pct == pytest.approx(100 * 1 / 5)
     assert score.wrong_grade_pct == 0.0
     near = score.by_border[0]
-    assert (near["from_m"], near["to_m"], near["cells"], near["known_pct"], near["wrong_pct"]) == (0, 1, 2, 100, 50)
-    assert [part["cells"] for part in score.by_border] == [2, 2, 2, 0, 0, 0, 0]
-    assert score.by_border[1]["known_pct"] == 50.0
-    assert score.by_border[-1]["to_m"] is None
-    assert np.isnan(score.by_border[-1]["wrong_pct"])
+    assert near == BorderBin(0, 1, 2, 100, 50)
+    assert [part.cells for part in score.by_border] == [2, 2, 2, 0, 0, 0, 0]
+    assert score.by_border[1].known_pct == 50.0
+    assert score.by_border[-1].to_m is None
+    assert np.isnan(score.by_border[-1].wrong_pct)
 
 
 def test_a_slope_that_is_none_is_wrong():
-    found = region([[0.04] * 6] * 2, grade_east=0.3)
-    assert score_driven(found, TRUE, [np.array([[100.5, 0.5], [105.5, 0.5]])]).wrong_grade_pct == 100.0
+    estimated = region([[0.04] * 6] * 2, grade_east=0.3)
+    assert score_driven(estimated, TRUE, [np.array([[100.5, 0.5], [105.5, 0.5]])]).wrong_grade_pct == 100.0
 
 
 def test_a_site_that_nobody_drove_has_no_score():
@@ -70,11 +71,11 @@ def test_cells_without_truth_do_not_count():
     cut = truth([[0.04, 0.04, NAN]])
     score = score_driven(region([[0.04, 0.06, 0.06]]), cut, [np.array([[100.5, 0.5], [102.5, 0.5]])])
     assert (score.cells, score.wrong_resistance_pct) == (2, 50.0)
-    assert score.by_border[-1]["cells"] == 2  # what is not known is no border
+    assert score.by_border[-1].cells == 2  # what is not known is no border
 
 
 def test_distance_counts_from_the_lower_edge_of_a_bin():
-    found, true = np.array([1, 1, UNKNOWN]), np.array([1, 2, 2])
-    parts = by_border_distance(found, true, np.array([0.99, 1.0, np.inf]))
-    assert [part["cells"] for part in parts] == [1, 1, 0, 0, 0, 0, 1]
-    assert (parts[0]["wrong_pct"], parts[1]["wrong_pct"], parts[6]["known_pct"]) == (0.0, 100.0, 0.0)
+    estimated, true = np.array([1, 1, UNKNOWN]), np.array([1, 2, 2])
+    parts = by_border_distance(estimated, true, np.array([0.99, 1.0, np.inf]))
+    assert [part.cells for part in parts] == [1, 1, 0, 0, 0, 0, 1]
+    assert (parts[0].wrong_pct, parts[1].wrong_pct, parts[6].known_pct) == (0.0, 100.0, 0.0)
