@@ -9,6 +9,7 @@ import gzip
 import json
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import cache, partial
 from pathlib import Path
@@ -88,7 +89,7 @@ def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], 
     if name == "reply":
         assert getattr(value, "problem", "").isprintable()
     if name in PLAIN:
-        json.dumps(value.values if name == "health" else value)
+        json.dumps(value.values if name == "health" else value, default=asdict)
     written = encode(value)
     assert encode(decode(written)) == written
 
