@@ -17,7 +17,8 @@ import numpy as np
 from benchmarks.measure import Report, in_child, machine, memory_mb, timed
 from benchmarks.merge_work import BATCH, batches, samples_of
 from mapserver.evidence import snapshot
-from mapserver.evidence.grid import Grid, PlacedPage
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.pages import CompactPages
 from mapserver.evidence.votes import FoldConfig
 
 GOALS = {"bytes_per_cell_and_bucket": 500, "resident_mb": 400}
@@ -42,23 +43,26 @@ def measured(hours: float) -> dict[str, float]:
     for name, rows in islice(batches(), samples_of(hours) // BATCH):
         grid.fold(rows, name)
     resident_mb = memory_mb()
-    pages = grid.state().pages
+    blocks = [pages for _, _, pages in grid.state().blocks]
     row = {
         "samples": grid.folded,
-        "pages": len(pages),
+        "pages": sum(len(pages.table) for pages in blocks),
         "cells": grid.known_cells(),
-        "bytes_per_cell_and_bucket": round(_bytes_per_cell([at for at in pages if at.tier == 0]), 1),
-        "evidence_mb": round(sum(at.page.nbytes for at in pages) / MB, 1),
+        "bytes_per_cell_and_bucket": round(_bytes_per_cell(blocks), 1),
+        "evidence_mb": round(sum(map(_bytes, blocks)) / MB, 1),
         "resident_mb": round(max(resident_mb, memory_mb()), 1),  # with all pages packed, or with blocks open
     }
     return row | _snapshot(grid)
 
 
-def _bytes_per_cell(pages: Sequence[PlacedPage]) -> float:
-    """Bytes of pages, with their Python objects, per cell that has evidence in them."""
-    overhead = sum(map(sys.getsizeof, (pages[0].page, np.empty(0), np.empty(0)))) if pages else 0
-    size = sum(at.page.nbytes + overhead for at in pages)
-    return size / max(1, sum(len(at.page.cells) for at in pages))
+def _bytes(pages: CompactPages) -> int:
+    """Bytes of the pages of one block, with their Python objects."""
+    return pages.nbytes + sys.getsizeof(pages) + len(pages.__slots__) * sys.getsizeof(np.empty(0))
+
+
+def _bytes_per_cell(blocks: Sequence[CompactPages]) -> float:
+    """Bytes of pages per cell that has evidence in them."""
+    return sum(map(_bytes, blocks)) / max(1, sum(len(pages.marks) for pages in blocks))
 
 
 def _snapshot(grid: Grid) -> dict[str, float]:

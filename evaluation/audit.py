@@ -18,7 +18,7 @@ from agents.delivery.audit import read_audit
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot
-from mapserver.evidence.grid import Grid, GridState, PlacedPage
+from mapserver.evidence.grid import REFOLD_ROWS, Grid, GridState, PlacedPage
 from mapserver.evidence.pages import Page
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
@@ -79,7 +79,7 @@ def compare(
 ) -> AuditResult:
     """Compare recorded samples with journal rows, and those, folded again, with a grid; excluded: of the grid."""
     withheld = 0
-    refolded = Grid(site.cell_m, config.fold)
+    refolded = Grid(site.cell_m, config.fold, REFOLD_ROWS)
     hashes: dict[SampleKey, list[str]] = {}
     contents: Counter[tuple[str, str]] = Counter()
     for row in rows:

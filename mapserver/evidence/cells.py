@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-SCHEMA = 3  # of everything below; a snapshot of another schema is folded again from the journal
+SCHEMA = 4  # of everything below; a snapshot of another schema is folded again from the journal
 
 CELLS = BLOCK_CELLS * BLOCK_CELLS  # of a block
 WEIGHT_UNITS_PER_M = 4096

@@ -8,19 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold import fold
-from mapserver.evidence.open_blocks import NoRoom, OpenBlocks, split_code
-from mapserver.evidence.pages import Page
+from mapserver.evidence.fold import Scratch, fold
+from mapserver.evidence.pages import CompactPages, Page
 from mapserver.evidence.sums import evidence
-from mapserver.evidence.timeline import Block, TimedPage, Timeline, tiers
-from mapserver.evidence.votes import FoldConfig
-from protocol.arrays import Table
+from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline
+from mapserver.evidence.votes import FoldConfig, is_foldable, name_hash
+from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-OPEN_BLOCKS = 128  # of 115 kB each: a fleet at work drives in about so many before they are packed
-PIECE = 4096  # samples that are folded at once; their weights together stay far below COUNT_MAX
+# Samples that wait to be folded together: the more, the fewer pages. While machines drive, the map is read every second
+# and a fold must not take long (8 ms); when a journal is folded again, only the sum counts.
+LIVE_ROWS, REFOLD_ROWS = 8192, 131_072
+PIECE = 4096  # samples whose weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
+_RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records field by field, and these at once
 
 
 @dataclass(frozen=True)
@@ -36,39 +38,85 @@ class PlacedPage:
 
 @dataclass(frozen=True)
 class GridState:
-    """Everything that a snapshot keeps; equal grids have equal states. newest_ns: of all samples, 0 for none."""
+    """Everything that a snapshot keeps; equal grids have equal states.
 
-    pages: tuple[PlacedPage, ...]
+    blocks: column, row and pages of each block, in the order of places. newest_ns: of all samples, 0 for none.
+    """
+
+    blocks: tuple[tuple[int, int, CompactPages], ...]
     folded: int
     skipped: int
     newest_ns: int
 
+    @property
+    def pages(self) -> list[PlacedPage]:
+        """All pages, one by one."""
+        return [
+            PlacedPage(x, y, tier, index, page)
+            for x, y, pages in self.blocks
+            for tier, index, page in pages.expanded().items()
+        ]
+
 
 class Grid:
-    """Evidence of one site.
+    """Evidence of one site. newest_ns: the newest stamp of all samples."""
 
-    folded, skipped: how many samples voted, and how many were too uncertain of their position to vote. newest_ns: the
-    newest stamp of all of them.
-    """
-
-    def __init__(self, cell_m: float, config: FoldConfig, open_blocks: int = OPEN_BLOCKS) -> None:
-        """open_blocks: so many blocks are unpacked at a time; they are no part of what the grid says."""
+    def __init__(self, cell_m: float, config: FoldConfig, waiting_rows: int = LIVE_ROWS) -> None:
+        """waiting_rows: so many samples are folded together, LIVE_ROWS or REFOLD_ROWS; the grid is the same."""
         self.cell_m = cell_m
         self.config = config
-        self.folded = 0
-        self.skipped = 0
         self.newest_ns = 0
-        self._tiers = tiers(config)
-        self._open = OpenBlocks(open_blocks)
+        self._folded = self._skipped = 0
+        self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
+        self._scratch, self._space = Scratch(), Space()
+        self._rows: AnyArray = np.empty(waiting_rows, _RAW_SAMPLE)
+        self._names = np.empty(waiting_rows, np.uint64)
+        self._waiting, self._weight = 0, 0
+
+    @property
+    def folded(self) -> int:
+        """How many samples voted."""
+        self._drain()
+        return self._folded
+
+    @property
+    def skipped(self) -> int:
+        """How many samples were too uncertain of their position to vote."""
+        self._drain()
+        return self._skipped
 
     def fold(self, rows: Table, machine: str) -> None:
         """Fold samples of one machine; commutative, not idempotent: exactly-once is decided at the journal."""
-        if len(rows):
-            self.newest_ns = max(self.newest_ns, int(rows["stamp_ns"].max()))
+        if not len(rows):
+            return
+        self.newest_ns = max(self.newest_ns, int(rows["stamp_ns"].max()))
+        name = name_hash(machine)
         for first in range(0, len(rows), PIECE):
-            self._fold_piece(rows[first : first + PIECE], machine)
+            self._take(np.ascontiguousarray(rows[first : first + PIECE]), name)
+
+    def merge(self, other: Grid) -> None:
+        """Add the evidence of another grid: the fold of both sets of samples, bit for bit.
+
+        The two share no sample: merging is commutative and associative, not idempotent. Raises ValueError where the
+        other was folded with another cell size or configuration.
+        """
+        if (self.cell_m, self.config) != (other.cell_m, other.config):
+            raise ValueError(f"folded otherwise: {other.cell_m} m, {other.config}; {self.cell_m} m, {self.config}")
+        self._drain()
+        other._drain()
+        for block, timeline in other._timelines.items():
+            self._timeline(block).add(timeline.settled().expanded())
+            self._touched.add(block)
+        self._folded += other._folded
+        self._skipped += other._skipped
+        self.newest_ns = max(self.newest_ns, other.newest_ns)
+
+    def resize_buffer(self, waiting_rows: int) -> None:
+        """Let so many samples wait from now on."""
+        self._drain()
+        self._rows, self._names = np.empty(waiting_rows, _RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
 
     def blocks_in(self, window: CellWindow) -> list[Block]:
         """Block columns and rows with evidence that the window touches."""
@@ -108,72 +156,55 @@ class Grid:
     def known_cells(self) -> int:
         """How many cells have any evidence."""
         self._drain()
-        known = np.zeros(ev.CELLS, np.bool_)
-        total = 0
-        for timeline in self._timelines.values():
-            known[:] = False
-            for _, _, page in timeline.items():
-                known[page.cells["cell"]] = True
-            total += int(known.sum())
-        return total
+        return sum(timeline.known_cells for timeline in self._timelines.values())
 
     def state(self) -> GridState:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()
-        pages = (
-            PlacedPage(x, y, tier, index, page)
-            for x, y in sorted(self._timelines)
-            for tier, index, page in self._timelines[x, y].items()
-        )
-        return GridState(tuple(pages), self.folded, self.skipped, self.newest_ns)
+        blocks = ((x, y, self._timelines[x, y].settled()) for x, y in sorted(self._timelines))
+        return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns)
 
     @classmethod
     def from_state(cls, cell_m: float, config: FoldConfig, state: GridState) -> Grid:
         """Undo `state`."""
         grid = cls(cell_m, config)
-        for at in state.pages:
-            grid._timeline((at.x, at.y)).put(at.tier, at.index, at.page)
-        grid.folded, grid.skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
+        for x, y, pages in state.blocks:
+            grid._timelines[x, y] = Timeline(grid._tiers, grid._space, pages)
+        grid._folded, grid._skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
         return grid
 
-    def _fold_piece(self, rows: Table, machine: str) -> None:
-        """Fold rows; where the open blocks have no room for all, first one half by place, then the other."""
+    def _take(self, rows: Table, name: int) -> None:
+        """Let rows wait; what waits is folded before its weight could exceed a count."""
         weight = int(rows["distance_m"].sum(dtype=np.float64) * ev.WEIGHT_UNITS_PER_M) + len(rows)
-        if self._open.load + weight > ev.COUNT_MAX:
+        if self._weight + weight > ev.COUNT_MAX:
             self._drain()
-        try:
-            folded = fold(rows, machine, self.cell_m, self.config, self._open)
-        except NoRoom as error:
-            self._make_room(rows, machine, error.blocks)
-            return
-        self._open.load += weight
-        self.folded += folded
-        self.skipped += len(rows) - folded
-
-    def _make_room(self, rows: Table, machine: str, blocks: int) -> None:
-        """Fold rows that touch more blocks than there is room for."""
-        if len(self._open):
-            self._drain()
-            self._fold_piece(rows, machine)
-        elif len(rows) == 1:  # its stencil alone is larger than all open blocks
-            self._open = OpenBlocks(blocks)
-            self._fold_piece(rows, machine)
-        else:
-            rows, half = rows[np.lexsort((rows["x_m"], rows["y_m"]))], len(rows) // 2
-            self._fold_piece(rows[:half], machine)
-            self._fold_piece(rows[half:], machine)
+        self._weight += weight
+        while len(rows):
+            part = rows[: len(self._rows) - self._waiting]
+            end = self._waiting + len(part)
+            self._rows[self._waiting : end] = part.view(_RAW_SAMPLE)
+            self._names[self._waiting : end] = name
+            self._waiting, rows = end, rows[len(part) :]
+            if end == len(self._rows):
+                self._drain()
 
     def _drain(self) -> None:
-        """Pack all open blocks."""
-        for code, page in self._open.drain():
-            bucket, x, y = split_code(code)
-            self._timeline((x, y)).add(bucket, page)
+        """Fold what waits."""
+        if not self._waiting:
+            return
+        rows, names = self._rows[: self._waiting].view(SAMPLE_DTYPE), self._names[: self._waiting]
+        for x, y, pages in fold(rows, names, self.cell_m, self.config, self._scratch):
+            self._timeline((x, y)).add(pages)
             self._touched.add((x, y))
+        voting = int(is_foldable(rows, self.config).sum())
+        self._folded += voting
+        self._skipped += len(rows) - voting
+        self._waiting, self._weight = 0, 0
 
     def _timeline(self, block: Block) -> Timeline:
         timeline = self._timelines.get(block)
         if timeline is None:
-            timeline = self._timelines[block] = Timeline(self._tiers)
+            timeline = self._timelines[block] = Timeline(self._tiers, self._space)
         return timeline
 
 

@@ -1,6 +1,6 @@
-"""Loops over pages, compiled by numba.
+"""Pages to their compact form and back, and sums over their votes, compiled.
 
-They write votes twice, as NARROW and as WIDE records: which of them fits is known when all are written.
+In memory between kernels, a vote is one number: the place (plane * 256 + cell) in its lower 16 bits, its count above.
 """
 
 from __future__ import annotations
@@ -10,110 +10,155 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver.evidence.cells import CELLS, COUNT_MAX
+from mapserver.evidence.cells import CELLS, COUNTS
+
+_PLANE, _CELL = np.uint64(0xFF00), np.uint64(CELLS - 1)  # of a place
+_LOW = np.uint64(0xFFFF)  # of a count
 
 
 @numba.njit(cache=True, nogil=True)
-def take_votes(counts: Any, planes: Any, newest_ns: Any, narrow: Any, wide: Any) -> tuple[int, int]:
-    """Move what is not zero in counts (COUNTS, 256) to votes; returns how many there are, and the largest count.
+def compact_votes(table: Any, votes: Any, runs: Any, cells: Any, counts: Any, high: Any) -> int:
+    """Split the votes of pages: runs of votes of one plane, their cells, and their counts.
 
-    planes (COUNTS,): which of them have been written to; most have not, and are not touched.
+    table (n, 6): as of PackedPages. Fills runs (m, 2) of plane and number of votes less one, cells (k,), counts (k,)
+    with the lower 16 bits and, where it is not empty, high (k,) with the upper ones. Writes in each page's row where
+    its runs end, in place of where its votes begin. Returns how many runs.
     """
-    n, largest = 0, np.uint32(0)
-    touched = np.flatnonzero(newest_ns)
-    for plane in np.flatnonzero(planes):
-        cells = counts[plane]
-        planes[plane] = False
-        for i in touched:
-            if cells[i]:
-                narrow[n].place, narrow[n].count = plane * CELLS + i, cells[i]
-                wide[n].place, wide[n].count = plane * CELLS + i, cells[i]
-                largest = max(largest, cells[i])
-                cells[i] = 0
-                n += 1
-    return n, int(largest)
+    used, i = 0, 0
+    for p in range(len(table)):
+        end = table[p, 3]
+        while i < end:
+            plane = votes[i] & _PLANE
+            first = i
+            while i < end and votes[i] & _PLANE == plane:
+                cells[i] = votes[i] & _CELL
+                counts[i] = votes[i] >> np.uint64(16) & _LOW
+                if len(high):
+                    high[i] = votes[i] >> np.uint64(32)
+                i += 1
+            runs[used, 0], runs[used, 1] = plane >> np.uint64(8), i - first - 1
+            used += 1
+        table[p, 2] = used
+    return used
 
 
 @numba.njit(cache=True, nogil=True)
-def take_cells(bitmaps: Any, newest_ns: Any, out: Any) -> int:
-    """Move bitmaps (2, 256) and stamps (256,) of touched cells to cells; returns how many there are."""
-    n = 0
-    for i in range(CELLS):
-        if newest_ns[i]:
-            out[n].cell, out[n].newest_ns = i, newest_ns[i]
-            out[n].visits, out[n].machines = bitmaps[0, i], bitmaps[1, i]
-            bitmaps[0, i] = bitmaps[1, i] = newest_ns[i] = 0
-            n += 1
-    return n
+def expand_votes(table: Any, runs: Any, cells: Any, counts: Any, high: Any, out: Any) -> None:
+    """Undo `compact_votes`; out (k,) votes. high may be empty. The table (n, 6) is put right again."""
+    run, at = 0, 0
+    for p in range(len(table)):
+        end_run = table[p, 2]
+        table[p, 2] = at
+        while run < end_run:
+            plane = np.uint64(runs[run, 0]) << np.uint64(8)
+            for _ in range(np.int64(runs[run, 1]) + 1):
+                count = np.uint64(counts[at])
+                if len(high):
+                    count |= np.uint64(high[at]) << np.uint64(16)
+                out[at] = (count << np.uint64(16)) | plane | np.uint64(cells[at])
+                at += 1
+            run += 1
+        table[p, 3] = at
 
 
 @numba.njit(cache=True, nogil=True)
-def pick_votes(votes: Any, chosen: Any, narrow: Any, wide: Any) -> tuple[int, int]:
-    """Votes of the chosen cells (256,); returns how many there are, and the largest count."""
-    n, largest = 0, np.uint32(0)
-    for i in range(len(votes)):
-        if chosen[votes[i].place % CELLS]:
-            narrow[n].place, narrow[n].count = votes[i].place, votes[i].count
-            wide[n].place, wide[n].count = votes[i].place, votes[i].count
-            largest = max(largest, np.uint32(votes[i].count))
-            n += 1
-    return n, int(largest)
+def compact_cells(table: Any, cells: Any, out: Any, words: Any) -> int:
+    """Replace bitmaps and stamps of cells by numbers of words: each page has its own, all different, in one list.
+
+    Fills out (k, 4): cell, and numbers of its visits, its machines and its stamp among the page's words; words (m,)
+    uint64: for each page how many of the three there are, packed in 9 bits each, then the words. Returns how many.
+    """
+    used = 0
+    for p in range(len(table)):
+        first, end = table[p, 4], table[p, 5]
+        header = used
+        used += 1
+        sizes = np.uint64(0)
+        for part in range(3):
+            begin = used
+            for j in range(first, end):
+                if part == 0:
+                    word = cells[j].visits
+                elif part == 1:
+                    word = cells[j].machines
+                else:
+                    word = np.uint64(cells[j].newest_ns)
+                number = used - 1
+                while number >= begin and words[number] != word:
+                    number -= 1
+                if number < begin:
+                    words[used] = word
+                    number = used
+                    used += 1
+                out[j, 1 + part] = number - begin
+            sizes |= np.uint64(used - begin) << np.uint64(9 * part)
+        words[header] = sizes
+        for j in range(first, end):
+            out[j, 0] = cells[j].cell
+    return used
 
 
 @numba.njit(cache=True, nogil=True)
-def pick_cells(cells: Any, chosen: Any, out: Any) -> int:
-    """The chosen cells; returns how many there are."""
-    n = 0
-    for i in range(len(cells)):
-        if chosen[cells[i].cell]:
-            out[n] = cells[i]
-            n += 1
-    return n
+def expand_cells(table: Any, compact: Any, words: Any, out: Any) -> None:
+    """Undo `compact_cells`; out (k,) CELL."""
+    at = 0
+    for p in range(len(table)):
+        sizes = words[at]
+        visits = at + 1
+        machines = visits + int(sizes & np.uint64(511))
+        stamps = machines + int(sizes >> np.uint64(9) & np.uint64(511))
+        at = stamps + int(sizes >> np.uint64(18))
+        for j in range(table[p, 4], table[p, 5]):
+            out[j].cell = compact[j, 0]
+            out[j].visits = words[visits + compact[j, 1]]
+            out[j].machines = words[machines + compact[j, 2]]
+            out[j].newest_ns = np.int64(words[stamps + compact[j, 3]])
 
 
 @numba.njit(cache=True, nogil=True)
-def add_votes(one: Any, other: Any, narrow: Any, wide: Any) -> tuple[int, int]:
-    """Merge votes in the order of places, saturated; returns how many there are, and the largest count."""
-    i, j, n, largest = 0, 0, 0, np.uint64(0)
-    while i < len(one) or j < len(other):
-        from_one = j == len(other) or (i < len(one) and one[i].place <= other[j].place)
-        from_other = i == len(one) or (j < len(other) and other[j].place <= one[i].place)
-        place = one[i].place if from_one else other[j].place
-        count = np.uint64(0)
-        if from_one:
-            count += np.uint64(one[i].count)
-            i += 1
-        if from_other:
-            count += np.uint64(other[j].count)
-            j += 1
-        count = min(count, np.uint64(COUNT_MAX))
-        narrow[n].place, narrow[n].count = place, count
-        wide[n].place, wide[n].count = place, count
-        largest = max(largest, count)
-        n += 1
-    return n, int(largest)
+def are_votes(table: Any, runs: Any, cells: Any, counts: Any, high: Any) -> bool:
+    """Whether these can be the votes of pages: what is read from a disk is looked at before it is expanded."""
+    run, vote = 0, 0
+    for p in range(len(table)):
+        plane = -1
+        if not run <= table[p, 2] <= len(runs):
+            return False
+        while run < table[p, 2]:
+            end = vote + int(runs[run, 1]) + 1
+            if not plane < runs[run, 0] < COUNTS or end > len(cells):
+                return False
+            plane = int(runs[run, 0])
+            for i in range(vote + 1, end):
+                if cells[i] <= cells[i - 1]:
+                    return False
+            vote = end
+            run += 1
+        if table[p, 3] != vote:
+            return False
+    return run == len(runs) and vote == len(cells) == len(counts) and len(high) in (0, vote)
 
 
 @numba.njit(cache=True, nogil=True)
-def add_cells(one: Any, other: Any, out: Any) -> int:
-    """Merge cells in the order of their numbers; returns how many there are."""
-    i, j, n = 0, 0, 0
-    while i < len(one) or j < len(other):
-        if j == len(other) or (i < len(one) and one[i].cell < other[j].cell):
-            out[n] = one[i]
-            i += 1
-        elif i == len(one) or other[j].cell < one[i].cell:
-            out[n] = other[j]
-            j += 1
-        else:
-            out[n] = one[i]
-            out[n].visits |= other[j].visits
-            out[n].machines |= other[j].machines
-            out[n].newest_ns = max(one[i].newest_ns, other[j].newest_ns)
-            i += 1
-            j += 1
-        n += 1
-    return n
+def are_cells(table: Any, marks: Any, words: Any) -> bool:
+    """Likewise, whether these can be the cells of pages."""
+    at, word = 0, 0
+    for p in range(len(table)):
+        if not (table[p, 4] == at and at < table[p, 5] <= len(marks) and word < len(words)):
+            return False
+        for part in range(3):
+            size = int(words[word] >> np.uint64(9 * part) & np.uint64(511))
+            for j in range(at, table[p, 5]):
+                if marks[j, 1 + part] >= size:
+                    return False
+        for j in range(at + 1, table[p, 5]):
+            if marks[j, 0] <= marks[j - 1, 0]:
+                return False
+        sizes = words[word]
+        for part in range(3):
+            word += int(sizes >> np.uint64(9 * part) & np.uint64(511))
+        word += 1
+        at = table[p, 5]
+    return at == len(marks) and word == len(words)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.grid import Grid, GridState, PlacedPage
-from mapserver.evidence.pages import CELL, NARROW, WIDE, Page, frozen
+from mapserver.evidence.grid import Grid, GridState
+from mapserver.evidence.pages import EMPTY, CompactPages
 from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
 from protocol.arrays import AnyArray
 from protocol.files import whole_file
@@ -41,7 +41,7 @@ def save(
     totals = {name: getattr(state, name) for name in _TOTALS}
     header = {**_parameters(cell_m, config, excluded), "row": row, **totals}
     with whole_file(path) as file:
-        np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.pages))  # type: ignore[arg-type]
+        np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.blocks))  # type: ignore[arg-type]
     for old in rows_on_disk(folder)[KEEP:]:
         (folder / f"snapshot-{old}.npz").unlink(missing_ok=True)
     return path
@@ -71,7 +71,7 @@ def load(path: Path, cell_m: float, config: FoldConfig, excluded: Collection[str
             expected = _parameters(cell_m, config, excluded)
             if {key: header.get(key) for key in expected} != expected:
                 return None
-            state = GridState(_pages(file), *(header[name] for name in _TOTALS))
+            state = GridState(_blocks(file), *(header[name] for name in _TOTALS))
             if path.name != f"snapshot-{header['row']}.npz":
                 raise ValueError(f"it is true for row {header['row']}")
             return header["row"], Grid.from_state(cell_m, config, state)
@@ -97,47 +97,33 @@ def _parameters(cell_m: float, config: FoldConfig, excluded: Collection[str]) ->
     return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": bins, "excluded": sorted(excluded), **fold}
 
 
-def _arrays(pages: Sequence[PlacedPage]) -> dict[str, AnyArray]:
-    """Pages as few long arrays: what each is and how long its parts are, and the parts end to end."""
-    narrow = [at.page.votes for at in pages if at.page.votes.dtype == NARROW]
-    wide = [at.page.votes for at in pages if at.page.votes.dtype == WIDE]
-    rows = [
-        (at.x, at.y, at.tier, at.index, at.page.votes.dtype == WIDE, len(at.page.votes), len(at.page.cells))
-        for at in pages
-    ]
-    return {
-        "pages": np.array(rows, np.int64).reshape(-1, 7),
-        "narrow": np.concatenate([np.empty(0, NARROW), *narrow]),
-        "wide": np.concatenate([np.empty(0, WIDE), *wide]),
-        "cells": np.concatenate([np.empty(0, CELL), *(at.page.cells for at in pages)]),
+def _arrays(blocks: Sequence[tuple[int, int, CompactPages]]) -> dict[str, AnyArray]:
+    """Blocks as few long arrays: place and lengths (n, 2 + parts) of each, and its parts end to end."""
+    parts = [[getattr(pages, name) for _, _, pages in blocks] for name in CompactPages.__slots__]
+    places = [(x, y) for x, y, _ in blocks]
+    lengths = [[len(part) for part in of_one] for of_one in zip(*parts, strict=True)]
+    table = np.array([(*place, *of_one) for place, of_one in zip(places, lengths, strict=True)], np.int64)
+    joined = {
+        name: np.concatenate([getattr(EMPTY, name), *part])
+        for name, part in zip(CompactPages.__slots__, parts, strict=True)
     }
+    return {"blocks": table.reshape(-1, 2 + len(parts)), **joined}
 
 
-def _pages(file: Mapping[str, AnyArray]) -> tuple[PlacedPage, ...]:
-    """Undo `_arrays`; pages are copies, so that those which are merged later give their memory back."""
-    table, cells, parts = file["pages"], file["cells"], (file["narrow"], file["wide"])
-    wide, votes, k = table[:, 4], table[:, 5], table[:, 6]
-    if (table[:, 2:] < 0).any() or (wide > 1).any() or (k < 1).any():
-        raise ValueError("a page of an impossible kind")
-    for which, part in enumerate(parts):
-        _check_order(part["place"], votes[wide == which], ev.COUNTS * ev.CELLS)
-    _check_order(cells["cell"], k, ev.CELLS)
-    pages, read = [], [0, 0, 0]
-    for x, y, tier, index, which, n, m in table.tolist():
-        page = Page(frozen(parts[which][read[which] :][:n]), frozen(cells[read[2] :][:m]))
-        pages.append(PlacedPage(x, y, tier, index, page))
-        read[which] += n
-        read[2] += m
-    return tuple(pages)
-
-
-def _check_order(values: AnyArray, lengths: AnyArray, limit: int) -> None:
-    """ValueError unless a part consists of pages, end to end: each in increasing order and below a limit."""
-    if int(lengths.sum()) != len(values):
-        raise ValueError("its parts have other lengths than its table of pages")
-    rises = np.ones(len(values), np.bool_)
-    rises[1:] = values[1:] > values[:-1]
-    starts = np.cumsum(lengths)[:-1]
-    rises[starts[starts < len(values)]] = True  # a new page begins
-    if not rises.all() or (len(values) and int(values.max()) >= limit):
-        raise ValueError("votes or cells that no page can have")
+def _blocks(file: Mapping[str, AnyArray]) -> tuple[tuple[int, int, CompactPages], ...]:
+    """Undo `_arrays`; pages are copies, so that those which grow give their memory back. ValueError for no pages."""
+    table, parts = file["blocks"], [file[name] for name in CompactPages.__slots__]
+    if (table[:, 2:] < 0).any() or table[:, 2:].sum(axis=0).tolist() != [len(part) for part in parts]:
+        raise ValueError("parts of other lengths than its blocks say")
+    for part, name in zip(parts, CompactPages.__slots__, strict=True):
+        if part.dtype != getattr(EMPTY, name).dtype or part.shape[1:] != getattr(EMPTY, name).shape[1:]:
+            raise ValueError(f"{name} of another kind")
+    blocks, starts = [], [0] * len(parts)
+    for x, y, *lengths in table.tolist():
+        ends = [start + length for start, length in zip(starts, lengths, strict=True)]
+        pages = CompactPages(*(part[i:j].copy() for part, i, j in zip(parts, starts, ends, strict=True)))
+        if not pages.is_sound:
+            raise ValueError(f"pages that cannot be, of block {x}, {y}")
+        blocks.append((x, y, pages))
+        starts = ends
+    return tuple(blocks)

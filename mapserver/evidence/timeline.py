@@ -1,9 +1,9 @@
 """The pages of one block by time: the newest buckets apart, older ones summed into hours, days and all before.
 
-What stays apart is decided by rank, cell by cell, not by age: ground that is driven once a day keeps its last passes
-apart as well as the haul road beside it, and a cell never takes more than a fixed number of places. The newest buckets
-of a set do not depend on the order in which they came, and sums commute, so that a timeline is a function of the
-samples alone.
+What is kept apart goes by rank, cell by cell, not by age: ground that is driven once a day keeps its last passes apart
+as well as the haul road beside it, and a cell never takes more than a fixed number of places. The newest buckets of
+a set do not depend on the order in which they came, and summing commutes, so that a timeline is a function of the
+samples alone. That is why it may be settled late, and why the timelines of two sets of samples merge into that of both.
 """
 
 from __future__ import annotations
@@ -14,66 +14,92 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.pages import Page, merge, pick
+from mapserver.evidence.pages import CELL, EMPTY, RAW_CELL, CompactPages, PackedPages, Page
+from mapserver.evidence.timeline_kernel import settle
 from mapserver.evidence.votes import FoldConfig
-from protocol.arrays import Bools
+from protocol.arrays import AnyArray, Bools, Ints
 
 HOUR_S, DAY_S = 3600, 86_400
-PATIENCE = 8  # pages that a tier takes before it hands on: fewer cost time, more cost memory
+PATIENCE = 24  # pages that wait before a timeline is settled: fewer cost time, more cost memory
 Block = tuple[int, int]  # column and row
-
-
-@dataclass(frozen=True)
-class Tier:
-    """Spans of one length [ns], of which the newest `keep` of each cell stay apart; keep 0: all of them are one."""
-
-    span_ns: int
-    keep: int
 
 
 @dataclass(frozen=True, slots=True)
 class TimedPage:
-    """A page, and the span of time in which its samples lie."""
+    """A page, and the span of time that its samples lie in."""
 
     first_ns: int
     end_ns: int
     page: Page
 
 
-def tiers(config: FoldConfig) -> tuple[Tier, ...]:
-    """Buckets, hours, days, and everything before them."""
-    return (
-        Tier(config.bucket_ns, config.keep_buckets),
-        Tier(HOUR_S * 10**9, config.keep_hours),
-        Tier(DAY_S * 10**9, config.keep_days),
-        Tier(0, 0),
-    )
+@dataclass(frozen=True)
+class Tiers:
+    """Spans of growing lengths [ns], of which the newest `keeps` of each cell stay apart; the last one has no end."""
+
+    spans_ns: Ints
+    keeps: Ints
+
+    @classmethod
+    def from_config(cls, config: FoldConfig) -> Tiers:
+        """Buckets, hours, days, and everything before them."""
+        spans = (config.bucket_ns, HOUR_S * 10**9, DAY_S * 10**9, 0)
+        return cls(np.array(spans), np.array((config.keep_buckets, config.keep_hours, config.keep_days, 0)))
+
+
+class Space:
+    """Where timelines are settled, one at a time: the pages that there are, those that come of them, and their sums."""
+
+    def __init__(self) -> None:
+        self.counts = np.zeros(ev.COUNTS * ev.CELLS, np.uint64)
+        self.votes, self.out_votes = np.empty(0, np.uint64), np.empty(0, np.uint64)
+        self.cells: AnyArray = np.empty(0, RAW_CELL)
+        self.out_cells: AnyArray = np.empty(0, RAW_CELL)
+
+    def grow(self, votes: int, cells: int) -> None:
+        """Have space for so many votes and cells, and one more of each for the kernel, which writes one place ahead."""
+        if votes >= len(self.votes):
+            self.votes, self.out_votes = (np.empty(2 * votes + 1, np.uint64) for _ in range(2))
+        if cells >= len(self.cells):
+            self.cells, self.out_cells = (np.empty(2 * cells + 1, RAW_CELL) for _ in range(2))
 
 
 class Timeline:
-    """Pages of one block. What is beyond the newest of a tier moves on after a few pages, and before a read."""
+    """Pages of one block: settled ones, and those that came since."""
 
-    def __init__(self, tiers: tuple[Tier, ...]) -> None:
-        self._tiers = tiers
-        self._pages: tuple[dict[int, Page], ...] = tuple({} for _ in tiers)
-        self._added = [0] * len(tiers)  # pages since the tier last handed on
+    __slots__ = ("_fresh", "_known", "_settled", "_space", "_tiers", "_waiting")
 
-    def add(self, bucket: int, page: Page) -> None:
-        """Add evidence of a time bucket."""
-        self._put(0, bucket, page)
+    def __init__(self, tiers: Tiers, space: Space, settled: CompactPages = EMPTY) -> None:
+        self._tiers, self._space = tiers, space
+        self._settled = settled
+        self._fresh: list[PackedPages] = []
+        self._waiting = 0
+        self._known: Bools = np.zeros(ev.CELLS, np.bool_)
+        self._known[settled.marks[:, 0]] = True
 
-    def put(self, tier: int, index: int, page: Page) -> None:
-        """Put a page back to the place that `items` gave."""
-        self._pages[tier][index] = page
+    @property
+    def known_cells(self) -> int:
+        """How many cells have evidence."""
+        return int(self._known.sum())
+
+    def add(self, pages: PackedPages) -> None:
+        """Add evidence of any tiers and spans, also of those that are there."""
+        self._fresh.append(pages)
+        self._known[pages.cells["cell"]] = True
+        self._waiting += len(pages.table)
+        if self._waiting >= PATIENCE:
+            self.settled()
+
+    def settled(self) -> CompactPages:
+        """All pages, in the order of tier and index, each cell's newest spans apart."""
+        if self._fresh:
+            self._settled = _settled(self._settled, self._fresh, self._tiers, self._space)
+            self._fresh, self._waiting = [], 0
+        return self._settled
 
     def items(self) -> Iterator[tuple[int, int, Page]]:
-        """Tier, index in it, and page, sorted."""
-        for tier, added in enumerate(self._added):  # the finest first: it hands on to the others
-            if added:
-                self._thin(tier)
-        for tier, pages in enumerate(self._pages):
-            for index in sorted(pages):
-                yield tier, index, pages[index]
+        """Tier, index on it, and page, sorted."""
+        return self.settled().expanded().items()
 
     def timed(self) -> list[TimedPage]:
         """Pages in the order of time.
@@ -81,41 +107,32 @@ class Timeline:
         A page of a coarser tier may begin before one of a finer tier ends: both have evidence of the same hour. In each
         cell, the finer one is newer.
         """
-        pages = []
-        for tier, index, page in self.items():
-            span = self._tiers[tier].span_ns
-            end = (index + 1) * span if span else int(page.cells["newest_ns"].max()) + 1
-            pages.append((-tier, TimedPage(index * span, end, page)))
-        return [timed for _, timed in sorted(pages, key=lambda item: (item[0], item[1].first_ns))]
+        spans = self._tiers.spans_ns.tolist()
+        pages = sorted(self.items(), key=lambda item: (-item[0], item[1]))
+        return [TimedPage(*_time_of(spans[tier], index, page), page) for tier, index, page in pages]
 
-    def _put(self, tier: int, index: int, page: Page) -> None:
-        pages = self._pages[tier]
-        pages[index] = merge(pages[index], page) if index in pages else page
-        self._added[tier] += 1
-        if self._added[tier] >= PATIENCE:
-            self._thin(tier)
 
-    def _thin(self, tier: int) -> None:
-        """Move what cells have beyond their newest `keep` spans to the next tier."""
-        self._added[tier] = 0
-        pages, keep = self._pages[tier], self._tiers[tier].keep
-        if not keep or len(pages) <= keep:
-            return
-        order = sorted(pages, reverse=True)
-        held: Bools = np.zeros((len(order), ev.CELLS), np.bool_)
-        for i, index in enumerate(order):
-            held[i, pages[index].cells["cell"]] = True
-        beyond = held & (held.cumsum(axis=0) > keep)
-        for i in np.flatnonzero(beyond.any(axis=1)).tolist():
-            index = order[i]
-            page = pages.pop(index)
-            if not (kept := held[i] & ~beyond[i]).any():
-                self._put(tier + 1, self._above(tier, index), page)
-                continue
-            pages[index] = pick(page, kept)
-            self._put(tier + 1, self._above(tier, index), pick(page, beyond[i]))
+def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
+    """First and end time of a page; before all spans, it ends with its newest sample."""
+    return index * span_ns, (index + 1) * span_ns if span_ns else int(page.cells["newest_ns"].max()) + 1
 
-    def _above(self, tier: int, index: int) -> int:
-        """Index of the coarser span that holds this one."""
-        span = self._tiers[tier + 1].span_ns
-        return index * self._tiers[tier].span_ns // span if span else 0
+
+def _settled(settled: CompactPages, fresh: list[PackedPages], tiers: Tiers, space: Space) -> CompactPages:
+    votes, cells = len(settled.cells), len(settled.marks)
+    table = np.concatenate([settled.table.astype(np.int64), *(pages.table for pages in fresh)])
+    space.grow(votes + sum(len(pages.votes) for pages in fresh), cells + sum(len(pages.cells) for pages in fresh))
+    row = len(settled.table)
+    settled.expand_into(PackedPages(table[:row], space.votes[:votes], space.cells[:cells].view(CELL)))
+    for pages in fresh:
+        table[row : row + len(pages.table), 2:4] += votes
+        table[row : row + len(pages.table), 4:6] += cells
+        space.votes[votes : votes + len(pages.votes)] = pages.votes
+        space.cells[cells : cells + len(pages.cells)] = pages.cells.view(RAW_CELL)
+        row, votes, cells = row + len(pages.table), votes + len(pages.votes), cells + len(pages.cells)
+    out_table: Ints = np.empty((len(table) * len(tiers.keeps), 6), np.int64)
+    out_cells = space.out_cells.view(CELL)
+    before = space.votes, space.cells.view(CELL)
+    n, used, filled = settle(
+        table, *before, tiers.spans_ns, tiers.keeps, space.counts, out_table, space.out_votes, out_cells
+    )
+    return CompactPages.from_packed(out_table[:n], space.out_votes[:used], out_cells[:filled])

@@ -10,7 +10,7 @@ import logging
 import threading
 from collections.abc import Mapping
 
-from mapserver.evidence.grid import Grid
+from mapserver.evidence.grid import REFOLD_ROWS, Grid
 from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest.writer import Writer
 from mapserver.journal.history import History, history_rows
@@ -89,7 +89,7 @@ class Exclusion:
 
     def _fold_again(self, excluded: frozenset[str]) -> None:
         until = self._reader.last_row
-        grid = Grid(self._cell_m, self._fold)
+        grid = Grid(self._cell_m, self._fold, REFOLD_ROWS)
         for row in history_rows(self._history, until=until, selection=Selection(without=excluded)):
             grid.fold(row.rows, row.machine)
             if self._ending.is_set():

@@ -14,7 +14,7 @@ from typing import Any
 
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
-from mapserver.evidence.grid import Grid
+from mapserver.evidence.grid import LIVE_ROWS, REFOLD_ROWS, Grid
 from mapserver.ingest.admission import GapError, admit, parse
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, history_rows
@@ -76,7 +76,9 @@ class Store:
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
+            self.grid.resize_buffer(REFOLD_ROWS)
             self._fold_tail(self.grid, self.merged, self.excluded)
+            self.grid.resize_buffer(LIVE_ROWS)
             self.merged = last_row
             self.newest_ns = self.journal.newest_ns()
             self._opened = opened.pop_all()
@@ -129,6 +131,7 @@ class Store:
     def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
         """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines."""
         self._fold_tail(grid, row, excluded)
+        grid.resize_buffer(LIVE_ROWS)
         self.grid, self.excluded = grid, excluded
         self.snapshot_row = 0  # what is on disk has other machines in it
         self.grid.touch_all()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.grid import Grid
+from mapserver.evidence.grid import REFOLD_ROWS, Grid
 from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.reader import LAST, ArchivedError, JournalQueries
@@ -83,7 +83,7 @@ def grid_as_of(
     """
     bounds = _reach_of(window, cell_m, config) if window else None
     selection = Selection(to_ns=to_ns, bounds=bounds, without=without)
-    grid = Grid(cell_m, config)
+    grid = Grid(cell_m, config, REFOLD_ROWS)
     for row in history_rows(history, selection=selection):
         grid.fold(samples_of(row, selection), row.machine)
     return grid

@@ -6,15 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import zenoh
 
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
-from mapserver.evidence.grid import OPEN_BLOCKS, Grid, GridState, PlacedPage
-from mapserver.evidence.pages import WIDE, Page
+from mapserver.evidence.grid import LIVE_ROWS, Grid, GridState, PlacedPage
+from mapserver.evidence.pages import CompactPages, Page
 from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
@@ -25,7 +24,7 @@ from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from tests.reference.fold import fold as reference_fold
+from tests.reference.grid import by_definition, of_grid, plain
 
 SITE = SiteConfig("pit", 48.0, 11.0)
 CONFIG = ServerConfig()
@@ -89,18 +88,15 @@ def incoming(rows: Table, first_seq: int = 1, machine: str = "a", spool_id: int 
     return Incoming(machine, encode_batch(batch(rows, first_seq, machine, spool_id, **more)))
 
 
-def folded(
-    rows: Table, machine: str = "a", cell_m: float = 1.0, open_blocks: int = OPEN_BLOCKS, **options: Any
-) -> Grid:
-    grid = Grid(cell_m, FoldConfig(**options), open_blocks)
+def folded(rows: Table, machine: str = "a", cell_m: float = 1.0, waiting_rows: int = LIVE_ROWS, **options: Any) -> Grid:
+    grid = Grid(cell_m, FoldConfig(**options), waiting_rows)
     grid.fold(rows, machine)
     return grid
 
 
-def reference(rows: Table, **options: Any) -> Grid:
-    """As `folded`, by the reference in numpy."""
-    with patch("mapserver.evidence.grid.fold", reference_fold):
-        return folded(rows, **options)
+def is_by_definition(grid: Grid, rows: Table, machine: str = "a") -> bool:
+    """Whether a grid holds what the reference makes of the same samples, bit for bit."""
+    return plain(of_grid(grid)) == plain(by_definition([(machine, rows)], grid.cell_m, grid.config))
 
 
 def total(grid: Grid) -> np.ndarray:
@@ -143,30 +139,23 @@ def _bits_of(page: Page) -> tuple[object, ...]:
 
 def filled_to(state: GridState, count: int) -> GridState:
     """The same state with every count that is not zero set to this one."""
-    pages = []
-    for at in state.pages:
-        votes = at.page.votes.astype(WIDE)
-        votes["count"] = count
-        pages.append(replace(at, page=Page(votes, at.page.cells)))
-    return replace(state, pages=tuple(pages))
+    blocks = []
+    for x, y, pages in state.blocks:
+        packed = pages.expanded()
+        votes = packed.votes & np.uint64(0xFFFF) | np.uint64(count) << np.uint64(16)
+        blocks.append((x, y, CompactPages.from_packed(packed.table, votes, packed.cells)))
+    return replace(state, blocks=tuple(blocks))
 
 
 APART = {"keep_buckets": 1000}  # so many buckets that a test sees none of them summed
 
 
-def merged(parts: Iterable[Grid], **options: Any) -> Grid:
-    """Put together grids that were folded apart, with every bucket on a page of its own."""
-    grid = None
-    for part in parts:
-        grid = grid or Grid(part.cell_m, FoldConfig(**options))
-        for at in part.state().pages:
-            assert at.tier == 0
-            grid._timeline((at.x, at.y)).add(at.index, at.page)
-        grid.folded += part.folded
-        grid.skipped += part.skipped
-        grid.newest_ns = max(grid.newest_ns, part.newest_ns)
-    assert grid is not None
-    return grid
+def merged(parts: Iterable[Grid]) -> Grid:
+    """Put together grids that were folded apart."""
+    first, *more = parts
+    for part in more:
+        first.merge(part)
+    return first
 
 
 def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Store:

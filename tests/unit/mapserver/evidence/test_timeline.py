@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.pages import Page, merge, pack
-from mapserver.evidence.timeline import DAY_S, HOUR_S, PATIENCE, Timeline, tiers
+from mapserver.evidence.pages import CELL, PackedPages
+from mapserver.evidence.timeline import DAY_S, HOUR_S, PATIENCE, Space, Tiers, Timeline
 from mapserver.evidence.votes import FoldConfig
 from tests.unit.mapserver.data import same_page
 
@@ -17,20 +17,27 @@ PER_HOUR, PER_DAY = HOUR_S // BUCKET_S, DAY_S // BUCKET_S
 START = 1_767_225_600 // BUCKET_S  # midnight
 
 
-def page(bucket: int, weight: int = 1, cells: tuple[int, ...] = (5,)) -> Page:
+SPACE = Space()
+
+
+def page(bucket: int, weight: int = 1, cells: tuple[int, ...] = (5,)) -> PackedPages:
     """A page of these cells, with the bucket's own stamp and a vote of this weight in each."""
-    counts, bitmaps = np.zeros((ev.COUNTS, ev.CELLS), np.uint32), np.zeros((2, ev.CELLS), np.uint64)
-    newest_ns = np.zeros(ev.CELLS, np.int64)
-    for cell in cells:
-        counts[bucket % ev.COUNTS, cell], bitmaps[:, cell], newest_ns[cell] = weight, 1, bucket * BUCKET_S * S + 7
-    return pack(counts, counts.any(axis=1), bitmaps, newest_ns)
+    numbers = np.array(sorted(cells), np.uint64)
+    known = np.zeros(len(cells), CELL)
+    known["cell"], known["visits"], known["machines"], known["newest_ns"] = numbers, 1, 1, bucket * BUCKET_S * S + 7
+    votes = np.uint64(weight) << np.uint64(16) | np.uint64(bucket % ev.COUNTS * ev.CELLS) | numbers
+    return PackedPages(np.array([(0, bucket, 0, len(votes), 0, len(known))]), votes, known)
+
+
+def empty_timeline(config: FoldConfig) -> Timeline:
+    return Timeline(Tiers.from_config(config), SPACE)
 
 
 def timeline(buckets, **keeps: int) -> Timeline:
     usual = {"keep_buckets": 2, "keep_hours": 2, "keep_days": 2}
-    line = Timeline(tiers(FoldConfig(**usual | keeps)))
+    line = empty_timeline(FoldConfig(**usual | keeps))
     for bucket in buckets:
-        line.add(bucket, page(bucket))
+        line.add(page(bucket))
     return line
 
 
@@ -77,16 +84,16 @@ def test_any_order_of_buckets_gives_the_same_timeline(buckets, a, b, c, random):
 )
 def test_what_stays_apart_is_decided_cell_by_cell(driven, keeps, random):
     named = dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True))
-    line = Timeline(tiers(FoldConfig(**named)))
+    line = empty_timeline(FoldConfig(**named))
     for bucket_, cells in driven:
-        line.add(bucket_, page(bucket_, cells=cells))
+        line.add(page(bucket_, cells=cells))
     for cell in range(4):
         in_cell = {(tier, index) for tier, index, one in line.items() if cell in one.cells["cell"]}
         assert in_cell == by_definition([b for b, cells in driven if cell in cells], keeps)
-    again = Timeline(tiers(FoldConfig(**named)))
+    again = empty_timeline(FoldConfig(**named))
     random.shuffle(driven)
     for bucket_, cells in driven:
-        again.add(bucket_, page(bucket_, cells=cells))
+        again.add(page(bucket_, cells=cells))
     assert same(line, again)
 
 
@@ -96,7 +103,7 @@ def test_reading_in_between_changes_nothing(driven):
     read, unread = timeline([]), timeline([])
     for bucket_, is_read, cells in driven:
         for one in (read, unread):
-            one.add(bucket_, page(bucket_, cells=cells))
+            one.add(page(bucket_, cells=cells))
         if is_read:
             read.timed()
     assert same(read, unread)
@@ -104,8 +111,8 @@ def test_reading_in_between_changes_nothing(driven):
 
 def test_a_timeline_that_nobody_reads_does_not_grow():
     line = timeline(START + 3 * i for i in range(1003))
-    assert all(len(pages) <= 2 + PATIENCE for pages in line._pages)
-    assert len(line._pages[0]) > 2, "it does not hand on with each page"
+    assert 2 < len(line._fresh) < PATIENCE, "it is settled now and then, not with each page"
+    assert len(line._settled.table) <= 2 + 2 + 2 + 1
 
 
 @pytest.mark.parametrize("keeps", [(1, 2, 4), (4, 1, 2), (2, 4, 1)])
@@ -143,14 +150,13 @@ def test_evidence_of_one_bucket_is_one_page():
     assert places(timeline([START] * 5)) == [(0, START)]
 
 
-def test_what_was_taken_out_is_put_back_where_it_was():
+def test_a_timeline_goes_on_from_its_pages():
     one = timeline(START + np.arange(0, 3 * PER_DAY, 7))
-    again = Timeline(tiers(FoldConfig(keep_buckets=2, keep_hours=2, keep_days=2)))
-    for tier, index, kept in one.items():
-        again.put(tier, index, kept)
+    again = Timeline(one._tiers, SPACE, one.settled())
     assert same(one, again)
-    one.add(START + 3 * PER_DAY, page(START)), again.add(START + 3 * PER_DAY, page(START))
+    one.add(page(START + 3 * PER_DAY)), again.add(page(START + 3 * PER_DAY))
     assert same(one, again)
+    assert one.known_cells == again.known_cells == 1
 
 
 # --- spans -----------------------------------------------------------------------------------------------------------
@@ -189,17 +195,16 @@ def test_the_first_and_the_last_bucket_of_an_hour_are_of_that_hour():
 
 def test_buckets_of_an_hour_are_not_cut_by_it():
     config = FoldConfig(bucket_s=3600.0, keep_buckets=1, keep_hours=1, keep_days=1)
-    line = Timeline(tiers(config))
+    line = empty_timeline(config)
     for bucket in range(500_000, 500_005):
-        line.add(bucket, page(bucket))
+        line.add(page(bucket))
     assert places(line) == [(0, 500_004), (1, 500_003), (2, 500_002 // 24)]
 
 
 def test_a_sum_in_a_timeline_saturates():
-    line = Timeline(tiers(FoldConfig(keep_buckets=1)))
+    line = empty_timeline(FoldConfig(keep_buckets=1))
     for _ in range(3):
-        line.add(START, page(START, ev.COUNT_MAX - 1))
+        line.add(page(START, ev.COUNT_MAX - 1))
     (_, _, only), *more = line.items()
     assert not more
     assert only.votes["count"].tolist() == [ev.COUNT_MAX]
-    assert same_page(only, merge(page(START, ev.COUNT_MAX), page(START, ev.COUNT_MAX)))

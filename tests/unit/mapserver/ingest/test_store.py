@@ -204,7 +204,7 @@ def test_an_adopted_grid_gets_what_came_since_without_those_excluded(store, row)
 
 # --- kill and replay -------------------------------------------------------------------------------------------------
 
-# Takes batches of 20 samples; in the fold of number `stuck`, half of it lies in the open blocks, and nothing goes on.
+# Takes batches of 20 samples; in the fold of number `stuck`, half of its pages are in the grid, and nothing goes on.
 TAKES = """
 import signal
 import sys
@@ -218,9 +218,11 @@ store = open_store(folder / "store")
 fold = grid.fold
 
 def half(rows, *rest):
-    if store.merged < stuck - 1:
-        return fold(rows, *rest)
-    fold(rows[: len(rows) // 2], *rest)
+    if store.merged < stuck:
+        yield from fold(rows, *rest)
+        return
+    pages = list(fold(rows, *rest))
+    yield from pages[: len(pages) // 2]
     print("folding", flush=True)
     signal.pause()
 
@@ -229,6 +231,7 @@ for i, part in enumerate(np.split(np.load(folder / "rows.npy"), 10)):
     if i == saved:
         store.save_snapshot()
     store.commit([incoming(part, 1 + 20 * i)])
+    store.grid.known_cells()  # folds what waits
     print("taken", i + 1, flush=True)
 """
 

@@ -1,0 +1,182 @@
+"""The timeline of one block, compiled: all of its pages at once into those that are kept apart.
+
+Votes are packed in 64 bits: the place (bin * 256 + cell) in the lower 16, the count above them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from mapserver.evidence.cells import CELLS, COUNT_MAX, COUNTS
+
+_INDEX_BITS = 40  # of a span, below its tier
+
+
+@numba.njit(cache=True, nogil=True)
+def settle(
+    table: Any,
+    votes: Any,
+    cells: Any,
+    spans: Any,
+    keeps: Any,
+    counts: Any,
+    out_table: Any,
+    out_votes: Any,
+    out_cells: Any,
+) -> tuple[int, int, int]:
+    """Sum the pages of a block, so that each cell keeps its newest spans of each tier apart.
+
+    table (n, 6): tier, index, first and end of the votes and of the cells of each page, in any order. spans, keeps:
+    length [ns] and number of the spans of each tier; the last tier is everything before, its span 0. counts: scratch
+    (COUNTS * 256,) uint64, zero before and after. Fills pages, votes and cells in the order of tier and index, and
+    returns how many of each.
+    """
+    indices = _indices(table, spans)
+    tiers = _tiers(table, indices, cells, keeps)
+    held = _held(table, tiers, len(spans))
+    spread = held.sum(axis=1) > 1  # pages whose cells are on several tiers
+    keys = _keys(indices, held)
+    wanted: Any = np.zeros(CELLS, np.bool_)
+    planes = np.zeros(COUNTS, np.bool_)
+    visits, machines, newest = np.zeros(CELLS, np.uint64), np.zeros(CELLS, np.uint64), np.zeros(CELLS, np.int64)
+    pages, used, filled = 0, 0, 0
+    for key in keys:
+        tier, index = key >> _INDEX_BITS, key & ((1 << _INDEX_BITS) - 1)
+        row = out_table[pages]
+        row[0], row[1], row[2], row[4] = tier, index, used, filled
+        sources, source = 0, 0
+        for p in range(len(table)):
+            if held[p, tier] and indices[p, tier] == index:
+                sources, source = sources + 1, p
+        if sources == 1 and not spread[source]:
+            used = _copy(votes, table[source, 2], table[source, 3], out_votes, used)
+            filled = _copy(cells, table[source, 4], table[source, 5], out_cells, filled)
+        else:
+            for p in range(len(table)):
+                if held[p, tier] and indices[p, tier] == index:
+                    _add(table[p], tier, tiers, votes, cells, wanted, counts, planes, visits, machines, newest)
+            used = _emit_votes(counts, planes, newest, out_votes, used)
+            filled = _emit_cells(visits, machines, newest, out_cells, filled)
+        row[3], row[5] = used, filled
+        pages += 1
+    return pages, used, filled
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(
+    page: Any, tier: int, tiers: Any, votes: Any, cells: Any, wanted: Any,
+    counts: Any, planes: Any, visits: Any, machines: Any, newest: Any,
+) -> None:  # fmt: skip
+    """Add the cells of a page that are on a tier, and their votes."""
+    for j in range(page[4], page[5]):
+        cell = cells[j]
+        wanted[cell.cell] = tiers[j] == tier
+        if tiers[j] == tier:
+            visits[cell.cell] |= cell.visits
+            machines[cell.cell] |= cell.machines
+            newest[cell.cell] = max(newest[cell.cell], cell.newest_ns)
+    for j in range(page[2], page[3]):
+        place = votes[j] & np.uint64(0xFFFF)
+        if wanted[place & np.uint64(CELLS - 1)]:
+            counts[place] += votes[j] >> np.uint64(16)
+            planes[place >> np.uint64(8)] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def _indices(table: Any, spans: Any) -> Any:
+    """Index (n, tiers) of the span that a page lies in on each tier, -1 on tiers finer than its own."""
+    indices = np.full((len(table), len(spans)), -1, np.int64)
+    for p in range(len(table)):
+        tier = table[p, 0]
+        indices[p, tier] = table[p, 1]
+        for coarser in range(tier + 1, len(spans)):
+            span = spans[coarser]
+            indices[p, coarser] = indices[p, coarser - 1] * spans[coarser - 1] // span if span else 0
+    return indices
+
+
+@numba.njit(cache=True, nogil=True)
+def _tiers(table: Any, indices: Any, cells: Any, keeps: Any) -> Any:
+    """Tier of each cell of each page: cell by cell, what is older than the newest spans of a tier is handed on."""
+    tiers = np.empty(table[:, 5].max() if len(table) else 0, np.int8)
+    for p in range(len(table)):
+        tiers[table[p, 4] : table[p, 5]] = table[p, 0]
+    kept, last = np.empty(CELLS, np.int64), np.empty(CELLS, np.int64)
+    for tier in range(len(keeps) - 1):
+        kept[:], last[:] = 0, -1
+        for p in np.argsort(-indices[:, tier]):
+            index = indices[p, tier]
+            if index < 0:
+                break
+            for j in range(table[p, 4], table[p, 5]):
+                if tiers[j] == tier:
+                    cell = cells[j].cell
+                    if last[cell] != index:
+                        last[cell] = index
+                        kept[cell] += 1
+                    if kept[cell] > keeps[tier]:
+                        tiers[j] = tier + 1
+    return tiers
+
+
+@numba.njit(cache=True, nogil=True)
+def _held(table: Any, tiers: Any, count: int) -> Any:
+    """Whether a page has cells on each tier (n, count)."""
+    held = np.zeros((len(table), count), np.bool_)
+    for p in range(len(table)):
+        for j in range(table[p, 4], table[p, 5]):
+            held[p, tiers[j]] = True
+    return held
+
+
+@numba.njit(cache=True, nogil=True)
+def _keys(indices: Any, held: Any) -> Any:
+    """Tier and index of the pages that there will be, in order."""
+    keys, used = np.empty(held.size, np.int64), 0
+    for p in range(len(held)):
+        for tier in range(held.shape[1]):
+            if held[p, tier]:
+                keys[used] = (np.int64(tier) << _INDEX_BITS) | indices[p, tier]
+                used += 1
+    return np.unique(keys[:used])
+
+
+@numba.njit(cache=True, nogil=True)
+def _copy(source: Any, first: int, end: int, out: Any, used: int) -> int:
+    for i in range(end - first):
+        out[used + i] = source[first + i]
+    return used + end - first
+
+
+@numba.njit(cache=True, nogil=True)
+def _emit_votes(counts: Any, planes: Any, newest: Any, out: Any, used: int) -> int:
+    """Move counts to votes in the order of their places, saturated; returns where they end."""
+    low, high = 0, CELLS
+    while not newest[low]:
+        low += 1
+    while not newest[high - 1]:
+        high -= 1
+    for plane in range(COUNTS):
+        if planes[plane]:
+            planes[plane] = False
+            for at in range(plane * CELLS + low, plane * CELLS + high):
+                count = min(counts[at], np.uint64(COUNT_MAX))
+                out[used] = (count << np.uint64(16)) | np.uint64(at)
+                used += 1 if count else 0
+                counts[at] = 0
+    return used
+
+
+@numba.njit(cache=True, nogil=True)
+def _emit_cells(visits: Any, machines: Any, newest: Any, out: Any, used: int) -> int:
+    """Move bitmaps and stamps to cells in the order of their numbers; returns where they end."""
+    for i in range(CELLS):
+        if newest[i]:
+            out[used].cell, out[used].newest_ns = i, newest[i]
+            out[used].visits, out[used].machines = visits[i], machines[i]
+            visits[i] = machines[i] = newest[i] = 0
+            used += 1
+    return used
