@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import secrets
 from collections.abc import Iterator
@@ -15,20 +16,20 @@ def whole_file(path: Path, permissions: int = 0o666) -> Iterator[BinaryIO]:
     """Open a binary file for reading and writing that replaces `path` when the block ends without an error.
 
     A reader sees the old file or the new one, never half of it, also after a power cut. The file beside it has a name
-    of its own for every writer (`.NAME.*.part`); what a killed writer left is removed by the next one.
+    of its own for every writer (`.NAME.*.part`), and is locked while it is written: what a killed writer left is not,
+    and is removed by the next one.
 
     permissions: of the new file, before the umask. Raises OSError.
     """
     for left in path.parent.glob(f".{path.name}.*.part"):
-        if not _is_running(left):
-            left.unlink(missing_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+        _remove_if_left(left)
+    part, file = _open_locked(path, permissions)
     try:
-        with open(part, "x+b", opener=lambda name, flags: os.open(name, flags, permissions)) as file:
+        with file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        part.replace(path)
+            part.replace(path)
     finally:
         part.unlink(missing_ok=True)
     sync_folder(path.parent)
@@ -49,12 +50,22 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _is_running(part: Path) -> bool:
-    """Whether the process that writes this file is alive; its number is the last but two of the name's parts."""
+def _open_locked(path: Path, permissions: int) -> tuple[Path, BinaryIO]:
+    """Make a file beside `path`; again where another writer took it for a leftover before it was locked."""
+    while True:
+        part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+        file = open(part, "x+b", opener=lambda name, flags: os.open(name, flags, permissions))  # noqa: SIM115
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if part.exists():
+            return part, file
+        file.close()
+
+
+def _remove_if_left(part: Path) -> None:
+    """Remove a file that nobody writes."""
     try:
-        os.kill(int(part.name.split(".")[-3]), 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, ValueError):
-        return True
-    return True
+        with part.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            part.unlink(missing_ok=True)
+    except (FileNotFoundError, BlockingIOError):  # finished meanwhile, or being written
+        return
