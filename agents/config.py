@@ -9,8 +9,9 @@ from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig
 from agents.holdout import HoldoutConfig
 from agents.pipeline import PipelineConfig
-from protocol.config import from_table, load_toml, section
+from protocol.config import from_table, section
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine
 
 

@@ -5,28 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import tomllib
 import types
 import typing
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any, TypeVar
 
 from protocol.errors import ConfigError
 
 T = TypeVar("T")
-
-
-def load_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file; errors name the file and the line."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(path, "no such file") from None
-    except OSError as error:
-        raise ConfigError(path, f"cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # also numbers of thousands of digits, and lists as deep
-        raise ConfigError(path, f"not valid TOML: {error}") from None
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:

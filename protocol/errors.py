@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # types alone: the functional core knows no files
+    from pathlib import Path
 
 
 class Refusal(StrEnum):

@@ -1,14 +1,29 @@
-"""Files that are whole or not there: written beside their place, synced, then given their name."""
+"""Files: TOML read with errors for people; files that are whole or not there, written beside their place."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import secrets
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from protocol.errors import ConfigError
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file; errors name the file and the line."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(path, "no such file") from None
+    except OSError as error:
+        raise ConfigError(path, f"cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:  # also numbers of thousands of digits, and lists as deep
+        raise ConfigError(path, f"not valid TOML: {error}") from None
 
 
 @contextmanager

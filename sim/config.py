@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from protocol.site.site_config import NAME
 from sim.scenario.file import check, load_scenario
 from sim.scenario.tables import MAX_MACHINES, FleetConfig, Scenario

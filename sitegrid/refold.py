@@ -24,10 +24,12 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow, Selection, Watermark
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from protocol.machine.readings import MAX_STAMP_NS
-from protocol.site.site_config import SiteConfig, load_site, site_toml
+from protocol.site.site_config import SiteConfig, site_toml
+from protocol.site.site_file import load_site
 from sitegrid.process.lifetime import say
 from sitegrid.process.progress import Display
 

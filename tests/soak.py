@@ -25,7 +25,8 @@ import zenoh
 from protocol.arrays import Table
 from protocol.errors import QueryError
 from protocol.machine.samples import SAMPLE_DTYPE
-from protocol.site.site_config import SiteConfig, load_site
+from protocol.site.site_config import SiteConfig
+from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch

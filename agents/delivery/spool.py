@@ -5,6 +5,8 @@ Samples are numbered through in the file. What is recorded between one opening a
 cloned, restored from a backup or set back by a disk that lies about its syncs therefore never gives one identity to two
 samples: what copies have in common has the same identity and the same bytes, what they record from then on has another
 spool_id.
+
+It is one module because every method is a transaction over the same few tables, and they must agree.
 """
 
 from __future__ import annotations

@@ -32,8 +32,9 @@ from evaluation.campaign.figures import root_mean_square
 from evaluation.campaign.truth import Truth
 from evaluation.positions.configurations import Configuration, pipeline_options
 from evaluation.positions.replay import Trace, errors, replay, score
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError, LogFolderError
+from protocol.files import load_toml
 from protocol.machine.log_folder import MANIFEST, LogFolder, open_log, open_text
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold_kernels import fold_sorted, locate, split, weigh
+from mapserver.evidence.fold_kernels import fold_sorted
 from mapserver.evidence.pages import CELL, PackedPages, frozen
+from mapserver.evidence.sample_kernels import locate, split, weigh
 from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
 from protocol.arrays import Bools, Ints, Table
 

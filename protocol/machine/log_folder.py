@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from protocol.config import from_table, load_toml, section, toml_lines
+from protocol.config import from_table, section, toml_lines
 from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal
+from protocol.files import load_toml
 from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
 from protocol.machine.readings import Reading, columns, parse_reading
 from protocol.site.site_config import SiteConfig, site_toml

@@ -10,13 +10,12 @@ import hashlib
 import re
 from dataclasses import dataclass, fields
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from protocol.arrays import Floats
-from protocol.config import from_table, load_toml, toml_lines
+from protocol.config import toml_lines
 from protocol.site.geometry import GridGeometry
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
@@ -134,11 +133,3 @@ class Projection:
         """Latitude, longitude [deg] and height [m] of places in `map`, all of one shape (...): (3, ...)."""
         lon, lat = self._proj(x_m.ravel(), y_m.ravel(), inverse=True)
         return np.stack([lat.reshape(x_m.shape), lon.reshape(x_m.shape), z_m + self._height_m])
-
-
-def load_site(path: Path) -> SiteConfig:
-    """Read a `site.toml`, or the [site] of a log's manifest."""
-    table = load_toml(path)
-    if isinstance(table.get("site"), dict):
-        return from_table(SiteConfig, table["site"], f"{path} [site]")
-    return from_table(SiteConfig, table, str(path))

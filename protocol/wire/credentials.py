@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, IDENTITY_FILE = "ca.pem", "cert.pem", "key.pem", "identity.toml"
 SIGNING_FILE = "sign.pem"  # machines only

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from protocol.arrays import Floats
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from protocol.machine.machine_config import BASE, FRONT, Mount
 from protocol.rotations import rpy_from_matrix
 from sim.machines.urdf import Mass, Robot, Transform, combined, read_urdf

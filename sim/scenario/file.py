@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from protocol.rotations import wrap_angle
 from sim.machines.model import MachineModel, load_model
 from sim.operators.driver import bend

@@ -8,8 +8,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from protocol.site.site_config import NAME
 from sim.sensors.datasheets import (
     ArticulationNoise,

@@ -1,7 +1,7 @@
 """One step of the fast world's machines, compiled by numba.
 
-All of it is in this long file, and constants of other files are passed in: numba's cache notices changes in the file of
-the function that is called, and in no other. After a change in `terrain/lookup.py`, touch this file.
+It is one module because numba's cache notices changes in the file of the function that is called, and in no other; for
+the same reason constants of other files are passed in. After a change in `terrain/lookup.py`, touch this file.
 """
 
 from __future__ import annotations

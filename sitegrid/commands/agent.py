@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import zenoh
 
 from protocol.errors import ConfigError, LinkError
-from protocol.site.site_config import SiteConfig, load_site
+from protocol.site.site_config import SiteConfig
+from protocol.site.site_file import load_site
 from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.options.groups import add_network

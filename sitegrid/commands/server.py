@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from protocol.config import from_table, load_toml
-from protocol.site.site_config import load_site
+from protocol.config import from_table
+from protocol.files import load_toml
+from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire.session import open_session
 from sitegrid.options.groups import add_network

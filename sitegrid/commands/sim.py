@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.errors import ConfigError
-from protocol.site.site_config import site_toml
 from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import END_S, note, say, stop_flag
 from sitegrid.process.progress import Display
@@ -63,6 +62,8 @@ def run(arguments: Namespace) -> int:
     stop = stop_flag(None if arguments.record else END_S)  # a recording is written at its end, whole
     config = _config(arguments)
     if arguments.write_configs:
+        from sim.agent_files import write_configs
+
         write_configs(config, arguments.write_configs)
     if arguments.picture:
         _draw(config, arguments)
@@ -107,21 +108,6 @@ def _draw(config: SimConfig, arguments: Namespace) -> None:
 
     pictures = [str(path) for path in draw(config, arguments.picture)]
     say({"pictures": pictures}) if arguments.json else note("\n".join(pictures))
-
-
-def write_configs(config: SimConfig, folder: Path) -> list[Path]:
-    """Write `site.toml` and `<machine>.toml` for the agents: nominal values, nothing of the truth."""
-    from protocol.machine.machine_config import machine_toml
-    from sim.config import resolve
-
-    scenario = resolve(config)
-    machines = [rig.machine for rig in scenario.rigs()]
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "site.toml").write_text(site_toml(scenario.site), encoding="utf-8")
-    paths = [folder / f"{machine.name}.toml" for machine in machines]
-    for path, machine in zip(paths, machines, strict=True):
-        path.write_text(machine_toml(machine), encoding="utf-8")
-    return paths
 
 
 def _config(arguments: Namespace) -> SimConfig:

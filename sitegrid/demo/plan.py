@@ -10,9 +10,9 @@ from pathlib import Path
 from protocol.errors import ConfigError
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.wire.session import free_endpoint
+from sim.agent_files import write_configs
 from sim.config import SimConfig, resolve
 from sim.scenario.tables import Scenario
-from sitegrid.commands.sim import write_configs
 
 DEFAULT_MANIFEST = Path("evaluation/logs/rl_test1_husky/log.toml")
 DEFAULT_DATA = Path("../shared/data/rl_test1_husky")

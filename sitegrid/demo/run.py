@@ -15,7 +15,7 @@ from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.queries.answers import Region
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect

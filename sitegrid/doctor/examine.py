@@ -12,7 +12,8 @@ import zenoh
 
 from protocol.errors import ConfigError, MessageError, SitegridError, StoreError
 from protocol.queries.answers import MapInfo
-from protocol.site.site_config import SiteConfig, load_site
+from protocol.site.site_config import SiteConfig
+from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from protocol.config import from_table, load_toml, toml_lines
+from protocol.config import from_table, toml_lines
 from protocol.errors import ConfigError
-from protocol.files import write_whole
+from protocol.files import load_toml, write_whole
 from protocol.wire.keys import check_name
 
 REGISTER_FILE = "register.toml"

@@ -20,7 +20,7 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from tests.chaos.chaos_site import ROUTER, SERVER, ChaosSite
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun

@@ -17,7 +17,8 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
 from protocol.errors import StoreError
 from protocol.machine.log_folder import open_log
-from protocol.site.site_config import load_site, site_toml
+from protocol.site.site_config import site_toml
+from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
 from tests.chaos.leashed import Process
 from tests.chaos.outcome import Console, FaultOutcome, TimeSpan, longest_pause

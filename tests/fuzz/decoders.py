@@ -19,8 +19,9 @@ from agents.config import load_agent
 from agents.estimation import calibration_file
 from agents.estimation.calibration import Calibration
 from mapserver.config import ServerConfig
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
+from protocol.files import load_toml
 from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu
@@ -28,7 +29,7 @@ from protocol.queries import requests
 from protocol.queries.commands import TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
 from protocol.site.geometry import Bounds
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from protocol.wire.credentials import check_valid, load_credentials
 from sim.config import load_sim
 from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from evaluation.audit import AuditResult, audit_store
 from mapserver.config import ServerConfig
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
+from sim.agent_files import write_configs
 from sim.config import SimConfig, resolve
 from sitegrid import Client, connect
-from sitegrid.commands.sim import write_configs
 from sitegrid.process.children import Child, Children, wait_until
 
 READY_S = 40.0

@@ -13,7 +13,7 @@ import zenoh
 from protocol.errors import Refusal
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.answer_codec import decode_error
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, decode_health, decode_reply, encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch

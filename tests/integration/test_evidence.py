@@ -14,7 +14,7 @@ import pytest
 
 from protocol.arrays import Table
 from protocol.machine.samples import empty
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch

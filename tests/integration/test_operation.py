@@ -26,7 +26,8 @@ from mapserver.journal.archive_writer import HOUR_NS
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
 from protocol.machine.samples import SAMPLE_DTYPE
-from protocol.site.site_config import SiteConfig, load_site
+from protocol.site.site_config import SiteConfig
+from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch

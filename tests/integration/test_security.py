@@ -20,16 +20,16 @@ import zenoh
 
 from protocol.errors import LinkError
 from protocol.machine.samples import SAMPLE_DTYPE
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
 from protocol.wire.credentials import SIGNING_FILE, Credentials, Identity, load_credentials
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from sim.agent_files import write_configs
 from sim.config import SimConfig
 from sitegrid import connect
 from sitegrid.cli import main
-from sitegrid.commands.sim import write_configs
 from sitegrid.process.children import Child, Children, wait_until
 from sitegrid.security.access import SPARE_BYTES
 from sitegrid.security.signing import Signer

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from sitegrid.process.lifetime import END_S
 from tests.paths import ROOT
 

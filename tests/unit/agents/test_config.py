@@ -11,7 +11,8 @@ from agents.estimation.ground import NOTHING_KNOWN
 from agents.estimation.plausibility import FAULTS
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
-from protocol.site.site_config import SiteConfig, load_site
+from protocol.site.site_config import SiteConfig
+from protocol.site.site_file import load_site
 from sim.scenario.file import load_scenario
 from tests.paths import CONFIG
 

@@ -4,8 +4,9 @@ import tomllib
 import pytest
 
 from mapserver.config import ServerConfig
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from tests.paths import CONFIG
 
 FILE = CONFIG / "server.toml"

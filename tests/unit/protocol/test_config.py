@@ -3,8 +3,9 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from protocol.config import from_table, load_toml, section
+from protocol.config import from_table, section
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 
 
 @dataclass(frozen=True)

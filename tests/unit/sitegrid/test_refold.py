@@ -20,9 +20,11 @@ from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow
 from protocol.arrays import Table
-from protocol.config import from_table, load_toml
+from protocol.config import from_table
+from protocol.files import load_toml
 from protocol.machine.samples import COLUMNS, empty
-from protocol.site.site_config import KnownGround, SiteConfig, load_site, site_toml
+from protocol.site.site_config import KnownGround, SiteConfig, site_toml
+from protocol.site.site_file import load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import refold as fold

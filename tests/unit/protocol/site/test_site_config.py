@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
-from protocol.site.site_config import KnownGround, Projection, SiteConfig, load_site
+from protocol.site.site_config import KnownGround, Projection, SiteConfig
+from protocol.site.site_file import load_site
 
 PAPER = SiteConfig("paper", 49.0, 8.4, 110.0)
 

@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.config import load_toml
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from protocol.site.ground_classes import ZONES
 from sim.machines.model import load_model
 from sim.operators.driver import bend

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.config import load_toml
 from protocol.errors import ConfigError
+from protocol.files import load_toml
 from protocol.machine.machine_config import BASE, FRONT
 from sim.sensors.datasheets import EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise
 from sim.sensors.presets import LIBRARY, load_preset, parse_preset

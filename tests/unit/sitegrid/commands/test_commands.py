@@ -13,7 +13,7 @@ from agents.config import AgentConfig
 from protocol.errors import ConfigError, LinkError
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import machine_toml
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
 from sim.config import resolve
 from sim.scenario.file import load_scenario

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.site.site_config import load_site
+from protocol.site.site_file import load_site
 from sitegrid.cli import build_parser
 from sitegrid.demo import plan as planning
 from sitegrid.demo.parts import start_sim

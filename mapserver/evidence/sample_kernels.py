@@ -1,0 +1,170 @@
+"""Samples before they are folded, compiled: where they lie, how their weight spreads, and what they vote for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_kernels import BLOCK_BITS, BUCKET_BITS, HALF
+from mapserver.evidence.votes import (
+    GRADE_LOW,
+    GRADE_STEPS,
+    HASH,
+    RESISTANCE_STEPS,
+    TABLE,
+    TABLE_LAST,
+    TABLE_PER_UNIT,
+    VISIT_NS,
+    WEIGHT_SHIFT,
+)
+
+_R_LAST, _G_LAST = ev.RESISTANCE_BINS - 2, ev.GRADE_BINS - 2
+_R_PER_LOG = len(RESISTANCE_STEPS) / np.log(ev.RESISTANCE_CENTRES[-1] / ev.RESISTANCE_CENTRES[0])
+_R_OFFSET = 0.5 - np.log(ev.RESISTANCE_CENTRES[0]) * _R_PER_LOG
+_G_TOP = (ev.GRADE_BINS - 1) * ev.SHARE_ONE
+_SECTOR_RAD, _SECTORS = 2 * np.pi / ev.SECTORS, ev.SECTORS
+_UNITS, _ONE = ev.WEIGHT_UNITS_PER_M, ev.SHARE_ONE
+_HASH = np.uint64(HASH)
+_TABLE = TABLE.astype(np.uint32)
+
+
+@numba.njit(cache=True, nogil=True)
+def locate(
+    rows: Any, limits: tuple[float, float, float], bucket_ns: int, places: Any, stencils: Any
+) -> tuple[Any, Any, int]:
+    """Where rows lie, and which blocks their stencils touch.
+
+    limits: cell size [m], variance added to every position, largest variance of one that votes [m2]. Fills places
+    (n, 5): position in cells, inverse covariance xx, 2 xy, yy; and stencils (n, 3): first column and row, and edge in
+    cells, 0 where a row has no vote. Returns keys and row numbers, one each for every block that a row touches, and the
+    cells of all stencils together.
+    """
+    keys, touching = np.empty(3 * len(rows) + 16, np.int64), np.empty(3 * len(rows) + 16, np.int32)
+    used, area = 0, 0
+    for k in range(len(rows)):
+        reach = _place(rows[k], limits, places[k])
+        stencils[k, 2] = n = 2 * reach + 1
+        if reach < 0:
+            stencils[k, 2] = 0
+            continue
+        area += n * n
+        column = stencils[k, 0] = int(np.floor(places[k, 0])) - reach
+        row = stencils[k, 1] = int(np.floor(places[k, 1])) - reach
+        bucket = rows[k].stamp_ns // bucket_ns
+        for y in range(row >> 4, ((row + n - 1) >> 4) + 1):
+            for x in range(column >> 4, ((column + n - 1) >> 4) + 1):
+                if used == len(keys):
+                    keys = np.concatenate((keys, np.empty_like(keys)))
+                    touching = np.concatenate((touching, np.empty_like(touching)))
+                keys[used] = ((x + HALF) << (BLOCK_BITS + BUCKET_BITS)) | ((y + HALF) << BUCKET_BITS) | bucket
+                touching[used] = k
+                used += 1
+    return keys[:used], touching[:used], area
+
+
+@numba.njit(cache=True, nogil=True)
+def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
+    """Position and inverse covariance of one row in cells; returns its reach in cells, -1 where it has no vote."""
+    cell_m, floor_m2, cap_m2 = limits
+    cov_xx, cov_xy, cov_yy = np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2)
+    half = (cov_xx - cov_yy) / 2
+    if not (cov_xx + cov_yy) / 2 + np.sqrt(half * half + cov_xy * cov_xy) <= cap_m2:
+        return -1
+    per_m2 = 1 / (cell_m * cell_m)
+    most = np.sqrt(cov_xx * cov_yy)
+    xx, yy = (cov_xx + floor_m2) * per_m2, (cov_yy + floor_m2) * per_m2
+    xy = min(max(cov_xy, -most), most) * per_m2  # what rounding lets pass must not make the covariance indefinite
+    scale = 1 / (xx * yy - xy * xy)
+    out[0], out[1] = row.x_m / cell_m, row.y_m / cell_m
+    out[2], out[3], out[4] = yy * scale, -2 * xy * scale, xx * scale
+    return int(np.ceil(2 * np.sqrt(max(xx, yy))))
+
+
+@numba.njit(cache=True, nogil=True)
+def weigh(rows: Any, places: Any, stencils: Any, starts: Any, shares: Any) -> None:
+    """Spread the weight of each row over its stencil.
+
+    Fills shares with the stencils (edge, edge), one behind the other from starts (n,) on. The integer shares of a row
+    sum exactly to its weight: what rounding down leaves over goes to the middle.
+    """
+    used = 0
+    for k in range(len(rows)):
+        starts[k] = used
+        n = stencils[k, 2]
+        if not n:
+            continue
+        total = _weights(places[k], stencils[k], shares, used)
+        weight = int(np.rint(np.float64(rows[k].distance_m) * _UNITS))
+        factor = (weight << WEIGHT_SHIFT) // max(total, 1)
+        rest: Any = weight
+        stencil = shares[used:][: n * n]
+        for i in range(n * n):
+            share = (np.int64(stencil[i]) * factor) >> WEIGHT_SHIFT
+            stencil[i] = share
+            rest -= share
+        stencil[n * n // 2] += np.uint32(rest)
+        used += n * n
+
+
+@numba.njit(cache=True, nogil=True)
+def _weights(place: Any, stencil: Any, shares: Any, used: int) -> int:
+    """Fill a stencil with weights from the table; returns their sum."""
+    n = stencil[2]
+    total = 0
+    for dy in range(n):
+        y = (stencil[1] + dy + 0.5) - place[1]
+        b, c = place[3] * y, place[4] * y * y
+        line = shares[used + dy * n :][:n]
+        for dx in range(n):
+            x = (stencil[0] + dx + 0.5) - place[0]
+            d2 = (place[2] * x + b) * x + c
+            weight = _TABLE[int(min(d2 * TABLE_PER_UNIT, TABLE_LAST))]
+            line[dx] = weight
+            total += int(weight)
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def split(rows: Any, names: Any, bins: Any, shares: Any, bits: Any, stamps: Any) -> None:
+    """What rows vote for.
+
+    names (n,): hashes of machines. Fills bins (n, 4): of resistance, grade east and grade north, -1 for no vote, and
+    sector of the heading; shares (n, 3) of the bin above, in 1/256; bits (n, 2): one of the visit and one of the
+    machine (a multiplicative hash takes the top six bits); stamps (n,).
+    """
+    for k in range(len(rows)):
+        row = rows[k]
+        bins[k, 0], shares[k, 0] = _split_resistance(np.float64(row.c_rr))
+        bins[k, 1], shares[k, 1] = _split_grade(np.float64(row.grade_e))
+        bins[k, 2], shares[k, 2] = _split_grade(np.float64(row.grade_n))
+        bins[k, 3] = np.int64(np.floor(np.float64(row.heading_rad) / _SECTOR_RAD + 0.5)) % _SECTORS
+        visit = (names[k] + np.uint64(row.stamp_ns // VISIT_NS)) * _HASH
+        bits[k, 0], bits[k, 1] = np.uint64(1) << (visit >> np.uint64(58)), np.uint64(1) << (names[k] >> np.uint64(58))
+        stamps[k] = row.stamp_ns
+
+
+@numba.njit(cache=True, nogil=True)
+def _split_resistance(c_rr: float) -> tuple[int, Any]:
+    """Lower bin and share of the bin above it, linear in log(c_rr); beyond the ends, the end bins; -1 for unknown."""
+    if np.isnan(c_rr):
+        return -1, np.uint32(0)
+    place = int(min(max(np.log(max(c_rr, 1e-9)) * _R_PER_LOG + _R_OFFSET, 0.0), len(RESISTANCE_STEPS)))  # nearly
+    while place < len(RESISTANCE_STEPS) and RESISTANCE_STEPS[place] <= c_rr:
+        place += 1
+    while place > 0 and RESISTANCE_STEPS[place - 1] > c_rr:
+        place -= 1
+    lower = min(place // _ONE, _R_LAST)
+    return lower, np.uint32(place - lower * _ONE)
+
+
+@numba.njit(cache=True, nogil=True)
+def _split_grade(grade: float) -> tuple[int, Any]:
+    """Lower bin and share of the bin above it; beyond the ends, the end bins; -1 for unknown."""
+    if np.isnan(grade):
+        return -1, np.uint32(0)
+    place = int(min(max(np.rint((grade - GRADE_LOW) * GRADE_STEPS), 0), _G_TOP))
+    lower = min(place // _ONE, _G_LAST)
+    return lower, np.uint32(place - lower * _ONE)
