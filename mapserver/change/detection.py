@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from mapserver.change.kernels import differ, histograms
 from mapserver.evidence import cells as ev
-from mapserver.evidence.pages import moments
-from mapserver.evidence.timeline import TimedPage
+from mapserver.evidence.timeline import TimedPage, packed_votes
 from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_positive
 from protocol.site.geometry import BLOCK_CELLS
@@ -57,17 +58,24 @@ class Cuts:
     first: Ints
     kind: Floats
 
+    @property
+    def has_change(self) -> bool:
+        """Whether any cell changed."""
+        return bool(self.first.any())
+
 
 def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
     """Find the last change in every cell of a block."""
     last = Cuts(np.zeros(ev.CELLS, np.int64), np.full(ev.CELLS, np.nan))
     if len(pages) < 2 or not config.detect:
         return last
+    votes_of_pages, ends = packed_votes(pages)
+    least, most = 0.1 * WEIGHT_M * ev.WEIGHT_UNITS_PER_M, min(ALIKE_BINS, BINS / 2)
     for part in _PARTS:
-        cells = np.flatnonzero(_may_differ(pages, part))
+        cells = np.flatnonzero(differ(votes_of_pages, ends, part.start, part.stop, least, most))
         if not len(cells):
             continue
-        votes = _histograms(pages, part, cells)
+        votes = _histograms(votes_of_pages, ends, part, cells)
         left = np.arange(len(cells))
         for _ in range(MOST_CHANGES):
             cut, kind = _best_cut(votes[:, :, left], last.first[cells[left]])
@@ -82,7 +90,11 @@ def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
 
 def kinds(pages: Sequence[TimedPage]) -> Floats:
     """Median (256,) of all c_rr votes of each cell, in bins; NaN where there are none."""
-    votes = _histograms(pages, ev.RESISTANCE, np.arange(ev.CELLS)).sum(axis=0)
+    packed, _ = packed_votes(pages)
+    places, counts = packed & np.uint64(0xFFFF), packed >> np.uint64(16)
+    here = places < ev.RESISTANCE.stop * ev.CELLS  # the first of the bins
+    sums = np.bincount(places[here].astype(np.int64), counts[here], ev.RESISTANCE.stop * ev.CELLS)
+    votes = sums.reshape(ev.RESISTANCE_BINS, ev.CELLS) / ev.WEIGHT_UNITS_PER_M
     weight = votes.sum(axis=0)
     return np.where(weight > 0, _median(votes / np.maximum(weight, 1e-9)), np.nan)
 
@@ -123,27 +135,14 @@ def _opened(cells: Bools, edge: int) -> Bools:
     return np.asarray(cv2.dilate(corners, square, anchor=(last, last), borderValue=0) > 0, np.bool_)
 
 
-def _histograms(pages: Sequence[TimedPage], part: slice, cells: Ints) -> Floats:
+def _histograms(votes: NDArray[np.uint64], ends: Ints, part: slice, cells: Ints) -> Floats:
     """Votes (pages, bins, cells) of some cells in metres."""
-    counts = np.zeros((len(pages), (part.stop - part.start) * ev.CELLS))
-    for i, timed in enumerate(pages):
-        first, end = np.searchsorted(timed.page.votes["place"], (part.start * ev.CELLS, part.stop * ev.CELLS))
-        votes = timed.page.votes[first:end]
-        counts[i][votes["place"] - part.start * ev.CELLS] = votes["count"]
-    metres: Floats = counts.reshape(len(pages), part.stop - part.start, ev.CELLS)[:, :, cells] / ev.WEIGHT_UNITS_PER_M
+    columns = np.full(ev.CELLS, -1)
+    columns[cells] = np.arange(len(cells))
+    counts = np.zeros((len(ends), part.stop - part.start, len(cells)))
+    histograms(votes, ends, part.start, part.stop, columns, counts)
+    metres: Floats = counts / ev.WEIGHT_UNITS_PER_M
     return metres
-
-
-def _may_differ(pages: Sequence[TimedPage], part: slice) -> Bools:
-    """Cells whose pages differ at all, by the mean of their votes or by the spread: most do not."""
-    sums = np.stack([moments(timed.page, part) for timed in pages])
-    weight = sums[:, 0]
-    mean, square = sums[:, 1] / np.maximum(weight, 1e-9), sums[:, 2] / np.maximum(weight, 1e-9)
-    spread = np.sqrt(np.maximum(square - mean**2, 0))
-    seen = weight > 0.1 * WEIGHT_M * ev.WEIGHT_UNITS_PER_M
-    alike = min(ALIKE_BINS, BINS / 2)
-    ranges = [np.where(seen, v, -np.inf).max(axis=0) - np.where(seen, v, np.inf).min(axis=0) for v in (mean, spread)]
-    return np.asarray(np.maximum(*ranges) > alike, np.bool_)
 
 
 def _best_cut(votes: Floats, first: Ints) -> tuple[Ints, Floats]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 
-from mapserver.change.detection import ChangeConfig, credible, cuts, kinds, reach_blocks
-from mapserver.evidence.timeline import Block, TimedPage
-from protocol.arrays import AnyArray, Ints
+from mapserver.change.detection import ChangeConfig, Cuts, credible, cuts, kinds, reach_blocks
+from mapserver.evidence.timeline import Block, TimedPage, TimedPages
+from protocol.arrays import AnyArray, Floats, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
 Pages = Mapping[Block, Sequence[TimedPage]]
+T = TypeVar("T")
 
 
 def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block, Ints]:
@@ -19,20 +21,52 @@ def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block
 
     Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted.
     """
-    last = {block: cuts(block_pages, config) for block, block_pages in pages.items()}
+    last = {block: _cuts(block_pages, config) for block, block_pages in pages.items()}
     first = {block: last[block].first for block in pages}
-    changed = [block for block in first if first[block].any()]
-    if not changed:
-        return first
+    changed = [block for block in first if last[block].has_change]
+    valid = dict(first)
     reach = reach_blocks(cell_m, config)
-    near = {block for one in changed for block in around(one, reach) if block in pages}
-    image, corner = image_of({block: first[block] > 0 for block in near}, False)
-    kind, _ = image_of({block: last[block].kind for block in near}, np.nan)
-    now, _ = image_of({block: kinds(pages[block]) for block in near}, np.nan)
-    holds = credible(image, kind, now, cell_m, config)
-    for block in changed:
-        first[block][~cells_of(holds, corner, block)] = 0
-    return first
+    for some in clusters(changed, reach):
+        near = {block for one in some for block in around(one, reach) if block in pages}
+        image, corner = image_of({block: first[block] > 0 for block in near}, False)
+        kind, _ = image_of({block: last[block].kind for block in near}, np.nan)
+        now, _ = image_of({block: _kinds(pages[block]) for block in near}, np.nan)
+        holds = credible(image, kind, now, cell_m, config)
+        for block in some:
+            valid[block] = np.where(cells_of(holds, corner, block), first[block], 0)
+    return valid
+
+
+def clusters(blocks: Iterable[Block], reach: int) -> list[list[Block]]:
+    """Blocks together with those that are near them, so that each image is small."""
+    left, parts = set(blocks), []
+    while left:
+        part = [left.pop()]
+        for block in part:  # which grows meanwhile
+            near = left.intersection(around(block, 2 * reach))
+            left -= near
+            part += sorted(near)
+        parts.append(part)
+    return parts
+
+
+def _cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
+    """As `cuts`, found once for the same pages."""
+    return _derived(pages, config, lambda: cuts(pages, config))
+
+
+def _kinds(pages: Sequence[TimedPage]) -> Floats:
+    """As `kinds`, found once for the same pages."""
+    return _derived(pages, kinds, lambda: kinds(pages))
+
+
+def _derived(pages: Sequence[TimedPage], key: object, derive: Callable[[], T]) -> T:
+    if not isinstance(pages, TimedPages):
+        return derive()
+    if key not in pages.derived:
+        pages.derived[key] = derive()
+    value: T = pages.derived[key]
+    return value
 
 
 def around(block: Block, reach: int) -> list[Block]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,12 +123,15 @@ class Grid:
         self._drain()
         first_x, last_x = window.column // BLOCK_CELLS, (window.column + window.columns - 1) // BLOCK_CELLS
         first_y, last_y = window.row // BLOCK_CELLS, (window.row + window.rows - 1) // BLOCK_CELLS
-        return sorted((x, y) for x, y in self._timelines if first_x <= x <= last_x and first_y <= y <= last_y)
+        if (last_x - first_x + 1) * (last_y - first_y + 1) > len(self._timelines):
+            return sorted((x, y) for x, y in self._timelines if first_x <= x <= last_x and first_y <= y <= last_y)
+        inside = ((x, y) for x in range(first_x, last_x + 1) for y in range(first_y, last_y + 1))
+        return [block for block in inside if block in self._timelines]
 
-    def pages(self, blocks: Iterable[Block]) -> list[list[TimedPage]]:
+    def pages(self, blocks: Iterable[Block]) -> list[Sequence[TimedPage]]:
         """Pages of each of these blocks in the order of time, none for a block without evidence."""
         self._drain()
-        return [self._timelines[block].timed() if block in self._timelines else [] for block in blocks]
+        return [self._timelines[block].timed() if block in self._timelines else () for block in blocks]
 
     def touch_all(self) -> None:
         """Count all blocks as touched."""

@@ -1,4 +1,4 @@
-"""Pages to their compact form and back, and sums over their votes, compiled.
+"""Pages to their compact form and back, compiled.
 
 In memory between kernels, a vote is one number: the place (plane * 256 + cell) in its lower 16 bits, its count above.
 """
@@ -159,15 +159,3 @@ def are_cells(table: Any, marks: Any, words: Any) -> bool:
         word += 1
         at = table[p, 5]
     return at == len(marks) and word == len(words)
-
-
-@numba.njit(cache=True, nogil=True)
-def moments(votes: Any, start: int, stop: int, out: Any) -> None:
-    """Add to out (3, 256) sums of counts, counts times bin and counts times bin squared, of planes start to stop."""
-    for i in range(len(votes)):
-        plane, cell = votes[i].place // CELLS, votes[i].place % CELLS
-        if start <= plane < stop:
-            bin_, count = plane - start, np.float64(votes[i].count)
-            out[0, cell] += count
-            out[1, cell] += count * bin_
-            out[2, cell] += count * bin_ * bin_

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence import page_kernels
-from protocol.arrays import Bools, Floats, Ints, Table
+from protocol.arrays import Bools, Ints, Table
 
 # place: bin * 256 + cell. Counts of a few passes fit into 16 bits; where one does not, all of a block are wide.
 TIERS = 4  # of a timeline: buckets, hours, days, all before
@@ -136,13 +136,6 @@ def pick(page: Page, wanted: Bools) -> Page:
     """Only what a page has of some cells (256,)."""
     votes = page.votes[wanted[page.votes["place"] % ev.CELLS]]
     return Page(votes, page.cells[wanted[page.cells["cell"]]])
-
-
-def moments(page: Page, part: slice) -> Floats:
-    """Sums (3, 256) of counts, counts times bin and counts times bin squared, of one part of the counts."""
-    out = np.zeros((3, ev.CELLS))
-    page_kernels.moments(page.votes, part.start, part.stop, out)
-    return out
 
 
 EMPTY = CompactPages.from_packed(np.empty((0, 6), np.int64), np.empty(0, np.uint64), np.empty(0, CELL))

@@ -8,10 +8,12 @@ samples alone. That is why it may be settled late, and why the timelines of two 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.pages import CELL, EMPTY, RAW_CELL, CompactPages, PackedPages, Page
@@ -33,6 +35,44 @@ class TimedPage:
     page: Page
 
 
+class TimedPages(Sequence[TimedPage]):
+    """Pages of one block in the order of time, as they were at one moment; expanded anew whenever they are read.
+
+    A page of a coarser tier may begin before one of a finer tier ends: both have evidence of the same hour. In each
+    cell, the finer one is newer. derived: what readers found out about these pages, by what it depends on; as long as
+    nothing was folded into a block, its pages are this same object.
+    """
+
+    __slots__ = ("_pages", "_tiers", "derived")
+
+    def __init__(self, pages: CompactPages, tiers: Tiers) -> None:
+        self._pages, self._tiers = pages, tiers
+        self.derived: dict[object, Any] = {}
+
+    def __len__(self) -> int:
+        return len(self._pages.table)
+
+    def __iter__(self) -> Iterator[TimedPage]:
+        spans = self._tiers.spans_ns.tolist()
+        pages = sorted(self._pages.expanded().items(), key=lambda item: (-item[0], item[1]))
+        return (TimedPage(*_time_of(spans[tier], index, page), page) for tier, index, page in pages)
+
+    def packed_votes(self) -> tuple[NDArray[np.uint64], Ints]:
+        """As the function of this name, without a page by itself."""
+        pages = self._pages.expanded()
+        order = np.lexsort((pages.table[:, 1], -pages.table[:, 0]))
+        parts = [pages.votes[first:end] for first, end in pages.table[order, 2:4].tolist()]
+        lengths = pages.table[order, 3] - pages.table[order, 2]
+        return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(lengths)
+
+    @overload
+    def __getitem__(self, index: int) -> TimedPage: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[TimedPage]: ...
+    def __getitem__(self, index: int | slice) -> TimedPage | list[TimedPage]:
+        return list(self)[index]
+
+
 @dataclass(frozen=True)
 class Tiers:
     """Spans of growing lengths [ns], of which the newest `keeps` of each cell stay apart; the last one has no end."""
@@ -45,6 +85,14 @@ class Tiers:
         """Buckets, hours, days, and everything before them."""
         spans = (config.bucket_ns, HOUR_S * 10**9, DAY_S * 10**9, 0)
         return cls(np.array(spans), np.array((config.keep_buckets, config.keep_hours, config.keep_days, 0)))
+
+
+def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
+    """Votes of pages as PackedPages has them, in the order of time, and where those of each page end."""
+    if isinstance(pages, TimedPages):
+        return pages.packed_votes()
+    parts = [PackedPages.from_page(0, 0, timed.page).votes for timed in pages]
+    return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum([len(part) for part in parts], dtype=np.int64)
 
 
 class Space:
@@ -67,13 +115,14 @@ class Space:
 class Timeline:
     """Pages of one block: settled ones, and those that came since."""
 
-    __slots__ = ("_fresh", "_known", "_settled", "_space", "_tiers", "_waiting")
+    __slots__ = ("_fresh", "_known", "_settled", "_space", "_tiers", "_timed", "_waiting")
 
     def __init__(self, tiers: Tiers, space: Space, settled: CompactPages = EMPTY) -> None:
         self._tiers, self._space = tiers, space
         self._settled = settled
         self._fresh: list[PackedPages] = []
         self._waiting = 0
+        self._timed: TimedPages | None = None
         self._known: Bools = np.zeros(ev.CELLS, np.bool_)
         self._known[settled.marks[:, 0]] = True
 
@@ -94,22 +143,19 @@ class Timeline:
         """All pages, in the order of tier and index, each cell's newest spans apart."""
         if self._fresh:
             self._settled = _settled(self._settled, self._fresh, self._tiers, self._space)
-            self._fresh, self._waiting = [], 0
+            self._fresh, self._waiting, self._timed = [], 0, None
         return self._settled
 
     def items(self) -> Iterator[tuple[int, int, Page]]:
         """Tier, index on it, and page, sorted."""
         return self.settled().expanded().items()
 
-    def timed(self) -> list[TimedPage]:
-        """Pages in the order of time.
-
-        A page of a coarser tier may begin before one of a finer tier ends: both have evidence of the same hour. In each
-        cell, the finer one is newer.
-        """
-        spans = self._tiers.spans_ns.tolist()
-        pages = sorted(self.items(), key=lambda item: (-item[0], item[1]))
-        return [TimedPage(*_time_of(spans[tier], index, page), page) for tier, index, page in pages]
+    def timed(self) -> TimedPages:
+        """Pages in the order of time; the same object until something is added."""
+        self.settled()
+        if self._timed is None:
+            self._timed = TimedPages(self._settled, self._tiers)
+        return self._timed
 
 
 def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:

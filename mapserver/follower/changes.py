@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from mapserver.change import change_log
@@ -62,7 +62,7 @@ class ChangeSearch:
         self._writer.run(lambda store: store.journal.append_event(change_log.KIND, change.last_ns, change.values))
 
 
-def _touched(store: Store, reach: int) -> tuple[list[Block], dict[Block, list[TimedPage]]]:
+def _touched(store: Store, reach: int) -> tuple[list[Block], dict[Block, Sequence[TimedPage]]]:
     """Some of the blocks in which something was folded since they were looked at, and pages of them and around."""
     blocks = store.grid.take_touched(LOOK_BLOCKS)
     wide = sorted({near for block in blocks for near in around(block, reach)})

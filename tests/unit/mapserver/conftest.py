@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from mapserver.evidence import cells as ev
+from mapserver.change.detection import ChangeConfig, cuts
 from mapserver.evidence.grid import warm_up
-from mapserver.evidence.pages import moments
 from mapserver.evidence.votes import FoldConfig
-from tests.unit.mapserver.data import folded, samples
+from tests.unit.mapserver.data import NOW_NS, folded, samples
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_kernels() -> None:
     """Compile the kernels, or read them from their cache, once: no single test pays for it."""
     warm_up(FoldConfig())
-    moments(folded(samples(1)).state().pages[0].page, ev.HEADING)
+    (pages,) = folded(samples(2, stamp_ns=[NOW_NS, NOW_NS + 10**12], c_rr=[0.01, 0.3])).pages([(0, 0)])
+    cuts(pages, ChangeConfig())

@@ -3,15 +3,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.change.detection import ChangeConfig
-from mapserver.change.validity import around, valid_pages
+from mapserver.change import validity
+from mapserver.change.detection import ChangeConfig, cuts
+from mapserver.change.validity import around, clusters, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.sums import evidence
 from mapserver.evidence.votes import FoldConfig
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import ReadConfig
-from tests.unit.mapserver.data import NOW_NS, samples
+from protocol.site.geometry import CellWindow
+from tests.unit.mapserver.data import NOW_NS, folded, random_samples, samples
 
 HOUR_NS = 3600 * 10**9
 CONFIG = ChangeConfig()
@@ -205,3 +207,25 @@ def test_around_a_block_are_all_blocks_so_far(reach):
     blocks = around((0, -1), reach)
     assert len(blocks) == len(set(blocks)) == (2 * reach + 1) ** 2
     assert {max(abs(x), abs(y + 1)) for x, y in blocks} == set(range(reach + 1))
+
+
+def test_pages_are_cut_once_as_long_as_nothing_is_folded_into_them(monkeypatch):
+    grid = folded(random_samples(200, 3, half_m=20.0))
+    calls = []
+    monkeypatch.setattr(validity, "cuts", lambda pages, config: calls.append(pages) or cuts(pages, config))
+
+    def look() -> int:
+        calls.clear()
+        blocks = grid.blocks_in(CellWindow(-64, -64, 128, 128))
+        valid_pages(dict(zip(blocks, grid.pages(blocks), strict=True)), 1.0, CONFIG)
+        return len(calls)
+
+    assert look() == len(grid.blocks_in(CellWindow(-64, -64, 128, 128))) > 1
+    assert look() == 0
+    grid.fold(samples(1, x_m=8.5, y_m=8.5, cov_xx_m2=0, cov_yy_m2=0), "b")
+    assert look() == 1
+
+
+def test_blocks_near_each_other_are_in_one_cluster():
+    parts = clusters([(0, 0), (40, 0), (2, 2), (4, 4), (40, 3)], 1)
+    assert sorted(map(sorted, parts)) == [[(0, 0), (2, 2), (4, 4)], [(40, 0)], [(40, 3)]]

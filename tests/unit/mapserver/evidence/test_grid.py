@@ -157,7 +157,7 @@ def test_pages_of_a_block_come_in_the_order_of_time():
     pages, nothing = grid.pages([(0, 0), (9, 9)])
     newest = [int(timed.page.cells["newest_ns"].max()) for timed in pages]
     assert newest == sorted(newest)
-    assert nothing == []
+    assert not len(nothing)
     assert all(timed.first_ns <= stamp < timed.end_ns for timed, stamp in zip(pages, newest, strict=True))
 
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.pages import CELL, EMPTY, NARROW, WIDE, CompactPages, PackedPages, Page, moments, pick
+from mapserver.evidence.pages import CELL, EMPTY, NARROW, WIDE, CompactPages, PackedPages, Page, pick
 
 PLACES = ev.COUNTS * ev.CELLS
 counts = st.one_of(st.integers(1, 2**17), st.integers(ev.COUNT_MAX - 3, ev.COUNT_MAX))
@@ -108,11 +108,3 @@ def test_sums_add_many_full_pages_without_wrapping():
     for _ in range(3):
         page({2: int(ev.COUNT_MAX)}).add_to(counts, bitmaps, newest_ns)
     assert counts[2] == 4 * int(ev.COUNT_MAX)
-
-
-@given(drawn, st.sampled_from([ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH, ev.HEADING]))
-def test_moments_are_those_of_the_histograms(drawn_page, part):
-    one = page(*drawn_page)
-    counts = unpacked(one)[0].reshape(ev.COUNTS, ev.CELLS)[part].astype(float)
-    bins = np.arange(len(counts))[:, None]
-    assert np.allclose(moments(one, part), [(counts * bins**power).sum(axis=0) for power in range(3)])
