@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.change.kernels import differ, histograms
+from mapserver.change.kernels import differ, histograms, likeliest_cuts
 from mapserver.evidence import cells as ev
 from mapserver.evidence.timeline import TimedPage, packed_votes
 from protocol.arrays import Bools, Floats, Ints
@@ -150,29 +150,13 @@ def _best_cut(votes: Floats, first: Ints) -> tuple[Ints, Floats]:
 
     votes: (pages, bins, cells); pages before `first` do not count. Also returns the median (cells,) after it.
     """
-    pages = np.arange(len(votes))
-    kept = np.where(pages[:, None, None] >= first, votes, 0)
-    until = kept.cumsum(axis=0)
-    old, new = until[:-1], until[-1] - until[:-1]  # (pages - 1, bins, cells): cut before page 1, 2, ...
-    likelihood = _entropy(until[-1])[None] - _entropy(old) - _entropy(new)
-    weights = np.minimum(old.sum(axis=1), new.sum(axis=1))
-    likelihood[weights < WEIGHT_M] = -np.inf
-    best = likelihood.argmax(axis=0)
-    cells = np.arange(votes.shape[2])
-    before, after = old[best, :, cells].T, new[best, :, cells].T  # (bins, cells)
+    best, before, after = likeliest_cuts(votes, first, WEIGHT_M)
     share_before, share_after = (part / np.maximum(part.sum(axis=0), 1e-9) for part in (before, after))
     variation = np.abs(share_before - share_after).sum(axis=0) / 2
     kind = _median(share_after)
     apart = np.abs(_median(share_before) - kind)
-    changed = (weights[best, cells] >= WEIGHT_M) & (variation > VARIATION) & (apart >= BINS)
-    return np.where(changed, best + 1, first), kind
-
-
-def _entropy(votes: Floats) -> Floats:
-    """Weight times entropy (...,) of histograms (..., bins, cells), in metres times nats."""
-    weight = votes.sum(axis=-2)
-    logs = votes * np.log(np.maximum(votes, 1e-12))
-    return np.asarray(weight * np.log(np.maximum(weight, 1e-12)) - logs.sum(axis=-2), np.float64)
+    changed = (best > 0) & (variation > VARIATION) & (apart >= BINS)
+    return np.where(changed, best, first), kind
 
 
 def _median(shares: Floats) -> Floats:

@@ -113,9 +113,9 @@ class Space:
 
 
 class Timeline:
-    """Pages of one block: settled ones, and those that came since."""
+    """Pages of one block: settled ones, and those that came since. known_cells: how many cells have evidence."""
 
-    __slots__ = ("_fresh", "_known", "_settled", "_space", "_tiers", "_timed", "_waiting")
+    __slots__ = ("_fresh", "_known", "_settled", "_space", "_tiers", "_timed", "_waiting", "known_cells")
 
     def __init__(self, tiers: Tiers, space: Space, settled: CompactPages = EMPTY) -> None:
         self._tiers, self._space = tiers, space
@@ -125,16 +125,13 @@ class Timeline:
         self._timed: TimedPages | None = None
         self._known: Bools = np.zeros(ev.CELLS, np.bool_)
         self._known[settled.marks[:, 0]] = True
-
-    @property
-    def known_cells(self) -> int:
-        """How many cells have evidence."""
-        return int(self._known.sum())
+        self.known_cells = int(np.count_nonzero(self._known))
 
     def add(self, pages: PackedPages) -> None:
         """Add evidence of any tiers and spans, also of those that are there."""
         self._fresh.append(pages)
         self._known[pages.cells["cell"]] = True
+        self.known_cells = int(np.count_nonzero(self._known))
         self._waiting += len(pages.table)
         if self._waiting >= PATIENCE:
             self.settled()

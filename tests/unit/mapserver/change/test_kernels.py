@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapserver.change.kernels import differ, histograms
+from mapserver.change.kernels import differ, histograms, likeliest_cuts
 from mapserver.evidence import cells as ev
 
 PARTS = [ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH]
@@ -45,3 +45,37 @@ def test_histograms_are_those_of_the_cells_asked_for(part):
     out = np.zeros((4, part.stop - part.start, 3))
     histograms(votes, ends, part.start, part.stop, columns, out)
     assert np.array_equal(out, counts[:, part][:, :, cells])
+
+
+def entropy(votes: np.ndarray) -> np.ndarray:
+    """Weight times entropy of histograms (..., bins, cells)."""
+    weight = votes.sum(axis=-2)
+    logs = votes * np.log(np.maximum(votes, 1e-12))
+    return weight * np.log(np.maximum(weight, 1e-12)) - logs.sum(axis=-2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_best_cut_is_the_likeliest(seed):
+    rng = np.random.default_rng(seed)
+    votes = rng.exponential(1.0, (7, 24, 30)) * (rng.random((7, 24, 30)) < 0.2)
+    votes[4:, :, ::2] = np.roll(votes[4:, :, ::2], 6, axis=1)
+    first = rng.integers(0, 3, 30)
+    kept = np.where(np.arange(7)[:, None, None] >= first, votes, 0)
+    until = kept.cumsum(axis=0)
+    old, new = until[:-1], until[-1] - until[:-1]
+    likelihood = entropy(until[-1])[None] - entropy(old) - entropy(new)
+    likelihood[np.minimum(old.sum(axis=1), new.sum(axis=1)) < 1.0] = -np.inf
+    best, before, after = likeliest_cuts(votes, first, 1.0)
+    known = np.isfinite(likelihood).any(axis=0)
+    assert np.array_equal(best[known], likelihood.argmax(axis=0)[known] + 1)
+    assert not best[~known].any()
+    cells = np.flatnonzero(known)
+    np.testing.assert_allclose(before[:, cells].T, old[best[cells] - 1, :, cells])
+    np.testing.assert_allclose(after[:, cells].T, new[best[cells] - 1, :, cells], atol=1e-12)
+
+
+def test_a_side_with_too_little_evidence_is_no_side():
+    votes = np.zeros((3, 24, 1))
+    votes[0, 3], votes[2, 20] = 5.0, 0.2
+    best, _, _ = likeliest_cuts(votes, np.zeros(1, np.int64), 0.3)
+    assert best.tolist() == [0]
