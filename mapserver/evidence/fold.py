@@ -80,6 +80,7 @@ def _by_block(pages: Ints, votes: NDArray[np.uint64], cells: Table) -> Iterator[
     """Cut pages into those of each block; copies, which keep nothing else alive."""
     if not len(pages):
         return
+    dtype: type[np.unsignedinteger[Any]] = np.uint32 if int(votes.max()) < 2**32 else np.uint64
     begins: Bools = np.ones(len(pages), np.bool_)
     begins[1:] = (pages[1:, :2] != pages[:-1, :2]).any(axis=1)
     firsts = np.flatnonzero(begins)
@@ -92,5 +93,5 @@ def _by_block(pages: Ints, votes: NDArray[np.uint64], cells: Table) -> Iterator[
     for first, end in zip(firsts.tolist(), ends, strict=True):
         x, y, _, first_vote, _, first_cell, _ = pages[first].tolist()
         _, _, _, _, end_vote, _, end_cell = pages[end - 1].tolist()
-        part = votes[first_vote:end_vote].copy(), frozen(cells[first_cell:end_cell])
-        yield x, y, PackedPages(tables[first:end].copy(), *part)
+        few = votes[first_vote:end_vote].astype(dtype)
+        yield x, y, PackedPages(tables[first:end].copy(), few, frozen(cells[first_cell:end_cell]))

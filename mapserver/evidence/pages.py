@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,12 +51,12 @@ class Page:
 class PackedPages:
     """Pages of one block end to end: few long arrays instead of many short ones.
 
-    table (n, 6): tier, index, first and end of the votes and of the cells of each page. votes (m,) uint64: place in the
-    lower 16 bits, count above; cells (k,) CELL.
+    table (n, 6): tier, index, first and end of the votes and of the cells of each page. votes (m,), uint32 or,
+    where one does not fit, uint64: place in the lower 16 bits, count above; cells (k,) CELL.
     """
 
     table: Ints
-    votes: NDArray[np.uint64]
+    votes: NDArray[np.unsignedinteger[Any]]
     cells: Table
 
     @classmethod
