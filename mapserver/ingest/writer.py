@@ -1,4 +1,4 @@
-"""The thread that owns the store: batches are journalled, acknowledged and folded here; other threads hand it work."""
+"""The thread that owns the store: it commits batches, folds them, then replies; other threads hand it work."""
 
 from __future__ import annotations
 

@@ -1,1 +1,4 @@
-"""Which machines contradict all others, and which are excluded from the map."""
+"""Which machines contradict all others, and which are excluded from the map.
+
+`comparison` measures, `judgement` has the rules, `auditor` votes, `decisions` keeps who is trusted.
+"""
