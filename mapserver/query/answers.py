@@ -1,4 +1,4 @@
-"""Map queries and commands answered: pages are copied by the writer's thread, layers are derived here, outside it."""
+"""Map queries and commands answered: pages come from the writer's thread, layers are derived here, outside it."""
 
 from __future__ import annotations
 
