@@ -14,7 +14,7 @@ from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
 from sim.machines.chassis import Bodies
-from sim.machines.model import MachineModel, load_model
+from sim.machines.model import load_model
 from sim.scenario.file import load_scenario
 from sim.simulator import Simulator
 from sim.state import STEP_S, FleetState, stack
@@ -26,6 +26,7 @@ from sim.worlds.world import World
 
 WORLDS: dict[str, type[BulletWorld] | type[FastWorld]] = {"pybullet": BulletWorld, "fast": FastWorld}
 GRADE_15 = math.tan(math.radians(15))
+LOADER = load_model("wheel_loader")
 SPEED_MPS = 2.0
 TOUR_S = 125.0  # a lap of the longest tour of the paper's site
 
@@ -73,18 +74,16 @@ def _traction(world: str) -> list[Row]:
 def _slope(world: str) -> list[Row]:
     """Drive force over load on 15 degrees."""
     rows = []
-    for uphill in (1, -1):
-        with _alone(world, _plane(WET_DIRT, uphill * GRADE_15)) as one:
+    for case, grade in (("uphill", GRADE_15), ("downhill", -GRADE_15)):
+        with _alone(world, _plane(WET_DIRT, grade)) as one:
             last = _hold(one, 10.0)[-1]
-        expected = SOILS[WET_DIRT].c_rr + uphill * GRADE_15
-        rows.append(_row("uphill" if uphill > 0 else "downhill", _pull(last), expected, "F/N", absolute=0.002))
+        rows.append(_row(case, _pull(last), SOILS[WET_DIRT].c_rr + grade, "F/N", absolute=0.002))
     return rows
 
 
 def _coast_down(world: str) -> list[Row]:
     """Deceleration when the engine lets go."""
-    model = _loader()
-    turning = 1 + 4 * model.wheel_inertia_kgm2 / model.wheel_radius_m**2 / model.mass_kg
+    turning = 1 + 4 * LOADER.wheel_inertia_kgm2 / LOADER.wheel_radius_m**2 / LOADER.mass_kg
     with _alone(world, _plane(GRAVEL)) as one:
         _hold(one, 8.0)
         start = float(_roll_out(one, 1.2)[-1].speed_mps[0])  # until the engine has let go
@@ -95,21 +94,21 @@ def _coast_down(world: str) -> list[Row]:
 def _parking(world: str) -> list[Row]:
     """Creep in 30 s on 15 degrees with the brakes on."""
     with _alone(world, _plane(CONCRETE, GRADE_15)) as one:
-        run = stack(_roll_out(one, 30.0, _loader().max_brake_n))
+        run = stack(_roll_out(one, 30.0, LOADER.max_brake_n))
     creep = math.hypot(run.x_m[-1, 0] - run.x_m[0, 0], run.y_m[-1, 0] - run.y_m[0, 0])
     return [_row("concrete, 15 deg, 30 s", creep, 0.0, "m", absolute=0.01)]
 
 
 def _circle(world: str) -> list[Row]:
     """Radius of the rear axle's circle at a fixed articulation."""
-    rows, model = [], _loader()
+    rows = []
     for angle in (0.2, 0.5):
         with _alone(world, _plane(CONCRETE)) as one:
             run = stack(_hold(one, 20.0, angle)[700:])
         x, y = run.x_m[:, 0], run.y_m[:, 0]
         # algebraic circle fit: x^2 + y^2 = 2 a x + 2 b y + c
         a, b, c = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], 1), x**2 + y**2, rcond=None)[0]
-        expected = (model.front_to_joint_m + model.rear_to_joint_m * math.cos(angle)) / math.sin(angle)
+        expected = (LOADER.front_to_joint_m + LOADER.rear_to_joint_m * math.cos(angle)) / math.sin(angle)
         rows.append(_row(f"{angle:g} rad", math.sqrt(c + a * a + b * b), expected, "m", relative=0.02))
     return rows
 
@@ -117,13 +116,10 @@ def _circle(world: str) -> list[Row]:
 def _apart(route: str, seed: int) -> Row:
     """How far both worlds part on one tour, driven alone."""
     one, other = (_tour(route, seed, world) for world in WORLDS)
-    apart = np.hypot(one.x_m - other.x_m, one.y_m - other.y_m)
-    faster = one.speed_mps - other.speed_mps
-    return {
-        "position_rms_m": round(float(np.sqrt((apart**2).mean())), 4),
-        "position_max_m": round(float(apart.max()), 4),
-        "speed_rms_mps": round(float(np.sqrt((faster**2).mean())), 4),
-    }
+    apart, faster = np.hypot(one.x_m - other.x_m, one.y_m - other.y_m), one.speed_mps - other.speed_mps
+    position_rms_m, speed_rms_mps = (float(np.sqrt((difference**2).mean())) for difference in (apart, faster))
+    figures = {"position_rms_m": position_rms_m, "position_max_m": float(apart.max()), "speed_rms_mps": speed_rms_mps}
+    return {name: round(value, 4) for name, value in figures.items()}
 
 
 def _tour(route: str, seed: int, world: str) -> FleetState:
@@ -137,10 +133,6 @@ def _tour(route: str, seed: int, world: str) -> FleetState:
 # --- one machine on a plane ------------------------------------------------------------------------------------------
 
 
-def _loader() -> MachineModel:
-    return load_model("wheel_loader")
-
-
 def _plane(zone: int, grade_east: float = 0.0) -> Terrain:
     x, _ = np.meshgrid([0.0, 1000.0], [0.0, 1000.0])
     return Terrain(grade_east * x, 1000.0, np.full((1, 1), zone), 1000.0)
@@ -148,9 +140,8 @@ def _plane(zone: int, grade_east: float = 0.0) -> Terrain:
 
 @contextmanager
 def _alone(world: str, terrain: Terrain) -> Iterator[World]:
-    model = _loader()
-    body = Bodies(np.array([model.mass_kg]), np.array([model.wheel_radius_m]))
-    one: World = WORLDS[world](terrain, [model], body, np.array([[500.0, 500.0, 0.0]]))
+    body = Bodies(np.array([LOADER.mass_kg]), np.array([LOADER.wheel_radius_m]))
+    one: World = WORLDS[world](terrain, [LOADER], body, np.array([[500.0, 500.0, 0.0]]))
     with closing(one):
         yield one
 
@@ -171,20 +162,12 @@ def _roll_out(world: World, seconds: float, brake_n: float = 0.0) -> list[FleetS
 
 
 def _pull(state: FleetState) -> float:
-    return float(state.torque_nm[0] / _loader().wheel_radius_m / state.load_n[0])
+    return float(state.torque_nm[0] / LOADER.wheel_radius_m / state.load_n[0])
 
 
 def _row(
     case: str, measured: float, expected: float, unit: str, *, relative: float = 0.0, absolute: float = 0.0
 ) -> Row:
-    error = abs(measured - expected)
-    goal = absolute or relative * abs(expected)
-    return {
-        "case": case,
-        "measured": round(measured, 6),
-        "expected": round(expected, 6),
-        "error": round(error, 6),
-        "unit": unit,
-        "goal": round(goal, 6),
-        "met": error <= goal,
-    }
+    error, goal = abs(measured - expected), absolute or relative * abs(expected)
+    row = {"case": case, "measured": round(measured, 6), "expected": round(expected, 6), "error": round(error, 6)}
+    return row | {"unit": unit, "goal": round(goal, 6), "met": error <= goal}

@@ -85,6 +85,14 @@ def _convert_tuple(value: Any, args: tuple[Any, ...], where: str) -> tuple[Any, 
     return tuple(_convert(v, a, f"{where}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True)))
 
 
+def require_between(config: Any, low: float, high: float, *names: str) -> None:
+    """Raise ValueError, by name, on the first of these numbers of a dataclass outside of the limits; None passes."""
+    for name in names:
+        value = getattr(config, name)
+        if value is not None and not low <= value <= high:  # also false for NaN
+            raise ValueError(f"{name}: {value!r} is not between {low:g} and {high:g}")
+
+
 def require_positive(config: Any, names: Iterable[str]) -> None:
     """Raise ValueError, by name, on the first of these numbers of a dataclass that is not positive and finite."""
     for name in names:

@@ -1,4 +1,7 @@
-"""Options of a simulation run, as `config/sim.toml` describes them: a scenario, what differs from it, and the pace."""
+"""Options of a simulation run, as `config/sim.toml` describes them: a scenario, what differs from it, and the pace.
+
+Also the files that agents of its machines are given.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from protocol.config import from_table
+from protocol.config import from_table, require_between
 from protocol.errors import ConfigError
 from protocol.files import load_toml
-from protocol.site.site_config import NAME
+from protocol.machine.machine_config import machine_toml
+from protocol.site.site_config import NAME, site_toml
 from sim.scenario.file import check, load_scenario
 from sim.scenario.tables import MAX_MACHINES, FleetConfig, Scenario
 
@@ -41,12 +45,10 @@ class SimConfig:
     speed: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.speed <= 1000:  # also false for NaN
-            raise ValueError(f"speed: {self.speed!r} is not between 0 and 1000")
-        if self.machines is not None and not 1 <= self.machines <= MAX_MACHINES:
-            raise ValueError(f"machines: {self.machines} is not between 1 and {MAX_MACHINES}")
-        for name in (*([self.site] if self.site is not None else []), *(self.names or ())):
-            if not NAME.fullmatch(name):
+        require_between(self, 0, 1000, "speed")
+        require_between(self, 1, MAX_MACHINES, "machines")
+        for name in (self.site, *(self.names or ())):
+            if name is not None and not NAME.fullmatch(name):
                 raise ValueError(f"site, names: {name!r} is not a name (lower-case letters, digits, - and _)")
 
 
@@ -59,24 +61,33 @@ def resolve(config: SimConfig) -> Scenario:
     """The scenario with the options of this run; a ConfigError says what does not fit."""
     scenario = load_scenario(config.scenario)
     where = f"scenario {config.scenario}"
-    over = {name: getattr(config, name) for name in ("world", "seed", "seconds", "names")}
-    fleets = tuple(_fleet(fleet, config) for fleet in scenario.fleet)
+    names = ("preset", "drive_mps", "gps", "imu", "attitude", "payload")
+    fleets = tuple(_replace(fleet, where, **_given(config, *names)) for fleet in scenario.fleet)
     if config.machines is not None:
         fleets = (_replace(fleets[0], where, count=config.machines), *fleets[1:])
     count = sum(fleet.size for fleet in fleets)
     if config.names is not None and len(config.names) != count:
         raise ConfigError(where, f"names: {len(config.names)} names for {count} machines")
     site = scenario.site if config.site is None else replace(scenario.site, name=config.site)
-    kept = {name: value for name, value in over.items() if value is not None}
-    scenario = _replace(scenario, where, fleet=fleets, site=site, **kept)
+    options = _given(config, "world", "seed", "seconds", "names")
+    scenario = _replace(scenario, where, fleet=fleets, site=site, **options)
     check(scenario, where)
     return scenario
 
 
-def _fleet(fleet: FleetConfig, config: SimConfig) -> FleetConfig:
-    over = {name: getattr(config, name) for name in ("preset", "drive_mps", "gps", "imu", "attitude", "payload")}
-    kept = {name: value for name, value in over.items() if value is not None}
-    return _replace(fleet, f"scenario {config.scenario}", **kept)
+def write_configs(config: SimConfig, folder: Path) -> list[Path]:
+    """Write `site.toml` and `<machine>.toml` for the agents: nominal values, nothing of the truth."""
+    scenario = resolve(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "site.toml").write_text(site_toml(scenario.site), encoding="utf-8")
+    machines = {folder / f"{rig.machine.name}.toml": rig.machine for rig in scenario.rigs()}
+    for path, machine in machines.items():
+        path.write_text(machine_toml(machine), encoding="utf-8")
+    return list(machines)
+
+
+def _given(config: SimConfig, *names: str) -> dict[str, Any]:
+    return {name: value for name in names if (value := getattr(config, name)) is not None}
 
 
 def _replace(old: T, where: str, **values: Any) -> T:

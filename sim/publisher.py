@@ -143,15 +143,11 @@ def _drive(
 @contextlib.contextmanager
 def _streams(simulator: Simulator, session_config: SessionConfig) -> Iterator[list[Stream]]:
     session: Any = open_session(session_config)
-    try:
+    with contextlib.closing(session), contextlib.ExitStack() as closing:
         streams = [Stream(session, simulator.site.name, machine.name) for machine in simulator.machines]
-        try:
-            yield streams
-        finally:
-            for stream in streams:
-                stream.close()
-    finally:
-        session.close()
+        for stream in streams:
+            closing.callback(stream.close)
+        yield streams
 
 
 def _await_subscribers(

@@ -17,32 +17,13 @@ from sim.truth import MAP_FILE, save_tracks
 TRACKS_FOLDER = "tracks"
 
 
-class Recorder:
-    """Keeps readings in memory, to be written as one log folder per machine."""
-
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator = simulator
-        self._readings: dict[str, list[Reading]] = {m.name: [] for m in simulator.machines}
-
-    def add(self, bundles: dict[str, list[Reading]]) -> None:
-        """Keep what `Simulator.advance` returned."""
-        for name, readings in bundles.items():
-            self._readings[name] += readings
-
-    def write(self, folder: Path) -> None:
-        """Write `<folder>/<machine>/log.toml` and its CSV files."""
-        for machine in self._simulator.machines:
-            name = f"{self._simulator.site.name}-{machine.name}"
-            write_log(folder / machine.name, name, self._simulator.site, machine, self._readings[machine.name])
-
-
 def write_truth(folder: Path, simulator: Simulator) -> None:
     """Write the truth map and the tracks so far: `truth_map.npz` and `tracks/<machine>.csv`.
 
     Where the ground changed, `truth_map_until_<second>s.npz` holds what was true before.
     """
     simulator.truth_map.save(folder / MAP_FILE)
-    for until_s, former in simulator.former_truth_maps():
+    for until_s, former in simulator.former_truth_maps:
         former.save(folder / f"{Path(MAP_FILE).stem}_until_{until_s:g}s.npz")
     save_tracks(folder / TRACKS_FOLDER, simulator.tracks())
 
@@ -55,20 +36,24 @@ def record(
     on_progress: Callable[[float], None] = lambda _: None,
     stop: threading.Event | None = None,
 ) -> Simulator:
-    """Simulate into log folders; the truth goes to truth_dir. Returns the simulator, at its end and closed.
+    """Simulate into `<record_dir>/<machine>/log.toml` and its CSV files; the truth goes to truth_dir.
 
-    on_progress gets the simulated time after every bundle. stop: once set, the recording ends with what it has.
+    on_progress gets the simulated time after every bundle. stop: once set, the recording ends with what it has. Returns
+    the simulator, at its end and closed.
     """
     with contextlib.closing(Simulator(config)) as simulator:
         if simulator.bundles is None:
             raise ConfigError("seconds", "a recording needs an end: set seconds above 0")
-        recording = Recorder(simulator)
+        readings: dict[str, list[Reading]] = {machine.name: [] for machine in simulator.machines}
         for _ in range(simulator.bundles):
             if stop and stop.is_set():
                 break
-            recording.add(simulator.advance())
+            for name, new in simulator.advance().items():
+                readings[name] += new
             on_progress(simulator.simulated_s)
-        recording.write(record_dir)
+        for machine in simulator.machines:
+            name = f"{simulator.site.name}-{machine.name}"
+            write_log(record_dir / machine.name, name, simulator.site, machine, readings[machine.name])
         if truth_dir:
             write_truth(truth_dir, simulator)
     return simulator

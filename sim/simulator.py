@@ -14,10 +14,8 @@ from protocol.site.site_config import Projection, SiteConfig
 from sim.config import SimConfig, resolve
 from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
-from sim.operators.course import Start, build_course, spread_starts
-from sim.operators.crew import crew_of
-from sim.operators.driver import DRIVER_STEPS, at_start, drive, look_out, no_commands
-from sim.operators.traffic import APART_M, LOOK_OUT_STEPS
+from sim.operators.course import APART_M, Start, build_course, crew_of, spread_starts
+from sim.operators.driver import DRIVER_STEPS, LOOK_OUT_STEPS, at_start, drive, look_out, no_commands
 from sim.scenario.ground import build_terrain, with_zone
 from sim.scenario.tables import Scenario
 from sim.sensors.rigs import draw_bodies
@@ -37,7 +35,8 @@ START_NS = 1_767_225_600_000_000_000  # stamp of the start, 2026-01-01T00:00:00Z
 class Simulator:
     """Simulates the machines of one site; the same config gives the same readings, bit for bit.
 
-    site, machines: what agents may know. truth_map, tracks(): what only an evaluation may see. close() ends the world.
+    site, machines: what agents may know. truth_map, tracks(): what only an evaluation may see; former_truth_maps: the
+    ground before each change so far, with the simulated second of that change. close() ends the world.
     """
 
     def __init__(self, config: SimConfig, scenario: Scenario | None = None, *, bundle_ms: int = BUNDLE_MS) -> None:
@@ -66,7 +65,7 @@ class Simulator:
         self._sensors = Sensors(rigs, self.scenario.seed, Projection(self.site))
         self._steps = 0
         self._tracks: list[Table] = []
-        self._truth_maps: list[tuple[float, TruthMap]] = []
+        self.former_truth_maps: list[tuple[float, TruthMap]] = []
 
     @property
     def simulated_s(self) -> float:
@@ -116,10 +115,6 @@ class Simulator:
         ground = self.scenario.ground
         return truth_map(self.terrain, ground.width_m, ground.depth_m, self.site.cell_m)
 
-    def former_truth_maps(self) -> Sequence[tuple[float, TruthMap]]:
-        """The ground before each change so far, with the simulated second of that change."""
-        return self._truth_maps
-
     def step(self) -> FleetState:
         """Simulate STEP_S without reading the sensors; returns the true state after it.
 
@@ -142,7 +137,7 @@ class Simulator:
 
     def _change_ground(self) -> None:
         change = self._changes.pop(0)
-        self._truth_maps.append((change.at_s, self.truth_map))
+        self.former_truth_maps.append((change.at_s, self.truth_map))
         self.terrain = with_zone(self.terrain, change.zone)
         self._world.set_terrain(self.terrain)
 

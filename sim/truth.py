@@ -17,19 +17,8 @@ from sim.terrain.terrain import Terrain
 
 TRACK_EVERY = 10  # steps: 10 Hz
 # Column of a track -> what it takes from the state record [m, rad, m/s, kg, -, m/m]
-TRACK_VALUES = {
-    "x": "x_m",
-    "y": "y_m",
-    "z": "z_m",
-    "yaw": "yaw_rad",
-    "pitch": "pitch_rad",
-    "roll": "roll_rad",
-    "speed": "speed_mps",
-    "mass": "mass_kg",
-    "c_rr": "c_rr",
-    "grade_e": "grade_e",
-    "grade_n": "grade_n",
-}
+TRACK_VALUES = {"x": "x_m", "y": "y_m", "z": "z_m", "yaw": "yaw_rad", "pitch": "pitch_rad", "roll": "roll_rad"}
+TRACK_VALUES |= {"speed": "speed_mps", "mass": "mass_kg", "c_rr": "c_rr", "grade_e": "grade_e", "grade_n": "grade_n"}
 TRACK_DTYPE = np.dtype([("stamp_ns", "<i8"), *((name, "<f8") for name in TRACK_VALUES)])
 MAP_FILE = "truth_map.npz"
 
@@ -72,9 +61,8 @@ def truth_map(terrain: Terrain, width_m: float, depth_m: float, cell_m: float = 
     half = cell_m / 2  # the gradient over the cell, not of the little patch that the centre lies on
     rise_e = (terrain.height(x + half, y) - terrain.height(x - half, y)) / cell_m
     rise_n = (terrain.height(x, y + half) - terrain.height(x, y - half)) / cell_m
-    c_rr = C_RR[terrain.zone(x, y)]
-    layers = [layer.astype(np.float32) for layer in (c_rr, rise_e, rise_n)]
-    return TruthMap(0.0, 0.0, layers[0], layers[1], layers[2], cell_m)
+    c_rr, east, north = (layer.astype(np.float32) for layer in (C_RR[terrain.zone(x, y)], rise_e, rise_n))
+    return TruthMap(0.0, 0.0, c_rr, east, north, cell_m)
 
 
 def save_tracks(folder: Path, tracks: Mapping[str, Table]) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,7 @@ class Chassis(NamedTuple):
     roll_inertia_gain_m2: Floats
     tyre_stiffness_npm: Floats
     tyre_damping_nspm: Floats
+    relaxation_m: Floats
     wheel_inertia_kgm2: Floats
     max_articulation_rad: Floats
     steer_radps: Floats
@@ -72,34 +73,26 @@ class Weight(NamedTuple):
 def chassis_of(models: Sequence[MachineModel]) -> Chassis:
     """Arrays out of one model per machine."""
     kinds = list(dict.fromkeys(models))
-    kind = np.array([kinds.index(model) for model in models])
+    kind, figures = [kinds.index(model) for model in models], [_figures(model) for model in kinds]
+    return Chassis(*(np.array([own[name] for own in figures])[kind] for name in Chassis._fields))
 
-    def each(value: Callable[[MachineModel], float]) -> Floats:
-        values: Floats = np.array([value(model) for model in kinds], float)[kind]
-        return values
 
-    return Chassis(
-        rear_to_joint_m=each(lambda m: m.rear_to_joint_m),
-        front_to_joint_m=each(lambda m: m.front_to_joint_m),
-        half_track_m=each(lambda m: 0.5 * m.track_m),
-        rolls_with_front=each(lambda m: m.rolls_with_front) > 0,
-        front_share=each(lambda m: m.front_share()),
-        centre_height_m=each(lambda m: m.centre_height_m()),
-        payload_share=each(lambda m: m.payload_centre_m[0] / m.wheelbase_m),
-        payload_height_m=each(lambda m: m.payload_centre_m[2]),
-        pitch_inertia_kgm2=each(lambda m: m.weight().inertia_kgm2[1, 1]),
-        pitch_inertia_gain_m2=each(lambda m: _gain(m)[1, 1]),
-        roll_inertia_kgm2=each(lambda m: m.weight().inertia_kgm2[0, 0]),
-        roll_inertia_gain_m2=each(lambda m: _gain(m)[0, 0]),
-        tyre_stiffness_npm=each(lambda m: m.tyre_stiffness_npm),
-        tyre_damping_nspm=each(lambda m: m.tyre_damping_nspm),
-        wheel_inertia_kgm2=each(lambda m: m.wheel_inertia_kgm2),
-        max_articulation_rad=each(lambda m: m.max_articulation_rad),
-        steer_radps=each(lambda m: m.steer_radps),
-        steer_gain_per_s=each(lambda m: m.steer_gain_per_s),
-        steer_lag_s=each(lambda m: m.steer_lag_s),
-        engine_lag_s=each(lambda m: m.engine_lag_s),
-    )
+def _figures(model: MachineModel) -> dict[str, Any]:
+    """Values of the fields of `Chassis`; what a kilogram of payload adds is taken from the full machine."""
+    inertia, (payload_x_m, _, payload_z_m) = model.weight().inertia_kgm2, model.payload_centre_m
+    gain = (model.weight(model.payload_kg).inertia_kgm2 - inertia) / model.payload_kg
+    return vars(model) | {
+        "half_track_m": 0.5 * model.track_m,
+        "rolls_with_front": model.rolls_with_front,
+        "front_share": model.front_share(),
+        "centre_height_m": model.centre_height_m(),
+        "payload_share": payload_x_m / model.wheelbase_m,
+        "payload_height_m": payload_z_m,
+        "pitch_inertia_kgm2": inertia[1, 1],
+        "pitch_inertia_gain_m2": gain[1, 1],
+        "roll_inertia_kgm2": inertia[0, 0],
+        "roll_inertia_gain_m2": gain[0, 0],
+    }
 
 
 def weigh(chassis: Chassis, bodies: Bodies, payload_kg: Floats) -> Weight:
@@ -110,12 +103,6 @@ def weigh(chassis: Chassis, bodies: Bodies, payload_kg: Floats) -> Weight:
     pitch = chassis.pitch_inertia_kgm2 + payload_kg * chassis.pitch_inertia_gain_m2
     roll = chassis.roll_inertia_kgm2 + payload_kg * chassis.roll_inertia_gain_m2
     return Weight(mass, share, height, pitch, roll)
-
-
-def _gain(model: MachineModel) -> Floats:
-    """Inertia (3, 3) that a kilogram of payload adds, taken from the full machine."""
-    gain: Floats = (model.weight(model.payload_kg).inertia_kgm2 - model.weight().inertia_kgm2) / model.payload_kg
-    return gain
 
 
 def steering_radps(chassis: Chassis, target_rad: Floats, articulation_rad: Floats, rate_radps: Floats) -> Floats:

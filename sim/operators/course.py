@@ -1,17 +1,20 @@
-"""The routes of all machines side by side, so that drivers look all of them up at once."""
+"""The routes of all machines, and their figures, side by side, so that drivers look all of them up at once."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
+from sim.machines.model import MachineModel
 from sim.operators.routes import SPACING_M, Leg, Route, speed_limits
+from sim.state import FleetState
 
 BEYOND_M = 24.0  # every leg goes on for so long, for drivers to look ahead
+APART_M = 12.0  # between the joints of machines at the start
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,29 @@ class Start:
     payload_kg: float
     joint_m: Floats
     heading_rad: float
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Figures of the machines of n drivers, all (n,), named as in `MachineModel`."""
+
+    rear_to_joint_m: Floats
+    front_to_joint_m: Floats
+    max_articulation_rad: Floats
+    mass_kg: Floats
+    max_drive_n: Floats
+    max_brake_n: Floats
+    max_power_w: Floats
+
+    def joint_m(self, state: FleetState) -> Floats:
+        """Position (n, 2) of the articulation joint, which follows the route."""
+        x = state.x_m + self.rear_to_joint_m * np.cos(state.yaw_rad)
+        return np.stack([x, state.y_m + self.rear_to_joint_m * np.sin(state.yaw_rad)], axis=-1)
+
+
+def crew_of(models: Sequence[MachineModel]) -> Crew:
+    """One driver per machine."""
+    return Crew(*(np.array([getattr(model, field.name) for model in models]) for field in fields(Crew)))
 
 
 def build_course(routes: Sequence[Route], drive_mps: Sequence[float]) -> Course:

@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
-from sim.operators.course import Course, Start
-from sim.operators.crew import Crew
-from sim.operators.traffic import clear_distance
+from sim.operators.course import BEYOND_M, Course, Crew, Start
 from sim.state import FleetState
 
 DRIVER_STEPS = 5  # of the world: drivers act at 20 Hz
@@ -19,6 +17,12 @@ REVERSE_SHARE = 0.5  # of the speed forwards
 GAIN_PER_S, INTEGRAL_PER_S2 = 2.9, 1.15  # acceleration asked for per m/s of speed error, and per m
 START_MPS2, STOP_MPS2 = 0.8, 0.5
 STOP_M, STANDING_MPS = 0.3, 0.03  # a leg's end is reached this close to it, and left once the machine stands
+LOOK_OUT_STEPS = 20  # of the world: drivers look about at 5 Hz
+OVERHANG_M = 2.2  # of frame or bucket beyond an axle
+CLEARANCE_M = 3.6  # between a leg and the middle of another machine: two half widths and a margin
+DISTANCE_M = 3.0  # that is kept to a machine ahead
+PROSPECT_S = (0.0, 1.5, 3.0)  # where others will be, if they go straight on
+AHEAD_M = np.arange(2.0, BEYOND_M + 1e-9, 2.0)
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float
 
 def look_out(course: Course, crew: Crew, old: Drivers, state: FleetState) -> Drivers:
     """Drivers look how far the leg ahead is clear of other machines."""
-    return replace(old, clear_m=clear_distance(course, crew, old.leg, old.distance_m, state))
+    return replace(old, clear_m=_clear_distance(course, crew, old.leg, old.distance_m, state))
 
 
 def pursue(crew: Crew, target_m: Floats, heading_rad: Floats) -> Floats:
@@ -154,3 +158,27 @@ def _payload(course: Course, old: Drivers, waited_s: Floats, dt: float) -> Float
     changes: Bools = (waited_s > 0) & ~np.isnan(target_kg)
     share = dt / np.maximum(wait_s - waited_s + dt, dt)
     return np.where(changes, old.payload_kg + np.minimum(share, 1.0) * (target_kg - old.payload_kg), old.payload_kg)
+
+
+def _clear_distance(course: Course, crew: Crew, leg: Ints, distance_m: Floats, state: FleetState) -> Floats:
+    """Distance (n,) [m] that each machine can drive before it meets another; infinite where none is near its leg.
+
+    Of two machines that block each other the one that is nearer to meeting the other goes first.
+    """
+    n, travel, joint_m = len(distance_m), course.travel[leg], crew.joint_m(state)
+    heading = np.stack([np.cos(state.yaw_rad), np.sin(state.yaw_rad)], axis=-1)
+    front, rear = crew.front_to_joint_m + OVERHANG_M, crew.rear_to_joint_m + OVERHANG_M
+    along = [np.zeros(n), front, -rear]
+    spots = [offset + state.speed_mps * s for s in PROSPECT_S for offset in along]
+    others = np.stack([joint_m + heading * spot[:, None] for spot in spots], axis=1)  # (n, spots, 2)
+
+    path = np.stack([course.at(leg, distance_m + ahead)[0] for ahead in AHEAD_M], axis=1)  # (n, ahead, 2)
+    nose = np.where(travel > 0, front, rear)
+    gap = np.hypot(*(path[:, None, :, None] - others[None, :, None]).transpose(4, 0, 1, 2, 3)).min(axis=-1)
+    blocked = gap < CLEARANCE_M  # (machine, other, ahead)
+    blocked[np.arange(n), np.arange(n)] = False
+    first = np.where(blocked.any(axis=-1), AHEAD_M[blocked.argmax(axis=-1)], np.inf)
+    nearer = (first < first.T) | ((first == first.T) & (np.arange(n)[:, None] < np.arange(n)))
+    first[np.isfinite(first.T) & nearer] = np.inf
+    clear: Floats = np.maximum(first.min(axis=1) - nose - DISTANCE_M, 0.0)
+    return clear

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
+from protocol.config import require_between
 from sim.terrain.soil import SOILS
 from sim.terrain.terrain import Terrain
 
@@ -70,10 +71,9 @@ class GroundConfig:
 
     def __post_init__(self) -> None:
         soil_index(self.soil)
-        limits = {"width_m": (10, 1e5), "depth_m": (10, 1e5), "cell_m": (0.05, 5), "roughness_m": (0, 0.1)}
-        for name, (low, high) in limits.items():
-            if not low <= getattr(self, name) <= high:  # also false for NaN
-                raise ValueError(f"{name}: {getattr(self, name)!r} is not between {low:g} and {high:g}")
+        require_between(self, 10, 1e5, "width_m", "depth_m")
+        require_between(self, 0.05, 5, "cell_m")
+        require_between(self, 0, 0.1, "roughness_m")
         if self.width_m * self.depth_m / self.cell_m**2 > MAX_NODES:
             raise ValueError(f"cell_m: {self.cell_m:g} m is too fine for so large a site, over {MAX_NODES} nodes")
 

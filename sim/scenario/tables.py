@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from protocol.config import require_between
 from protocol.site.site_config import NAME, SiteConfig
 from sim.machines.model import load_model
 from sim.operators.routes import ROUNDING_M, Leg, Route, open_leg, tour
@@ -33,8 +34,7 @@ class LegConfig:
 
     def __post_init__(self) -> None:
         _check_line(self.corners, self.rounding_m, 2)
-        if not 0 <= self.wait_s <= 86400:
-            raise ValueError(f"wait_s: {self.wait_s!r} is not between 0 and 86400")
+        require_between(self, 0, 86400, "wait_s")
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,9 @@ class FleetConfig:
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
         if not self.routes:
             raise ValueError("routes: none is named")
-        if self.count is not None and not 1 <= self.count <= MAX_MACHINES:
-            raise ValueError(f"count: {self.count} is not between 1 and {MAX_MACHINES}")
-        limits = {"drive_mps": (0.5, 12), "start": (0, 1)}
-        for name, (low, high) in limits.items():
-            if not low <= getattr(self, name) <= high:  # also false for NaN
-                raise ValueError(f"{name}: {getattr(self, name)!r} is not between {low:g} and {high:g}")
+        require_between(self, 1, MAX_MACHINES, "count")
+        require_between(self, 0.5, 12, "drive_mps")
+        require_between(self, 0, 1, "start")
 
     @property
     def size(self) -> int:
@@ -174,7 +171,8 @@ class Scenario:
         """Sensors of every machine."""
         rigs: list[Rig] = []
         faults = {f.machine: f for f in self.fault}
-        for fleet, name in zip(self._fleets(), self.machine_names, strict=True):
+        fleets = [fleet for fleet in self.fleet for _ in range(fleet.size)]
+        for fleet, name in zip(fleets, self.machine_names, strict=True):
             model, preset = load_model(fleet.model), self.preset(fleet.preset)
             payload = self._loads(fleet) if fleet.payload is None else fleet.payload
             config = machine_config(name, model, preset, fleet.gps, fleet.imu, fleet.attitude, payload=payload)
@@ -198,10 +196,6 @@ class Scenario:
         """Whether a route of this fleet changes what machines carry."""
         legs = itertools.chain.from_iterable(route.leg for route in self.route if route.name in fleet.routes)
         return any(leg.payload_kg is not None for leg in legs)
-
-    def _fleets(self) -> list[FleetConfig]:
-        """The fleet of every machine."""
-        return list(itertools.chain.from_iterable([fleet] * fleet.size for fleet in self.fleet))
 
 
 def _check_line(corners: Sequence[Point], rounding_m: float, least: int) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.site_config import Projection
-from sim.sensors.datasheets import BASE_RATE_HZ
 from sim.sensors.frames import map_from_base
 from sim.sensors.noise import Draws, GaussMarkov, generator, site_generator
+from sim.sensors.presets import BASE_RATE_HZ
 from sim.sensors.sensor_group import SensorGroup, SensorUnit
 from sim.state import STEP_S, FleetState
 

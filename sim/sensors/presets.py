@@ -1,4 +1,7 @@
-"""Presets: named sets of sensor errors, like those of real sensors; `sim/sensors/presets.toml` is their library."""
+"""Presets: errors of all sensor models and how often they read, in named sets like those of real sensors.
+
+Standard deviations are of one reading unless they say otherwise; `presets.toml`, the library, holds values and sources.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +9,143 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
-from protocol.config import from_table
+from protocol.config import from_table, require_between
 from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.site.site_config import NAME
-from sim.sensors.datasheets import (
-    ArticulationNoise,
-    AttitudeNoise,
-    BodySpread,
-    EncoderNoise,
-    GpsNoise,
-    ImuNoise,
-    PayloadNoise,
-    TorqueNoise,
-)
 
 LIBRARY = Path(__file__).parent / "presets.toml"
+BASE_RATE_HZ = 100  # of the world; sensors read at every so many of its steps
+
+# What values may be, lowest and highest.
+NotNegative = Annotated[float, (0.0, 1e6)]
+Positive = Annotated[float, (0.01, 1e6)]
+Share = Annotated[float, (0, 1)]
+Scale = Annotated[float, (0, 0.5)]
+Tilt = Annotated[float, (0, 45)]
+Heading = Annotated[float, (0, 180)]
+
+
+@dataclass(frozen=True)
+class Ranged:
+    """Values that lie in the ranges of their types."""
+
+    def __post_init__(self) -> None:
+        for name, hint in get_type_hints(type(self), include_extras=True).items():
+            for low, high in getattr(hint, "__metadata__", ()):
+                require_between(self, low, high, name)
+
+
+@dataclass(frozen=True)
+class SensorErrors(Ranged):
+    """Errors of one kind of sensor, and how often it reads."""
+
+    rate_hz: int
+
+    def __post_init__(self) -> None:
+        if self.rate_hz < 1 or BASE_RATE_HZ % self.rate_hz:
+            raise ValueError(f"rate_hz: {self.rate_hz!r} does not divide {BASE_RATE_HZ}")
+        super().__post_init__()
+
+
+@dataclass(frozen=True)
+class GpsNoise(SensorErrors):
+    """A receiver: slow Gauss-Markov drift and white noise per horizontal axis; heights are 5/3 worse.
+
+    scale: multiplies drift and white noise alike. shared: share of the drift's variance that all receivers of the site
+    have in common. The receiver is silent for outage_s of every outage_period_s.
+    """
+
+    drift_std_m: NotNegative
+    drift_time_s: Positive
+    white_std_m: NotNegative
+    scale: NotNegative
+    shared: Share
+    outage_s: NotNegative
+    outage_period_s: Positive
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.outage_s > self.outage_period_s:
+            raise ValueError(f"outage_s: {self.outage_s} is longer than outage_period_s")
+
+
+@dataclass(frozen=True)
+class ImuNoise(SensorErrors):
+    """An IMU, per axis: white noise, a zero that is drawn at turn-on, slow drift of it, scale (of 1), mounting.
+
+    force_vibration_mps2: added to the white noise of the force while driving, in full from vibration_speed_mps on.
+    """
+
+    gyro_white_degps: NotNegative
+    gyro_turn_on_degps: NotNegative
+    gyro_drift_degps: NotNegative
+    force_white_mps2: NotNegative
+    force_turn_on_mps2: NotNegative
+    force_drift_mps2: NotNegative
+    force_vibration_mps2: NotNegative
+    vibration_speed_mps: Positive
+    drift_time_s: Positive
+    scale: Scale
+    mounting_deg: Tilt
+
+
+@dataclass(frozen=True)
+class AttitudeNoise(SensorErrors):
+    """An attitude and heading reference: slow and white errors of roll, pitch and heading.
+
+    heading_offset_deg: constant part of the heading's error, drawn once.
+    """
+
+    tilt_drift_deg: Tilt
+    tilt_white_deg: Tilt
+    heading_offset_deg: Heading
+    heading_drift_deg: Heading
+    heading_white_deg: Heading
+    drift_time_s: Positive
+
+
+@dataclass(frozen=True)
+class EncoderNoise(SensorErrors):
+    """Wheel encoders: whole ticks. Slip and the wheels' true radius are errors of the wheels, not of these."""
+
+    ticks_per_rev: Annotated[int, (1, 1_000_000)]
+
+
+@dataclass(frozen=True)
+class TorqueNoise(SensorErrors):
+    """Drive torque: white noise, noise correlated over correlation_s, and an error of the scale (of 1) drawn once."""
+
+    white_nm: NotNegative
+    correlated_nm: NotNegative
+    correlation_s: Positive
+    scale: Scale
+
+
+@dataclass(frozen=True)
+class ArticulationNoise(SensorErrors):
+    """Angle of the joint: white noise, and a zero that is drawn once."""
+
+    white_deg: Tilt
+    zero_deg: Tilt
+
+
+@dataclass(frozen=True)
+class PayloadNoise(SensorErrors):
+    """A weighing system: white noise, and an error of the scale (of 1) drawn once."""
+
+    white_kg: NotNegative
+    scale: Scale
+
+
+@dataclass(frozen=True)
+class BodySpread(Ranged):
+    """How bodies differ from their nominal: mass, evenly up to this share; wheel radius, standard deviation (of 1)."""
+
+    mass: Scale
+    wheel_radius: Annotated[float, (0, 0.1)]
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from protocol.config import require_between
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
-from sim.sensors.datasheets import GpsNoise
 from sim.sensors.noise import generator
-from sim.sensors.presets import Preset
+from sim.sensors.presets import GpsNoise, Preset
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,9 @@ class Faults:
     clock_off_s: float = 0.0
 
     def __post_init__(self) -> None:
-        values = {"from_s": self.from_s, "torque_scale": self.torque_scale, "clock_off_s": self.clock_off_s}
-        limits = {"from_s": (0, 1e7), "torque_scale": (0, 10), "clock_off_s": (-1e6, 1e6)}
-        for name, (low, high) in limits.items():
-            if not low <= values[name] <= high:  # also false for NaN
-                raise ValueError(f"{name}: {values[name]!r} is not between {low:g} and {high:g}")
+        require_between(self, 0, 1e7, "from_s")
+        require_between(self, 0, 10, "torque_scale")
+        require_between(self, -1e6, 1e6, "clock_off_s")
         if not all(abs(off) <= 100 for off in self.antenna_off_m):
             raise ValueError(f"antenna_off_m: {self.antenna_off_m!r} is more than 100 m away")
 

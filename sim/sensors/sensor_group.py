@@ -11,7 +11,7 @@ import numpy as np
 from protocol.arrays import Bools, Floats, Ints
 from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import KINDS, Reading, columns
-from sim.sensors.datasheets import BASE_RATE_HZ
+from sim.sensors.presets import BASE_RATE_HZ
 from sim.sensors.rigs import Rig
 from sim.state import STEP_S, FleetState
 

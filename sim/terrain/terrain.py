@@ -1,14 +1,26 @@
-"""The ground: height on a grid of nodes, bilinear in between, and the soil's zone on a grid of cells."""
+"""The ground: height on a grid of nodes, bilinear in between, and the soil's zone on a grid of cells (numba)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from protocol.arrays import Floats, Ints
-from sim.terrain import lookup
+
+_compiled = numba.njit(cache=True, inline="always", error_model="numpy")
+
+
+class TerrainGrid(NamedTuple):
+    """Arrays of a `Terrain`, for compiled functions."""
+
+    heights_m: Floats
+    cell_m: float
+    zones: Ints
+    zone_cell_m: float
 
 
 @dataclass(frozen=True)
@@ -25,14 +37,14 @@ class Terrain:
     zone_cell_m: float
 
     @cached_property
-    def grid(self) -> lookup.TerrainGrid:
-        """The same as a tuple of arrays, for kernels."""
+    def grid(self) -> TerrainGrid:
+        """The same as a tuple of arrays."""
         heights, zones = np.ascontiguousarray(self.heights_m, float), np.ascontiguousarray(self.zones, np.int64)
-        return lookup.TerrainGrid(heights, float(self.cell_m), zones, float(self.zone_cell_m))
+        return TerrainGrid(heights, float(self.cell_m), zones, float(self.zone_cell_m))
 
     def surface(self, x_m: Floats, y_m: Floats) -> Floats:
         """Height [m], bilinear, and its gradient to the east and north [m/m], as (3, ...)."""
-        values: Floats = lookup.surfaces(self.grid, x_m.ravel(), y_m.ravel())
+        values: Floats = _surfaces(self.grid, x_m.ravel(), y_m.ravel())
         return values.reshape(3, *x_m.shape)
 
     def height(self, x_m: Floats, y_m: Floats) -> Floats:
@@ -47,5 +59,46 @@ class Terrain:
 
     def zone(self, x_m: Floats, y_m: Floats) -> Ints:
         """Index into `soil.SOILS`."""
-        indices: Ints = lookup.zones(self.grid, x_m.ravel(), y_m.ravel())
+        indices: Ints = _zones(self.grid, x_m.ravel(), y_m.ravel())
         return indices.reshape(x_m.shape)
+
+
+@_compiled
+def surface(grid: TerrainGrid, x: float, y: float) -> tuple[float, float, float]:
+    """Height, bilinear between the nodes, and its slopes to the east and north; beyond the edges, the edge goes on."""
+    heights, cell = grid.heights_m, grid.cell_m
+    rows, columns = heights.shape
+    u, v = x / cell, y / cell
+    i, j = min(max(int(u), 0), columns - 2), min(max(int(v), 0), rows - 2)
+    a, b = min(max(u - i, 0.0), 1.0), min(max(v - j, 0.0), 1.0)
+    h00, h10, h01, h11 = heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1]
+    south, north = h00 + a * (h10 - h00), h01 + a * (h11 - h01)
+    east = (h10 - h00) * (1 - b) + (h11 - h01) * b
+    return south + b * (north - south), east / cell, (north - south) / cell
+
+
+@_compiled
+def zone(grid: TerrainGrid, x: float, y: float) -> int:
+    """Zone of the cell; beyond the edges, the edge goes on."""
+    rows, columns = grid.zones.shape
+    row, column = int(y / grid.zone_cell_m), int(x / grid.zone_cell_m)
+    index: int = grid.zones[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)]
+    return index
+
+
+@_compiled
+def _surfaces(grid: TerrainGrid, x: Floats, y: Floats) -> Floats:
+    """`surface` of places (k,), as (3, k)."""
+    values = np.empty((3, x.size))
+    for i in range(x.size):
+        values[0, i], values[1, i], values[2, i] = surface(grid, x[i], y[i])
+    return values
+
+
+@_compiled
+def _zones(grid: TerrainGrid, x: Floats, y: Floats) -> Ints:
+    """`zone` of places (k,)."""
+    indices = np.empty(x.size, np.int64)
+    for i in range(x.size):
+        indices[i] = zone(grid, x[i], y[i])
+    return indices

@@ -16,8 +16,7 @@ from sim.state import STEP_S, FleetState
 from sim.terrain.soil import TRACTION
 from sim.terrain.terrain import Terrain
 from sim.worlds.bullet_client import MultiBodies
-from sim.worlds.bullet_scene import POINT_FRAME, WheelGround, scene_at
-from sim.worlds.bullet_state import DriveTrain, Weights, state_from_scenes
+from sim.worlds.bullet_scene import POINT_FRAME, DriveTrain, Weights, WheelGround, scene_at, state_from_scenes
 from sim.worlds.tyre import TyreForces, Tyres, WheelMotion, at_rest, radial_load, turn_wheels
 
 
@@ -33,8 +32,7 @@ class Actuators:
 class BulletWorld:
     """n machines on one terrain, moved by PyBullet at 100 Hz.
 
-    bodies: true mass, empty [kg], and true wheel radius [m]. starts: x, y [m] and yaw [rad] of each `base_link`,
-    (n, 3). The machines stand straight, empty and settled on their tyres.
+    starts: x, y [m] and yaw [rad] of each `base_link`, (n, 3), where the machines settle on their tyres.
     """
 
     def __init__(self, terrain: Terrain, models: Sequence[MachineModel], bodies: Bodies, starts: Floats) -> None:
@@ -45,7 +43,14 @@ class BulletWorld:
         for machine in range(len(models)):
             self.set_payload(machine, 0.0)
 
-        self._tyres, self._free_radius_m = _tyres(models, bodies), _free_radius_m(models, bodies)
+        chassis = self._chassis
+        of_wheels = [bodies.wheel_radius_m, chassis.tyre_stiffness_npm, chassis.tyre_damping_nspm]
+        of_wheels += [chassis.relaxation_m, chassis.wheel_inertia_kgm2]
+        self._tyres = Tyres(*(np.repeat(values[:, None], 4, axis=1) for values in of_wheels))
+        # Unloaded tyres are so large that the nominal machine stands level when empty, hubs at their radius.
+        sunk_m = 0.5 * np.array([m.mass_kg for m in models]) * GRAVITY_MPS2 / chassis.tyre_stiffness_npm
+        share = np.stack([chassis.front_share] * 2 + [1 - chassis.front_share] * 2, axis=-1)
+        self._free_radius_m = bodies.wheel_radius_m[:, None] + share * sunk_m[:, None]
         self._arms_m = _points(models) - self._multi.centres_m[:, POINT_FRAME]
         self._rolling = at_rest((len(models), 4))
         self._scene = scene_at(terrain, self._multi.read(), self._arms_m)
@@ -54,17 +59,12 @@ class BulletWorld:
         zero, hold = np.zeros(len(models)), np.array([m.max_brake_n for m in models])
         wheels = np.zeros((len(models), 2))
         self._actuators = Actuators(zero, zero, zero)
-        self._state = state_from_scenes(
+        self.state = state_from_scenes(
             self._scene, self._scene, self._wheel_load_n, self._weights, DriveTrain(zero, zero, wheels, wheels)
         )
         for _ in range(SETTLE_STEPS):
             self.advance(zero, zero, hold)
-        self._state = replace(self._state, wheel_rad=wheels)
-
-    @property
-    def state(self) -> FleetState:
-        """The state after the last step."""
-        return self._state
+        self.state = replace(self.state, wheel_rad=wheels)
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
         """Change what one machine carries."""
@@ -97,17 +97,17 @@ class BulletWorld:
         self._scene = scene_at(self._terrain, self._multi.read(), self._arms_m, ground.point_m)
         self._wheel_load_n = self._loads(self._scene.ground)
         rear = self._rolling.spin_radps[:, 2:]
-        turned = self._state.wheel_rad + STEP_S * rear
+        turned = self.state.wheel_rad + STEP_S * rear
         drive = DriveTrain(self._actuators.drive_n, forces.torque_nm.sum(axis=-1), rear, turned)
-        self._state = state_from_scenes(before, self._scene, self._wheel_load_n, self._weights, drive)
-        return self._state
+        self.state = state_from_scenes(before, self._scene, self._wheel_load_n, self._weights, drive)
+        return self.state
 
     def _follow_commands(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> Actuators:
         """Hydraulics and engine follow with their lags."""
         old = self._actuators
-        steering = steering_radps(self._chassis, steer_rad, self._state.articulation_rad, old.steering_radps)
+        steering = steering_radps(self._chassis, steer_rad, self.state.articulation_rad, old.steering_radps)
         least = TRACTION[self._scene.ground.zone].min(axis=-1)
-        grip = TRACTION_USE * least * self._state.load_n
+        grip = TRACTION_USE * least * self.state.load_n
         return Actuators(steering, drive_force_n(self._chassis, drive_n, old.drive_n, grip), brake_n)
 
     def _loads(self, ground: WheelGround) -> Floats:
@@ -137,31 +137,5 @@ def _standing(terrain: Terrain, models: Sequence[MachineModel], starts: Floats) 
 
 def _points(models: Sequence[MachineModel]) -> Floats:
     """The points of `bullet_scene.POINT_FRAME` in the links of their frames, (n, 5, 3)."""
-    rows = []
-    for model in models:
-        robot = model.robot
-        carriers = [robot.joints[wheel].parent for wheel in WHEELS]
-        hubs = [robot.place(wheel, carrier).xyz_m for wheel, carrier in zip(WHEELS, carriers, strict=True)]
-        rows.append([*hubs, np.zeros(3)])
-    return np.array(rows)
-
-
-def _tyres(models: Sequence[MachineModel], bodies: Bodies) -> Tyres:
-    def of_wheels(values: Sequence[float]) -> Floats:
-        return np.repeat(np.array(values)[:, None], 4, axis=1)
-
-    return Tyres(
-        radius_m=of_wheels(bodies.wheel_radius_m.tolist()),
-        stiffness_npm=of_wheels([m.tyre_stiffness_npm for m in models]),
-        damping_nspm=of_wheels([m.tyre_damping_nspm for m in models]),
-        relaxation_m=of_wheels([m.relaxation_m for m in models]),
-        inertia_kgm2=of_wheels([m.wheel_inertia_kgm2 for m in models]),
-    )
-
-
-def _free_radius_m(models: Sequence[MachineModel], bodies: Bodies) -> Floats:
-    """Radius of unloaded tyres (n, 4), so that the nominal machine stands level when empty, hubs at their radius."""
-    share = np.array([[m.front_share()] * 2 + [1 - m.front_share()] * 2 for m in models])
-    sunk_m = np.array([0.5 * m.mass_kg * GRAVITY_MPS2 / m.tyre_stiffness_npm for m in models])
-    free: Floats = bodies.wheel_radius_m[:, None] + share * sunk_m[:, None]
-    return free
+    robots = [model.robot for model in models]
+    return np.array([[*(r.place(w, r.joints[w].parent).xyz_m for w in WHEELS), np.zeros(3)] for r in robots])

@@ -63,7 +63,9 @@ class MultiBodies:
         rows = zip(models, mass_factor.tolist(), base_pose.tolist(), strict=True)
         self._machines = [self._load(model, factor, pose) for model, factor, pose in rows]
         self._steer_nm = [model.steer_nm for model in models]
-        inertial = np.array([[self._inertial(m, link) for link in (-1, m.front, m.rear)] for m in self._machines])
+        machines, client = self._machines, self._client
+        links = [[pybullet.getDynamicsInfo(m.body, link, client) for link in (-1, m.front, m.rear)] for m in machines]
+        inertial = np.array([[[*info[3], *info[4]] for info in own] for own in links])
         self.centres_m = inertial[:, :, :3]  # of mass, in the links' own axes: (n, FRAMES, 3)
         self._link_from_inertial = np.swapaxes(rotations(inertial[:, :, 3:]), -1, -2)
 
@@ -100,25 +102,15 @@ class MultiBodies:
             apply(body, machine.front, force[1], point[1], map_frame, client)
             apply(body, machine.rear, force[2], point[2], map_frame, client)
             apply(body, machine.rear, force[3], point[3], map_frame, client)
-            pybullet.setJointMotorControl2(
-                body,
-                machine.articulation,
-                pybullet.VELOCITY_CONTROL,
-                targetVelocity=rate,
-                force=torque,
-                physicsClientId=client,
-            )
+            _turn_joint(client, body, machine.articulation, rate, torque)
         pybullet.stepSimulation(client)
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
         """Change what one machine carries."""
         m = self._machines[machine]
+        inertia = [payload_kg * i for i in m.payload_inertia_m2]
         pybullet.changeDynamics(
-            m.body,
-            m.payload,
-            mass=payload_kg,
-            localInertiaDiagonal=[payload_kg * i for i in m.payload_inertia_m2],
-            physicsClientId=self._client,
+            m.body, m.payload, mass=payload_kg, localInertiaDiagonal=inertia, physicsClientId=self._client
         )
 
     def _load(self, model: MachineModel, mass_factor: float, pose: list[float]) -> _Machine:
@@ -147,19 +139,12 @@ class MultiBodies:
             pybullet.changeDynamics(
                 body, link, linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=self._client
             )
-        pybullet.setJointMotorControl2(
-            body,
-            joints["oscillation"],
-            pybullet.VELOCITY_CONTROL,
-            targetVelocity=0,
-            force=OSCILLATION_NM,
-            physicsClientId=self._client,
-        )
+        _turn_joint(self._client, body, joints["oscillation"], 0.0, OSCILLATION_NM)
 
-    def _inertial(self, machine: _Machine, link: int) -> tuple[float, ...]:
-        info = pybullet.getDynamicsInfo(machine.body, link, self._client)
-        centre, orientation = info[3], info[4]
-        return (*centre, *orientation)
+
+def _turn_joint(client: int, body: int, joint: int, radps: float, most_nm: float) -> None:
+    velocity = pybullet.VELOCITY_CONTROL
+    pybullet.setJointMotorControl2(body, joint, velocity, targetVelocity=radps, force=most_nm, physicsClientId=client)
 
 
 def _rotation(squares: Floats) -> Floats:

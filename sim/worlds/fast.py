@@ -12,28 +12,31 @@ from dataclasses import fields
 
 import numpy as np
 
-from protocol.arrays import Floats, Table
+from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
-from sim.machines.chassis import (
-    SETTLE_STEPS,
-    STANDSTILL_MPS,
-    TRACTION_USE,
-    Bodies,
-    chassis_of,
-    drive_force_n,
-    steering_radps,
-    weigh,
-)
+from sim.machines import chassis
+from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
 from sim.state import STEP_S, FleetState
 from sim.terrain.soil import C_RR, SLIP_STIFFNESS, TRACTION
 from sim.terrain.terrain import Terrain
 from sim.worlds import fast_kernels as k
-from sim.worlds.fast_records import MACHINE, STATE
 
-_CONSTANTS = k.Constants(STEP_S, GRAVITY_MPS2, STANDSTILL_MPS, TRACTION_USE)
+_CONSTANTS = k.Constants(STEP_S, GRAVITY_MPS2, chassis.STANDSTILL_MPS, chassis.TRACTION_USE)
 _SOILS = np.array([C_RR, TRACTION, SLIP_STIFFNESS])
-_IN_BOTH = [field.name for field in fields(FleetState) if field.name in (STATE.names or ())]
+
+# One machine in the state array (n,): what `FleetState` explains, and what the next step needs beside it.
+# grip: the most drive force. crab: how far a machine moves off its heading to the left, because tyres push sideways
+# only while they slip sideways. ride: how high the body's centre is. *_aim: where ride, pitch and roll would settle.
+_IN_BOTH = [field.name for field in fields(FleetState) if field.name not in ("mass_kg", "payload_kg")]
+_BESIDE = ("grip_n", "crab_rad", "ride_m", "ride_mps", "ride_aim_m", "pitch_aim_rad", "roll_aim_rad")
+_AXES = {"rates_radps": 3, "rates_dot_radps2": 3, "force_mps2": 3, "wheel_radps": 2, "wheel_rad": 2}
+STATE = np.dtype([(name, "f8", _AXES.get(name, ())) for name in (*_IN_BOTH, *_BESIDE)])
+
+# One machine's parameters, as `chassis.Chassis` and `chassis.Weight` explain them.
+_OF_TYRES = ("tyre_stiffness_npm", "tyre_damping_nspm", "wheel_radius_m", "wheel_inertia_kgm2")
+_FIGURES = ("rear_to_joint_m", "front_to_joint_m", "half_track_m", *_OF_TYRES, *chassis.Weight._fields)
+MACHINE = np.dtype([("rolls_with_front", "?"), *((name, "f8") for name in _FIGURES)])
 
 
 class FastWorld:
@@ -41,29 +44,25 @@ class FastWorld:
 
     def __init__(self, terrain: Terrain, models: Sequence[MachineModel], bodies: Bodies, starts: Floats) -> None:
         n = len(models)
-        self._terrain, self._bodies, self._chassis = terrain, bodies, chassis_of(models)
+        self._terrain, self._bodies, self._chassis = terrain, bodies, chassis.chassis_of(models)
         self._payload_kg = np.zeros(n)
         self._weigh()
         self._rows = np.zeros(n, STATE)
         self._rows["x_m"], self._rows["y_m"], self._rows["yaw_rad"] = starts.T
         k.settle(self._machines, terrain.grid, self._rows)
-        for _ in range(SETTLE_STEPS):
+        for _ in range(chassis.SETTLE_STEPS):
             self.advance(np.zeros(n), np.zeros(n), np.full(n, np.inf))
-
-    @property
-    def state(self) -> FleetState:
-        """The state after the last step."""
-        return self._state
 
     def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
         """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
-        rows, chassis = self._rows, self._chassis
-        steering = steering_radps(chassis, steer_rad, rows["articulation_rad"], rows["articulation_radps"])
-        drive = drive_force_n(chassis, drive_n, rows["drive_n"], rows["grip_n"])
+        rows, own = self._rows, self._chassis
+        steering = chassis.steering_radps(own, steer_rad, rows["articulation_rad"], rows["articulation_radps"])
+        drive = chassis.drive_force_n(own, drive_n, rows["drive_n"], rows["grip_n"])
         brake, machines, ground = np.ascontiguousarray(brake_n, float), self._machines, self._terrain.grid
         self._rows = k.advance(_CONSTANTS, _SOILS, machines, ground, rows, steering, drive, brake)
-        self._state = _state(self._rows, self._weight.mass_kg, self._payload_kg)
-        return self._state
+        in_both = {name: self._rows[name] for name in _IN_BOTH}
+        self.state = FleetState(mass_kg=self._weight.mass_kg, payload_kg=self._payload_kg, **in_both)
+        return self.state
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
         """Change what one machine carries."""
@@ -80,13 +79,8 @@ class FastWorld:
         """Nothing to free."""
 
     def _weigh(self) -> None:
-        chassis, bodies = self._chassis, self._bodies
-        self._weight = weigh(chassis, bodies, self._payload_kg)
-        values = chassis._asdict() | self._weight._asdict() | {"wheel_radius_m": bodies.wheel_radius_m}
-        self._machines = np.empty(len(bodies.mass_kg), MACHINE)
+        self._weight = chassis.weigh(self._chassis, self._bodies, self._payload_kg)
+        values = vars(self._bodies) | self._chassis._asdict() | self._weight._asdict()
+        self._machines = np.empty(len(self._payload_kg), MACHINE)
         for name in MACHINE.names or ():
             self._machines[name] = values[name]
-
-
-def _state(rows: Table, mass_kg: Floats, payload_kg: Floats) -> FleetState:
-    return FleetState(mass_kg=mass_kg, payload_kg=payload_kg, **{name: rows[name] for name in _IN_BOTH})

@@ -1,22 +1,22 @@
 """One step of the fast world's machines, compiled by numba.
 
 It is one module because numba's cache notices changes in the file of the function that is called, and in no other; for
-the same reason constants of other files are passed in. After a change in `terrain/lookup.py`, touch this file.
+the same reason constants of other files are passed in. After a change in `terrain/terrain.py`, touch this file.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
 from protocol.arrays import Floats, Table
-from sim.terrain.lookup import TerrainGrid, surface, zone
-from sim.worlds.fast_records import Record
+from sim.terrain.terrain import TerrainGrid, surface, zone
 
 _compiled = numba.njit(cache=True, inline="always", error_model="numpy")
+Record = Any  # one of `fast.STATE` or `fast.MACHINE`: numba reads and writes its fields as attributes
 
 
 class Constants(NamedTuple):

@@ -10,12 +10,12 @@ from sim.terrain.terrain import Terrain
 
 
 class World(Protocol):
-    """Moves all machines of a site, under the commands of their drivers; they start straight, empty and at rest."""
+    """Moves all machines of a site, under the commands of their drivers; they start straight, empty and at rest.
 
-    @property
-    def state(self) -> FleetState:
-        """The state after the last step."""
-        ...
+    state: after the last step.
+    """
+
+    state: FleetState
 
     def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
         """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""

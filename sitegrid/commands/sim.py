@@ -62,7 +62,7 @@ def run(arguments: Namespace) -> int:
     stop = stop_flag(None if arguments.record else END_S)  # a recording is written at its end, whole
     config = _config(arguments)
     if arguments.write_configs:
-        from sim.agent_files import write_configs
+        from sim.config import write_configs
 
         write_configs(config, arguments.write_configs)
     if arguments.picture:

@@ -10,8 +10,7 @@ from pathlib import Path
 from protocol.errors import ConfigError
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.wire.session import free_endpoint
-from sim.agent_files import write_configs
-from sim.config import SimConfig, resolve
+from sim.config import SimConfig, resolve, write_configs
 from sim.scenario.tables import Scenario
 
 DEFAULT_MANIFEST = Path("evaluation/logs/rl_test1_husky/log.toml")

@@ -8,8 +8,7 @@ from pathlib import Path
 from evaluation.audit import AuditResult, audit_store
 from mapserver.config import ServerConfig
 from protocol.site.site_file import load_site
-from sim.agent_files import write_configs
-from sim.config import SimConfig, resolve
+from sim.config import SimConfig, resolve, write_configs
 from sitegrid import Client, connect
 from sitegrid.process.children import Child, Children, wait_until
 

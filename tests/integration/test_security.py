@@ -26,8 +26,7 @@ from protocol.wire.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, 
 from protocol.wire.credentials import SIGNING_FILE, Credentials, Identity, load_credentials
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from sim.agent_files import write_configs
-from sim.config import SimConfig
+from sim.config import SimConfig, write_configs
 from sitegrid import connect
 from sitegrid.cli import main
 from sitegrid.process.children import Child, Children, wait_until

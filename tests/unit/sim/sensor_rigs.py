@@ -10,8 +10,7 @@ import pytest
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.units import GRAVITY_MPS2
 from sim.machines.model import load_model
-from sim.sensors.datasheets import GpsNoise
-from sim.sensors.presets import Preset, load_preset
+from sim.sensors.presets import GpsNoise, Preset, load_preset
 from sim.sensors.rigs import Faults, Rig, machine_config
 from sim.sensors.sensor_group import GroupReadings
 from sim.sensors.sensors import Sensors
@@ -32,7 +31,7 @@ def perfect() -> Preset:
 
 def _quiet(noise: object) -> object:
     assert is_dataclass(noise)
-    names = [f.name for f in fields(noise) if f.type == "float" and not f.name.endswith(KEPT)]
+    names = [f.name for f in fields(noise) if isinstance(getattr(noise, f.name), float) and not f.name.endswith(KEPT)]
     zeros = replace(noise, **dict.fromkeys(names, 0.0))
     return replace(zeros, scale=1.0) if isinstance(noise, GpsNoise) else zeros
 

@@ -9,8 +9,7 @@ import pytest
 from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.machine.machine_config import BASE, FRONT
-from sim.sensors.datasheets import EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise
-from sim.sensors.presets import LIBRARY, load_preset, parse_preset
+from sim.sensors.presets import LIBRARY, EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise, load_preset, parse_preset
 from sim.sensors.rigs import Rig, draw_bodies, machine_config
 from sim.sensors.sensors import _GROUPS
 from tests.unit.sim.sensor_rigs import DGPS, LOADER, noisy, perfect, rig
