@@ -84,6 +84,21 @@ def to_map(fixes: np.ndarray) -> np.ndarray:
     return np.stack([x.reshape(lat.shape), y.reshape(lat.shape), height - 110.0], axis=-1)
 
 
+def errors(preset: Preset, kind: str, seconds: float, n: int, **states: object) -> np.ndarray:
+    """Errors (r, n, columns) of level machines; of fixes [m], of attitudes as roll, pitch and heading [rad]."""
+    truth = {"payload_kg": 4000.0, "torque_nm": 1e4, "yaw_rad": 0.0, **states}
+    one = rig(preset, attitude=(3,), payload=True, only=kind)
+    seen = values(one, kind, seconds, n, **truth)
+    if kind == "gps":
+        return to_map(seen) - [0.8, 0.0, 3.35]
+    if kind == "attitude":
+        x, y, z, w, *_ = np.moveaxis(seen, -1, 0)
+        roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return np.stack([roll, np.arcsin(2 * (w * y - z * x)), heading], axis=-1)
+    return seen - {"imu": [0, 0, 0, 0, 0, GRAVITY_MPS2], "torque": 1e4, "payload": 4000.0}.get(kind, 0.0)
+
+
 def check_deviation(errors: np.ndarray, std: float, draws: int) -> None:
     """Errors have this standard deviation about 0. draws: how many are independent; five standard errors may be."""
     assert math.sqrt((errors**2).mean()) == pytest.approx(std, rel=5 / math.sqrt(2 * draws)), f"seed {SEED}"

@@ -67,28 +67,15 @@ def test_option_that_does_not_fit_the_scenario_is_refused(options: dict, problem
 
 
 def test_options_go_over_the_scenario() -> None:
-    scenario = resolve(
-        SimConfig(
-            site="pit",
-            world="fast",
-            machines=2,
-            names=("red", "blue"),
-            seed=9,
-            seconds=5.0,
-            preset="rtk",
-            drive_mps=2.0,
-            gps=(3,),
-            imu=(1, 4),
-            attitude=(4,),
-            payload=True,
-        )
-    )
+    run = {"site": "pit", "world": "fast", "machines": 2, "names": ("red", "blue"), "seed": 9, "seconds": 5.0}
+    sensors = {"preset": "rtk", "gps": (3,), "imu": (1, 4), "attitude": (4,), "payload": True}
+    scenario = resolve(SimConfig(drive_mps=2.0, **run, **sensors))
     assert (scenario.site.name, scenario.world, scenario.seed, scenario.seconds) == ("pit", "fast", 9, 5.0)
     assert scenario.machine_names == ("red", "blue")
     assert {rig.preset.name for rig in scenario.rigs()} == {"rtk"}
     assert {speed for _, speed, _ in scenario.journeys()} == {2.0}
-    sensors = {s.name for s in scenario.rigs()[0].machine.sensors}
-    assert sensors == {"gps-3", "imu-1", "imu-4", "attitude-4", "torque", "wheels", "articulation", "payload"}
+    names = {s.name for s in scenario.rigs()[0].machine.sensors}
+    assert names == {"gps-3", "imu-1", "imu-4", "attitude-4", "torque", "wheels", "articulation", "payload"}
 
 
 def test_without_options_everything_is_as_the_scenario_says() -> None:

@@ -7,9 +7,7 @@ from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig
 from sim.machines.model import BASE, FOLDER, FRONT, PAYLOAD, WHEELS, MachineModel, load_model
 from sim.machines.urdf import Mass, Transform, combined, read_urdf, rigid_urdf
-from tests.unit.sim.planes import LOADER, TRUCK
-
-BOTH = pytest.mark.parametrize("model", [LOADER, TRUCK], ids=lambda m: m.name)
+from tests.unit.sim.planes import BOTH, LOADER, TRUCK
 
 
 @BOTH

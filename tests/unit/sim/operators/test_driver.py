@@ -1,18 +1,51 @@
 import itertools
 import math
-from dataclasses import fields
+from contextlib import closing
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
 from sim.operators.driver import bend
 from sim.scenario.ground import build_terrain
-from sim.state import FleetState
-from tests.unit.sim.drives import Driven, drive
+from sim.scenario.tables import Scenario
+from sim.simulator import Simulator
+from sim.state import FleetState, stack
+
+EVERY = 10  # steps between two states that are kept
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What happened: states (k, n, ...), payloads (k, n), and how far from its route each joint was (k, n) [m]."""
+
+    scenario: Scenario
+    states: FleetState
+    payload_kg: Floats
+    off_m: Floats
+    joint_m: Floats
+
+
+def drive(config: SimConfig, seconds: float) -> Driven:
+    with closing(Simulator(config)) as simulator:
+        states, payloads, off, joints = [], [], [], []
+        lines = [np.vstack([leg.points for leg in route.legs]) for route, _, _ in simulator.scenario.journeys()]
+        for i in range(round(seconds * 100)):
+            state = simulator.step()
+            if i % EVERY:
+                continue
+            joint = simulator._crew.joint_m(state)
+            states.append(state)
+            payloads.append(simulator._drivers.payload_kg)
+            joints.append(joint)
+            if i % 50 == 0:
+                off.append([np.hypot(*(line - at).T).min() for line, at in zip(lines, joint, strict=True)])
+        return Driven(simulator.scenario, stack(states), np.array(payloads), np.array(off), np.array(joints))
 
 
 @cache
@@ -85,7 +118,8 @@ def test_drivers_keep_their_speed_and_slow_down_in_curves() -> None:
 
 
 @pytest.mark.slow
-def test_work_cycles_load_reverse_dump_and_wait(quarry: Driven) -> None:
+def test_work_cycles_load_reverse_dump_and_wait_on_their_routes(quarry: Driven) -> None:
+    assert quarry.off_m[4:].max() < 0.6
     speed, payload = quarry.states.speed_mps, quarry.payload_kg
     loader, truck = 4, 0
     assert speed[:, loader].min() < -1.0 < 2.0 < speed[:, loader].max()
@@ -105,7 +139,7 @@ def test_work_cycles_load_reverse_dump_and_wait(quarry: Driven) -> None:
 
 
 @pytest.mark.slow
-def test_loaders_at_work_get_round_in_each_others_company(loading: Driven) -> None:
+def test_loaders_at_work_get_round_over_all_soils_in_each_others_company(loading: Driven) -> None:
     speed, payload = loading.states.speed_mps, loading.payload_kg
     assert ((np.diff((payload > 2000).astype(int), axis=0) == 1).sum(axis=0) >= 2).all()  # two cycles, each of them
     assert (payload.min(axis=0) == 0).all()
@@ -117,10 +151,6 @@ def test_loaders_at_work_get_round_in_each_others_company(loading: Driven) -> No
         assert (backwards & ramp[:, machine]).sum() > 50
         assert (backwards & (payload[:, machine] > 2000)).sum() > 50
         assert (backwards & ~ramp[:, machine]).sum() > 50
-
-
-@pytest.mark.slow
-def test_loaders_at_work_cover_all_soils_and_keep_to_their_routes(loading: Driven) -> None:
     x, y, metres = loading.states.x_m, loading.states.y_m, abs(loading.states.speed_mps) * 0.1
     zones = build_terrain(loading.scenario.ground, 1).zone(x, y)
     assert np.bincount(zones.ravel(), metres.ravel(), minlength=5).min() > 150
@@ -139,11 +169,6 @@ def test_each_of_the_loaders_routes_can_be_driven_alone(tmp_path: Path) -> None:
     starts = alone.joint_m[:50].mean(axis=0)
     back = np.hypot(*(alone.joint_m[1400:] - starts).transpose(2, 0, 1)) < 3.0
     assert back.any(axis=0).all()  # they have come round
-
-
-@pytest.mark.slow
-def test_reversing_machines_keep_to_their_route(quarry: Driven) -> None:
-    assert quarry.off_m[4:].max() < 0.6
 
 
 @pytest.mark.slow

@@ -41,25 +41,25 @@ def test_the_plan_names_routes_machines_and_slope(monkeypatch) -> None:
     assert all((image == colour).all(axis=-1).any() for colour in pale)
 
 
-def test_the_plan_tells_what_happens_at_the_stops(monkeypatch) -> None:
-    _, written = plan(monkeypatch, "haul_road")
-    assert {"loads 22 t in 30 s", "dumps 22 t in 15 s", "loads 4.5 t in 6 s", "dumps 4.5 t in 4 s"} <= set(written)
-    assert {"9 deg uphill", "5 deg uphill"} <= set(written)
-
-
-def test_the_plan_tells_what_will_change(monkeypatch) -> None:
-    _, written = plan(monkeypatch, "repaved")
-    assert {"after 150 s: dry concrete", "after 200 s: wet dirt"} <= set(written)
-
-
 def test_many_machines_are_dots_without_names(monkeypatch) -> None:
     _, written = plan(monkeypatch, "busy_site")
     assert sorted(written) == sorted(["west", "east", "middle", "15 deg uphill"])
 
 
-def test_a_faulty_machine_is_called_so(monkeypatch) -> None:
-    _, written = plan(monkeypatch, "bad_machine")
-    assert "loader-2, faulty" in written
+HAUL = {"loads 22 t in 30 s", "dumps 22 t in 15 s", "loads 4.5 t in 6 s", "dumps 4.5 t in 4 s"}
+CHANGES = {"after 150 s: dry concrete", "after 200 s: wet dirt"}
+
+
+@pytest.mark.parametrize(
+    ("scenario", "labels"),
+    [
+        ("haul_road", HAUL | {"9 deg uphill", "5 deg uphill"}),
+        ("repaved", CHANGES),
+        ("bad_machine", {"loader-2, faulty"}),
+    ],
+)
+def test_the_plan_tells_of_stops_changes_and_faults(monkeypatch, scenario: str, labels: set[str]) -> None:
+    assert labels <= set(plan(monkeypatch, scenario)[1])
 
 
 def test_a_change_of_direction_is_no_stop() -> None:

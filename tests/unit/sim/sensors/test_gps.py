@@ -11,8 +11,8 @@ from tests.unit.sim.sensor_rigs import (
     DGPS,
     PROJECTION,
     SEED,
-    check_correlation,
     check_deviation,
+    errors,
     groups,
     noisy,
     perfect,
@@ -23,34 +23,13 @@ from tests.unit.sim.sensor_rigs import (
 )
 
 N = 1000  # machines, hence independent draws
-RATES = pytest.mark.parametrize("rate_hz", [5, 10])
-
-
-def errors(preset: Preset, seconds: float, n: int = N) -> np.ndarray:
-    return to_map(values(rig(preset, only="gps"), "gps", seconds, n)) - [0.8, 0.0, 3.35]
-
-
-@RATES
-def test_drift_has_its_deviation_and_correlation_time(rate_hz: int) -> None:
-    drift = errors(noisy("gps", rate_hz=rate_hz, drift_std_m=1.2, drift_time_s=2.0), 6)
-    for axis, std in enumerate((1.2, 1.2, 2.0)):
-        check_deviation(drift[..., axis], std, N)
-        check_correlation(drift[..., axis], 2 * rate_hz, math.exp(-1), N)
-
-
-@RATES
-def test_white_noise_is_white(rate_hz: int) -> None:
-    drift = errors(noisy("gps", rate_hz=rate_hz, white_std_m=0.7), 2)
-    for axis, std in enumerate((0.7, 0.7, 0.7 * 5 / 3)):
-        check_deviation(drift[..., axis], std, drift[..., axis].size)
-        check_correlation(drift[..., axis], 1, 0.0, drift[..., axis].size)
 
 
 def test_receivers_state_the_variance_of_their_errors() -> None:
     preset = replace(DGPS, gps=replace(DGPS.gps, scale=1.5, outage_s=0.0))
     stated = values(rig(preset, only="gps"), "gps", 0.2)[0, 0, 3:]
     assert stated == pytest.approx([1.5**2 * (1.2**2 + 0.7**2) * k for k in (1, 1, (5 / 3) ** 2)])
-    drift = errors(preset, 0.2, 4 * N)
+    drift = errors(preset, "gps", 0.2, 4 * N)
     for axis in range(3):
         check_deviation(drift[..., axis], math.sqrt(stated[axis]), 4 * N)
 
@@ -90,7 +69,7 @@ def test_fully_shared_drift_is_one_whatever_the_rates_and_the_other_machines() -
     assert abs(mixed[2] - mixed[0]).max() > 0.1
 
 
-@RATES
+@pytest.mark.parametrize("rate_hz", [5, 10])
 @pytest.mark.parametrize(("outage_s", "period_s"), [(1.0, 10.0), (3.0, 6.0), (0.0, 10.0)])
 def test_receivers_are_silent_as_often_as_the_preset_says(rate_hz: int, outage_s: float, period_s: float) -> None:
     preset = noisy("gps", rate_hz=rate_hz, outage_s=outage_s, outage_period_s=period_s)

@@ -5,15 +5,14 @@ import numpy as np
 import pytest
 
 from protocol.machine.machine_config import BASE, FRONT, Mount
-from sim.sensors.presets import Preset
 from sim.state import FleetState
 from tests.unit.sim.sensor_rigs import (
     DGPS,
     GRAVITY_MPS2,
     LOADER,
     SEED,
-    check_correlation,
     check_deviation,
+    errors,
     groups,
     noisy,
     perfect,
@@ -23,45 +22,14 @@ from tests.unit.sim.sensor_rigs import (
 )
 
 N = 500
-AT_REST = np.array([0, 0, 0, 0, 0, GRAVITY_MPS2])
-IMU_RATES = pytest.mark.parametrize("rate_hz", [100, 50])
-ATTITUDE_RATES = pytest.mark.parametrize("rate_hz", [50, 20])
-
-
-def imu_errors(preset: Preset, seconds: float, n: int = N, **states: object) -> np.ndarray:
-    return values(rig(preset, only="imu"), "imu", seconds, n, **states) - AT_REST
 
 
 # --- IMU -------------------------------------------------------------------------------------------------------------
 
 
-@IMU_RATES
-def test_imu_white_noise_is_white(rate_hz: int) -> None:
-    errors = imu_errors(noisy("imu", rate_hz=rate_hz, gyro_white_degps=0.1, force_white_mps2=0.08), 0.5)
-    for part, std in ((errors[..., :3], math.radians(0.1)), (errors[..., 3:], 0.08)):
-        check_deviation(part, std, part.size)
-        check_correlation(part, 1, 0.0, part.size)
-
-
-@IMU_RATES
-def test_imu_drift_has_its_deviation_and_correlation_time(rate_hz: int) -> None:
-    preset = noisy("imu", rate_hz=rate_hz, gyro_drift_degps=0.02, force_drift_mps2=0.01, drift_time_s=0.5)
-    errors = imu_errors(preset, 1.5)
-    for part, std in ((errors[..., :3], math.radians(0.02)), (errors[..., 3:], 0.01)):
-        check_deviation(part, std, 3 * N)
-        check_correlation(part, rate_hz // 2, math.exp(-1), 3 * N)
-
-
-def test_imu_zeros_are_drawn_once() -> None:
-    errors = imu_errors(noisy("imu", gyro_turn_on_degps=0.05, force_turn_on_mps2=0.03), 0.05, 2 * N)
-    np.testing.assert_allclose(errors, np.broadcast_to(errors[0], errors.shape))
-    check_deviation(errors[0, :, :3], math.radians(0.05), 6 * N)
-    check_deviation(errors[0, :, 3:], 0.03, 6 * N)
-
-
 def test_imu_scale_and_mounting_errors() -> None:
-    check_deviation(imu_errors(noisy("imu", scale=0.002), 0.01, 2 * N)[0, :, 5] / GRAVITY_MPS2, 0.002, 2 * N)
-    tilted = imu_errors(noisy("imu", mounting_deg=1.0), 0.01, 2 * N)[0, :, 3:] / GRAVITY_MPS2
+    check_deviation(errors(noisy("imu", scale=0.002), "imu", 0.01, 2 * N)[0, :, 5] / GRAVITY_MPS2, 0.002, 2 * N)
+    tilted = errors(noisy("imu", mounting_deg=1.0), "imu", 0.01, 2 * N)[0, :, 3:] / GRAVITY_MPS2
     check_deviation(tilted[:, :2], math.radians(1.0), 4 * N)
     np.testing.assert_allclose(np.hypot(tilted[:, 0], tilted[:, 1]) ** 2 + (1 + tilted[:, 2]) ** 2, 1.0)
 
@@ -69,9 +37,9 @@ def test_imu_scale_and_mounting_errors() -> None:
 @pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (0.25, 0.5), (-0.5, 1.0), (4.0, 1.0)])
 def test_imu_shakes_while_driving(speed: float, share: float) -> None:
     preset = noisy("imu", force_white_mps2=0.08, force_vibration_mps2=0.3, vibration_speed_mps=0.5)
-    errors = imu_errors(preset, 0.1, speed_mps=speed)
-    check_deviation(errors[..., 3:], math.hypot(0.08, 0.3 * share), errors[..., 3:].size)
-    np.testing.assert_allclose(errors[..., :3], 0.0, atol=1e-12)
+    seen = errors(preset, "imu", 0.1, N, speed_mps=speed)
+    check_deviation(seen[..., 3:], math.hypot(0.08, 0.3 * share), seen[..., 3:].size)
+    np.testing.assert_allclose(seen[..., :3], 0.0, atol=1e-12)
 
 
 def test_imu_reads_in_its_own_axes() -> None:
@@ -160,47 +128,13 @@ def test_attitude_turns_vectors_of_the_sensor_into_map(number: int) -> None:
     assert np.linalg.norm(q) == pytest.approx(1.0)
 
 
-def attitude_errors(preset: Preset, seconds: float, n: int = N) -> np.ndarray:
-    """Roll, pitch and heading (r, n, 3) of a level sensor that looks 1 rad north of east."""
-    x, y, z, w, *_ = np.moveaxis(
-        values(rig(preset, attitude=(3,), only="attitude"), "attitude", seconds, n, yaw_rad=1.0), -1, 0
-    )
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.stack([roll, np.arcsin(2 * (w * y - z * x)), heading - 1.0], axis=-1)
-
-
-@ATTITUDE_RATES
-def test_attitude_drift_has_its_deviation_and_correlation_time(rate_hz: int) -> None:
-    preset = noisy("attitude", rate_hz=rate_hz, tilt_drift_deg=0.4, heading_drift_deg=1.0, drift_time_s=0.5)
-    errors = attitude_errors(preset, 1.5)
-    for axis, std in enumerate((0.4, 0.4, 1.0)):
-        check_deviation(errors[..., axis], math.radians(std), N)
-        check_correlation(errors[..., axis], rate_hz // 2, math.exp(-1), N)
-
-
-@ATTITUDE_RATES
-def test_attitude_white_noise_is_white(rate_hz: int) -> None:
-    errors = attitude_errors(noisy("attitude", rate_hz=rate_hz, tilt_white_deg=0.1, heading_white_deg=0.3), 0.5)
-    for axis, std in enumerate((0.1, 0.1, 0.3)):
-        check_deviation(errors[..., axis], math.radians(std), errors[..., axis].size)
-        check_correlation(errors[..., axis], 1, 0.0, errors[..., axis].size)
-
-
-def test_attitude_heading_has_a_constant_offset() -> None:
-    errors = attitude_errors(noisy("attitude", heading_offset_deg=1.5), 0.1)
-    np.testing.assert_allclose(errors, np.broadcast_to(errors[0], errors.shape), atol=1e-12)
-    np.testing.assert_allclose(errors[..., :2], 0.0, atol=1e-12)
-    check_deviation(errors[0, :, 2], math.radians(1.5), N)
-
-
 def test_attitude_states_the_variances_of_its_errors() -> None:
     stated = values(rig(DGPS, attitude=(3,), only="attitude"), "attitude", 0.02)[0, 0, 4:]
     tilt = math.radians(1) ** 2 * (0.4**2 + 0.1**2)
     assert stated == pytest.approx([tilt, tilt, math.radians(1) ** 2 * (1.5**2 + 1.0**2 + 0.3**2)])
-    errors = attitude_errors(DGPS, 0.02, 4 * N)
+    seen = errors(DGPS, "attitude", 0.02, 4 * N)
     for axis in range(3):
-        check_deviation(errors[..., axis], math.sqrt(stated[axis]), 4 * N)
+        check_deviation(seen[..., axis], math.sqrt(stated[axis]), 4 * N)
 
 
 def test_no_reading_writes_into_the_states() -> None:

@@ -17,6 +17,7 @@ from tests.unit.sim.sensor_rigs import (
     WIDTHS,
     check_correlation,
     check_deviation,
+    errors,
     groups,
     noisy,
     perfect,
@@ -140,6 +141,72 @@ def test_groups_say_whose_readings_they_hold() -> None:
     assert readings == {(m, sensor.name) for m in range(3) for sensor in FULL.machine.sensors}
 
 
+# --- errors ----------------------------------------------------------------------------------------------------------
+
+# Kind and rates of sensors, errors that they are given, and the deviation of each column.
+WHITE = [
+    ("gps", (5, 10), {"white_std_m": 0.7}, (0.7, 0.7, 0.7 * 5 / 3)),
+    ("imu", (100, 50), {"gyro_white_degps": 0.1, "force_white_mps2": 0.08}, (*np.radians([0.1] * 3), *[0.08] * 3)),
+    ("attitude", (50, 20), {"tilt_white_deg": 0.1, "heading_white_deg": 0.3}, np.radians([0.1, 0.1, 0.3])),
+    ("torque", (50, 20), {"white_nm": 600.0}, (600.0,)),
+    ("articulation", (20, 50), {"white_deg": 0.2}, np.radians([0.2])),
+    ("payload", (1, 5), {"white_kg": 50.0}, (50.0,)),
+]
+SLOW = [
+    ("gps", (5, 10), {"drift_std_m": 1.2, "drift_time_s": 2.0}, (1.2, 1.2, 2.0)),
+    (
+        "imu",
+        (100, 50),
+        {"gyro_drift_degps": 0.2, "force_drift_mps2": 0.01, "drift_time_s": 0.5},
+        [*np.radians([0.2] * 3), *[0.01] * 3],
+    ),
+    (
+        "attitude",
+        (50, 20),
+        {"tilt_drift_deg": 0.4, "heading_drift_deg": 1.0, "drift_time_s": 0.5},
+        np.radians([0.4, 0.4, 1.0]),
+    ),
+    ("torque", (50, 20), {"correlated_nm": 300.0, "correlation_s": 0.5}, (300.0,)),
+]
+ONCE = [
+    ("imu", {"gyro_turn_on_degps": 0.05, "force_turn_on_mps2": 0.03}, (*np.radians([0.05] * 3), *[0.03] * 3)),
+    ("attitude", {"heading_offset_deg": 1.5}, np.radians([0, 0, 1.5])),
+    ("torque", {"scale": 0.03}, (300.0,)),
+    ("articulation", {"zero_deg": 0.3}, np.radians([0.3])),
+    ("payload", {"scale": 0.02}, (80.0,)),
+]
+
+
+@pytest.mark.parametrize(("kind", "rates_hz", "given", "stds"), WHITE)
+def test_white_noise_is_white(kind: str, rates_hz: tuple[int, int], given: dict, stds: Sequence[float]) -> None:
+    for rate_hz in rates_hz:
+        seen = errors(noisy(kind, rate_hz=rate_hz, **given), kind, 20 / rate_hz, N)
+        assert seen.shape == (20, N, len(stds))
+        for column, std in enumerate(stds):
+            check_deviation(seen[..., column], std, seen[..., column].size)
+            check_correlation(seen[..., column], 1, 0.0, seen[..., column].size)
+
+
+@pytest.mark.parametrize(("kind", "rates_hz", "given", "stds"), SLOW)
+def test_drift_has_its_deviation_and_time(
+    kind: str, rates_hz: tuple[int, int], given: dict, stds: Sequence[float]
+) -> None:
+    time_s = given.get("drift_time_s", 0.5)
+    for rate_hz in rates_hz:
+        seen = errors(noisy(kind, rate_hz=rate_hz, **given), kind, 3 * time_s, N)
+        for column, std in enumerate(stds):
+            check_deviation(seen[..., column], std, N)
+            check_correlation(seen[..., column], round(time_s * rate_hz), math.exp(-1), N)
+
+
+@pytest.mark.parametrize(("kind", "given", "stds"), ONCE)
+def test_zeros_and_scales_are_drawn_once(kind: str, given: dict, stds: Sequence[float]) -> None:
+    seen = errors(noisy(kind, rate_hz=10, **given), kind, 0.5, 2 * N)
+    np.testing.assert_allclose(seen, np.broadcast_to(seen[0], seen.shape), atol=1e-12)
+    for column, std in enumerate(stds):
+        check_deviation(seen[0, :, column], std, 2 * N)
+
+
 # --- drive train -----------------------------------------------------------------------------------------------------
 
 
@@ -149,54 +216,6 @@ def test_encoder_counts_whole_ticks_of_both_wheels() -> None:
     assert ticks.tolist() == [[0, 0], [50, 98], [100, 111], [-1, 0]]
     fine = groups([rig(noisy("encoder", ticks_per_rev=1000), only="encoder")], still(20, 1, wheel_rad=turns))
     assert fine["encoder"].values[:, 0].tolist() == [[0, 1], [500, 986], [1000, 1114], [-2, 0]]
-
-
-@pytest.mark.parametrize("rate_hz", [50, 20])
-def test_torque_noise_is_white_and_correlated(rate_hz: int) -> None:
-    preset = noisy("torque", rate_hz=rate_hz, white_nm=600.0, correlated_nm=300.0, correlation_s=0.5)
-    errors = values(rig(preset, only="torque"), "torque", 1.5, N)[..., 0]
-    check_deviation(errors, math.hypot(600, 300), N)
-    slow = 300**2 / (600**2 + 300**2)
-    check_correlation(errors, 1, slow * math.exp(-2 / rate_hz), N)
-    check_correlation(errors, rate_hz // 2, slow * math.exp(-1), N)
-    alone = values(
-        rig(noisy("torque", rate_hz=rate_hz, correlated_nm=300.0, correlation_s=0.5), only="torque"), "torque", 1.5, N
-    )
-    check_correlation(alone[..., 0], rate_hz // 2, math.exp(-1), N)
-
-
-def test_torque_has_a_scale_error() -> None:
-    scales = values(rig(noisy("torque", scale=0.03), only="torque"), "torque", 0.02, 2 * N, torque_nm=1e4)[0] / 1e4 - 1
-    check_deviation(scales, 0.03, 2 * N)
-
-
-@pytest.mark.parametrize("rate_hz", [20, 50])
-def test_articulation_has_white_noise_and_a_zero(rate_hz: int) -> None:
-    white = values(
-        rig(noisy("articulation", rate_hz=rate_hz, white_deg=0.2), only="articulation"), "articulation", 1.0, N
-    )
-    check_deviation(white, math.radians(0.2), white.size)
-    check_correlation(white, 1, 0.0, white.size)
-    preset = noisy("articulation", rate_hz=rate_hz, zero_deg=0.3)
-    zero = values(rig(preset, only="articulation"), "articulation", 0.2, 2 * N, articulation_rad=0.4) - 0.4
-    np.testing.assert_allclose(zero, np.broadcast_to(zero[0], zero.shape))
-    check_deviation(zero[0], math.radians(0.3), 2 * N)
-
-
-@pytest.mark.parametrize("rate_hz", [1, 5])
-def test_payload_has_white_noise(rate_hz: int) -> None:
-    one = rig(noisy("payload", rate_hz=rate_hz, white_kg=50.0), only="payload", payload=True)
-    white = values(one, "payload", 4.0, N, payload_kg=4000.0) - 4000.0
-    assert len(white) == 4 * rate_hz
-    check_deviation(white, 50.0, white.size)
-    check_correlation(white, 1, 0.0, white.size)
-
-
-def test_payload_has_a_scale_error_drawn_once() -> None:
-    one = rig(noisy("payload", scale=0.02), only="payload", payload=True)
-    scales = values(one, "payload", 3.0, 2 * N, payload_kg=4000.0) / 4000.0 - 1
-    np.testing.assert_allclose(scales, np.broadcast_to(scales[0], scales.shape))
-    check_deviation(scales[0], 0.02, 2 * N)
 
 
 def test_payload_follows_what_is_carried_and_is_never_negative() -> None:

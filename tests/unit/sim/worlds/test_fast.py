@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from protocol.machine.machine_config import Mount
-from protocol.units import GRAVITY_MPS2
 from sim.machines.model import MachineModel
 from sim.state import STEP_S, FleetState, stack
-from sim.terrain.soil import C_RR, SAND, SLIP_STIFFNESS, TRACTION
+from sim.terrain.soil import C_RR
 from sim.terrain.terrain import Terrain
 from sim.worlds.fast import FastWorld
-from tests.unit.sim.planes import BOTH, GRADE_15, LOADER, TRUCK, Lane, hold_speed, idle, lanes, placed, plane
+from tests.unit.sim.planes import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, placed, plane
 
 
 def wheels(model: MachineModel, state: FleetState) -> np.ndarray:
@@ -38,15 +37,6 @@ def test_neither_axle_slips_sideways_while_the_joint_turns(model: MachineModel) 
             mean = moved[axle].mean(axis=0)
             turned_in_a_step = 0.005
             assert abs(mean @ [-math.sin(yaw[0]), math.cos(yaw[0])]) < turned_in_a_step * np.hypot(*mean) + 1e-3
-
-
-@pytest.mark.parametrize("steer", [0.2, -0.4, 0.6])
-def test_turning_is_that_of_equal_arms(steer: float) -> None:
-    with placed(FastWorld, plane(0), LOADER) as world:
-        last = hold_speed(world, 2.0, 14.0, steer)[-1]
-    rates, speed = last.rates_radps[0], last.speed_mps[0]
-    assert rates[2] == pytest.approx(speed * math.tan(steer / 2) / LOADER.rear_to_joint_m, rel=1e-5)
-    assert last.force_mps2[0, 1] == pytest.approx(speed * rates[2], rel=1e-3)
 
 
 @BOTH
@@ -98,25 +88,6 @@ def test_brakes_hold_without_any_creep_and_slide_beyond_the_grip() -> None:
         assert idle(world, 1.0, TRUCK.max_brake_n).speed_mps[0] < -0.5
 
 
-def test_inner_wheel_turns_more_slowly() -> None:
-    with placed(FastWorld, plane(0), LOADER) as world:
-        last = hold_speed(world, 2.0, 10.0, 0.4)[-1]
-    left, right = last.wheel_radps[0]
-    assert (right - left) * 0.75 == pytest.approx(2.2 * last.rates_radps[0, 2], rel=0.02)
-
-
-@pytest.mark.parametrize("grade", [0.15, -0.2])
-def test_wheels_slip_as_the_soil_table_says(grade: float) -> None:
-    zones, direction = [0, SAND, 0, SAND], np.array([1, 1, -1, -1])
-    with lanes(FastWorld, [Lane(zone=zone) for zone in zones], grade) as world:
-        last = hold_speed(world, 2.0 * direction, 10.0)[-1]
-    use = direction * last.torque_nm / LOADER.wheel_radius_m / last.load_n
-    slip = np.arctanh(use / TRACTION[zones]) * TRACTION[zones] / SLIP_STIFFNESS[zones]
-    for wheel in (last.wheel_radps * LOADER.wheel_radius_m).T:
-        measured = (wheel - last.speed_mps) / np.maximum(abs(wheel), abs(last.speed_mps)) * direction
-        np.testing.assert_allclose(measured, slip, rtol=1e-3)
-
-
 def test_machines_do_not_feel_each_other() -> None:
     together = [(500, 500, 0.3), (500, 520, 1.0)]
     steer, drive = np.array([0.2, -0.3]), np.array([40e3, 60e3])
@@ -127,11 +98,6 @@ def test_machines_do_not_feel_each_other() -> None:
             own = stack([alone.advance(steer[i : i + 1], drive[i : i + 1], np.zeros(1)) for _ in range(200)])
         np.testing.assert_array_equal(joint.x_m[:, i], own.x_m[:, 0])
         np.testing.assert_array_equal(joint.force_mps2[:, i], own.force_mps2[:, 0])
-
-
-def test_at_rest_the_specific_force_is_gravity() -> None:
-    with placed(FastWorld, plane(0, 0.2, 0.1), LOADER, starts=[(500, 500, 0.7)]) as world:
-        assert np.linalg.norm(world.state.force_mps2) == pytest.approx(GRAVITY_MPS2)
 
 
 def test_rates_are_those_of_the_turning_frame() -> None:

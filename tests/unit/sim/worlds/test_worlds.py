@@ -1,6 +1,5 @@
 """What holds in both worlds, the fast one and PyBullet's."""
 
-import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import fields
@@ -16,7 +15,6 @@ from sim.state import STEP_S, FleetState, stack
 from sim.terrain.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.fast import FastWorld
-from sim.worlds.world import World
 from tests.unit.sim.planes import (
     BOTH,
     EACH,
@@ -33,13 +31,6 @@ from tests.unit.sim.planes import (
 )
 
 MODELS = (LOADER, TRUCK)
-
-
-@EACH
-def test_worlds_offer_what_the_seam_asks_for(kind: type) -> None:
-    for name in ("advance", "set_payload", "set_terrain", "close"):
-        assert inspect.signature(getattr(kind, name)) == inspect.signature(getattr(World, name)), name
-    assert inspect.signature(kind) == inspect.signature(FastWorld)
 
 
 @EACH
@@ -100,6 +91,19 @@ def test_steady_traction_on_the_level_is_the_rolling_resistance(kind: type) -> N
     np.testing.assert_allclose(traction_of(soils, last), soil_of(soils), rtol=0.01)
     np.testing.assert_allclose(last.c_rr, soil_of(soils))
     np.testing.assert_allclose(last.load_n, load_of(soils), rtol=1e-3)
+
+
+@EACH
+@pytest.mark.parametrize("grade", [0.15, -0.2])
+def test_wheels_slip_as_the_soil_table_says(kind: type, grade: float) -> None:
+    zones, direction = [0, SAND, 0, SAND], np.array([1, 1, -1, -1])
+    with lanes(kind, [Lane(zone=zone) for zone in zones], grade) as world:
+        last = hold_speed(world, 2.0 * direction, 10.0)[-1]
+    use = direction * last.torque_nm / LOADER.wheel_radius_m / last.load_n
+    slip = np.arctanh(use / TRACTION[zones]) * TRACTION[zones] / SLIP_STIFFNESS[zones]
+    for wheel in (last.wheel_radps * LOADER.wheel_radius_m).T:
+        measured = (wheel - last.speed_mps) / np.maximum(abs(wheel), abs(last.speed_mps)) * direction
+        np.testing.assert_allclose(measured, slip, rtol=1e-3 if kind is FastWorld else 0.02)
 
 
 @EACH
@@ -193,6 +197,8 @@ def test_turning_radius_is_that_of_the_articulation(kind: type) -> None:
     sideways = states.speed_mps[-1] * states.rates_radps[-1, :, 2]
     np.testing.assert_allclose(states.force_mps2[-1, :, 1] - leaning, sideways, rtol=0.02)
     np.testing.assert_allclose(states.articulation_rad[-1], steer, atol=1e-3)
+    left, right = states.wheel_radps[-1].T * of_each(cases, "wheel_radius_m")
+    np.testing.assert_allclose(right - left, of_each(cases, "track_m") * states.rates_radps[-1, :, 2], rtol=0.02)
 
 
 @EACH
