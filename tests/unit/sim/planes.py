@@ -67,7 +67,7 @@ def of_each(lanes: Sequence[Lane], name: str) -> np.ndarray:
     return np.array([getattr(lane.model, name) for lane in lanes])
 
 
-def hold_speed(world: World, speed: ArrayLike, seconds: float, steer: ArrayLike = 0.0) -> list[FleetState]:
+def cruise(world: World, speed: ArrayLike, seconds: float, steer: ArrayLike = 0.0) -> list[FleetState]:
     """Drive the machines of a world at a speed each."""
     states, integral, zero = [world.state], 0.0, np.zeros(len(world.state.x_m))
     for i in range(round(seconds / STEP_S)):

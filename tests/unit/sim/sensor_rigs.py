@@ -13,7 +13,7 @@ from sim.machines.model import load_model
 from sim.sensors.presets import GpsNoise, Preset, load_preset
 from sim.sensors.rigs import Faults, Rig, machine_config
 from sim.sensors.sensor_group import GroupReadings
-from sim.sensors.sensors import Sensors
+from sim.sensors.sensors import FleetReadings, Sensors
 from sim.state import FleetState
 
 SEED = 7
@@ -65,11 +65,15 @@ def still(k: int, n: int = 1, **values: object) -> FleetState:
     return FleetState(**{name: np.broadcast_to(given.get(name, 0.0), shape) for name, shape in arrays.items()})
 
 
-def groups(rigs: Sequence[Rig], states: FleetState, seed: int = SEED) -> dict[str, GroupReadings]:
-    """What sensors say of states at 100 Hz, by kind."""
+def sampled(rigs: Sequence[Rig], states: FleetState, seed: int = SEED) -> FleetReadings:
+    """What sensors say of states at 100 Hz."""
     steps = np.arange(1, len(states.x_m) + 1)
-    span = Sensors(rigs, seed, PROJECTION).sample(steps, steps * 10_000_000, states)
-    return {group.kind: group for group in span.groups}
+    return Sensors(rigs, seed, PROJECTION).sample(steps, steps * 10_000_000, states)
+
+
+def groups(rigs: Sequence[Rig], states: FleetState, seed: int = SEED) -> dict[str, GroupReadings]:
+    """The same, by kind."""
+    return {group.kind: group for group in sampled(rigs, states, seed).groups}
 
 
 def values(one: Rig, kind: str, seconds: float, n: int = 1, **states: object) -> np.ndarray:

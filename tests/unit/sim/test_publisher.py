@@ -51,10 +51,14 @@ def listening(session_config: SessionConfig, site: str, machines: tuple[str, ...
         session.close()
 
 
-def published(config: SimConfig, act: Callable[[Listener, threading.Event], None] = lambda *_: None, **options):
+def published(
+    config: SimConfig,
+    act: Callable[[Listener, threading.Event], None] = lambda *_: None,
+    stop: threading.Event | None = None,
+    **options,
+):
     """Run the publisher as the router itself, agents connect to it."""
-    endpoint = free_endpoint()
-    stop = threading.Event()
+    endpoint, stop = free_endpoint(), stop or threading.Event()
     with ThreadPoolExecutor(1) as pool:
         result = pool.submit(run, config, SessionConfig(endpoint, mode="router"), stop, **options)
         with listening(SessionConfig(endpoint, wait_s=10.0), "pit", resolve(config).machine_names) as listener:
@@ -123,13 +127,9 @@ class FakeStop(threading.Event):
 
 def test_run_takes_as_long_as_its_speed_says() -> None:
     stop = FakeStop()
-    endpoint = free_endpoint()
     config = replace(CONFIG, seconds=10.0, speed=4.0)
-    with ThreadPoolExecutor(1) as pool:
-        session_config = SessionConfig(endpoint, mode="router")
-        result = pool.submit(run, config, session_config, stop, clock=lambda: stop.now, wait_s=1e6)
-        with listening(SessionConfig(endpoint, wait_s=10.0), "pit", resolve(config).machine_names):
-            assert result.result(timeout=30).wall_s == pytest.approx(2.5)
+    report, _ = published(config, stop=stop, clock=lambda: stop.now, wait_s=1e6)
+    assert report.wall_s == pytest.approx(2.5)
 
 
 @pytest.mark.parametrize(("speed", "wall_s"), [(1.0, 12.0), (4.0, 3.0), (0.0, 0.0)])

@@ -12,8 +12,6 @@ from sim.truth import truth_map
 
 PAPER = load_scenario("paper_site").ground
 FOOT_M, TOP_M = PAPER.ramp[0].foot_m[0], PAPER.ramp[0].top_m[0]
-
-
 SMOOTH = build_terrain(replace(PAPER, roughness_m=0.0), 0)
 
 
@@ -42,15 +40,9 @@ def test_ground_continues_beyond_the_edges() -> None:
     assert SMOOTH.zone(*outside).tolist() == [CONCRETE, WET_DIRT]
 
 
-@pytest.mark.parametrize(
-    ("x", "y", "zone"),
-    [(20, 20, CONCRETE), (100, 20, GRAVEL), (90, 110, DRY_DIRT), (180, 120, WET_DIRT), (30, 130, SAND)],
-)
-def test_zones_lie_where_the_proposal_puts_them(x: float, y: float, zone: int) -> None:
-    assert SMOOTH.zone(np.array([x]), np.array([y]))[0] == zone
-
-
-def test_soils_have_the_papers_resistance() -> None:
+def test_zones_lie_where_the_proposal_puts_them_and_resist_as_in_the_paper() -> None:
+    x, y = np.array([[20, 20], [100, 20], [90, 110], [180, 120], [30, 130]]).T
+    assert SMOOTH.zone(x, y).tolist() == [CONCRETE, GRAVEL, DRY_DIRT, WET_DIRT, SAND]
     assert [s.c_rr for s in SOILS] == [0.008, 0.02, 0.04, 0.06, 0.25]
 
 

@@ -6,7 +6,6 @@ import pytest
 
 from sim.sensors.presets import Preset
 from sim.sensors.rigs import Rig
-from sim.sensors.sensors import Sensors
 from tests.unit.sim.sensor_rigs import (
     DGPS,
     PROJECTION,
@@ -17,6 +16,7 @@ from tests.unit.sim.sensor_rigs import (
     noisy,
     perfect,
     rig,
+    sampled,
     still,
     to_map,
     values,
@@ -58,8 +58,7 @@ def test_fully_shared_drift_is_one_whatever_the_rates_and_the_other_machines() -
         return noisy("gps", rate_hz=rate_hz, drift_std_m=1.0, drift_time_s=time_s, shared=1.0)
 
     def tracks(rigs: list[Rig]) -> dict[int, np.ndarray]:
-        steps = np.arange(1, 201)
-        span = Sensors(rigs, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(200, len(rigs)))
+        span = sampled(rigs, still(200, len(rigs)))
         return {m: to_map(b.values[:, u]) for b in span.groups for u, m in enumerate(b.machines.tolist())}
 
     alone = tracks([rig(preset(5), only="gps")])
@@ -89,12 +88,10 @@ def test_receivers_of_one_machine_are_silent_in_turn() -> None:
 
 
 def test_silent_fixes_are_no_readings_but_their_errors_run_on() -> None:
-    steps = np.arange(1, 1001)
     runs = []
     for outage_s in (0.0, 1.0):
         preset = replace(DGPS, gps=replace(DGPS.gps, outage_s=outage_s))
-        span = Sensors([rig(preset, only="gps")], SEED, PROJECTION).sample(steps, steps * 10_000_000, still(1000))
-        runs.append(span.readings(0))
+        runs.append(sampled([rig(preset, only="gps")], still(1000)).readings(0))
     assert [len(run) for run in runs] == [50, 45]
     assert set(runs[1]) < set(runs[0])
 

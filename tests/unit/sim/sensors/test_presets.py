@@ -10,7 +10,7 @@ from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.machine.machine_config import BASE, FRONT
 from sim.sensors.presets import LIBRARY, EncoderNoise, GpsNoise, PayloadNoise, TorqueNoise, load_preset, parse_preset
-from sim.sensors.rigs import Rig, draw_bodies, machine_config
+from sim.sensors.rigs import draw_bodies, machine_config
 from sim.sensors.sensors import _GROUPS
 from tests.unit.sim.sensor_rigs import DGPS, LOADER, noisy, perfect, rig
 
@@ -171,10 +171,6 @@ def test_bodies_differ_from_nominal_by_what_the_preset_says() -> None:
     assert 0.029 < abs(mass).max() <= 0.03
     assert mass.std() == pytest.approx(0.03 / math.sqrt(3), rel=5 / math.sqrt(2 * n))
     assert radius.std() == pytest.approx(0.015, rel=5 / math.sqrt(2 * n))
-    exact = replace(rig(), preset=perfect_body(rig()))
+    exact = replace(rig(), preset=replace(DGPS, body=replace(DGPS.body, mass=0.0, wheel_radius=0.0)))
     np.testing.assert_array_equal(draw_bodies([exact], 3).mass_kg, [LOADER.mass_kg])
     np.testing.assert_array_equal(draw_bodies([rig(), exact], 3).mass_kg[0], bodies.mass_kg[0])
-
-
-def perfect_body(one: Rig) -> Any:
-    return replace(one.preset, body=replace(one.preset.body, mass=0.0, wheel_radius=0.0))

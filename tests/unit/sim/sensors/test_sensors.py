@@ -22,6 +22,7 @@ from tests.unit.sim.sensor_rigs import (
     noisy,
     perfect,
     rig,
+    sampled,
     still,
     to_map,
     values,
@@ -106,21 +107,15 @@ def test_readings_come_at_their_rates() -> None:
     expected = {"imu-1": 100, "imu-3": 100, "attitude-3": 50, "torque": 50, "wheels": 20, "articulation": 20}
     counts = Counter(r.sensor for r in run([rig(silent, imu=(1, 3), attitude=(3,))])[0])
     assert counts == {name: 6 * rate for name, rate in {**expected, "gps-1": 5}.items()}
-    slow = replace(
-        silent,
-        gps=replace(silent.gps, rate_hz=10),
-        imu=replace(silent.imu, rate_hz=50),
-        encoder=replace(silent.encoder, rate_hz=10),
-    )
+    rates_hz = {"gps": 10, "imu": 50, "encoder": 10}
+    slow = replace(silent, **{kind: replace(getattr(silent, kind), rate_hz=hz) for kind, hz in rates_hz.items()})
     counts = Counter(r.sensor for r in run([rig(slow)])[0])
     assert counts == {"imu-3": 300, "torque": 300, "articulation": 120, "wheels": 60, "gps-1": 60}
 
 
 def test_readings_are_valid_and_plain() -> None:
     kinds = {sensor.name: sensor.kind for sensor in FULL.machine.sensors}
-    resting = Sensors([FULL], SEED, PROJECTION)
-    steps = np.arange(1, 101)
-    for reading in resting.sample(steps, steps * 10_000_000, still(100)).readings(0):
+    for reading in sampled([FULL], still(100)).readings(0):
         row = tuple(getattr(reading, name) for name in columns(reading.kind))
         assert all(type(value) is float for value in row), reading
         assert kinds[reading.sensor] == reading.kind
@@ -128,8 +123,7 @@ def test_readings_are_valid_and_plain() -> None:
 
 
 def test_groups_say_whose_readings_they_hold() -> None:
-    steps = np.arange(1, 21)
-    span = Sensors([FULL] * 3, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(20, 3))
+    span = sampled([FULL] * 3, still(20, 3))
     for group in span.groups:
         rows, units = group.stamps_ns.shape
         assert group.values.shape == (rows, units, len(columns(group.kind)))
@@ -153,20 +147,10 @@ WHITE = [
     ("payload", (1, 5), {"white_kg": 50.0}, (50.0,)),
 ]
 SLOW = [
-    ("gps", (5, 10), {"drift_std_m": 1.2, "drift_time_s": 2.0}, (1.2, 1.2, 2.0)),
-    (
-        "imu",
-        (100, 50),
-        {"gyro_drift_degps": 0.2, "force_drift_mps2": 0.01, "drift_time_s": 0.5},
-        [*np.radians([0.2] * 3), *[0.01] * 3],
-    ),
-    (
-        "attitude",
-        (50, 20),
-        {"tilt_drift_deg": 0.4, "heading_drift_deg": 1.0, "drift_time_s": 0.5},
-        np.radians([0.4, 0.4, 1.0]),
-    ),
-    ("torque", (50, 20), {"correlated_nm": 300.0, "correlation_s": 0.5}, (300.0,)),
+    ("gps", (5, 10), {"drift_std_m": 1.2}, (1.2, 1.2, 2.0)),
+    ("imu", (100, 50), {"gyro_drift_degps": 0.2, "force_drift_mps2": 0.01}, (*np.radians([0.2] * 3), *[0.01] * 3)),
+    ("attitude", (50, 20), {"tilt_drift_deg": 0.4, "heading_drift_deg": 1.0}, np.radians([0.4, 0.4, 1.0])),
+    ("torque", (50, 20), {"correlated_nm": 300.0}, (300.0,)),
 ]
 ONCE = [
     ("imu", {"gyro_turn_on_degps": 0.05, "force_turn_on_mps2": 0.03}, (*np.radians([0.05] * 3), *[0.03] * 3)),
@@ -188,15 +172,13 @@ def test_white_noise_is_white(kind: str, rates_hz: tuple[int, int], given: dict,
 
 
 @pytest.mark.parametrize(("kind", "rates_hz", "given", "stds"), SLOW)
-def test_drift_has_its_deviation_and_time(
-    kind: str, rates_hz: tuple[int, int], given: dict, stds: Sequence[float]
-) -> None:
-    time_s = given.get("drift_time_s", 0.5)
+def test_drift_has_its_deviation_and_time(kind: str, rates_hz: tuple[int, int], given: dict, stds: list) -> None:
+    time = {"correlation_s" if kind == "torque" else "drift_time_s": 1.0}
     for rate_hz in rates_hz:
-        seen = errors(noisy(kind, rate_hz=rate_hz, **given), kind, 3 * time_s, N)
+        seen = errors(noisy(kind, rate_hz=rate_hz, **given, **time), kind, 3.0, N)
         for column, std in enumerate(stds):
             check_deviation(seen[..., column], std, N)
-            check_correlation(seen[..., column], round(time_s * rate_hz), math.exp(-1), N)
+            check_correlation(seen[..., column], rate_hz, math.exp(-1), N)
 
 
 @pytest.mark.parametrize(("kind", "given", "stds"), ONCE)
@@ -254,8 +236,7 @@ def test_antennas_are_off_from_their_time_on() -> None:
 
 @pytest.mark.parametrize("clock_off_s", [0.25, -0.25])
 def test_clock_is_off_from_its_time_on(clock_off_s: float) -> None:
-    rigs, steps = faulty(clock_off_s=clock_off_s), np.arange(1, 401)
-    span = Sensors(rigs, SEED, PROJECTION).sample(steps, steps * 10_000_000, still(400, 2))
+    span = sampled(faulty(clock_off_s=clock_off_s), still(400, 2))
     for group in span.groups:
         wrong, right = group.stamps_ns.T
         late = right >= 2_000_000_000

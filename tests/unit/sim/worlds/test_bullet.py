@@ -1,7 +1,4 @@
-import hashlib
 import math
-import subprocess
-import sys
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -89,23 +86,3 @@ def test_front_frame_moves_as_the_rear_frame_and_the_joint_imply(model: MachineM
         rates_dot + state.articulation_radps2[0] * up + np.cross(rates, state.articulation_radps[0] * up)
     )
     np.testing.assert_allclose(((turn - old_turn) / STEP_S)[held], dot[held], atol=0.05)
-
-
-def digest() -> str:
-    """Fingerprint of a short drive of two machines, one of which is loaded halfway."""
-    with placed(BulletWorld, plane(2, 0.05), LOADER, TRUCK, starts=[(500, 500, 0.3), (500, 520, 1)]) as world:
-        states = []
-        for i in range(200):
-            if i == 100:
-                world.set_payload(1, 12_000.0)
-            states.append(world.advance(np.array([0.2, -0.3]), np.array([40e3, 60e3]), np.zeros(2)))
-        run = stack(states)
-    return hashlib.sha256(b"".join(getattr(run, f.name).tobytes() for f in fields(FleetState))).hexdigest()
-
-
-@pytest.mark.slow
-def test_a_drive_repeats_bit_for_bit_here_and_in_another_process() -> None:
-    first = digest()
-    assert digest() == first
-    command = [sys.executable, "-c", "from tests.unit.sim.worlds.test_bullet import digest; print(digest())"]
-    assert subprocess.run(command, capture_output=True, check=True, text=True).stdout.strip() == first

@@ -12,7 +12,7 @@ from sim.state import STEP_S, FleetState, stack
 from sim.terrain.soil import C_RR
 from sim.terrain.terrain import Terrain
 from sim.worlds.fast import FastWorld
-from tests.unit.sim.planes import BOTH, GRADE_15, LOADER, TRUCK, hold_speed, idle, placed, plane
+from tests.unit.sim.planes import BOTH, GRADE_15, LOADER, TRUCK, cruise, idle, placed, plane
 
 
 def wheels(model: MachineModel, state: FleetState) -> np.ndarray:
@@ -29,7 +29,7 @@ def wheels(model: MachineModel, state: FleetState) -> np.ndarray:
 @BOTH
 def test_neither_axle_slips_sideways_while_the_joint_turns(model: MachineModel) -> None:
     with placed(FastWorld, plane(0), model, starts=[(500, 500, 0.4)]) as world:
-        hold_speed(world, 2.0, 4.0)
+        cruise(world, 2.0, 4.0)
         states = [world.advance(np.array([0.5]), np.array([3e3]), np.zeros(1)) for _ in range(150)]
     for old, new in pairwise(states):
         moved = (wheels(model, new) - wheels(model, old)) / STEP_S
@@ -44,7 +44,7 @@ def test_the_estimators_equation_holds_at_every_instant(model: MachineModel) -> 
     # F/m - f_x - (lambda-1) dv = c g cos(theta): the accelerometer contains gravity's share
     rolling = 4 * model.wheel_inertia_kgm2 / model.wheel_radius_m**2
     with placed(FastWorld, plane(3, 0.1, 0.05), model, starts=[(500, 500, 0.4)]) as world:
-        for state in hold_speed(world, 3.0, 6.0)[300:]:
+        for state in cruise(world, 3.0, 6.0)[300:]:
             force = state.torque_nm[0] / model.wheel_radius_m - rolling * state.accel_mps2[0]
             left = force / model.mass_kg - state.force_mps2[0, 0]
             assert left == pytest.approx(0.06 * state.load_n[0] / model.mass_kg, abs=1e-3)
@@ -103,7 +103,7 @@ def test_machines_do_not_feel_each_other() -> None:
 def test_rates_are_those_of_the_turning_frame() -> None:
     """Angular rate in `base_link`, against what the rotation matrix does from step to step."""
     with placed(FastWorld, plane(0, 0.12, -0.07), LOADER) as world:
-        states = hold_speed(world, 2.0, 6.0, 0.4)[-2:]
+        states = cruise(world, 2.0, 6.0, 0.4)[-2:]
     matrices = []
     for state in states:
         angles = np.degrees([state.roll_rad[0], state.pitch_rad[0], state.yaw_rad[0]])

@@ -15,20 +15,7 @@ from sim.state import STEP_S, FleetState, stack
 from sim.terrain.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.fast import FastWorld
-from tests.unit.sim.planes import (
-    BOTH,
-    EACH,
-    GRADE_15,
-    LOADER,
-    TRUCK,
-    Lane,
-    hold_speed,
-    idle,
-    lanes,
-    of_each,
-    placed,
-    plane,
-)
+from tests.unit.sim.planes import BOTH, EACH, GRADE_15, LOADER, TRUCK, Lane, cruise, idle, lanes, of_each, placed, plane
 
 MODELS = (LOADER, TRUCK)
 
@@ -50,7 +37,7 @@ def test_past_states_do_not_change(kind: type) -> None:
     with placed(kind, plane(0), LOADER) as world:
         first = world.state
         before = {f.name: getattr(first, f.name).copy() for f in fields(FleetState)}
-        hold_speed(world, 2.0, 0.5, 0.3)
+        cruise(world, 2.0, 0.5, 0.3)
         world.set_payload(0, 3000.0)
         for name, values in before.items():
             np.testing.assert_array_equal(getattr(first, name), values, err_msg=name)
@@ -87,7 +74,7 @@ def traction_of(lanes: Sequence[Lane], state: FleetState) -> np.ndarray:
 def test_steady_traction_on_the_level_is_the_rolling_resistance(kind: type) -> None:
     soils = [Lane(zone=zone) for zone in range(5)]
     with lanes(kind, soils) as world:
-        last = hold_speed(world, 2.0, 7.0)[-1]
+        last = cruise(world, 2.0, 7.0)[-1]
     np.testing.assert_allclose(traction_of(soils, last), soil_of(soils), rtol=0.01)
     np.testing.assert_allclose(last.c_rr, soil_of(soils))
     np.testing.assert_allclose(last.load_n, load_of(soils), rtol=1e-3)
@@ -98,7 +85,7 @@ def test_steady_traction_on_the_level_is_the_rolling_resistance(kind: type) -> N
 def test_wheels_slip_as_the_soil_table_says(kind: type, grade: float) -> None:
     zones, direction = [0, SAND, 0, SAND], np.array([1, 1, -1, -1])
     with lanes(kind, [Lane(zone=zone) for zone in zones], grade) as world:
-        last = hold_speed(world, 2.0 * direction, 10.0)[-1]
+        last = cruise(world, 2.0 * direction, 10.0)[-1]
     use = direction * last.torque_nm / LOADER.wheel_radius_m / last.load_n
     slip = np.arctanh(use / TRACTION[zones]) * TRACTION[zones] / SLIP_STIFFNESS[zones]
     for wheel in (last.wheel_radps * LOADER.wheel_radius_m).T:
@@ -111,7 +98,7 @@ def test_steady_traction_on_15_degrees_adds_the_slope(kind: type) -> None:
     cases = [Lane(*case) for case in product(MODELS, (CONCRETE, WET_DIRT), (0.0, math.pi))]
     uphill = np.array([1 if lane.yaw == 0 else -1 for lane in cases])
     with lanes(kind, cases, GRADE_15) as world:
-        last = hold_speed(world, 2.0, 10.0)[-1]
+        last = cruise(world, 2.0, 10.0)[-1]
     np.testing.assert_allclose(traction_of(cases, last), soil_of(cases) + uphill * GRADE_15, atol=0.002)
     np.testing.assert_allclose(last.load_n, load_of(cases, math.radians(15)), rtol=1e-3)
     np.testing.assert_allclose(np.degrees(last.pitch_rad), -15 * uphill, atol=0.4)  # tyres give way by some mm
@@ -122,7 +109,7 @@ def test_machine_rolls_out_by_its_resistance_and_stays(kind: type) -> None:
     cases = [Lane(*case) for case in product(MODELS, (1, SAND))]
     radius, mass, wheel = (of_each(cases, name) for name in ("wheel_radius_m", "mass_kg", "wheel_inertia_kgm2"))
     with lanes(kind, cases) as world:
-        hold_speed(world, 5.0, 6.0)
+        cruise(world, 5.0, 6.0)
         start = idle(world, 1.2).speed_mps  # until the engine has let go
         slower = start - idle(world, 0.5).speed_mps
         end = idle(world, 4.0)
@@ -151,7 +138,7 @@ def test_brakes_stop_a_machine_and_never_drive_it_back(kind: type) -> None:
     direction = np.array([1, 1, -1, -1])
     zero = np.zeros(4)
     with lanes(kind, cases) as world:
-        start = hold_speed(world, 3.0 * direction, 5.0)[-1]
+        start = cruise(world, 3.0 * direction, 5.0)[-1]
         states = stack([world.advance(zero, zero, 0.2 * load_of(cases)) for _ in range(500)])
     along = direction * states.speed_mps
     slowing = (0.2 + SOILS[CONCRETE].c_rr) * GRAVITY_MPS2 / of_each(cases, "rotating_mass_factor")
@@ -167,8 +154,8 @@ def test_brakes_stop_a_machine_and_never_drive_it_back(kind: type) -> None:
 def test_reversing_mirrors_driving(kind: type) -> None:
     cases = [Lane(model, WET_DIRT) for model in MODELS]
     with lanes(kind, cases) as world:
-        last = hold_speed(world, -2.0, 12.0)[-1]
-        turned = hold_speed(world, -2.0, 2.0, 0.3)[-1]
+        last = cruise(world, -2.0, 12.0)[-1]
+        turned = cruise(world, -2.0, 2.0, 0.3)[-1]
     np.testing.assert_allclose(last.speed_mps, -2.0, atol=1e-3)
     assert last.x_m.max() < 485
     use = SOILS[WET_DIRT].c_rr
@@ -185,7 +172,7 @@ def test_turning_radius_is_that_of_the_articulation(kind: type) -> None:
     cases = [Lane(model) for model in (LOADER, TRUCK, LOADER, TRUCK)]
     steer = np.array([0.2, 0.2, -0.6, -0.6])
     with lanes(kind, cases) as world:
-        states = stack(hold_speed(world, 2.0, 12.0, steer)[600:])
+        states = stack(cruise(world, 2.0, 12.0, steer)[600:])
     rear, front = of_each(cases, "rear_to_joint_m"), of_each(cases, "front_to_joint_m")
     kinematic = (front + rear * np.cos(steer)) / np.sin(abs(steer))
     for i, radius in enumerate(kinematic):
@@ -205,8 +192,8 @@ def test_turning_radius_is_that_of_the_articulation(kind: type) -> None:
 def test_steering_stays_within_its_limits(kind: type) -> None:
     cases = [Lane(model) for model in MODELS]
     with lanes(kind, cases) as world:
-        hold_speed(world, 1.0, 2.0)
-        states = stack(hold_speed(world, 1.0, 5.0, 1.5))
+        cruise(world, 1.0, 2.0)
+        states = stack(cruise(world, 1.0, 5.0, 1.5))
     angle, rate = states.articulation_rad, states.articulation_radps
     np.testing.assert_allclose(angle.max(axis=0), of_each(cases, "max_articulation_rad"), atol=2e-3)
     np.testing.assert_allclose(abs(rate).max(axis=0), of_each(cases, "steer_radps"), rtol=0.02)
@@ -245,10 +232,10 @@ def test_a_load_slows_a_machine_down(kind: type) -> None:
 @EACH
 def test_repaved_ground_acts_on_machines(kind: type) -> None:
     with placed(kind, plane(CONCRETE), LOADER) as world:
-        hold_speed(world, 2.0, 4.0)
+        cruise(world, 2.0, 4.0)
         assert world.state.c_rr[0] == pytest.approx(SOILS[CONCRETE].c_rr)
         world.set_terrain(plane(SAND))
-        last = hold_speed(world, 2.0, 6.0)[-1]
+        last = cruise(world, 2.0, 6.0)[-1]
     assert last.c_rr[0] == pytest.approx(SOILS[SAND].c_rr)
     assert last.torque_nm[0] / LOADER.wheel_radius_m / last.load_n[0] == pytest.approx(SOILS[SAND].c_rr, rel=0.01)
 
@@ -287,7 +274,7 @@ def test_grade_and_attitude_are_those_of_the_plane(kind: type, model: MachineMod
 def test_true_bodies_differ_from_the_model(kind: type) -> None:
     world = kind(plane(0), [LOADER], Bodies(np.array([18_000.0]), np.array([0.76])), np.array([[500, 500, 0.0]]))
     assert world.state.load_n[0] == pytest.approx(18_000 * GRAVITY_MPS2, rel=1e-4)
-    last = hold_speed(world, 2.0, 5.0)[-1]
+    last = cruise(world, 2.0, 5.0)[-1]
     assert last.wheel_radps[0, 0] * 0.76 == pytest.approx(last.speed_mps[0], rel=1e-3)
     world.close()
 
