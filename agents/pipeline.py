@@ -3,8 +3,6 @@
 `Positioning` is the half of it that locates the machine; `Pipeline` adds the estimate of the ground, and samples of it.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -3,8 +3,6 @@
 A sample is made LAG_S later than the machine was there, so that the estimator has seen what came next.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections import Counter, deque

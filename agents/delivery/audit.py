@@ -6,8 +6,6 @@ crash prevented are added when the spool is opened again. So no line claims a sa
 that loses committed samples shows as a loss.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 

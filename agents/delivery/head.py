@@ -1,7 +1,5 @@
 """What the spool hands to the uplink: its oldest samples."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from protocol.arrays import Table

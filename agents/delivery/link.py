@@ -1,7 +1,5 @@
 """The uplink's thread: it carries out the actions of an `Uplink`, on the spool's file and over Zenoh."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

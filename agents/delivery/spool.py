@@ -9,8 +9,6 @@ spool_id.
 It is one module because every method is a transaction over the same few tables, and they must agree.
 """
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import sqlite3

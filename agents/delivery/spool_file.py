@@ -1,7 +1,5 @@
 """The spool's file: its tables, how it is opened, and transactions that leave nothing half done."""
 
-from __future__ import annotations
-
 import sqlite3
 import zlib
 from pathlib import Path

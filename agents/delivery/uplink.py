@@ -8,8 +8,6 @@ What holds through kills of router, server and agent is a query with payload, a 
 a deletion after the reply. An empty reply means "no server" or "denied", never "done".
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The driver door: simulation, replayed logs and real sensors enter an agent as the same stream of readings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 

@@ -8,8 +8,6 @@ rotating mass factor,
 The accelerometer measures gravity's share of the slope as well, so the grade cancels.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

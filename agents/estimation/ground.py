@@ -5,8 +5,6 @@ Readings become balances of force (`balance`); those that show nothing of the gr
 stamp is asked for a little later, so that the steps after it help.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections import deque

@@ -1,7 +1,5 @@
 """What the estimators of the rolling resistance have in common: their input, and their methods."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -22,8 +22,6 @@ Nikiforov 1993, chapter 2). The likeliest jump is accepted if it is large enough
 so that a border lies where it is and not where it was noticed. The smoother never crosses a border.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from typing import NamedTuple

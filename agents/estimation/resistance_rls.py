@@ -10,8 +10,6 @@ where L_i in the second equation is computed as if the other parameters were kno
 here, f in lambda = f^dt, so that they mean the same at any rate.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

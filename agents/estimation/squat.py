@@ -5,8 +5,6 @@ of stiffness k per axle by N / k; the nose rises by (N_r - N_f) / (k L). The emp
 is subtracted.
 """
 
-from __future__ import annotations
-
 import math
 
 from protocol.machine.machine_config import MachineConfig

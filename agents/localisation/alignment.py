@@ -1,7 +1,5 @@
 """Alignment: how the frame of dead reckoning lies in `map`, and the belief that the filter starts from."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Options of localisation, the table [pipeline.localisation]."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ an angular rate. Relative: the heading is turned so that the first one agrees wi
 stay, since gravity gives them. Differential and relative ones are measurements of their own stamps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Which states the sensors of a machine need."""
 
-from __future__ import annotations
-
 from agents.dead_reckoning import turn_source
 from agents.localisation.filters.state import Layout
 from agents.localisation.gps import drifting

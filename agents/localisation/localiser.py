@@ -1,7 +1,5 @@
 """The localiser: readings in, poses out. Until it knows its heading it only collects."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """IMUs, wheels, and what else shows the turn: from filter steps to measurements of the body's motion."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

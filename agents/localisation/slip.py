@@ -6,8 +6,6 @@ traction: drive force over weight, signed ahead. rolling: the part of it that ne
 accelerometer ahead measures together. s0, s1: `slip` and `slip_soft` of the tyres; soft ground resists, and gives way.
 """
 
-from __future__ import annotations
-
 import math
 
 from protocol.units import GRAVITY_MPS2

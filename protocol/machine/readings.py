@@ -4,8 +4,6 @@ Each kind is a flat frozen dataclass whose fields are also the columns of log fo
 suffix of a field is its unit. Values are raw: in the sensor's own frame, before any correction.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from typing import ClassVar

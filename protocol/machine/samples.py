@@ -1,7 +1,5 @@
 """Samples: geotagged resistance and gradient, as structured rows; the same bytes on machine, wire and server."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Reading ignores fields that it does not know, and refuses an answer without one that it does: a MessageError names it.
 """
 
-from __future__ import annotations
-
 import functools
 import types
 import typing

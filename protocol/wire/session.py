@@ -1,7 +1,5 @@
 """Zenoh sessions as this project uses them: no scouting, and no shared memory, which can drop queries."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The extended Kalman filter. x, P: belief, F: the motion's Jacobian, Q: its noise, L: lower factor of P."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

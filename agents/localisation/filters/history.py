@@ -4,8 +4,6 @@ The history holds nodes: a stamp, the measurements of that stamp, and the belief
 late is put into its place, and everything after it is filtered again.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left, bisect_right
 from collections import Counter

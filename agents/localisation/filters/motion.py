@@ -12,8 +12,6 @@ measures besides (rate x velocity, gravity) belongs to the measurement. On a pla
 the states off it are zero before and after each step, with a small variance so that the covariance stays definite.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
