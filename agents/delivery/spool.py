@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from agents.delivery.audit import AuditLog
-from agents.delivery.head import Head
 from agents.delivery.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
+from agents.delivery.uplink import Head
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.estimation.resistance import BalanceStep
+from agents.estimation.balance import BalanceStep
 from protocol.arrays import Floats
 
 LEAD, TRAIL, SCALE = 0, 1, 2

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from agents.estimation.resistance import BalanceStep
+from agents.estimation.balance import BalanceStep
 from protocol.arrays import Floats
 
 NEAR_NS = 500_000_000  # a stamp this far from a usable step has no estimate

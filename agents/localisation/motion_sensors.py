@@ -1,5 +1,14 @@
-"""IMUs, wheels, and what else shows the turn: from filter steps to measurements of the body's motion."""
+"""IMUs, wheels, and what else shows the turn: from filter steps to measurements of the body's motion.
 
+Driven wheels turn further than the machine moves, by a share that grows with traction.
+
+    slip = traction (s0 + s1 rolling)        machine speed = wheel speed (1 - slip sign(speed))
+
+traction: drive force over weight, signed ahead. rolling: the part of it that neither climbs nor accelerates, which an
+accelerometer ahead measures together. s0, s1: `slip` and `slip_soft` of the tyres; soft ground resists, and gives way.
+"""
+
+import math
 from collections import Counter
 
 import numpy as np
@@ -10,17 +19,18 @@ from agents.localisation.filters.belief import Measurement
 from agents.localisation.filters.state import Layout
 from agents.localisation.headings import UNKNOWN_STD
 from agents.localisation.imu_steps import FilterStep
-from agents.localisation.slip import machine_speed, rolling_resistance
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.units import GRAVITY_MPS2
 
 STANDSTILL_S = 1.0  # after so long without travel the machine stands; coarse ticks of one that crawls come sooner
+ROLLING_S = 0.5  # time constant of the low-pass on the rolling resistance
 
 
 class MotionSensors:
     """The motion sensors of one machine; step_s: length of a filter step.
 
-    slip, slip_soft: of the tyres, as in `slip`.
+    slip, slip_soft: of the tyres.
     """
 
     def __init__(self, machine: MachineConfig, layout: Layout, step_s: float, slip: float, slip_soft: float) -> None:
@@ -88,6 +98,17 @@ class MotionSensors:
         return measurements.inertial(
             step.stamp_ns, sensor.name, z, R, lever, bias, sensor.gate(measurements.GATE_SIGMA)
         )
+
+
+def rolling_resistance(before: float, traction: float, force_ahead_mps2: float, dt_s: float) -> float:
+    """Rolling resistance over weight [-], low-passed from the one before; force_ahead_mps2: of the accelerometer."""
+    rolling = abs(traction - force_ahead_mps2 / GRAVITY_MPS2)
+    return before + min(dt_s / ROLLING_S, 1.0) * (rolling - before)
+
+
+def machine_speed(wheel_mps: float, traction: float, slip_per_traction: float) -> float:
+    """Speed of a machine [m/s] from that of its wheels."""
+    return wheel_mps * (1 - traction * slip_per_traction * math.copysign(1.0, wheel_mps))
 
 
 def _turn_std(source: SensorConfig) -> float:

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.squat import front_share, squat_rad
-from agents.localisation.config import LocalisationConfig
+from agents.estimation.balance import front_share, squat_rad
 from agents.localisation.filters.belief import Belief, PoseBelief
-from agents.localisation.localiser import STEP_S, Localiser
+from agents.localisation.localiser import STEP_S, LocalisationConfig, Localiser
 from protocol.arrays import Floats, Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Articulation, Encoder, Gps, Imu, Payload, Reading, Torque

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.balance import Balance, Balancer
+from agents.estimation.balance import Balance, Balancer, BalanceStep
 from agents.estimation.calibration import Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEstimator
-from agents.estimation.resistance import BalanceStep, ResistanceEstimator
+from agents.estimation.resistance_kalman import KalmanResistance
+from agents.estimation.resistance_rls import RecursiveResistance
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
@@ -112,7 +113,7 @@ def level_steps(raw: Iterable[float], *, share: Iterable[float] | float = 0.04) 
     ]
 
 
-def feed(estimator: ResistanceEstimator, steps: Iterable[BalanceStep]) -> None:
+def feed(estimator: KalmanResistance | RecursiveResistance, steps: Iterable[BalanceStep]) -> None:
     for step in steps:
         estimator.update(step)
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.delivery.head import Head
 from agents.delivery.link import linger, perform
 from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import (
@@ -16,6 +15,7 @@ from agents.delivery.uplink import (
     PASSING,
     Action,
     Delete,
+    Head,
     LowerWatermark,
     Pacing,
     Quarantine,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents.estimation import resistance_kalman
-from agents.estimation.resistance import BalanceStep
+from agents.estimation.balance import BalanceStep
 from agents.estimation.resistance_kalman import FIRST_C_RR, FIRST_STD, NOISE, WALK, KalmanResistance
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.localisation.config import LocalisationConfig
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import ATTITUDE, BASE_STATES, SPEED, YAW, Layout
+from agents.localisation.localiser import LocalisationConfig
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Attitude, Encoder, Gps, Imu, Reading, Torque
