@@ -6,7 +6,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,23 +30,6 @@ class PipelineConfig:
 
     localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
     estimation: EstimationConfig = field(default_factory=EstimationConfig)
-
-
-class PoseSource(Protocol):
-    """A source of poses: a `Pipeline`, or its half that locates alone."""
-
-    @property
-    def pose(self) -> PoseBelief | None:
-        """The newest pose, None until the start heading is known."""
-        ...
-
-    def pose_at(self, stamp_ns: int) -> PoseBelief | None:
-        """Pose at a recent stamp, None where it is not known."""
-        ...
-
-    def step(self, readings: Sequence[Reading]) -> object:
-        """Take in readings in the order of their stamps."""
-        ...
 
 
 class Accepted(NamedTuple):
@@ -211,3 +194,6 @@ class Pipeline:
         self._estimator = GroundEstimator(machine, config.estimation, known)
         self._sampler = Sampler(self._positioning.poses, machine.load_centre_m)
         self._odometer = Odometer()
+
+
+PoseSource = Positioning | Pipeline  # what locates a machine

@@ -8,17 +8,7 @@ from collections.abc import Callable
 import zenoh
 
 from agents.delivery.spool import Spool
-from agents.delivery.uplink import (
-    Action,
-    Delete,
-    LowerWatermark,
-    Quarantine,
-    ReadHead,
-    Send,
-    StartNewRun,
-    Uplink,
-    Wait,
-)
+from agents.delivery.uplink import Action, Delete, LowerWatermark, Quarantine, ReadHead, Send, StartNewRun, Uplink, Wait
 from protocol.errors import MessageError, StoreError
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply

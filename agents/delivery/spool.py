@@ -77,11 +77,7 @@ class Spool:
     """
 
     def __init__(
-        self,
-        path: Path,
-        config: SpoolConfig,
-        audit: AuditLog | None = None,
-        draw_id: Callable[[], int] = random_id,
+        self, path: Path, config: SpoolConfig, audit: AuditLog | None = None, draw_id: Callable[[], int] = random_id
     ) -> None:
         self._path = path
         self._config = config

@@ -11,12 +11,9 @@ class Driver(Protocol):
 
     def read(self, timeout_s: float) -> Sequence[Reading] | None:
         """Readings that have come in, none if nothing came within timeout_s, None once the stream has ended."""
-        ...
 
     def counters(self) -> Mapping[str, int]:
         """What was refused or lost on the way, by name."""
-        ...
 
     def close(self) -> None:
         """Let go of files and subscriptions."""
-        ...

@@ -151,6 +151,8 @@ class Balancer:
         share = drive_n / ((machine.mass_kg + self.payload_kg) * g)
         on_front = front_share(machine, self.payload_kg, force)
         squat = squat_rad(machine, self.payload_kg, force)
+        bend = self._climb_of_bend(on_front, squat)
+        unbalanced = share - force / g + squat - bend - (machine.rotating_mass_factor - 1) * accel / g
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
         self._force_sums, self._torque_sums = NO_SUMS, (0, 0.0)
         return Balance(
@@ -159,11 +161,7 @@ class Balancer:
             speed_mps=speed,
             accel_mps2=accel,
             distance_m=dead_reckoning.distance_m,
-            unbalanced=share
-            - force / g
-            + squat
-            - self._climb_of_bend(on_front, squat)
-            - (machine.rotating_mass_factor - 1) * accel / g,
+            unbalanced=unbalanced,
             share=share,
             slope_x=self._slope.ahead.angle_rad - squat,
             slope_y=self._slope.left.angle_rad,

@@ -50,12 +50,10 @@ class Measured(Protocol):
     @property
     def stamp_ns(self) -> int:
         """When it was measured."""
-        ...
 
     @property
     def sensor(self) -> SensorConfig:
         """What measured it."""
-        ...
 
 
 Value = TypeVar("Value", bound=Measured)

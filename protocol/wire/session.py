@@ -20,8 +20,7 @@ class SessionConfig:
 
     mode: "client" connects to a router; "router" is the site's router and listens. wait_s: how long to wait for the
     router; negative opens at once and goes on looking for it in the background, as an agent does. credentials: for
-    mutual TLS; None for links without encryption. guard: the router's rules, as Zenoh's
-    settings.
+    mutual TLS; None for links without encryption. guard: the router's rules, as settings of Zenoh.
     """
 
     endpoint: str = DEFAULT_ENDPOINT

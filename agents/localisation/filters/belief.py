@@ -97,8 +97,6 @@ class Filter(Protocol):
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
         """Move the belief through a motion, to its new stamp."""
-        ...
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement of its stamp."""
-        ...

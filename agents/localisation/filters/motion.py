@@ -22,6 +22,7 @@ import numpy as np
 from agents.localisation.filters.belief import Belief, Motion
 from agents.localisation.filters.state import (
     ACCELERATION,
+    ANGLES,
     ATTITUDE,
     OFF_PLANE,
     POSITION,
@@ -110,7 +111,7 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     def jacobian(x: Floats) -> Floats:
         return _jacobian(x * scale, dt_s) * scale
 
-    return Motion(f, jacobian, Q, layout.angles)
+    return Motion(f, jacobian, Q, ANGLES)
 
 
 def map_from_base(attitude: Floats) -> Floats:

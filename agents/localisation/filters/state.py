@@ -44,11 +44,6 @@ class Layout:
         return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references
 
     @property
-    def angles(self) -> tuple[int, ...]:
-        """States that are angles."""
-        return ANGLES
-
-    @property
     def gyro_biases(self) -> slice:
         """One per IMU [rad/s]."""
         return slice(BASE_STATES, BASE_STATES + self.imus)

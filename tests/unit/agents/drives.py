@@ -173,11 +173,7 @@ def _imu(sensor: SensorConfig, vehicle: MachineConfig, ground: Ground, leg: Leg,
     nose_up = squat_rad(vehicle, leg.payload_kg, ahead)
     c, s = math.cos(nose_up), math.sin(nose_up)
     out_m = sensor.mount.xyz_m
-    force = (
-        c * ahead + s * up - leg.turn_radps**2 * out_m[0],
-        left - leg.turn_radps**2 * out_m[1],
-        c * up - s * ahead,
-    )
+    force = (c * ahead + s * up - leg.turn_radps**2 * out_m[0], left - leg.turn_radps**2 * out_m[1], c * up - s * ahead)
     sensor_from_base = sensor.mount.frame_from_sensor().T
     gyro = sensor_from_base @ (0.0, 0.0, leg.turn_radps)
     return Imu(sensor.name, stamp_ns, *gyro.tolist(), *(sensor_from_base @ force).tolist())

@@ -15,13 +15,7 @@ from tests.unit.agents.ground import balances
 
 FORWARDS = [Leg(2), Leg(4, 0.5), Leg(10)]
 REVERSE = [Leg(2), Leg(4, -0.5), Leg(10)]
-BODY = {
-    "wheelbase_m": 3.3,
-    "axle_stiffness_npm": 1.8e6,
-    "cog_height_m": 1.05,
-    "payload_x_m": 4.7,
-    "payload_z_m": 0.85,
-}
+BODY = {"wheelbase_m": 3.3, "axle_stiffness_npm": 1.8e6, "cog_height_m": 1.05, "payload_x_m": 4.7, "payload_z_m": 0.85}
 
 
 def loader(mount: Mount | None = None, **options: float) -> MachineConfig:
@@ -291,11 +285,7 @@ LOADER = MachineConfig(
     [
         (0.0, 0.0, 0.5),  # the load centre lies in the middle
         (4000.0, 0.0, (17_500 * 1.5 + 4000 * 4.7) / (21_500 * 3.0)),
-        (
-            0.0,
-            2.0,
-            0.5 - 2.0 / math.sqrt(GRAVITY_MPS2**2 - 4) / 3.0,
-        ),  # uphill, or faster: to the rear
+        (0.0, 2.0, 0.5 - 2.0 / math.sqrt(GRAVITY_MPS2**2 - 4) / 3.0),  # uphill, or faster: to the rear
         (0.0, -2.0, 0.5 + 2.0 / math.sqrt(GRAVITY_MPS2**2 - 4) / 3.0),
     ],
 )

@@ -11,13 +11,7 @@ from agents.localisation import measurements
 from agents.localisation.filters.state import Layout
 from agents.localisation.headings import UNKNOWN_STD
 from agents.localisation.imu_steps import FilterStep, ImuMean, Turn
-from agents.localisation.motion_sensors import (
-    ROLLING_S,
-    STANDSTILL_S,
-    MotionSensors,
-    machine_speed,
-    rolling_resistance,
-)
+from agents.localisation.motion_sensors import ROLLING_S, STANDSTILL_S, MotionSensors, machine_speed, rolling_resistance
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.units import GRAVITY_MPS2
 
