@@ -40,6 +40,9 @@ def machine(mount: Mount | None = None, receivers: int = 1, **options: Any) -> M
     return MachineConfig("loader-1", sensors=tuple(sensors), **options)
 
 
+VEHICLE = machine()
+
+
 def changed_sensor(vehicle: MachineConfig, name: str, **options: Any) -> MachineConfig:
     return replace(vehicle, sensors=tuple(replace(s, **options) if s.name == name else s for s in vehicle.sensors))
 
@@ -240,7 +243,6 @@ def reckoned(vehicle: MachineConfig, readings: Iterable[Reading], slip: float = 
     dead_reckoning = DeadReckoning(vehicle, slip)
     for reading in readings:
         sensor = vehicle.sensor(reading.sensor)
-        assert sensor
         dead_reckoning.update(reading, sensor)
     return dead_reckoning
 
@@ -258,7 +260,6 @@ class RunLocaliser(Localiser):
         poses: list[PoseBelief] = []
         for reading in readings:
             sensor = self._vehicle.sensor(reading.sensor)
-            assert sensor
             self.dead_reckoning.update(reading, sensor)
             poses += self.update(reading, sensor, self.dead_reckoning)
         return poses

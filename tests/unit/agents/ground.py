@@ -56,7 +56,6 @@ def balances(machine: MachineConfig, readings: Iterable[Reading], *, weighs: boo
     made = []
     for reading in readings:
         sensor = machine.sensor(reading.sensor)
-        assert sensor
         dead_reckoning.update(reading, sensor)
         if balance := balancer.update(reading, sensor, dead_reckoning):
             made.append(balance)
@@ -84,7 +83,6 @@ class EstimatorRun:
     def feed(self, readings: Iterable[Reading]) -> EstimatorRun:
         for reading in readings:
             sensor = self._machine.sensor(reading.sensor)
-            assert sensor
             self.dead_reckoning.update(reading, sensor)
             self.estimator.update(reading, sensor, self.dead_reckoning, self._known_c_rr)
             if reading.stamp_ns - self._asked_ns >= 100_000_000:
