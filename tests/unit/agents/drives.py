@@ -16,7 +16,7 @@ from agents.localisation.filters.belief import Belief, PoseBelief
 from agents.localisation.localiser import STEP_S, LocalisationConfig, Localiser
 from protocol.arrays import Floats, Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Articulation, Encoder, Gps, Imu, Payload, Reading, Torque
+from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu, Payload, Reading, Torque
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.units import GRAVITY_MPS2
@@ -25,6 +25,7 @@ from sim.simulator import Simulator
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 PROJECTION = Projection(SITE)
+START = (10.0, 20.0, 0.7)  # where drives start
 START_NS = 1_767_225_600_000_000_000
 TRUE_STEP_S = 0.01
 LEVER_M = (0.8, 0.3, 3.0)
@@ -224,6 +225,21 @@ def simulated(seed: int, seconds: float, **options: Any) -> tuple[SiteConfig, Ma
     for _ in range(simulator.bundles or 0):
         readings += simulator.advance()["loader-1"]
     return simulator.site, simulator.machines[0], readings, simulator.tracks()["loader-1"]
+
+
+def after(reading: Reading, seconds: float) -> bool:
+    return reading.stamp_ns > START_NS + seconds * 1e9
+
+
+def with_ahrs(made: Drive, off_rad: float = 0.0, from_s: float = 0.0, variance: float = 1e-4) -> list[Reading]:
+    """An attitude reference 20 times a second whose heading is off."""
+    more = [
+        Attitude("ahrs", stamp, 0.0, 0.0, math.sin(half), math.cos(half), variance, variance, variance)
+        for stamp, heading in zip(made.stamps_ns[::5], made.heading_rad[::5].tolist(), strict=True)
+        for half in [(heading + off_rad) / 2]
+        if stamp > START_NS + from_s * 1e9
+    ]
+    return sorted([*made.readings, *more], key=lambda r: r.stamp_ns)
 
 
 def made_up_samples(n: int, seed: int = 0) -> Table:

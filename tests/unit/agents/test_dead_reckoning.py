@@ -94,8 +94,6 @@ def test_odometry_is_integrated_over_time_and_a_pause_counts_one_second_at_most(
 def test_slip_is_taken_off_where_torque_drives(direction: int) -> None:
     """At a drive force of a tenth of the weight and slip 0.2 per traction, two per cent of the distance are lost."""
     wheels, torque = VEHICLE.sensor("wheels"), VEHICLE.sensor("torque")
-    assert wheels
-    assert torque
     reckoning = DeadReckoning(VEHICLE, slip=0.2)
     force_n = 0.1 * VEHICLE.mass_kg * GRAVITY_MPS2 * direction
     reckoning.update(Torque("torque", START_NS, force_n * VEHICLE.wheel_radius_m), torque)

@@ -20,19 +20,7 @@ from protocol.machine.samples import SAMPLE_DTYPE, check_samples
 from protocol.site.site_config import KnownGround, SiteConfig
 from sim.config import SimConfig
 from sim.recorder import record
-from tests.unit.agents.drives import (
-    S_BEND,
-    SITE,
-    START_NS,
-    VEHICLE,
-    Drive,
-    Ground,
-    Leg,
-    changed_sensor,
-    drive,
-    machine,
-    simulated,
-)
+from tests.unit.agents.drives import S_BEND, SITE, START_NS, VEHICLE, Ground, Leg, changed_sensor, drive, simulated
 
 SECOND = 10**9
 
@@ -238,8 +226,8 @@ FAIL_S, HEAL_S = 18.0, 30.0
 
 
 @cache
-def long_drive() -> Drive:
-    return drive(LONG, machine(), ground=Ground(0.05, 0.1))
+def long_drive() -> Any:
+    return drive(LONG, VEHICLE, ground=Ground(0.05, 0.1))
 
 
 def failing(fault: Callable[[Reading], Reading | None]) -> list[Reading]:
@@ -274,7 +262,7 @@ FAULTS: dict[str, tuple[Callable[[Reading], Reading | None], str]] = {
 def with_fault(name: str) -> tuple[Table, Pipeline, str]:
     """All samples, the pipeline at the end, and the fault that it reported a second before the sensor healed."""
     readings = failing(FAULTS[name][0])
-    pipeline = Pipeline(SITE, machine(), PipelineConfig())
+    pipeline = Pipeline(SITE, VEHICLE, PipelineConfig())
     rows = [pipeline.step([r for r in readings if seconds(r) < HEAL_S - 1])]
     fault = pipeline.health()["ground"]["fault"]
     rows += [pipeline.step([r for r in readings if seconds(r) >= HEAL_S - 1]), pipeline.finish()]
@@ -304,8 +292,8 @@ def test_sensor_that_fails_costs_the_resistance_and_nothing_else(name: str) -> N
 def test_torque_in_a_wrong_unit_costs_the_resistance_and_nothing_else() -> None:
     """In kNm where Nm are meant: known for sure once the machine has driven 20 s."""
     legs = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.6), Leg(3, -0.6)] * 7]
-    readings = [torque_times(0.001)(r) for r in drive(legs, machine(), ground=Ground(0.05, 0.1)).readings]
-    pipeline = Pipeline(SITE, machine(), PipelineConfig())
+    readings = [torque_times(0.001)(r) for r in drive(legs, VEHICLE, ground=Ground(0.05, 0.1)).readings]
+    pipeline = Pipeline(SITE, VEHICLE, PipelineConfig())
     rows = pipeline.step([r for r in readings if r])
     assert pipeline.health()["ground"]["fault"] == "torque_implausible"
     late = rows[rows["stamp_ns"] > START_NS + 30 * SECOND]
@@ -316,7 +304,7 @@ def test_torque_in_a_wrong_unit_costs_the_resistance_and_nothing_else() -> None:
 
 def test_torque_a_thousand_times_too_large_moves_no_position() -> None:
     made = long_drive()
-    rows = Pipeline(SITE, machine(), PipelineConfig()).step(failing(torque_times(1000.0)))
+    rows = Pipeline(SITE, VEHICLE, PipelineConfig()).step(failing(torque_times(1000.0)))
     for row in rows:
         x, y, heading = made.at(int(row["stamp_ns"]))
         assert math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y)) < 3
@@ -328,7 +316,7 @@ def test_accelerometer_in_g_withholds_samples_and_is_reported() -> None:
             return r
         return replace(r, force_x_mps2=r.force_x_mps2 / 9.81, force_z_mps2=r.force_z_mps2 / 9.81)
 
-    pipeline = Pipeline(SITE, machine(), PipelineConfig())
+    pipeline = Pipeline(SITE, VEHICLE, PipelineConfig())
     rows = pipeline.step([r for r in failing(in_g) if seconds(r) < HEAL_S])
     assert pipeline.health()["ground"]["fault"] == "accelerometer"
     assert pipeline.health()["withheld"]["accelerometer"] > 40
@@ -365,7 +353,7 @@ def test_finish_gives_what_still_waits_and_counts_what_has_no_place() -> None:
 
 def test_calibration_is_handed_over_a_pause_and_to_the_next_pipeline() -> None:
     known = Calibration(0.004, 0.02, ((1e-7, 0.0), (0.0, 1e-5)), START_NS - 10**9, 80)
-    vehicle, made = machine(), drive([*S_BEND, Leg(8), *S_BEND[2:]], machine()).readings
+    vehicle, made = VEHICLE, drive([*S_BEND, Leg(8), *S_BEND[2:]], VEHICLE).readings
     pipeline = Pipeline(SITE, vehicle, PipelineConfig(), known)
     pipeline.step([r for r in made if seconds(r) < 10 or seconds(r) > 20])
     assert pipeline.health()["counters"]["gap_restarts"] == 1
@@ -394,7 +382,7 @@ def test_known_ground_counts_well_inside_of_it_only(half_m: float, known: bool) 
 def test_known_ground_has_to_be_all_around_an_unsure_position(std_m: float, c_rr: float | None) -> None:
     """8 m from its edge: 3 m, and twice the standard deviation."""
     pad = KnownGround("pad", 0.04, ((0.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0)))
-    pipeline = Pipeline(replace(SITE, known_ground=(pad,)), machine(), PipelineConfig())
+    pipeline = Pipeline(replace(SITE, known_ground=(pad,)), VEHICLE, PipelineConfig())
     pipeline._positioning.poses.append(PoseBelief(START_NS, 8.0, 20.0, 0.0, 2.0, std_m**2 * np.eye(2)))
     assert pipeline._known_c_rr() == c_rr
 

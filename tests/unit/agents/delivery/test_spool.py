@@ -492,11 +492,6 @@ def test_failed_commit_leaves_no_transaction_open(
     spool.close()
 
 
-def test_bad_spool_option_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="max_samples"):
-        SpoolConfig(max_samples=0)
-
-
 # --- damage that SQLite does not see ---------------------------------------------------------------------------------
 
 

@@ -10,14 +10,7 @@ import pytest
 
 from agents.estimation import ground, plausibility
 from agents.estimation.calibration import SCALE_STD, ZERO_STD, Calibration
-from agents.estimation.ground import (
-    ESTIMATORS,
-    MASSES,
-    NOTHING_KNOWN,
-    EstimationConfig,
-    GroundEstimate,
-    GroundEstimator,
-)
+from agents.estimation.ground import ESTIMATORS, NOTHING_KNOWN, EstimationConfig, GroundEstimate, GroundEstimator
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Reading, Torque
 from protocol.units import GRAVITY_MPS2
@@ -428,7 +421,7 @@ def test_nothing_is_learnt_of_moments_that_show_nothing(monkeypatch: pytest.Monk
 # --- options ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mass", MASSES)
+@pytest.mark.parametrize("mass", ground.MASSES)
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_every_combination_runs(estimator: str, mass: str) -> None:
     vehicle = weighing()

@@ -10,33 +10,34 @@ from agents.localisation.filters.state import ATTITUDE, BASE_STATES, SPEED, YAW,
 from agents.localisation.localiser import LocalisationConfig
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Attitude, Encoder, Gps, Imu, Reading, Torque
+from protocol.machine.readings import Encoder, Gps, Imu, Reading, Torque
 from protocol.site.site_config import Projection
 from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import (
     PROJECTION,
     S_BEND,
+    START,
     START_NS,
     VEHICLE,
     Drive,
     Ground,
     Leg,
     RunLocaliser,
+    after,
     changed_sensor,
     drive,
     fix,
     localiser,
     machine,
     simulated,
+    with_ahrs,
 )
 
 GYRO_BIAS = Layout(imus=1).gyro_bias(0)
 FILTERS = pytest.mark.parametrize("engine", ["ekf", "ukf"])
-START = (10.0, 20.0, 0.7)  # where made-up drives start
 
 
 def state(located: RunLocaliser) -> Floats:
-    assert located.belief
     return located.belief.x
 
 
@@ -48,10 +49,6 @@ def moved(reading: Reading, north_m: float) -> Reading:
     """A fix that lies further north."""
     assert isinstance(reading, Gps)
     return replace(reading, lat_deg=reading.lat_deg + north_m / 111_200)
-
-
-def after(reading: Reading, seconds: float) -> bool:
-    return reading.stamp_ns > START_NS + seconds * 1e9
 
 
 @pytest.mark.parametrize(  # each pair of choices once
@@ -347,16 +344,6 @@ def test_a_given_start_may_lie_anywhere() -> None:
     x, y, heading = made.at(last.stamp_ns)
     assert (last.x_m, last.y_m) == pytest.approx((-500 - (x - 10), 70 - (y - 20)), abs=0.6)
     assert abs(math.remainder(last.heading_rad - heading - math.pi, math.tau)) < 0.02
-
-
-def with_ahrs(made: Drive, off_rad: float) -> list[Reading]:
-    """An attitude reference 20 times a second whose heading is off."""
-    more = [
-        Attitude("ahrs", stamp, 0.0, 0.0, math.sin(half), math.cos(half), 1e-4, 1e-4, 1e-4)
-        for stamp, heading in zip(made.stamps_ns[::5], made.heading_rad[::5].tolist(), strict=True)
-        for half in [(heading + off_rad) / 2]
-    ]
-    return sorted([*made.readings, *more], key=lambda r: r.stamp_ns)
 
 
 def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores() -> None:
