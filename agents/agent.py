@@ -1,7 +1,5 @@
 """One machine's process: driver -> pipeline -> spool -> uplink; it publishes pose and health too."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

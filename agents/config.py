@@ -1,7 +1,5 @@
 """Options of an agent (config/agent.toml): its machine, its sensors, and one table per stage."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Dead reckoning: distance, turn and speed of a machine from its wheels and gyro."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Fixes that are withheld from the filter and compared with its poses: an honest error on real logs."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

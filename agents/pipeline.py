@@ -3,12 +3,10 @@
 `Positioning` is the half of it that locates the machine; `Pipeline` adds the estimate of the ground, and samples of it.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,10 +14,9 @@ from agents.dead_reckoning import DeadReckoning
 from agents.drivers.stream_order import Decision, StreamOrder
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
-from agents.localisation.config import LocalisationConfig
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import SPEED
-from agents.localisation.localiser import Localiser
+from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
 from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig, SensorConfig
@@ -33,23 +30,6 @@ class PipelineConfig:
 
     localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
     estimation: EstimationConfig = field(default_factory=EstimationConfig)
-
-
-class PoseSource(Protocol):
-    """A source of poses: a `Pipeline`, or its half that locates alone."""
-
-    @property
-    def pose(self) -> PoseBelief | None:
-        """The newest pose, None until the start heading is known."""
-        ...
-
-    def pose_at(self, stamp_ns: int) -> PoseBelief | None:
-        """Pose at a recent stamp, None where it is not known."""
-        ...
-
-    def step(self, readings: Sequence[Reading]) -> object:
-        """Take in readings in the order of their stamps."""
-        ...
 
 
 class Accepted(NamedTuple):
@@ -214,3 +194,6 @@ class Pipeline:
         self._estimator = GroundEstimator(machine, config.estimation, known)
         self._sampler = Sampler(self._positioning.poses, machine.load_centre_m)
         self._odometer = Odometer()
+
+
+PoseSource = Positioning | Pipeline  # what locates a machine

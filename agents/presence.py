@@ -7,8 +7,6 @@ both started without a router, neither sees the other. Their samples have differ
 spool.py.)
 """
 
-from __future__ import annotations
-
 import os
 import secrets
 import socket

@@ -3,13 +3,12 @@
 A sample is made LAG_S later than the machine was there, so that the estimator has seen what came next.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
@@ -28,6 +27,7 @@ HISTORY_S = 30.0  # how long poses are kept: a sample looks back by LAG_S, and a
 LAG_NS, HISTORY_NS = round(LAG_S * 1e9), round(HISTORY_S * 1e9)
 SILENT_NS = 500_000_000  # wheels without a reading for so long are taken to be gone
 MIN_SPEED_MPS = 0.3  # a slower speed of the filter alone is noise, not distance
+_stamp = attrgetter("stamp_ns")
 
 
 @dataclass(frozen=True)
@@ -146,10 +146,6 @@ class Sampler:
         grade = (c * e.slope_x - s * e.slope_y, s * e.slope_x + c * e.slope_y, e.slope_var)
         place = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)
         return [(*place, e.c_rr, e.c_rr_var, *grade)]
-
-
-def _stamp(pose: PoseBelief) -> int:
-    return pose.stamp_ns
 
 
 def _interpolate(a: PoseBelief, b: PoseBelief, stamp_ns: int) -> PoseBelief:

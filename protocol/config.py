@@ -1,7 +1,5 @@
 """TOML files into frozen dataclasses: types checked, unknown keys refused by name, every error with its place."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,12 +1,6 @@
 """The error tree. Each error makes its own one-line message: what is wrong, where, and what to do where that helps."""
 
-from __future__ import annotations
-
 from enum import StrEnum
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:  # types alone: the functional core knows no files
-    from pathlib import Path
 
 
 class Refusal(StrEnum):
@@ -58,18 +52,19 @@ class SitegridError(Exception):
         super().__init__(one_line(text))
 
 
-class ConfigError(SitegridError):
+class _PlaceError(SitegridError):
+    """Something is wrong at a place: a file or a key in it, a folder, an address."""
+
+    def __init__(self, where: object, problem: str) -> None:
+        super().__init__(f"{where}: {problem}")
+
+
+class ConfigError(_PlaceError):
     """A configuration file, or a value in it, is wrong."""
 
-    def __init__(self, where: str | Path, problem: str) -> None:
-        super().__init__(f"{where}: {problem}")
 
-
-class LogFolderError(SitegridError):
+class LogFolderError(_PlaceError):
     """A log folder or its manifest cannot be read."""
-
-    def __init__(self, where: str | Path, problem: str) -> None:
-        super().__init__(f"{where}: {problem}")
 
 
 class MessageError(SitegridError):
@@ -94,15 +89,9 @@ class QueryError(SitegridError):
         self.reason = str(reason)
 
 
-class LinkError(SitegridError):
+class LinkError(_PlaceError):
     """Nobody answered on the network."""
 
-    def __init__(self, endpoint: str, problem: str) -> None:
-        super().__init__(f"{endpoint}: {problem}")
 
-
-class StoreError(SitegridError):
+class StoreError(_PlaceError):
     """A database or snapshot on disk cannot be used."""
-
-    def __init__(self, path: str | Path, problem: str) -> None:
-        super().__init__(f"{path}: {problem}")

@@ -1,7 +1,5 @@
 """Files: TOML read with errors for people; files that are whole or not there, written beside their place."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import secrets

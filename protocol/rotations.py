@@ -4,8 +4,6 @@ Everything takes one attitude or arrays of them; vectors, matrices and quaternio
 Plain sums of products rather than `@` and `einsum`, which round differently with the number of attitudes.
 """
 
-from __future__ import annotations
-
 import math
 from typing import TypeVar
 

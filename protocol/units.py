@@ -1,7 +1,5 @@
 """Units that logs come in, their factor to the unit that a field's suffix names, and standard gravity."""
 
-from __future__ import annotations
-
 import math
 
 GRAVITY_MPS2 = 9.80665  # standard gravity (ISO 80000-3)

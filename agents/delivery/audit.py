@@ -6,9 +6,7 @@ crash prevented are added when the spool is opened again. So no line claims a sa
 that loses committed samples shows as a loss.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from protocol.arrays import Table
@@ -66,21 +64,15 @@ def read_audit(path: Path) -> dict[Identity, str]:
 def parse(lines: Iterable[str]) -> dict[Identity, str]:
     """Hash by identity, of audit lines; malformed lines are skipped."""
     recorded: dict[Identity, str] = {}
-    for sign, spool_id, seq, content in _fields(lines):
-        if sign == "+":
-            recorded[spool_id, seq] = content
-        else:
-            recorded.pop((spool_id, seq), None)
+    for line in lines:
+        match line.split() if "#" not in line else []:
+            case ["+", spool_id, seq, content]:
+                recorded[int(spool_id, 16), int(seq)] = content
+            case ["-", spool_id, seq]:
+                recorded.pop((int(spool_id, 16), int(seq)), None)
     return recorded
 
 
 def _whole_lines(text: str) -> list[str]:
     """Lines without a last one that a crash cut off."""
     return text[: text.rfind("\n") + 1].splitlines()
-
-
-def _fields(lines: Iterable[str]) -> Iterator[tuple[str, int, int, str]]:
-    for line in lines:
-        parts = line.split()
-        if "#" not in line and (len(parts), parts[:1]) in ((4, ["+"]), (3, ["-"])):
-            yield parts[0], int(parts[1], 16), int(parts[2]), parts[3] if len(parts) == 4 else ""

@@ -1,7 +1,5 @@
 """The uplink's thread: it carries out the actions of an `Uplink`, on the spool's file and over Zenoh."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time
@@ -10,17 +8,7 @@ from collections.abc import Callable
 import zenoh
 
 from agents.delivery.spool import Spool
-from agents.delivery.uplink import (
-    Action,
-    Delete,
-    LowerWatermark,
-    Quarantine,
-    ReadHead,
-    Send,
-    StartNewRun,
-    Uplink,
-    Wait,
-)
+from agents.delivery.uplink import Action, Delete, LowerWatermark, Quarantine, ReadHead, Send, StartNewRun, Uplink, Wait
 from protocol.errors import MessageError, StoreError
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply

@@ -9,8 +9,6 @@ spool_id.
 It is one module because every method is a transaction over the same few tables, and they must agree.
 """
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import sqlite3
@@ -22,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from agents.delivery.audit import AuditLog
-from agents.delivery.head import Head
 from agents.delivery.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
+from agents.delivery.uplink import Head
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty
@@ -79,11 +77,7 @@ class Spool:
     """
 
     def __init__(
-        self,
-        path: Path,
-        config: SpoolConfig,
-        audit: AuditLog | None = None,
-        draw_id: Callable[[], int] = random_id,
+        self, path: Path, config: SpoolConfig, audit: AuditLog | None = None, draw_id: Callable[[], int] = random_id
     ) -> None:
         self._path = path
         self._config = config

@@ -1,9 +1,9 @@
 """The spool's file: its tables, how it is opened, and transactions that leave nothing half done."""
 
-from __future__ import annotations
-
 import sqlite3
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 SCHEMA = 3
@@ -52,19 +52,13 @@ def why_unusable(error: Exception) -> str:
     return f"is no usable spool: {error}"
 
 
-class transaction:  # noqa: N801 - used like a keyword
+@contextmanager
+def transaction(db: sqlite3.Connection) -> Iterator[None]:
     """All or nothing; an error rolls back and goes on up, also one of the commit itself."""
-
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
-
-    def __enter__(self) -> None:
-        self._db.execute("BEGIN IMMEDIATE")
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        try:
-            if not kind:
-                self._db.execute("COMMIT")
-        finally:
-            if self._db.in_transaction:  # SQLite itself has rolled back after some errors of the disk
-                self._db.execute("ROLLBACK")
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        db.execute("COMMIT")
+    finally:
+        if db.in_transaction:  # SQLite itself has rolled back after some errors of the disk
+            db.execute("ROLLBACK")

@@ -8,15 +8,13 @@ What holds through kills of router, server and agent is a query with payload, a 
 a deletion after the reply. An empty reply means "no server" or "denied", never "done".
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
-from agents.delivery.head import Head
+from protocol.arrays import Table
 from protocol.errors import Refusal
 from protocol.machine.samples import empty
 from protocol.wire.codec import encode_batch
@@ -64,6 +62,26 @@ class Pacing:
     backoff_s: float = 0.2
     max_backoff_s: float = 5.0
     gather_s: float = 1.0
+
+
+@dataclass(frozen=True)
+class Head:
+    """What the spool hands over: its oldest final samples, of one run; none where an earlier run is to be closed.
+
+    lost_before: how many directly before them will never be sent. newest: the last sequence number given out, of the
+    run that is being recorded; None for an earlier run.
+    """
+
+    spool_id: int
+    first_seq: int
+    rows: Table
+    lost_before: int
+    newest: int | None = None
+
+    @property
+    def acknowledged(self) -> int:
+        """The last sample before the rows that the server has confirmed."""
+        return self.first_seq - 1 - self.lost_before
 
 
 @dataclass(frozen=True)

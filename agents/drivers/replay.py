@@ -1,7 +1,5 @@
 """Replay of a log folder, in real time, faster, or as fast as the agent is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 from protocol.machine.log_folder import LogFolder

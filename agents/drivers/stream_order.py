@@ -1,7 +1,5 @@
 """Order of readings by their stamps: duplicates and late readings are refused, jumps of the clock are noticed."""
 
-from __future__ import annotations
-
 from collections import Counter
 from enum import Enum
 

@@ -1,7 +1,5 @@
 """Sensor bundles of a simulated machine or a remote driver, over Zenoh."""
 
-from __future__ import annotations
-
 import queue
 from collections import Counter
 from collections.abc import Mapping, Sequence

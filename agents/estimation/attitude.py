@@ -9,8 +9,6 @@ The gyros predict u, the accelerometer corrects it. The parts of u ahead and to 
 slopes, positive uphill.
 """
 
-from __future__ import annotations
-
 import math
 
 from protocol.units import GRAVITY_MPS2

@@ -6,16 +6,17 @@ rotating mass factor,
     F / (m g) - (f - g squat) / g - (lambda - 1) a / g  =  direction c_rr cos(slope)
 
 The accelerometer measures gravity's share of the slope as well, so the grade cancels.
-"""
 
-from __future__ import annotations
+Squat is the pitch that payload and longitudinal force add to that of the ground. Axle loads of a rigid body in balance,
+N_f = m (g cos(slope) l_c - f h) / L and N_r = m g cos(slope) - N_f, press tyres of stiffness k per axle by N / k; the
+nose rises by (N_r - N_f) / (k L). The empty machine stands level: its own pitch is subtracted.
+"""
 
 import math
 from dataclasses import dataclass
 
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import SlopeFilter
-from agents.estimation.squat import front_share, squat_rad
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Articulation, Encoder, Imu, Odometry, Payload, Reading, Torque
@@ -60,6 +61,27 @@ class Balance:
     def direction(self) -> float:
         """+1 forwards, -1 in reverse."""
         return math.copysign(1.0, self.speed_mps)
+
+
+@dataclass(frozen=True, slots=True)
+class BalanceStep:
+    """One usable step of the force balance: raw = direction cos(slope) c_rr + scale error * share.
+
+    stamp_ns: of its end; dt_s; distance_m: driven since the last usable step. raw: with the calibration applied [-].
+    regressor: direction cos(slope) [-]. share: drive force over weight, signed ahead [-]. lead_share: share of the load
+    that the leading axle carries; wheelbase_m: how far the trailing axle is behind it; lead_m: how far the load centre
+    is. Without a wheelbase, all wheels stand on the same ground.
+    """
+
+    stamp_ns: int
+    dt_s: float
+    distance_m: float
+    raw: float
+    regressor: float
+    share: float
+    lead_share: float = 1.0
+    wheelbase_m: float = 0.0
+    lead_m: float = 0.0
 
 
 class Balancer:
@@ -129,6 +151,8 @@ class Balancer:
         share = drive_n / ((machine.mass_kg + self.payload_kg) * g)
         on_front = front_share(machine, self.payload_kg, force)
         squat = squat_rad(machine, self.payload_kg, force)
+        bend = self._climb_of_bend(on_front, squat)
+        unbalanced = share - force / g + squat - bend - (machine.rotating_mass_factor - 1) * accel / g
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
         self._force_sums, self._torque_sums = NO_SUMS, (0, 0.0)
         return Balance(
@@ -137,11 +161,7 @@ class Balancer:
             speed_mps=speed,
             accel_mps2=accel,
             distance_m=dead_reckoning.distance_m,
-            unbalanced=share
-            - force / g
-            + squat
-            - self._climb_of_bend(on_front, squat)
-            - (machine.rotating_mass_factor - 1) * accel / g,
+            unbalanced=unbalanced,
             share=share,
             slope_x=self._slope.ahead.angle_rad - squat,
             slope_y=self._slope.left.angle_rad,
@@ -165,3 +185,31 @@ class Balancer:
 
     def _wheels_s(self) -> float:
         return (self._imu_ns - self._wheels_ns) * 1e-9 if self._wheels_ns else math.inf
+
+
+def front_share(machine: MachineConfig, payload_kg: float, force_mps2: float) -> float:
+    """Share of the load on the front axle [-]; 0 where the machine's data are missing.
+
+    force_mps2: specific force ahead, gravity's share included.
+    """
+    if not machine.wheelbase_m:
+        return 0.0
+    ahead = machine.mass_kg * machine.load_centre_m + payload_kg * machine.payload_x_m  # first moments of mass
+    above = machine.mass_kg * machine.cog_height_m + payload_kg * machine.payload_z_m
+    lever = ahead - above * force_mps2 / _down(force_mps2)
+    return lever / ((machine.mass_kg + payload_kg) * machine.wheelbase_m)
+
+
+def squat_rad(machine: MachineConfig, payload_kg: float, force_mps2: float) -> float:
+    """Nose-up angle [rad] against the empty machine at rest on the level; 0 where the machine's data are missing."""
+    if not (machine.wheelbase_m and machine.axle_stiffness_npm):
+        return 0.0
+    weight_n = (machine.mass_kg + payload_kg) * _down(force_mps2)
+    rear_n = weight_n * (1 - 2 * front_share(machine, payload_kg, force_mps2))  # more than on the front
+    empty_n = machine.mass_kg * GRAVITY_MPS2 * (1 - 2 * front_share(machine, 0.0, 0.0))
+    return (rear_n - empty_n) / (machine.axle_stiffness_npm * machine.wheelbase_m)
+
+
+def _down(force_mps2: float) -> float:
+    """Gravity's share across the slope that a steady machine with this force stands on [m/s2]."""
+    return math.sqrt(max(GRAVITY_MPS2**2 - force_mps2**2, 1.0))

@@ -10,8 +10,6 @@ resistance, one passage is enough. Both enter a Kalman filter over zero and scal
 as at the border of a zone, is excluded.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter, deque
 from dataclasses import dataclass

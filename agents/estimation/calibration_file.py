@@ -1,7 +1,5 @@
 """The calibration of a machine on disk, so that a restart does not forget it."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict

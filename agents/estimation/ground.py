@@ -5,8 +5,6 @@ Readings become balances of force (`balance`); those that show nothing of the gr
 stamp is asked for a little later, so that the steps after it help.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections import deque
@@ -14,10 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.balance import Balance, Balancer
+from agents.estimation.balance import Balance, Balancer, BalanceStep
 from agents.estimation.calibration import UNCALIBRATED, ZERO_STD, Calibration, Calibrator
 from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility
-from agents.estimation.resistance import BalanceStep, ResistanceEstimator
 from agents.estimation.resistance_kalman import KalmanResistance
 from agents.estimation.resistance_rls import RecursiveGrade, RecursiveResistance
 from protocol.machine.machine_config import MachineConfig, SensorConfig
@@ -98,7 +95,7 @@ class GroundEstimator:
         self._calibrator = Calibrator(calibration)
         self._applied = UNCALIBRATED
         estimates_mass = config.mass == "estimated"
-        self._resistance: ResistanceEstimator = (
+        self._resistance: KalmanResistance | RecursiveResistance = (
             KalmanResistance(estimates_mass=estimates_mass)
             if config.estimator == "kalman"
             else RecursiveResistance(estimates_mass=estimates_mass)

@@ -5,8 +5,6 @@ its axles stand on two slopes; and sensors fail: they fall silent, freeze (stuck
 in the wrong unit.
 """
 
-from __future__ import annotations
-
 import math
 
 from agents.estimation.balance import Balance

@@ -22,15 +22,13 @@ Nikiforov 1993, chapter 2). The likeliest jump is accepted if it is large enough
 so that a border lies where it is and not where it was noticed. The smoother never crosses a border.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from typing import NamedTuple
 
 import numpy as np
 
-from agents.estimation.resistance import BalanceStep
+from agents.estimation.balance import BalanceStep
 from protocol.arrays import Floats
 
 LEAD, TRAIL, SCALE = 0, 1, 2

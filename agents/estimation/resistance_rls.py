@@ -10,13 +10,11 @@ where L_i in the second equation is computed as if the other parameters were kno
 here, f in lambda = f^dt, so that they mean the same at any rate.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 
-from agents.estimation.resistance import BalanceStep
+from agents.estimation.balance import BalanceStep
 from protocol.arrays import Floats
 
 NEAR_NS = 500_000_000  # a stamp this far from a usable step has no estimate

@@ -1,7 +1,5 @@
 """Alignment: how the frame of dead reckoning lies in `map`, and the belief that the filter starts from."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,19 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.dead_reckoning import DeadReckonedPose
+from agents.localisation.filters import state
 from agents.localisation.filters.belief import Belief
-from agents.localisation.filters.state import (
-    ACCELERATION,
-    ATTITUDE,
-    PITCH,
-    POSITION,
-    RATE,
-    ROLL,
-    SPEED,
-    VELOCITY,
-    YAW,
-    Layout,
-)
 from agents.localisation.gps import Fix
 from agents.localisation.imu_steps import FilterStep
 from protocol.arrays import Floats
@@ -87,7 +74,7 @@ def align_start(start: Sequence[float], reckoned: DeadReckonedPose) -> Alignment
 
 
 def start_belief(
-    alignment: Alignment, step: FilterStep, forces_mps2: Sequence[Floats], layout: Layout, turn_error_radps: float
+    alignment: Alignment, step: FilterStep, forces_mps2: Sequence[Floats], layout: state.Layout, turn_error_radps: float
 ) -> Belief:
     """The belief at the first step. The filter uses the fixes again, so the position is left wide.
 
@@ -98,15 +85,15 @@ def start_belief(
     c, s = math.cos(alignment.rotation_rad), math.sin(alignment.rotation_rad)
     x, variance = np.zeros(layout.n), np.full(layout.n, 1e-6)
     x[:2] = alignment.origin_m + np.array([c * reckoned.x_m - s * reckoned.y_m, s * reckoned.x_m + c * reckoned.y_m])
-    x[YAW] = wrap_angle(alignment.rotation_rad + reckoned.angle_rad)
-    x[SPEED] = step.speed_mps
+    x[state.YAW] = wrap_angle(alignment.rotation_rad + reckoned.angle_rad)
+    x[state.SPEED] = step.speed_mps
     if forces_mps2:
         ahead, left, _ = np.mean(forces_mps2, axis=0) / GRAVITY_MPS2
-        x[ROLL], x[PITCH] = math.asin(np.clip(left, -0.7, 0.7)), -math.asin(np.clip(ahead, -0.7, 0.7))
-    variance[POSITION] = (2 * alignment.fix_std_m) ** 2
-    variance[ATTITUDE] = 0.1**2
-    variance[YAW] = min(0.5, 2 * alignment.std_rad + 0.05) ** 2
-    variance[VELOCITY], variance[RATE], variance[ACCELERATION] = SPEED_STD_MPS**2, 0.1**2, 1.0
+        x[state.ROLL], x[state.PITCH] = math.asin(np.clip(left, -0.7, 0.7)), -math.asin(np.clip(ahead, -0.7, 0.7))
+    variance[state.POSITION] = (2 * alignment.fix_std_m) ** 2
+    variance[state.ATTITUDE] = 0.1**2
+    variance[state.YAW] = min(0.5, 2 * alignment.std_rad + 0.05) ** 2
+    variance[state.VELOCITY], variance[state.RATE], variance[state.ACCELERATION] = SPEED_STD_MPS**2, 0.1**2, 1.0
     variance[layout.gyro_biases] = GYRO_BIAS_RADPS**2
     variance[layout.wheel_scales] = WHEEL_SCALE**2
     if layout.imus and turn_error_radps:

@@ -5,8 +5,6 @@ innovations are not correlated (white): Bar-Shalom, Li, Kirubarajan, Estimation 
 Navigation, section 5.4.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ this is the transform of a receiver's fixes into the vehicle's own world, by its
 and yaw (navsat_transform): on the way back into the map the rotations cancel, and this shift is left.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

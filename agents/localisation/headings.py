@@ -5,8 +5,6 @@ an angular rate. Relative: the heading is turned so that the first one agrees wi
 stay, since gravity gives them. Differential and relative ones are measurements of their own stamps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +16,7 @@ from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Change, Measurement
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.imu_steps import FilterStep
+from agents.localisation.measurements import GATE_SIGMA
 from agents.localisation.sensor_modes import ModalSensors, StampedValue, anchor_states
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, RELATIVE, SensorConfig
@@ -89,9 +88,7 @@ class References(ModalSensors[Orientation]):
     ) -> Measurement:
         sensor, R = orientation.sensor, np.diag(orientation.value.variances)
         error = self._states.get(sensor.name)
-        return measurements.orientation(
-            stamp_ns, sensor.name, rpy_rad, R, sensor.gate(measurements.GATE_SIGMA), error, change
-        )
+        return measurements.orientation(stamp_ns, sensor.name, rpy_rad, R, sensor.gate(GATE_SIGMA), error, change)
 
     def _first_change(self, orientation: Orientation) -> Change | None:
         """Gives the state of the anchor's error its first value."""
@@ -109,9 +106,8 @@ class References(ModalSensors[Orientation]):
         (sr, cr), (sp, cp) = ((math.sin(a), math.cos(a)) for a in now.values[:2].tolist())
         body_from_rates = np.array([[1.0, 0.0, -sp], [0.0, cr, cp * sr], [0.0, -sr, cp * cr]])
         R = body_from_rates * mean.variances @ body_from_rates.T
-        return measurements.rotation(
-            mean.stamp_ns, sensor.name, body_from_rates @ mean.values, R, sensor.gate(measurements.GATE_SIGMA)
-        )
+        rates = body_from_rates @ mean.values
+        return measurements.rotation(mean.stamp_ns, sensor.name, rates, R, sensor.gate(GATE_SIGMA))
 
 
 def _anchor_heading(belief: Belief, states: slice, variance: float) -> Belief:

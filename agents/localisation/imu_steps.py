@@ -1,7 +1,5 @@
 """Readings of fast sensors gathered into filter steps: means of IMUs in `base_link`, the wheels' speed at the end."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import dataclass

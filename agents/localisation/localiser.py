@@ -1,13 +1,11 @@
 """The localiser: readings in, poses out. Until it knows its heading it only collects."""
 
-from __future__ import annotations
-
+import math
 from collections import Counter, deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
-from agents.localisation.config import LocalisationConfig
 from agents.localisation.consistency import Consistency
 from agents.localisation.filters.belief import Belief, Filter, PoseBelief
 from agents.localisation.filters.ekf import Ekf
@@ -15,13 +13,12 @@ from agents.localisation.filters.history import Fusion
 from agents.localisation.filters.motion import MotionModel
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
-from agents.localisation.gps import Fix, Receivers
-from agents.localisation.headings import References
+from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.headings import References, anchored_headings
 from agents.localisation.imu_steps import FilterStep, StepGatherer
-from agents.localisation.layout import layout_of, shows_tilt
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Reading
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
@@ -29,6 +26,34 @@ from protocol.site.site_config import Projection
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
 ENGINES: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
+PROFILES = ("default", "paper")
+
+
+@dataclass(frozen=True)
+class LocalisationConfig:
+    """How positions are found.
+
+    filter: ekf or ukf. profile: "paper" takes GPS errors as white; "default" estimates a slow error of each receiver, a
+    bias of each yaw gyro and the wheels' scale. start: x, y [m] and heading [rad] in `map`, where they are known: no
+    alignment is needed then, nor GPS. slip, slip_soft: wheel slip per traction on firm ground, and how much it rises
+    with the rolling resistance; of the tyres.
+    """
+
+    filter: str = "ukf"
+    profile: str = "default"
+    start: tuple[float, ...] = ()
+    slip: float = 0.1
+    slip_soft: float = 0.9
+
+    def __post_init__(self) -> None:
+        if self.filter not in ENGINES:
+            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(ENGINES)}")
+        if self.profile not in PROFILES:
+            raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
+        if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
+            raise ValueError("slip: must be from 0 to below 1, slip_soft not negative")
+        if len(self.start) not in (0, 3) or not all(map(math.isfinite, self.start)):
+            raise ValueError("start: must be x, y and heading, or empty")
 
 
 class Localiser:
@@ -39,12 +64,12 @@ class Localiser:
     ) -> None:
         self._config = config
         augmented = config.profile == "default"
-        layout = layout_of(machine) if augmented else Layout()
+        layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
         self._receivers = Receivers(machine.sensors, projection, layout, slow=augmented)
         self._references = References(machine.sensors, layout)
         self._body = MotionSensors(machine, layout, step_s, config.slip, config.slip_soft)
-        source, on_plane = turn_source(machine), not shows_tilt(machine, config.profile)
+        source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
         self._model = MotionModel(layout, on_plane, self._receivers.errors, turn_error_radps=turn_error)
         self._fusion: Fusion | None = None
@@ -134,6 +159,23 @@ class Localiser:
         self._steps.clear()
         self._fixes.clear()
         return beliefs
+
+
+def _layout_of(machine: MachineConfig) -> Layout:
+    """States for the slow errors of a machine's sensors."""
+    source = turn_source(machine)
+    imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
+    turns = imus + (source is not None and source.kind != "imu")
+    return Layout(turns, True, len(drifting(machine.sensors)), len(anchored_headings(machine.sensors)))
+
+
+def _shows_tilt(machine: MachineConfig, profile: str) -> bool:
+    """Whether a sensor shows roll and pitch, or how they change; a machine without any is taken to be on a plane."""
+    return any(
+        s.kind == "imu" or (s.kind == "attitude" and s.provides("tilt") and (profile == "paper" or s.mode != ABSOLUTE))
+        for s in machine.sensors
+        if s.use
+    )
 
 
 def _pose(belief: Belief, speed_mps: float) -> PoseBelief:

@@ -6,8 +6,6 @@ and [.]_en are the components east and north. States (m, n) come as rows; where 
 it works on columns, whose values adjoin. Angular rates and forces are turned into `base_link` before they come here.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,14 @@
-"""IMUs, wheels, and what else shows the turn: from filter steps to measurements of the body's motion."""
+"""IMUs, wheels, and what else shows the turn: from filter steps to measurements of the body's motion.
 
-from __future__ import annotations
+Driven wheels turn further than the machine moves, by a share that grows with traction.
 
+    slip = traction (s0 + s1 rolling)        machine speed = wheel speed (1 - slip sign(speed))
+
+traction: drive force over weight, signed ahead. rolling: the part of it that neither climbs nor accelerates, which an
+accelerometer ahead measures together. s0, s1: `slip` and `slip_soft` of the tyres; soft ground resists, and gives way.
+"""
+
+import math
 from collections import Counter
 
 import numpy as np
@@ -12,17 +19,19 @@ from agents.localisation.filters.belief import Measurement
 from agents.localisation.filters.state import Layout
 from agents.localisation.headings import UNKNOWN_STD
 from agents.localisation.imu_steps import FilterStep
-from agents.localisation.slip import machine_speed, rolling_resistance
+from agents.localisation.measurements import GATE_SIGMA
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.units import GRAVITY_MPS2
 
 STANDSTILL_S = 1.0  # after so long without travel the machine stands; coarse ticks of one that crawls come sooner
+ROLLING_S = 0.5  # time constant of the low-pass on the rolling resistance
 
 
 class MotionSensors:
     """The motion sensors of one machine; step_s: length of a filter step.
 
-    slip, slip_soft: of the tyres, as in `slip`.
+    slip, slip_soft: of the tyres.
     """
 
     def __init__(self, machine: MachineConfig, layout: Layout, step_s: float, slip: float, slip_soft: float) -> None:
@@ -59,11 +68,8 @@ class MotionSensors:
             return []
         error = layout.gyro_biases.stop - 1 if layout.imus else None
         rate, per_error = step.turn.rate_radps, step.turn.per_error
-        return [
-            measurements.turn(
-                step.stamp_ns, rate, _turn_std(source), error, per_error, source.gate(measurements.GATE_SIGMA)
-            )
-        ]
+        std, gate = _turn_std(source), source.gate(GATE_SIGMA)
+        return [measurements.turn(step.stamp_ns, rate, std, error, per_error, gate)]
 
     def wheels(self, step: FilterStep) -> list[Measurement]:
         """Speed of the wheels less their slip, and a standstill; nothing of wheels that are silent, not at rest."""
@@ -75,9 +81,8 @@ class MotionSensors:
         forward_std, side_std = self._wheels.std.get("speed", measurements.SPEED_MPS), measurements.SIDE_MPS
         R = np.diag([forward_std**2, side_std**2, side_std**2])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
-        rolled = measurements.wheels(
-            step.stamp_ns, "wheels", np.array([speed, 0.0, 0.0]), R, scale, self._wheels.gate(measurements.GATE_SIGMA)
-        )
+        z, gate = np.array([speed, 0.0, 0.0]), self._wheels.gate(GATE_SIGMA)
+        rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate)
         return [rolled, measurements.standstill(step.stamp_ns)] if step.still_s >= STANDSTILL_S else [rolled]
 
     def _inertial(self, step: FilterStep, index: int, sensor: SensorConfig) -> Measurement:
@@ -87,9 +92,18 @@ class MotionSensors:
         z, R = np.concatenate([mean.rates_radps, mean.force_mps2]), np.diag([rate_std**2] * 3 + [force_std**2] * 3)
         bias = self._layout.gyro_bias(index) if self._layout.imus else None
         lever = np.array(sensor.mount.xyz_m)
-        return measurements.inertial(
-            step.stamp_ns, sensor.name, z, R, lever, bias, sensor.gate(measurements.GATE_SIGMA)
-        )
+        return measurements.inertial(step.stamp_ns, sensor.name, z, R, lever, bias, sensor.gate(GATE_SIGMA))
+
+
+def rolling_resistance(before: float, traction: float, force_ahead_mps2: float, dt_s: float) -> float:
+    """Rolling resistance over weight [-], low-passed from the one before; force_ahead_mps2: of the accelerometer."""
+    rolling = abs(traction - force_ahead_mps2 / GRAVITY_MPS2)
+    return before + min(dt_s / ROLLING_S, 1.0) * (rolling - before)
+
+
+def machine_speed(wheel_mps: float, traction: float, slip_per_traction: float) -> float:
+    """Speed of a machine [m/s] from that of its wheels."""
+    return wheel_mps * (1 - traction * slip_per_traction * math.copysign(1.0, wheel_mps))
 
 
 def _turn_std(source: SensorConfig) -> float:

@@ -6,8 +6,6 @@ start is zero by definition. Here the filter may be unsure of it and learn bette
 anchor gets states of its own: how far off the filter was at that moment.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
@@ -52,12 +50,10 @@ class Measured(Protocol):
     @property
     def stamp_ns(self) -> int:
         """When it was measured."""
-        ...
 
     @property
     def sensor(self) -> SensorConfig:
         """What measured it."""
-        ...
 
 
 Value = TypeVar("Value", bound=Measured)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from agents.localisation.config import LocalisationConfig
+from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import PipelineConfig
 from protocol.errors import SitegridError
 from protocol.machine.machine_config import MachineConfig

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from agents.dead_reckoning import DeadReckoning
-from agents.localisation.config import LocalisationConfig
-from agents.localisation.localiser import Localiser
+from agents.localisation.localiser import LocalisationConfig, Localiser
 from evaluation.campaign.figures import rounded
 from evaluation.positions.real_logs import refitted
 from protocol.machine.log_folder import LogFolder, open_log

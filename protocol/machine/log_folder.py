@@ -3,14 +3,12 @@
 The manifest may lie apart from the data, so that logs of others are described without touching them.
 """
 
-from __future__ import annotations
-
 import csv
 import gzip
 import heapq
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -68,14 +66,15 @@ class LogFolder:
         path = self.data / source.file
         try:
             with open_text(path) as text:
-                yield from self._parse(csv.DictReader(_lines(text, path)), source, path)
+                yield from self._parse(text, source, path)
         except (OSError, EOFError, zlib.error, ValueError, csv.Error) as error:  # ValueError: no UTF-8, or no path
             raise LogFolderError(path, f"cannot be read: {error}") from None
 
-    def _parse(self, rows: csv.DictReader[str], source: SensorFile, path: Path) -> Iterator[Reading]:
-        names = columns(source.sensor.kind)
-        picks = [_pick(name, source.fields[name], rows, path) for name in names]
-        stamp_column, scale = _require(source.stamp.column, rows, path), stamp_scale(source.stamp.unit or "s")
+    def _parse(self, text: IO[str], source: SensorFile, path: Path) -> Iterator[Reading]:
+        rows = csv.DictReader(_lines(text, path))
+        header = rows.fieldnames or ()
+        picks = [_pick(name, source.fields[name], header, path) for name in columns(source.sensor.kind)]
+        stamp_column, scale = _require(source.stamp.column, header, path), stamp_scale(source.stamp.unit or "s")
         newest = 0
         for row in rows:
             try:
@@ -166,17 +165,17 @@ def _check_unit(name: str, column: Column, where: str) -> None:
         raise ConfigError(where, str(error)) from None
 
 
-def _pick(name: str, column: Column, rows: csv.DictReader[str], path: Path) -> tuple[str, float]:
+def _pick(name: str, column: Column, header: Sequence[str], path: Path) -> tuple[str, float]:
     """Return a CSV column and the factor to the field's unit; or no column and a constant."""
     scale = factor(column.unit, name) if column.unit else 1.0
     if not column.column:
         return "", column.value * scale
-    return _require(column.column, rows, path), scale
+    return _require(column.column, header, path), scale
 
 
-def _require(column: str, rows: csv.DictReader[str], path: Path) -> str:
-    if column not in (rows.fieldnames or ()):
-        raise LogFolderError(path, f"has no column `{column}`; it has {', '.join(rows.fieldnames or ())}")
+def _require(column: str, header: Sequence[str], path: Path) -> str:
+    if column not in header:
+        raise LogFolderError(path, f"has no column `{column}`; it has {', '.join(header)}")
     return column
 
 

@@ -1,7 +1,5 @@
 """Description of a machine: the nominal dimensions of its body, and its sensors with their mounting."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

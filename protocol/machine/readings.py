@@ -4,8 +4,6 @@ Each kind is a flat frozen dataclass whose fields are also the columns of log fo
 suffix of a field is its unit. Values are raw: in the sensor's own frame, before any correction.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from typing import ClassVar
@@ -35,9 +33,7 @@ class Gps(Reading):
         "lat_deg": (-90, 90),
         "lon_deg": (-180, 180),
         "height_m": (-1e4, 1e5),
-        "var_e_m2": (1e-8, 1e6),
-        "var_n_m2": (1e-8, 1e6),
-        "var_u_m2": (1e-8, 1e6),
+        **dict.fromkeys(("var_e_m2", "var_n_m2", "var_u_m2"), (1e-8, 1e6)),
     }
 
     lat_deg: float
@@ -91,8 +87,7 @@ class Odometry(Reading):
 
     kind: ClassVar[str] = "odometry"
     limits: ClassVar[dict[str, tuple[float, float]]] = {
-        "speed_x_mps": (-100, 100),
-        "speed_y_mps": (-100, 100),
+        **dict.fromkeys(("speed_x_mps", "speed_y_mps"), (-100, 100)),
         "rate_z_radps": (-50, 50),
     }
 

@@ -1,13 +1,10 @@
 """Samples: geotagged resistance and gradient, as structured rows; the same bytes on machine, wire and server."""
 
-from __future__ import annotations
-
 import hashlib
-from dataclasses import dataclass
 
 import numpy as np
 
-from protocol.arrays import AnyArray, Bools, Floats, Table
+from protocol.arrays import Bools, Table
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 
@@ -36,27 +33,20 @@ RESISTANCE = ("c_rr", "c_rr_var")  # may both be NaN
 GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
 
 
-@dataclass(frozen=True)
-class Limit:
-    """Plausible range of one column."""
-
-    low: float
-    high: float
-
-
-LIMITS: dict[str, Limit] = {
-    "stamp_ns": Limit(1, MAX_STAMP_NS),
-    "cov_xx_m2": Limit(0.0, 1e6),
-    "cov_yy_m2": Limit(0.0, 1e6),
-    "cov_xy_m2": Limit(-1e6, 1e6),
-    "heading_rad": Limit(-7.0, 7.0),
-    "speed_mps": Limit(-100.0, 100.0),
-    "distance_m": Limit(0.0, 100.0),
-    "c_rr": Limit(-1.0, 5.0),
-    "c_rr_var": Limit(0.0, 100.0),
-    "grade_e": Limit(-5.0, 5.0),
-    "grade_n": Limit(-5.0, 5.0),
-    "grade_var": Limit(0.0, 100.0),
+# Plausible range of each column.
+LIMITS: dict[str, tuple[float, float]] = {
+    "stamp_ns": (1, MAX_STAMP_NS),
+    "cov_xx_m2": (0.0, 1e6),
+    "cov_yy_m2": (0.0, 1e6),
+    "cov_xy_m2": (-1e6, 1e6),
+    "heading_rad": (-7.0, 7.0),
+    "speed_mps": (-100.0, 100.0),
+    "distance_m": (0.0, 100.0),
+    "c_rr": (-1.0, 5.0),
+    "c_rr_var": (0.0, 100.0),
+    "grade_e": (-5.0, 5.0),
+    "grade_n": (-5.0, 5.0),
+    "grade_var": (0.0, 100.0),
 }
 
 
@@ -78,42 +68,28 @@ def check_samples(rows: Table, extent_m: float) -> None:
     _check_finite(rows)
     for name in ("x_m", "y_m"):
         _refuse(np.abs(rows[name]) > extent_m, rows, name, Refusal.OUTSIDE_SITE, f"beyond {extent_m:g} m of the origin")
-    for name, limit in LIMITS.items():
-        bad: Bools = np.asarray(
-            (rows[name] < limit.low) | (rows[name] > limit.high)
-        )  # NaN passes here: it was checked above
+    for name, (low, high) in LIMITS.items():
+        bad: Bools = (rows[name] < low) | (rows[name] > high)  # NaN passes here: it was checked above
         reason = Refusal.COVARIANCE if name.startswith("cov_") else Refusal.OUT_OF_RANGE
-        _refuse(bad, rows, name, reason, f"not between {limit.low:g} and {limit.high:g}")
+        _refuse(bad, rows, name, reason, f"not between {low:g} and {high:g}")
     _refuse(~_is_semidefinite(rows), rows, "cov_xy_m2", Refusal.COVARIANCE, "covariance is not positive semidefinite")
 
 
 def _check_finite(rows: Table) -> None:
     for group in (RESISTANCE, GRADE):
         missing = np.stack([np.isnan(rows[name]) for name in group]).sum(axis=0)
-        _refuse(
-            (missing > 0) & (missing < len(group)),
-            rows,
-            group[0],
-            Refusal.NOT_FINITE,
-            f"{', '.join(group)} must be NaN together or not at all",
-        )
+        partly = (missing > 0) & (missing < len(group))
+        _refuse(partly, rows, group[0], Refusal.NOT_FINITE, f"{', '.join(group)} must be NaN together or not at all")
     for name in COLUMNS[1:]:
         may_be_nan = name in RESISTANCE or name in GRADE
-        bad = np.isinf if may_be_nan else _is_not_finite
-        _refuse(bad(rows[name]), rows, name, Refusal.NOT_FINITE, "not finite")
-
-
-def _is_not_finite(values: AnyArray) -> Bools:
-    return ~np.isfinite(values)
+        bad = np.isinf(rows[name]) if may_be_nan else ~np.isfinite(rows[name])
+        _refuse(bad, rows, name, Refusal.NOT_FINITE, "not finite")
 
 
 def _is_semidefinite(rows: Table) -> Bools:
-    xx, xy, yy = (_double(rows, name) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
-    return xx * yy - xy * xy >= -1e-6 * np.maximum(xx * yy, 1e-12)  # single precision rounds the product
-
-
-def _double(rows: Table, name: str) -> Floats:
-    return rows[name].astype(np.float64)
+    xx, xy, yy = (rows[name].astype(np.float64) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
+    semidefinite: Bools = xx * yy - xy * xy >= -1e-6 * np.maximum(xx * yy, 1e-12)  # single precision rounds the product
+    return semidefinite
 
 
 def _refuse(bad: Bools, rows: Table, field: str, reason: Refusal, problem: str) -> None:

@@ -3,8 +3,6 @@
 Reading ignores fields that it does not know, and refuses an answer without one that it does: a MessageError names it.
 """
 
-from __future__ import annotations
-
 import functools
 import types
 import typing
@@ -16,16 +14,7 @@ import numpy as np
 
 from protocol.arrays import Floats32
 from protocol.errors import MessageError, QueryError, Refusal
-from protocol.queries.answers import (
-    GroundChange,
-    HistoryAnswer,
-    HistorySpan,
-    MachineState,
-    MapInfo,
-    PointAnswer,
-    Region,
-    TrustAnswer,
-)
+from protocol.queries import answers
 from protocol.site.geometry import MAX_CELLS
 from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, unpack
 
@@ -40,20 +29,20 @@ _hints = functools.cache(typing.get_type_hints)
 # --- the map ---------------------------------------------------------------------------------------------------------
 
 
-def encode_point(answer: PointAnswer) -> bytes:
+def encode_point(answer: answers.PointAnswer) -> bytes:
     """Answer of `point`."""
     place = {"x_m": answer.x_m, "y_m": answer.y_m}
     return pack({**place, "values": _plain(answer.values), "merged": answer.merged, "stamp_ns": answer.stamp_ns})
 
 
-def decode_point(data: bytes) -> PointAnswer:
+def decode_point(data: bytes) -> answers.PointAnswer:
     """Undo `encode_point`."""
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     x, y, values = take(table, "x_m", float), take(table, "y_m", float), _take_values(table)
-    return PointAnswer(x, y, values, take(table, "merged", int), take(table, "stamp_ns", int))
+    return answers.PointAnswer(x, y, values, take(table, "merged", int), take(table, "stamp_ns", int))
 
 
-def encode_region(region: Region) -> bytes:
+def encode_region(region: answers.Region) -> bytes:
     """Answer of `region`: layers as float32 little-endian, row by row from the south."""
     layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in region.layers.items()}
     return pack(
@@ -70,7 +59,7 @@ def encode_region(region: Region) -> bytes:
     )
 
 
-def decode_region(data: bytes) -> Region:
+def decode_region(data: bytes) -> answers.Region:
     """Undo `encode_region`."""
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
@@ -80,7 +69,7 @@ def decode_region(data: bytes) -> Region:
         raise MessageError(Refusal.MISSING_FIELD, "empty", field="layers")
     layers = {name: _decode_layer(tables, name, rows, columns) for name in tables}
     west_m, south_m = (_take_place(table, name) for name in ("west_m", "south_m"))
-    return Region(
+    return answers.Region(
         x_m=west_m + (np.arange(columns) + 0.5) * cell_m,
         y_m=south_m + (np.arange(rows) + 0.5) * cell_m,
         cell_m=cell_m,
@@ -105,22 +94,22 @@ def _decode_layer(layers: dict[str, Any], name: str, rows: int, columns: int) ->
     return np.frombuffer(data, "<f4").reshape(rows, columns)
 
 
-def encode_history(answer: HistoryAnswer) -> bytes:
+def encode_history(answer: answers.HistoryAnswer) -> bytes:
     """Answer of `history`."""
     spans = [{"first_ns": s.first_ns, "last_ns": s.last_ns, "values": _plain(s.values)} for s in answer.spans]
     place = {"x_m": answer.x_m, "y_m": answer.y_m}
     return pack({**place, "spans": spans, "merged": answer.merged, "stamp_ns": answer.stamp_ns})
 
 
-def decode_history(data: bytes) -> HistoryAnswer:
+def decode_history(data: bytes) -> answers.HistoryAnswer:
     """Undo `encode_history`."""
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     spans = tuple(
-        HistorySpan(take(span, "first_ns", int), take(span, "last_ns", int), _take_values(span))
+        answers.HistorySpan(take(span, "first_ns", int), take(span, "last_ns", int), _take_values(span))
         for span in _take_tables(table, "spans")
     )
     x, y = take(table, "x_m", float), take(table, "y_m", float)
-    return HistoryAnswer(x, y, spans, take(table, "merged", int), take(table, "stamp_ns", int))
+    return answers.HistoryAnswer(x, y, spans, take(table, "merged", int), take(table, "stamp_ns", int))
 
 
 def _plain(values: Mapping[str, float]) -> dict[str, float]:
@@ -146,54 +135,54 @@ def _take_tables(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
 # --- records ---------------------------------------------------------------------------------------------------------
 
 
-def encode_info(info: MapInfo | Mapping[str, Any]) -> bytes:
+def encode_info(info: answers.MapInfo | Mapping[str, Any]) -> bytes:
     """Answer of `info`; here and below, a record or a table of its fields."""
     return pack({"info": _table(info)})
 
 
-def decode_info(data: bytes) -> MapInfo:
+def decode_info(data: bytes) -> answers.MapInfo:
     """Undo `encode_info`."""
-    return _record(MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
+    return _record(answers.MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
 
 
-def encode_machines(machines: Iterable[MachineState | Mapping[str, Any]]) -> bytes:
+def encode_machines(machines: Iterable[answers.MachineState | Mapping[str, Any]]) -> bytes:
     """Answer of `machines`."""
     return pack({"machines": [_table(machine) for machine in machines]})
 
 
-def decode_machines(data: bytes) -> list[MachineState]:
+def decode_machines(data: bytes) -> list[answers.MachineState]:
     """Undo `encode_machines`."""
-    return _take_records(MachineState, data, "machines")
+    return _take_records(answers.MachineState, data, "machines")
 
 
-def encode_machine(machine: TrustAnswer | Mapping[str, Any]) -> bytes:
+def encode_machine(machine: answers.TrustAnswer | Mapping[str, Any]) -> bytes:
     """Answer to a command about one machine."""
     return pack({"machine": _table(machine)})
 
 
-def decode_machine(data: bytes) -> TrustAnswer:
+def decode_machine(data: bytes) -> answers.TrustAnswer:
     """Undo `encode_machine`."""
-    return _record(TrustAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
+    return _record(answers.TrustAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
 
 
-def encode_changes(changes: Iterable[GroundChange | Mapping[str, Any]]) -> bytes:
+def encode_changes(changes: Iterable[answers.GroundChange | Mapping[str, Any]]) -> bytes:
     """Answer of `changes`."""
     return pack({"changes": [_table(change) for change in changes]})
 
 
-def decode_changes(data: bytes) -> list[GroundChange]:
+def decode_changes(data: bytes) -> list[answers.GroundChange]:
     """Undo `encode_changes`."""
-    return _take_records(GroundChange, data, "changes")
+    return _take_records(answers.GroundChange, data, "changes")
 
 
-def encode_change(change: GroundChange | Mapping[str, Any]) -> bytes:
+def encode_change(change: answers.GroundChange | Mapping[str, Any]) -> bytes:
     """The event that an area changed, put on `map/changed`."""
     return pack({"change": _table(change)})
 
 
-def decode_change(data: bytes) -> GroundChange:
+def decode_change(data: bytes) -> answers.GroundChange:
     """Undo `encode_change`."""
-    return _record(GroundChange, unpack(data, MAX_SMALL_BYTES), "change")
+    return _record(answers.GroundChange, unpack(data, MAX_SMALL_BYTES), "change")
 
 
 def _table(record: Any) -> dict[str, Any]:

@@ -4,8 +4,6 @@ Stamps are UTC in nanoseconds. `merged` is the journal row that an answer is tru
 the time that the map is as of.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Commands to a map server, on keys of their own so that access rules can tell them from queries (docs/protocol.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

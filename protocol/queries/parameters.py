@@ -1,7 +1,5 @@
 """Selector parameters of queries: values to text, and text to checked values; QueryError names what is wrong."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from urllib.parse import quote, unquote

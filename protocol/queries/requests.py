@@ -3,8 +3,6 @@
 The server parses a query once, into a frozen type; an unknown parameter is refused by name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

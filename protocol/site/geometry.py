@@ -4,8 +4,6 @@ Cell (0, 0) has its south-west corner at the origin of `map`; columns grow to th
 16 x 16 cells are the unit of memory.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

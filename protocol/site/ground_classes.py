@@ -1,7 +1,5 @@
 """Kinds of ground as the paper distinguishes them: names, coefficients, colours, and the classes of a map's cells."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The frame is a transverse Mercator projection at the origin with scale 1 (docs/d
 has a true coordinate reference system, and all machines share it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from dataclasses import dataclass, fields

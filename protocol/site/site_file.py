@@ -1,7 +1,5 @@
 """The file of a site (config/site.toml)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from protocol.config import from_table

@@ -1,7 +1,5 @@
 """Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from typing import Any

@@ -4,8 +4,6 @@ identity.toml repeats the certificate's role, name and end as text, so that a wr
 once: a router that refuses a certificate does not answer at all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime

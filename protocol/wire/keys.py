@@ -1,7 +1,5 @@
 """All key expressions, built and parsed here and nowhere else (docs/protocol.md, "Keys")."""
 
-from __future__ import annotations
-
 from protocol.errors import ConfigError
 from protocol.site.site_config import NAME
 

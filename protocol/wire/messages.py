@@ -1,7 +1,5 @@
 """The messages of the wire as frozen records. `codec.py` turns them into bytes and back; docs/protocol.md specifies."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Zenoh sessions as this project uses them: no scouting, and no shared memory, which can drop queries."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections.abc import Mapping
@@ -22,8 +20,7 @@ class SessionConfig:
 
     mode: "client" connects to a router; "router" is the site's router and listens. wait_s: how long to wait for the
     router; negative opens at once and goes on looking for it in the background, as an agent does. credentials: for
-    mutual TLS; None for links without encryption. guard: the router's rules, as Zenoh's
-    settings.
+    mutual TLS; None for links without encryption. guard: the router's rules, as settings of Zenoh.
     """
 
     endpoint: str = DEFAULT_ENDPOINT

@@ -3,8 +3,6 @@
 x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k), as in the filtering literature.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -99,8 +97,6 @@ class Filter(Protocol):
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
         """Move the belief through a motion, to its new stamp."""
-        ...
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement of its stamp."""
-        ...

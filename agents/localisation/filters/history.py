@@ -4,13 +4,12 @@ The history holds nodes: a stamp, the measurements of that stamp, and the belief
 late is put into its place, and everything after it is filtered again.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from agents.localisation.filters.motion import MotionModel, motion
 WINDOW_S = 1.0  # how far back measurements may come; receivers and networks are late by less
 RELOCK = 15  # refusals in a row after which a sensor is accepted again: the filter is lost, not the sensor
 NO_SENSOR: frozenset[str] = frozenset()
+_stamp = attrgetter("stamp_ns")
 
 
 @dataclass
@@ -164,7 +164,3 @@ def _opened(belief: Belief, result: Conditioned, states: slice | None) -> Belief
     P = belief.P.copy()
     P[states, states] += np.outer(result.innovation, result.innovation) + np.eye(len(result.innovation))
     return Belief(belief.stamp_ns, belief.x, P)
-
-
-def _stamp(node: _Node) -> int:
-    return node.stamp_ns

@@ -12,8 +12,6 @@ measures besides (rate x velocity, gravity) belongs to the measurement. On a pla
 the states off it are zero before and after each step, with a small variance so that the covariance stays definite.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,6 +22,7 @@ import numpy as np
 from agents.localisation.filters.belief import Belief, Motion
 from agents.localisation.filters.state import (
     ACCELERATION,
+    ANGLES,
     ATTITUDE,
     OFF_PLANE,
     POSITION,
@@ -112,7 +111,7 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     def jacobian(x: Floats) -> Floats:
         return _jacobian(x * scale, dt_s) * scale
 
-    return Motion(f, jacobian, Q, layout.angles)
+    return Motion(f, jacobian, Q, ANGLES)
 
 
 def map_from_base(attitude: Floats) -> Floats:

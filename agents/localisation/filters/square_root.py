@@ -9,8 +9,6 @@ mean, Z (k, m) of the measurement together with X (n, m) of the state; noise dev
 On matrices this small `dot` takes half the time of `@`, and LAPACK itself a tenth of that of numpy.linalg.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Frames as in REP-103 and REP-105: `map` is east, north, up; `base_link` is forwa
 map_from_base = Rz(yaw) Ry(pitch) Rx(roll).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 POSITION = slice(0, 3)  # [m], in map
@@ -44,11 +42,6 @@ class Layout:
     def n(self) -> int:
         """Number of states."""
         return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references
-
-    @property
-    def angles(self) -> tuple[int, ...]:
-        """States that are angles."""
-        return ANGLES
 
     @property
     def gyro_biases(self) -> slice:

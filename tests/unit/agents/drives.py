@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.squat import front_share, squat_rad
-from agents.localisation.config import LocalisationConfig
+from agents.estimation.balance import front_share, squat_rad
 from agents.localisation.filters.belief import Belief, PoseBelief
-from agents.localisation.localiser import STEP_S, Localiser
+from agents.localisation.localiser import STEP_S, LocalisationConfig, Localiser
 from protocol.arrays import Floats, Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Articulation, Encoder, Gps, Imu, Payload, Reading, Torque
+from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu, Payload, Reading, Torque
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.units import GRAVITY_MPS2
@@ -26,6 +25,7 @@ from sim.simulator import Simulator
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 PROJECTION = Projection(SITE)
+START = (10.0, 20.0, 0.7)  # where drives start
 START_NS = 1_767_225_600_000_000_000
 TRUE_STEP_S = 0.01
 LEVER_M = (0.8, 0.3, 3.0)
@@ -39,6 +39,9 @@ def machine(mount: Mount | None = None, receivers: int = 1, **options: Any) -> M
         *(SensorConfig(f"gps-{i + 1}", "gps", Mount(LEVER_M)) for i in range(receivers)),
     ]
     return MachineConfig("loader-1", sensors=tuple(sensors), **options)
+
+
+VEHICLE = machine()
 
 
 def changed_sensor(vehicle: MachineConfig, name: str, **options: Any) -> MachineConfig:
@@ -174,11 +177,7 @@ def _imu(sensor: SensorConfig, vehicle: MachineConfig, ground: Ground, leg: Leg,
     nose_up = squat_rad(vehicle, leg.payload_kg, ahead)
     c, s = math.cos(nose_up), math.sin(nose_up)
     out_m = sensor.mount.xyz_m
-    force = (
-        c * ahead + s * up - leg.turn_radps**2 * out_m[0],
-        left - leg.turn_radps**2 * out_m[1],
-        c * up - s * ahead,
-    )
+    force = (c * ahead + s * up - leg.turn_radps**2 * out_m[0], left - leg.turn_radps**2 * out_m[1], c * up - s * ahead)
     sensor_from_base = sensor.mount.frame_from_sensor().T
     gyro = sensor_from_base @ (0.0, 0.0, leg.turn_radps)
     return Imu(sensor.name, stamp_ns, *gyro.tolist(), *(sensor_from_base @ force).tolist())
@@ -228,6 +227,21 @@ def simulated(seed: int, seconds: float, **options: Any) -> tuple[SiteConfig, Ma
     return simulator.site, simulator.machines[0], readings, simulator.tracks()["loader-1"]
 
 
+def after(reading: Reading, seconds: float) -> bool:
+    return reading.stamp_ns > START_NS + seconds * 1e9
+
+
+def with_ahrs(made: Drive, off_rad: float = 0.0, from_s: float = 0.0, variance: float = 1e-4) -> list[Reading]:
+    """An attitude reference 20 times a second whose heading is off."""
+    more = [
+        Attitude("ahrs", stamp, 0.0, 0.0, math.sin(half), math.cos(half), variance, variance, variance)
+        for stamp, heading in zip(made.stamps_ns[::5], made.heading_rad[::5].tolist(), strict=True)
+        for half in [(heading + off_rad) / 2]
+        if stamp > START_NS + from_s * 1e9
+    ]
+    return sorted([*made.readings, *more], key=lambda r: r.stamp_ns)
+
+
 def made_up_samples(n: int, seed: int = 0) -> Table:
     """Plausible samples, every one different."""
     rng = np.random.default_rng(seed)
@@ -245,7 +259,6 @@ def reckoned(vehicle: MachineConfig, readings: Iterable[Reading], slip: float = 
     dead_reckoning = DeadReckoning(vehicle, slip)
     for reading in readings:
         sensor = vehicle.sensor(reading.sensor)
-        assert sensor
         dead_reckoning.update(reading, sensor)
     return dead_reckoning
 
@@ -263,7 +276,6 @@ class RunLocaliser(Localiser):
         poses: list[PoseBelief] = []
         for reading in readings:
             sensor = self._vehicle.sensor(reading.sensor)
-            assert sensor
             self.dead_reckoning.update(reading, sensor)
             poses += self.update(reading, sensor, self.dead_reckoning)
         return poses

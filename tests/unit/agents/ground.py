@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.balance import Balance, Balancer
+from agents.estimation.balance import Balance, Balancer, BalanceStep
 from agents.estimation.calibration import Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEstimator
-from agents.estimation.resistance import BalanceStep, ResistanceEstimator
+from agents.estimation.resistance_kalman import KalmanResistance
+from agents.estimation.resistance_rls import RecursiveResistance
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
@@ -55,7 +56,6 @@ def balances(machine: MachineConfig, readings: Iterable[Reading], *, weighs: boo
     made = []
     for reading in readings:
         sensor = machine.sensor(reading.sensor)
-        assert sensor
         dead_reckoning.update(reading, sensor)
         if balance := balancer.update(reading, sensor, dead_reckoning):
             made.append(balance)
@@ -83,7 +83,6 @@ class EstimatorRun:
     def feed(self, readings: Iterable[Reading]) -> EstimatorRun:
         for reading in readings:
             sensor = self._machine.sensor(reading.sensor)
-            assert sensor
             self.dead_reckoning.update(reading, sensor)
             self.estimator.update(reading, sensor, self.dead_reckoning, self._known_c_rr)
             if reading.stamp_ns - self._asked_ns >= 100_000_000:
@@ -112,7 +111,7 @@ def level_steps(raw: Iterable[float], *, share: Iterable[float] | float = 0.04) 
     ]
 
 
-def feed(estimator: ResistanceEstimator, steps: Iterable[BalanceStep]) -> None:
+def feed(estimator: KalmanResistance | RecursiveResistance, steps: Iterable[BalanceStep]) -> None:
     for step in steps:
         estimator.update(step)
 

@@ -8,7 +8,7 @@ from agents.dead_reckoning import DeadReckoning, WheelTracker
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Odometry, Torque
 from protocol.units import GRAVITY_MPS2
-from tests.unit.agents.drives import START_NS, Leg, changed_sensor, drive, machine, reckoned
+from tests.unit.agents.drives import START_NS, VEHICLE, Leg, changed_sensor, drive, machine, reckoned
 
 
 @pytest.mark.parametrize("rate_hz", [10, 20, 100])
@@ -58,9 +58,8 @@ def test_tracker_starts_anew_after_a_pause_and_ignores_time_that_stands_still() 
 
 
 def test_dead_reckoning_closes_a_circle() -> None:
-    vehicle = machine()
-    made = drive([Leg(5, 0.6), Leg(2 * math.pi / 0.2, 0.0, 0.2)], vehicle, heading_rad=0.0, without=("gps-1",))
-    reckoning = reckoned(vehicle, made.readings)
+    made = drive([Leg(5, 0.6), Leg(2 * math.pi / 0.2, 0.0, 0.2)], VEHICLE, heading_rad=0.0, without=("gps-1",))
+    reckoning = reckoned(VEHICLE, made.readings)
     turned = reckoning.pose
     start = made.at(START_NS + 5_000_000_000)  # where the circle begins
     assert turned.angle_rad == pytest.approx(2 * math.pi, abs=0.01)
@@ -76,8 +75,7 @@ def test_mounted_imu_gives_the_right_turn(rpy_deg: tuple[float, float, float]) -
 
 
 def test_distance_counts_up_in_reverse_and_travel_down() -> None:
-    vehicle = machine()
-    reckoning = reckoned(vehicle, drive([Leg(4, 0.5), Leg(4, -0.5), Leg(4, -0.5), Leg(4, 0.5)], vehicle).readings)
+    reckoning = reckoned(VEHICLE, drive([Leg(4, 0.5), Leg(4, -0.5), Leg(4, -0.5), Leg(4, 0.5)], VEHICLE).readings)
     assert reckoning.travel_m == pytest.approx(0.0, abs=0.05)
     assert reckoning.distance_m == pytest.approx(16.0, abs=0.1)
 
@@ -95,16 +93,13 @@ def test_odometry_is_integrated_over_time_and_a_pause_counts_one_second_at_most(
 @pytest.mark.parametrize("direction", [1, -1])
 def test_slip_is_taken_off_where_torque_drives(direction: int) -> None:
     """At a drive force of a tenth of the weight and slip 0.2 per traction, two per cent of the distance are lost."""
-    vehicle = machine()
-    wheels, torque = vehicle.sensor("wheels"), vehicle.sensor("torque")
-    assert wheels
-    assert torque
-    reckoning = DeadReckoning(vehicle, slip=0.2)
-    force_n = 0.1 * vehicle.mass_kg * GRAVITY_MPS2 * direction
-    reckoning.update(Torque("torque", START_NS, force_n * vehicle.wheel_radius_m), torque)
+    wheels, torque = VEHICLE.sensor("wheels"), VEHICLE.sensor("torque")
+    reckoning = DeadReckoning(VEHICLE, slip=0.2)
+    force_n = 0.1 * VEHICLE.mass_kg * GRAVITY_MPS2 * direction
+    reckoning.update(Torque("torque", START_NS, force_n * VEHICLE.wheel_radius_m), torque)
     for i in range(101):
         reckoning.update(Encoder("wheels", START_NS + i * 50_000_000, i * direction, i * direction), wheels)
-    rolled_m = 2 * math.pi * vehicle.wheel_radius_m
+    rolled_m = 2 * math.pi * VEHICLE.wheel_radius_m
     assert reckoning.travel_m == pytest.approx(direction * 0.98 * rolled_m)
     assert reckoning.distance_m == pytest.approx(0.98 * rolled_m)
     assert reckoning.traction == pytest.approx(direction * 0.1)
@@ -113,28 +108,25 @@ def test_slip_is_taken_off_where_torque_drives(direction: int) -> None:
 
 
 def test_braking_makes_the_wheels_slower_than_the_machine() -> None:
-    vehicle = machine()
-    made = drive([Leg(4, 0.5), Leg(3, -0.6)], vehicle)
-    with_slip, without = reckoned(vehicle, made.readings, slip=0.2), reckoned(vehicle, made.readings)
+    made = drive([Leg(4, 0.5), Leg(3, -0.6)], VEHICLE)
+    with_slip, without = reckoned(VEHICLE, made.readings, slip=0.2), reckoned(VEHICLE, made.readings)
     driven = replace(made, readings=[r for r in made.readings if r.stamp_ns <= START_NS + 4 * 10**9])
-    driven_with_slip, driven_without = reckoned(vehicle, driven.readings, slip=0.2), reckoned(vehicle, driven.readings)
+    driven_with_slip, driven_without = reckoned(VEHICLE, driven.readings, slip=0.2), reckoned(VEHICLE, driven.readings)
     assert driven_with_slip.travel_m < driven_without.travel_m
     assert with_slip.travel_m - driven_with_slip.travel_m > without.travel_m - driven_without.travel_m
 
 
 def test_second_imu_and_second_wheel_sensor_do_not_count_twice() -> None:
-    vehicle = machine()
     more = replace(
-        vehicle, sensors=(*vehicle.sensors, SensorConfig("imu-2", "imu"), SensorConfig("wheels-2", "encoder"))
+        VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("imu-2", "imu"), SensorConfig("wheels-2", "encoder"))
     )
     legs = [Leg(4, 0.5), Leg(2, 0.0, 0.2)]
-    one, two = reckoned(vehicle, drive(legs, vehicle).readings), reckoned(more, drive(legs, more).readings)
+    one, two = reckoned(VEHICLE, drive(legs, VEHICLE).readings), reckoned(more, drive(legs, more).readings)
     assert (two.travel_m, two.angle_rad) == (one.travel_m, one.angle_rad)
 
 
 def test_restarted_tick_counter_moves_nothing() -> None:
-    vehicle = machine()
-    made = drive([Leg(4, 0.5), Leg(6)], vehicle)
+    made = drive([Leg(4, 0.5), Leg(6)], VEHICLE)
     restart_ns = START_NS + 6 * 10**9
     readings = [
         replace(r, left_ticks=r.left_ticks - 1e6, right_ticks=r.right_ticks - 1e6)
@@ -142,14 +134,13 @@ def test_restarted_tick_counter_moves_nothing() -> None:
         else r
         for r in made.readings
     ]
-    before, after = reckoned(vehicle, made.readings), reckoned(vehicle, readings)
+    before, after = reckoned(VEHICLE, made.readings), reckoned(VEHICLE, readings)
     assert after.travel_m == pytest.approx(before.travel_m, abs=0.15)  # what was driven between two counts
     assert after.distance_m == pytest.approx(before.distance_m, abs=0.15)
     assert after.wheels.speed_mps == pytest.approx(before.wheels.speed_mps, abs=0.1)
 
 
 def test_more_ticks_per_turn_are_less_distance() -> None:
-    vehicle = machine()
-    made = drive([Leg(4, 0.5)], vehicle)
-    finer = reckoned(changed_sensor(vehicle, "wheels", ticks_per_rev=200), made.readings)
-    assert finer.travel_m == pytest.approx(reckoned(vehicle, made.readings).travel_m / 2)
+    made = drive([Leg(4, 0.5)], VEHICLE)
+    finer = reckoned(changed_sensor(VEHICLE, "wheels", ticks_per_rev=200), made.readings)
+    assert finer.travel_m == pytest.approx(reckoned(VEHICLE, made.readings).travel_m / 2)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from agents.holdout import Holdout, HoldoutConfig
-from agents.localisation.config import LocalisationConfig
+from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig

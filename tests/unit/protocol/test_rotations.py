@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from protocol.rotations import (
-    matrix_from_quaternion,
-    matrix_from_rpy,
-    quaternion_from_rpy,
-    rpy_from_matrix,
-    wrap_angle,
-)
+from protocol.rotations import matrix_from_quaternion, matrix_from_rpy, quaternion_from_rpy, rpy_from_matrix, wrap_angle
 
 RPY = np.random.default_rng(5).uniform((-3.1, -1.5, -3.1), (3.1, 1.5, 3.1), (200, 3)).T
 

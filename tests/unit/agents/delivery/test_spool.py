@@ -4,6 +4,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,13 @@ ROWS = made_up_samples(60)
 
 def opened(path: Path, max_samples: int = 1000, audit: AuditLog | None = None) -> Spool:
     return Spool(path / "spool.db", SpoolConfig(max_samples), audit)
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Iterator[Spool]:
+    spool = opened(tmp_path)
+    yield spool
+    spool.close()
 
 
 def kill(spool: Spool) -> None:
@@ -47,24 +55,19 @@ def hashes(rows: np.ndarray) -> list[str]:
     return [content_hash(row) for row in rows]
 
 
-def test_samples_are_numbered_from_one_and_come_out_in_order(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+def test_samples_are_numbered_from_one_and_come_out_in_order(spool: Spool) -> None:
     assert spool.head(10) is None
     assert spool.record(ROWS[:4]) == 1
     assert spool.record(ROWS[4:9]) == 5
     head = spool.head(7)
-    assert head
     assert (head.spool_id, head.first_seq, head.lost_before) == (spool.spool_id, 1, 0)
     assert hashes(head.rows) == hashes(ROWS[:7])
     assert spool.newest == 9
-    spool.close()
 
 
-def test_commits_are_full_and_logged_ahead(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+def test_commits_are_full_and_logged_ahead(spool: Spool) -> None:
     assert spool._db.execute("PRAGMA synchronous").fetchone()[0] == 2
     assert spool._db.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
-    spool.close()
 
 
 def test_acknowledged_samples_are_deleted_and_stay_so(tmp_path: Path) -> None:
@@ -76,7 +79,6 @@ def test_acknowledged_samples_are_deleted_and_stay_so(tmp_path: Path) -> None:
     spool.close()
     again = opened(tmp_path)
     head = again.head(99)
-    assert head
     assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 7, 4, 0)
     assert again.counters()["depth"] == 4
     again.close()
@@ -190,7 +192,6 @@ def test_spool_survives_kill_in_the_middle_of_writing(tmp_path: Path) -> None:
     audit = AuditLog(tmp_path / "audit.txt")
     spool = opened(tmp_path, 10**6, audit)
     head = spool.head(10**6)
-    assert head
     assert len(head.rows) >= printed
     assert head.first_seq == 1
     assert hashes(head.rows) == hashes(made_up_samples(100_000)[: len(head.rows)])
@@ -213,44 +214,34 @@ def test_kill_while_the_file_is_made_leaves_no_broken_spool(tmp_path: Path) -> N
 # --- pending and final -----------------------------------------------------------------------------------------------
 
 
-def test_pending_samples_wait_until_they_are_final(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+def test_pending_samples_wait_until_they_are_final(spool: Spool) -> None:
     spool.record(ROWS[:3], final=False)
     assert spool.head(99) is None
     better = ROWS[:2].copy()
     better["x_m"] += 1
     spool.finalise(1, better)
     head = spool.head(99)
-    assert head
     assert hashes(head.rows) == hashes(better)
-    spool.close()
 
 
-def test_final_samples_never_overtake_pending_ones(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+def test_final_samples_never_overtake_pending_ones(spool: Spool) -> None:
     spool.record(ROWS[:2])
     spool.record(ROWS[2:4], final=False)
     spool.record(ROWS[4:6])
     head = spool.head(99)
-    assert head
     assert len(head.rows) == 2
     spool.acknowledge(spool.spool_id, 2)
     assert spool.head(99) is None
     spool.finalise(3, ROWS[2:4])
     head = spool.head(99)
-    assert head
     assert (head.first_seq, len(head.rows)) == (3, 4)
-    spool.close()
 
 
-def test_what_is_final_stays_as_it_is(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+def test_what_is_final_stays_as_it_is(spool: Spool) -> None:
     spool.record(ROWS[:1])
     spool.finalise(1, ROWS[5:6])
     head = spool.head(1)
-    assert head
     assert hashes(head.rows) == hashes(ROWS[:1])
-    spool.close()
 
 
 def test_pending_samples_are_final_after_a_crash(tmp_path: Path) -> None:
@@ -259,7 +250,6 @@ def test_pending_samples_are_final_after_a_crash(tmp_path: Path) -> None:
     kill(spool)
     again = opened(tmp_path)
     head = again.head(99)
-    assert head
     assert hashes(head.rows) == hashes(ROWS[:3])
     again.close()
 
@@ -271,15 +261,12 @@ def test_head_ends_before_a_hole(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
     bad = spool.head(99)
-    assert bad
     spool.acknowledge(spool.spool_id, 3)
     spool.quarantine(type(bad)(bad.spool_id, 6, ROWS[5:6], 0), "too bad")
     first = spool.head(99)
-    assert first
     assert (first.first_seq, len(first.rows), first.lost_before) == (4, 2, 0)
     spool.acknowledge(spool.spool_id, 5)
     rest = spool.head(99)
-    assert rest
     assert (rest.first_seq, len(rest.rows), rest.lost_before) == (7, 4, 1)
     assert spool.counters()["put_aside"] == 1
     spool.close()
@@ -292,7 +279,6 @@ def test_full_spool_drops_the_oldest_counts_them_and_declares_them_lost(tmp_path
     for i in range(0, 60, 4):
         spool.record(ROWS[i : i + 4])
     head = spool.head(99)
-    assert head
     assert (head.first_seq, head.lost_before) == (61 - limit, 60 - limit)
     assert hashes(head.rows) == hashes(ROWS[-limit:])
     expected = {"depth": limit, "dropped": 60 - limit, "put_aside": 0, "recorded": 60}
@@ -309,12 +295,10 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool.close()
     spool = opened(changed(tmp_path, "UPDATE sample SET row = zeroblob(68) WHERE number IN (1, 2, 3, 6)"))
     first = spool.head(2)
-    assert first
     assert (first.first_seq, first.lost_before) == (4, 3)
     assert hashes(first.rows) == hashes(ROWS[3:5])
     spool.acknowledge(first.spool_id, 5)
     rest = spool.head(99)
-    assert rest
     assert (rest.first_seq, rest.lost_before) == (7, 1)
     assert hashes(rest.rows) == hashes(ROWS[6:10])
     assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10}
@@ -326,15 +310,12 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
 # --- servers and files that are set back ------------------------------------------------------------------------------
 
 
-def test_server_that_knows_less_than_it_acknowledged_is_told_what_is_lost(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+def test_server_that_knows_less_than_it_acknowledged_is_told_what_is_lost(spool: Spool) -> None:
     spool.record(ROWS[:10])
     spool.acknowledge(spool.spool_id, 8)
     spool.lower_watermark(spool.spool_id, 5)
     head = spool.head(99)
-    assert head
     assert (head.first_seq, head.lost_before) == (9, 3)
-    spool.close()
 
 
 def test_earlier_runs_are_declared_again_to_a_server_that_was_set_back(tmp_path: Path) -> None:
@@ -349,18 +330,15 @@ def test_earlier_runs_are_declared_again_to_a_server_that_was_set_back(tmp_path:
     spool.acknowledge(spool.spool_id, 1)
     spool.lower_watermark(spool.spool_id, 0)
     head = spool.head(9)
-    assert head
     assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 4, 0, 3)
     spool.close()
 
 
-def test_ack_never_goes_back_nor_beyond_the_end(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
+def test_ack_never_goes_back_nor_beyond_the_end(spool: Spool) -> None:
     spool.record(ROWS[:6])
     for watermark, expected in ((4, 4), (2, 4), (99, 6)):
         spool.acknowledge(spool.spool_id, watermark)
         assert spool.acknowledged == expected
-    spool.close()
 
 
 def drain(spool: Spool, journal: dict[tuple[int, int], str]) -> None:
@@ -410,7 +388,6 @@ def test_two_clones_that_both_send_lose_and_double_nothing(tmp_path: Path) -> No
         b.record(ROWS[i + 2 : i + 4])
         for clone in (a, b):
             head = clone.head(3)
-            assert head
             for j, row in enumerate(head.rows):
                 journal.setdefault((head.spool_id, head.first_seq + j), content_hash(row))
             clone.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
@@ -497,7 +474,6 @@ def test_failed_commit_leaves_no_transaction_open(
     with pytest.raises(StoreError, match="disk is full"):
         spool.record(ROWS[4:6])
     head = spool.head(9)
-    assert head
     attempts = (
         lambda: spool.acknowledge(spool.spool_id, 2),
         lambda: spool.quarantine(head, "bad"),
@@ -514,11 +490,6 @@ def test_failed_commit_leaves_no_transaction_open(
     monkeypatch.setattr(FullDisk, "full_at", "never")
     assert spool.record(ROWS[4:6]) == 5
     spool.close()
-
-
-def test_bad_spool_option_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="max_samples"):
-        SpoolConfig(max_samples=0)
 
 
 # --- damage that SQLite does not see ---------------------------------------------------------------------------------

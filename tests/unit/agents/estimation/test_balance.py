@@ -6,21 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agents.estimation.balance import front_share, squat_rad
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Odometry, Payload, Torque
 from protocol.units import GRAVITY_MPS2
-from tests.unit.agents.drives import START_NS, Drive, Ground, Leg, changed_sensor, drive, machine, noisy
+from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, changed_sensor, drive, machine, noisy
 from tests.unit.agents.ground import balances
 
 FORWARDS = [Leg(2), Leg(4, 0.5), Leg(10)]
 REVERSE = [Leg(2), Leg(4, -0.5), Leg(10)]
-BODY = {
-    "wheelbase_m": 3.3,
-    "axle_stiffness_npm": 1.8e6,
-    "cog_height_m": 1.05,
-    "payload_x_m": 4.7,
-    "payload_z_m": 0.85,
-}
+BODY = {"wheelbase_m": 3.3, "axle_stiffness_npm": 1.8e6, "cog_height_m": 1.05, "payload_x_m": 4.7, "payload_z_m": 0.85}
 
 
 def loader(mount: Mount | None = None, **options: float) -> MachineConfig:
@@ -34,8 +29,7 @@ def loader(mount: Mount | None = None, **options: float) -> MachineConfig:
 @pytest.mark.parametrize("c_rr", [0.008, 0.25])
 @pytest.mark.parametrize("ahead_deg", [0.0, 15.0, -15.0])
 def test_what_is_left_is_the_rolling_resistance(legs: list[Leg], c_rr: float, ahead_deg: float) -> None:
-    vehicle = machine()
-    last = balances(vehicle, drive(legs, vehicle, ground=Ground(c_rr, math.radians(ahead_deg))).readings)[-1]
+    last = balances(VEHICLE, drive(legs, VEHICLE, ground=Ground(c_rr, math.radians(ahead_deg))).readings)[-1]
     direction = 1.0 if legs is FORWARDS else -1.0
     assert last.direction == direction
     assert last.unbalanced == pytest.approx(direction * c_rr * math.cos(math.radians(ahead_deg)), abs=1e-4)
@@ -46,15 +40,13 @@ def test_what_is_left_is_the_rolling_resistance(legs: list[Leg], c_rr: float, ah
 
 
 def test_distance_counts_up_in_reverse_too() -> None:
-    vehicle = machine()
-    steps = balances(vehicle, drive([*FORWARDS, Leg(8, -0.5), Leg(5)], vehicle).readings)
+    steps = balances(VEHICLE, drive([*FORWARDS, Leg(8, -0.5), Leg(5)], VEHICLE).readings)
     assert (np.diff([b.distance_m for b in steps]) >= 0).all()
     assert steps[-1].distance_m == pytest.approx(4 + 20 + 4 + 4 + 10, abs=0.3)
 
 
 def test_a_step_ends_every_50_ms() -> None:
-    vehicle = machine()
-    steps = balances(vehicle, drive(FORWARDS, vehicle).readings)
+    steps = balances(VEHICLE, drive(FORWARDS, VEHICLE).readings)
     assert [b.dt_s for b in steps] == pytest.approx([0.05] * 319)
     assert np.diff([b.stamp_ns for b in steps]).tolist() == [50_000_000] * 318
 
@@ -90,18 +82,16 @@ def test_lever_arm_of_the_accelerometer_in_a_bend_is_taken_off() -> None:
 
 
 def test_centripetal_acceleration_of_a_bend_is_no_slope() -> None:
-    vehicle = machine()
-    last = balances(vehicle, drive([Leg(2), Leg(4, 0.5), Leg(10, 0.0, 0.3)], vehicle).readings)[-1]
+    last = balances(VEHICLE, drive([Leg(2), Leg(4, 0.5), Leg(10, 0.0, 0.3)], VEHICLE).readings)[-1]
     assert last.slope_y == pytest.approx(0.0, abs=2e-3)
     assert last.slope_x == pytest.approx(0.0, abs=2e-3)
 
 
 def test_turning_across_a_slope_keeps_slopes_and_resistance_right() -> None:
     """The wheels' share of the force is off by up to g sin(15 deg) if the slope does not turn with the machine."""
-    vehicle = machine()
     ground = Ground(0.04, left_rad=math.radians(15))
     legs = [Leg(2), Leg(4, 0.5), Leg(4), Leg(12, 0.0, 0.25)]
-    for at in balances(vehicle, drive(legs, vehicle, ground=ground).readings)[160:]:
+    for at in balances(VEHICLE, drive(legs, VEHICLE, ground=ground).readings)[160:]:
         turned = max((at.stamp_ns - START_NS) * 1e-9 - 10, 0) * 0.25
         here = ground.turned(turned)
         assert (at.slope_x, at.slope_y) == pytest.approx((here.ahead_rad, here.left_rad), abs=0.01)
@@ -165,29 +155,26 @@ def test_squat_is_no_slope_and_no_resistance(accel_mps2: float, payload_kg: floa
 
 
 def test_nose_that_rises_is_a_positive_pitch_rate() -> None:
-    vehicle = machine()
-    made = drive(FORWARDS, vehicle, without=("imu",)).readings
+    made = drive(FORWARDS, VEHICLE, without=("imu",)).readings
     turning = [Imu("imu", r.stamp_ns, 0.0, -0.1, 0.02, 0.0, 0.0, 9.81) for r in made if isinstance(r, Torque)]
-    last = balances(vehicle, sorted([*made, *turning], key=lambda r: r.stamp_ns))[-1]
+    last = balances(VEHICLE, sorted([*made, *turning], key=lambda r: r.stamp_ns))[-1]
     assert last.pitch_radps == pytest.approx(0.1)
     assert last.norm_mps2 == pytest.approx(9.81)
 
 
 def test_body_s_acceleration_is_the_accelerometer_s_without_the_slope() -> None:
-    vehicle = machine()
-    last = balances(vehicle, drive([Leg(2), Leg(4, 0.5), Leg(4, 0.4)], vehicle, ground=Ground(0.04, 0.1)).readings)[-1]
+    last = balances(VEHICLE, drive([Leg(2), Leg(4, 0.5), Leg(4, 0.4)], VEHICLE, ground=Ground(0.04, 0.1)).readings)[-1]
     assert last.body_mps2 == pytest.approx(0.4, abs=0.03)
     assert last.accel_mps2 == pytest.approx(0.4, abs=0.03)
 
 
 def test_torque_between_two_steps_is_averaged_and_the_last_one_kept() -> None:
-    vehicle = machine()
-    made = [r for r in drive(FORWARDS, vehicle).readings if not isinstance(r, Torque)]
-    wheel_nm = vehicle.mass_kg * GRAVITY_MPS2 * vehicle.wheel_radius_m
+    made = [r for r in drive(FORWARDS, VEHICLE).readings if not isinstance(r, Torque)]
+    wheel_nm = VEHICLE.mass_kg * GRAVITY_MPS2 * VEHICLE.wheel_radius_m
     stamps = [r.stamp_ns for r in made if isinstance(r, Imu)]
     stated = {stamps[500 + i]: wheel_nm * 0.01 * i for i in range(1, 6)}
     torques = [Torque("torque", stamp, nm) for stamp, nm in stated.items()]
-    steps = balances(vehicle, sorted([*torques, *made], key=lambda r: r.stamp_ns))
+    steps = balances(VEHICLE, sorted([*torques, *made], key=lambda r: r.stamp_ns))
     share = {b.stamp_ns: b for b in steps}
     first = next(b for b in steps if b.torque_s < math.inf)
     assert first.stamp_ns <= stamps[505]
@@ -199,16 +186,15 @@ def test_torque_between_two_steps_is_averaged_and_the_last_one_kept() -> None:
 
 
 def test_ages_of_wheels_and_torque_and_silent_wheels_that_stand() -> None:
-    vehicle = machine()
-    made = drive(FORWARDS, vehicle)
+    made = drive(FORWARDS, VEHICLE)
     cut = made.stamps_ns[700]
     silent = [r for r in made.readings if not isinstance(r, Encoder | Torque) or r.stamp_ns <= cut]
-    steps = balances(vehicle, silent)
+    steps = balances(VEHICLE, silent)
     last = steps[-1]
     assert last.wheels_s == pytest.approx((last.stamp_ns - cut) * 1e-9, abs=0.06)
     assert last.torque_s == pytest.approx((last.stamp_ns - cut) * 1e-9, abs=0.02)
     assert (last.speed_mps, last.accel_mps2) == (0.0, 0.0)
-    never = balances(vehicle, [r for r in made.readings if isinstance(r, Imu)])[-1]
+    never = balances(VEHICLE, [r for r in made.readings if isinstance(r, Imu)])[-1]
     assert (never.wheels_s, never.torque_s) == (math.inf, math.inf)
 
 
@@ -226,27 +212,24 @@ def test_odometry_counts_as_wheels() -> None:
     "options", [{"frame": FRONT}, {"measures": ("rate",)}], ids=["front frame", "no accelerometer"]
 )
 def test_only_an_accelerometer_on_the_rear_frame_counts(options: dict[str, object]) -> None:
-    vehicle = machine()
-    made: Drive = drive(FORWARDS, vehicle)
-    assert balances(changed_sensor(vehicle, "imu", **options), made.readings) == []
-    assert balances(vehicle, made.readings)
+    made: Drive = drive(FORWARDS, VEHICLE)
+    assert balances(changed_sensor(VEHICLE, "imu", **options), made.readings) == []
+    assert balances(VEHICLE, made.readings)
 
 
 def test_the_first_accelerometer_is_used_alone() -> None:
-    vehicle = machine()
-    both = replace(vehicle, sensors=(*vehicle.sensors, SensorConfig("imu-b", "imu")))
-    made = drive(FORWARDS, vehicle).readings
+    both = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("imu-b", "imu")))
+    made = drive(FORWARDS, VEHICLE).readings
     bad = [Imu("imu-b", r.stamp_ns, 0.0, 0.0, 0.0, 3.0, 3.0, 3.0) for r in made if isinstance(r, Imu)]
     stream = sorted([*made, *bad], key=lambda r: r.stamp_ns)
-    assert balances(both, stream) == balances(vehicle, made)
+    assert balances(both, stream) == balances(VEHICLE, made)
 
 
 def test_pause_of_the_imu_spoils_no_step() -> None:
-    vehicle = machine()
-    made = drive(FORWARDS, vehicle)
+    made = drive(FORWARDS, VEHICLE)
     silent = (made.stamps_ns[600], made.stamps_ns[750])
     steps = balances(
-        vehicle, [r for r in made.readings if not (isinstance(r, Imu) and silent[0] < r.stamp_ns < silent[1])]
+        VEHICLE, [r for r in made.readings if not (isinstance(r, Imu) and silent[0] < r.stamp_ns < silent[1])]
     )
     assert max(b.dt_s for b in steps) < 0.07
     assert not [b for b in steps if silent[0] < b.stamp_ns < silent[1]]
@@ -255,9 +238,8 @@ def test_pause_of_the_imu_spoils_no_step() -> None:
 
 def test_noise_of_the_readings_averages_out_over_steps() -> None:
     """The raw balance has the density that the estimators are told of, or less."""
-    vehicle = machine()
-    made = drive([Leg(2), Leg(4, 0.5), Leg(60)], vehicle)
-    raw = np.array([b.unbalanced for b in balances(vehicle, noisy(made.readings, 1))][100:])
+    made = drive([Leg(2), Leg(4, 0.5), Leg(60)], VEHICLE)
+    raw = np.array([b.unbalanced for b in balances(VEHICLE, noisy(made.readings, 1))][100:])
     assert raw.mean() == pytest.approx(0.04, abs=2e-3)
     assert raw.std() * math.sqrt(0.05) < 0.005
 
@@ -269,3 +251,64 @@ def test_payload_reading_is_kept_until_the_next() -> None:
     shares = [b.share for b in balances(vehicle, [*stated, *made])]
     empty = [b.share for b in balances(vehicle, made)]
     assert shares == pytest.approx([share * 17.5 / 21.5 for share in empty])
+
+
+# --- squat ------------------------------------------------------------------------------------------------------------
+
+LOADER = MachineConfig("loader-1", **{**BODY, "wheelbase_m": 3.0, "cog_height_m": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("payload_kg", "force_mps2", "share"),
+    [
+        (0.0, 0.0, 0.5),  # the load centre lies in the middle
+        (4000.0, 0.0, (17_500 * 1.5 + 4000 * 4.7) / (21_500 * 3.0)),
+        (0.0, 2.0, 0.5 - 2.0 / math.sqrt(GRAVITY_MPS2**2 - 4) / 3.0),  # uphill, or faster: to the rear
+        (0.0, -2.0, 0.5 + 2.0 / math.sqrt(GRAVITY_MPS2**2 - 4) / 3.0),
+    ],
+)
+def test_share_on_the_front_axle(payload_kg: float, force_mps2: float, share: float) -> None:
+    assert front_share(LOADER, payload_kg, force_mps2) == pytest.approx(share)
+    assert front_share(replace(LOADER, wheelbase_m=0.0), payload_kg, force_mps2) == 0.0
+
+
+def test_empty_machine_at_rest_stands_level() -> None:
+    assert squat_rad(LOADER, 0.0, 0.0) == 0.0
+
+
+def test_payload_ahead_of_the_front_axle_lowers_the_nose() -> None:
+    """By hand: 4000 kg at 4.7 m put 61.5 kN on the front axle and take 22.2 kN off the rear one."""
+    front_n, rear_n = 4000 * GRAVITY_MPS2 * 4.7 / 3.0, 4000 * GRAVITY_MPS2 * (1 - 4.7 / 3.0)
+    assert (front_n, rear_n) == pytest.approx((61_455, -22_228), abs=1)
+    assert squat_rad(LOADER, 4000, 0.0) == pytest.approx((rear_n - front_n) / (1.8e6 * 3.0))
+    assert squat_rad(LOADER, 4000, 0.0) == pytest.approx(-0.015497, abs=1e-6)
+
+
+def test_acceleration_raises_the_nose() -> None:
+    """By hand: 17.5 t at 2 m/s2, 1 m above the ground, shift 11.67 kN from the front axle to the rear one."""
+    assert squat_rad(LOADER, 0.0, 2.0) == pytest.approx(2 * 17_500 * 2.0 * 1.0 / 3.0 / (1.8e6 * 3.0), abs=1e-9)
+    assert squat_rad(LOADER, 0.0, -2.0) == -squat_rad(LOADER, 0.0, 2.0)
+
+
+def test_payload_s_height_counts_with_acceleration() -> None:
+    more = squat_rad(LOADER, 4000, 2.0) - squat_rad(LOADER, 4000, -2.0)
+    assert more == pytest.approx(2 * 2 * 2.0 * (17_500 * 1.0 + 4000 * 0.85) / 3.0 / (1.8e6 * 3.0))
+
+
+def test_on_a_slope_less_weight_presses_the_tyres() -> None:
+    """A machine with its weight at the rear: its squat on level ground is subtracted, what it loses uphill is not."""
+    rear_heavy = replace(LOADER, load_centre_m=1.0, cog_height_m=0.0)
+    slope_rad = math.radians(20)
+    squat = squat_rad(rear_heavy, 0.0, GRAVITY_MPS2 * math.sin(slope_rad))
+    weight_n = 17_500 * GRAVITY_MPS2
+    assert squat == pytest.approx(weight_n * (2 / 3 - 1 / 3) * (math.cos(slope_rad) - 1) / (1.8e6 * 3.0))
+
+
+@pytest.mark.parametrize("unknown", ["wheelbase_m", "axle_stiffness_npm"])
+def test_without_data_there_is_no_squat(unknown: str) -> None:
+    assert squat_rad(replace(LOADER, **{unknown: 0.0}), 4000, 2.0) == 0.0  # type: ignore[arg-type]
+    assert squat_rad(MachineConfig("loader-1"), 4000, 2.0) == 0.0
+
+
+def test_force_beyond_gravity_is_survived() -> None:
+    assert math.isfinite(squat_rad(LOADER, 4000, 30.0))

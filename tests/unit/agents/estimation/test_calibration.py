@@ -11,16 +11,7 @@ import pytest
 from agents.dead_reckoning import DeadReckonedPose, DeadReckoning
 from agents.estimation import calibration as module
 from agents.estimation.balance import Balance
-from agents.estimation.calibration import (
-    FLOOR,
-    RELOCK,
-    SCALE_STD,
-    STRETCH_STD,
-    UNCALIBRATED,
-    ZERO_STD,
-    Calibration,
-    Calibrator,
-)
+from agents.estimation.calibration import FLOOR, SCALE_STD, STRETCH_STD, UNCALIBRATED, ZERO_STD, Calibration, Calibrator
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
 from tests.unit.agents.ground import STEADY, STEP_S
@@ -259,7 +250,7 @@ def test_a_zero_far_beyond_its_class_is_found_in_the_end() -> None:
     on = course(zero=0.03, noise=NOISE, seed=5)
     on.there_and_back(40, 6)
     assert on.calibrator.counters["relocked"] >= 1
-    assert on.calibrator.counters["off"] >= RELOCK
+    assert on.calibrator.counters["off"] >= module.RELOCK
     assert on.calibrator.calibration.zero == pytest.approx(0.03, abs=0.003)
 
 

@@ -10,18 +10,11 @@ import pytest
 
 from agents.estimation import ground, plausibility
 from agents.estimation.calibration import SCALE_STD, ZERO_STD, Calibration
-from agents.estimation.ground import (
-    ESTIMATORS,
-    MASSES,
-    NOTHING_KNOWN,
-    EstimationConfig,
-    GroundEstimate,
-    GroundEstimator,
-)
+from agents.estimation.ground import ESTIMATORS, NOTHING_KNOWN, EstimationConfig, GroundEstimate, GroundEstimator
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Reading, Torque
 from protocol.units import GRAVITY_MPS2
-from tests.unit.agents.drives import START_NS, Drive, Ground, Leg, drive, machine, noisy
+from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, drive, machine, noisy
 from tests.unit.agents.ground import STEADY, EstimatorRun
 
 SLOPE_RAD = math.radians(15)
@@ -49,10 +42,9 @@ def weighing(**options: Any) -> MachineConfig:
 @pytest.mark.parametrize("ahead_rad", [0.0, SLOPE_RAD, -SLOPE_RAD])
 def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad: float) -> None:
     """Positive slope is uphill ahead, also when the machine drives down it backwards."""
-    vehicle = machine()
-    made = drive(legs, vehicle, ground=Ground(c_rr, ahead_rad))
+    made = drive(legs, VEHICLE, ground=Ground(c_rr, ahead_rad))
     for estimator in ESTIMATORS:
-        estimate = last_estimate(vehicle, made, estimator=estimator)
+        estimate = last_estimate(VEHICLE, made, estimator=estimator)
         assert estimate.c_rr == pytest.approx(c_rr, abs=0.003), estimator
         assert estimate.slope_x == pytest.approx(math.tan(ahead_rad), abs=0.005), estimator
         assert estimate.slope_y == pytest.approx(0.0, abs=0.002), estimator
@@ -63,10 +55,9 @@ def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad:
 @pytest.mark.parametrize("turn_radps", [0.0, 0.2])
 def test_slope_across_the_driving_direction(estimator: str, turn_radps: float) -> None:
     """A machine that turns on a plane takes its slope from another side; the bend's own acceleration is no slope."""
-    vehicle = machine()
     ground = Ground(0.04, left_rad=SLOPE_RAD)
-    made = drive([STAND, START, Leg(10, 0.0, turn_radps)], vehicle, ground=ground)
-    run = EstimatorRun(vehicle, EstimationConfig(estimator=estimator)).feed(made.readings)
+    made = drive([STAND, START, Leg(10, 0.0, turn_radps)], VEHICLE, ground=ground)
+    run = EstimatorRun(VEHICLE, EstimationConfig(estimator=estimator)).feed(made.readings)
     here = ground.turned(turn_radps * (10 - 1.5))
     assert run.last.slope_y == pytest.approx(math.tan(here.left_rad), abs=0.01)
     assert run.last.slope_x == pytest.approx(math.tan(here.ahead_rad), abs=0.01 if estimator == "kalman" else 0.1)
@@ -75,10 +66,9 @@ def test_slope_across_the_driving_direction(estimator: str, turn_radps: float) -
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_accelerating_does_not_change_the_resistance(estimator: str) -> None:
-    vehicle = machine()
     legs = [STAND, START, Leg(2), Leg(2, 0.6), Leg(2, -0.6), Leg(2, 0.6), Leg(2)]
-    run = EstimatorRun(vehicle, EstimationConfig(estimator=estimator)).feed(
-        drive(legs, vehicle, ground=Ground(0.05)).readings
+    run = EstimatorRun(VEHICLE, EstimationConfig(estimator=estimator)).feed(
+        drive(legs, VEHICLE, ground=Ground(0.05)).readings
     )
     values = [e.c_rr for e in run.between(7, 14) if not e.reason]
     assert len(values) > 60
@@ -88,9 +78,8 @@ def test_accelerating_does_not_change_the_resistance(estimator: str) -> None:
 @pytest.mark.parametrize("ahead_rad", [0.0, 0.15])
 def test_border_between_two_grounds_is_found_where_it_is(ahead_rad: float) -> None:
     """Within half a metre, asked 1.5 s later."""
-    vehicle = machine()
     border_ns = START_NS + 10 * 10**9
-    run = EstimatorRun(vehicle).feed(two_grounds(vehicle, 0.02, 0.25, border_ns, ahead_rad=ahead_rad))
+    run = EstimatorRun(VEHICLE).feed(two_grounds(VEHICLE, 0.02, 0.25, border_ns, ahead_rad=ahead_rad))
     for stamp_ns, estimate in run.estimates:
         off_s = (stamp_ns - border_ns) * 1e-9
         if abs(off_s) > 0.25 and stamp_ns > START_NS + 8 * 10**9 and not estimate.reason:
@@ -124,13 +113,12 @@ def test_health_says_what_the_machine_carries(estimator: str) -> None:
 
 
 def test_mass_that_nobody_weighs_is_estimated_from_forces() -> None:
-    vehicle = machine()
-    loaded = replace(vehicle, mass_kg=1.2 * vehicle.mass_kg)
+    loaded = replace(VEHICLE, mass_kg=1.2 * VEHICLE.mass_kg)
     legs = [STAND, START, *[Leg(2, 0.7), Leg(2, -0.7)] * 12]
     made = drive(legs, loaded, ground=Ground(0.05))
     errors = {}
     for mass in ("known", "estimated"):
-        run = EstimatorRun(vehicle, EstimationConfig(mass=mass)).feed(made.readings)
+        run = EstimatorRun(VEHICLE, EstimationConfig(mass=mass)).feed(made.readings)
         errors[mass] = np.nanmean([abs(e.c_rr - 0.05) for e in run.between(40, 55)])
     assert errors["estimated"] < 0.006
     assert errors["known"] > 2 * errors["estimated"]
@@ -141,8 +129,7 @@ def test_mass_that_nobody_weighs_is_estimated_from_forces() -> None:
 
 def test_variance_grows_with_the_drive_force() -> None:
     """By the scale error of torque and mass that nothing is known of."""
-    vehicle = machine()
-    flat, steep = (last_estimate(vehicle, drive(FORWARDS, vehicle, ground=Ground(0.02, a))) for a in (0.0, SLOPE_RAD))
+    flat, steep = (last_estimate(VEHICLE, drive(FORWARDS, VEHICLE, ground=Ground(0.02, a))) for a in (0.0, SLOPE_RAD))
     assert steep.c_rr_var > 3 * flat.c_rr_var
     share = math.sin(SLOPE_RAD) + 0.02 * math.cos(SLOPE_RAD)
     steep_var = (ZERO_STD**2 + (SCALE_STD * share) ** 2) / math.cos(SLOPE_RAD) ** 2
@@ -152,18 +139,17 @@ def test_variance_grows_with_the_drive_force() -> None:
 
 def test_variance_has_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """That of the model, of zero and of scale, beside the filter's."""
-    vehicle = machine()
-    made = drive(FORWARDS, vehicle)
-    base = last_estimate(vehicle, made).c_rr_var
+    made = drive(FORWARDS, VEHICLE)
+    base = last_estimate(VEHICLE, made).c_rr_var
     for zero_std, scale_std, more in (
         (0.02, SCALE_STD, 0.02**2 - 0.0045**2),
         (ZERO_STD, 0.5, (0.5**2 - 0.045**2) * 0.04**2),
     ):
         vague = Calibration(0.0, 0.0, ((zero_std**2, 0.0), (0.0, scale_std**2)))
-        run = EstimatorRun(vehicle, EstimationConfig(), calibration=vague).feed(made.readings)
+        run = EstimatorRun(VEHICLE, EstimationConfig(), calibration=vague).feed(made.readings)
         assert run.last.c_rr_var - base == pytest.approx(more, rel=1e-3)
     monkeypatch.setattr(ground, "MODEL_STD", 0.01)
-    assert last_estimate(vehicle, made).c_rr_var - base == pytest.approx(0.01**2 - 0.0015**2)
+    assert last_estimate(VEHICLE, made).c_rr_var - base == pytest.approx(0.01**2 - 0.0015**2)
 
 
 @pytest.mark.slow
@@ -204,18 +190,16 @@ def test_slope_s_normalised_errors_are_about_one() -> None:
 
 
 def test_nothing_is_known_before_the_imu_speaks() -> None:
-    vehicle = machine()
-    assert GroundEstimator(vehicle, EstimationConfig()).at(START_NS) == NOTHING_KNOWN
-    run = EstimatorRun(vehicle).feed(drive(FORWARDS, vehicle, without=("imu",)).readings)
+    assert GroundEstimator(VEHICLE, EstimationConfig()).at(START_NS) == NOTHING_KNOWN
+    run = EstimatorRun(VEHICLE).feed(drive(FORWARDS, VEHICLE, without=("imu",)).readings)
     assert run.last == NOTHING_KNOWN
     assert run.estimator.newest_ns == 0
     assert not NOTHING_KNOWN.is_blurred
 
 
 def test_without_torque_there_is_a_slope_but_no_resistance() -> None:
-    vehicle = machine()
-    run = EstimatorRun(vehicle).feed(
-        drive(FORWARDS, vehicle, ground=Ground(0.04, SLOPE_RAD), without=("torque",)).readings
+    run = EstimatorRun(VEHICLE).feed(
+        drive(FORWARDS, VEHICLE, ground=Ground(0.04, SLOPE_RAD), without=("torque",)).readings
     )
     assert math.isnan(run.last.c_rr)
     assert math.isnan(run.last.c_rr_var)
@@ -226,10 +210,9 @@ def test_without_torque_there_is_a_slope_but_no_resistance() -> None:
 
 @pytest.mark.parametrize(("kind", "reason"), [(Torque, "no_torque"), (Encoder, "no_wheels")])
 def test_sensor_that_falls_silent_is_missed_and_welcomed_back(kind: type[Reading], reason: str) -> None:
-    vehicle = machine()
-    made = drive([*FORWARDS, Leg(10)], vehicle)
+    made = drive([*FORWARDS, Leg(10)], VEHICLE)
     silent = (made.stamps_ns[1200], made.stamps_ns[1600])
-    run = EstimatorRun(vehicle).feed(
+    run = EstimatorRun(VEHICLE).feed(
         [r for r in made.readings if not (isinstance(r, kind) and silent[0] < r.stamp_ns < silent[1])]
     )
     assert {e.reason for e in run.between(8, 12.3)} == {""}
@@ -241,13 +224,12 @@ def test_sensor_that_falls_silent_is_missed_and_welcomed_back(kind: type[Reading
 
 
 def test_accelerometer_in_g_is_no_accelerometer() -> None:
-    vehicle = machine()
-    made = drive(FORWARDS, vehicle).readings
+    made = drive(FORWARDS, VEHICLE).readings
     in_g = [
         replace(r, force_x_mps2=r.force_x_mps2 / 9.81, force_z_mps2=r.force_z_mps2 / 9.81) if isinstance(r, Imu) else r
         for r in made
     ]
-    run = EstimatorRun(vehicle).feed(in_g)
+    run = EstimatorRun(VEHICLE).feed(in_g)
     assert run.last.reason == "accelerometer"
     assert run.last.is_blurred
     assert run.estimator.health()["fault"] == "accelerometer"
@@ -255,40 +237,36 @@ def test_accelerometer_in_g_is_no_accelerometer() -> None:
 
 @pytest.mark.parametrize("factor", [1000.0, 0.001])
 def test_torque_in_a_wrong_unit_is_noticed(factor: float) -> None:
-    vehicle = machine()
     legs = [STAND, START, *[Leg(3, 0.6), Leg(3, -0.6)] * 10]
     made = [
         replace(r, torque_nm=r.torque_nm * factor) if isinstance(r, Torque) else r
-        for r in drive(legs, vehicle).readings
+        for r in drive(legs, VEHICLE).readings
     ]
-    run = EstimatorRun(vehicle).feed(made)
+    run = EstimatorRun(VEHICLE).feed(made)
     assert run.last.reason == "torque_implausible"
     assert run.estimator.fault == "torque_implausible"
 
 
 def test_torque_that_is_stuck_is_noticed() -> None:
-    vehicle = machine()
-    made = drive([STAND, START, Leg(3), *[Leg(3, 0.6), Leg(3, -0.6)] * 4], vehicle).readings
+    made = drive([STAND, START, Leg(3), *[Leg(3, 0.6), Leg(3, -0.6)] * 4], VEHICLE).readings
     stuck = [
         replace(r, torque_nm=9000.0) if isinstance(r, Torque) and r.stamp_ns > START_NS + 8 * 10**9 else r for r in made
     ]
-    run = EstimatorRun(vehicle).feed(stuck)
+    run = EstimatorRun(VEHICLE).feed(stuck)
     assert "torque_frozen" in {e.reason for e in run.between(10, 30)}
-    assert "torque_frozen" not in {e.reason for e in EstimatorRun(vehicle).feed(made).between(0, 40)}
+    assert "torque_frozen" not in {e.reason for e in EstimatorRun(VEHICLE).feed(made).between(0, 40)}
 
 
 def test_fault_of_the_moment_is_none() -> None:
     """A machine that stands or brakes is not broken."""
-    vehicle = machine()
-    run = EstimatorRun(vehicle).feed(drive([*FORWARDS, Leg(4, -0.5), Leg(3)], vehicle).readings)
+    run = EstimatorRun(VEHICLE).feed(drive([*FORWARDS, Leg(4, -0.5), Leg(3)], VEHICLE).readings)
     assert run.last.reason == "standstill"
     assert run.estimator.fault == ""
 
 
 def test_standing_machine_learns_nothing_and_keeps_what_it_knew() -> None:
-    vehicle = machine()
     legs = [*FORWARDS, Leg(4, -0.5), Leg(5), Leg(2, 0.6), Leg(2)]
-    run = EstimatorRun(vehicle).feed(drive(legs, vehicle, ground=Ground(0.2)).readings)
+    run = EstimatorRun(VEHICLE).feed(drive(legs, VEHICLE, ground=Ground(0.2)).readings)
     standing = run.between(21, 24)
     assert {e.reason for e in standing} == {"standstill"}
     assert all(math.isnan(e.c_rr) and e.slope_x == pytest.approx(0.0, abs=0.005) for e in standing)
@@ -298,8 +276,7 @@ def test_standing_machine_learns_nothing_and_keeps_what_it_knew() -> None:
 
 
 def test_an_estimate_belongs_to_its_stamp_and_to_none_else() -> None:
-    vehicle = machine()
-    run = EstimatorRun(vehicle).feed(drive(FORWARDS, vehicle).readings)
+    run = EstimatorRun(VEHICLE).feed(drive(FORWARDS, VEHICLE).readings)
     newest = run.estimator.newest_ns
     assert not run.estimator.at(newest).reason
     assert run.estimator.at(newest + 250_000_000) == NOTHING_KNOWN
@@ -308,13 +285,12 @@ def test_an_estimate_belongs_to_its_stamp_and_to_none_else() -> None:
 
 
 def test_change_of_slope_blurs_slope_and_resistance() -> None:
-    vehicle = machine()
-    made = drive([*FORWARDS, Leg(5)], vehicle).readings
+    made = drive([*FORWARDS, Leg(5)], VEHICLE).readings
     turning = [
         replace(r, gyro_y_radps=-0.05) if isinstance(r, Imu) and 0 < r.stamp_ns - START_NS - 10 * 10**9 < 10**9 else r
         for r in made
     ]
-    estimates = EstimatorRun(vehicle).feed(turning).between(10.2, 10.8)
+    estimates = EstimatorRun(VEHICLE).feed(turning).between(10.2, 10.8)
     assert {e.reason for e in estimates} == {"pitch_transient"}
     assert all(e.is_blurred for e in estimates)
 
@@ -354,9 +330,8 @@ def off(readings: list[Reading], zero_mps2: float, torque: float = 1.0) -> list[
 @pytest.mark.slow
 def test_zero_is_found_by_the_work_cycle() -> None:
     """0.06 m/s2 are 0.006 of c_rr, each direction the other way; slope ahead is put right too."""
-    vehicle = machine()
-    readings = off(cycles(vehicle, 5), 0.06)
-    run, without = (EstimatorRun(vehicle, EstimationConfig(calibrate=c)).feed(readings) for c in (True, False))
+    readings = off(cycles(VEHICLE, 5), 0.06)
+    run, without = (EstimatorRun(VEHICLE, EstimationConfig(calibrate=c)).feed(readings) for c in (True, False))
     for direction in ((151.5, 155.5), (169.5, 173.5)):  # of the last cycle
         calibrated, uncalibrated = ([e.c_rr for e in r.between(*direction) if not e.reason] for r in (run, without))
         assert len(calibrated) > 20
@@ -374,9 +349,8 @@ def test_zero_is_found_by_the_work_cycle() -> None:
 
 
 def test_known_ground_shows_the_zero_without_a_way_back() -> None:
-    vehicle = machine()
-    readings = off(drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(10)], vehicle).readings, 0.06)
-    run = EstimatorRun(vehicle, known_c_rr=0.04).feed(readings)
+    readings = off(drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(10)], VEHICLE).readings, 0.06)
+    run = EstimatorRun(VEHICLE, known_c_rr=0.04).feed(readings)
     health = run.estimator.health()["calibration"]
     assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)
     assert health["known_ground"] > 100
@@ -384,9 +358,8 @@ def test_known_ground_shows_the_zero_without_a_way_back() -> None:
 
 
 def test_new_calibration_takes_effect_at_a_standstill_only() -> None:
-    vehicle = machine()
-    made = drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(6)], vehicle).readings
-    run = EstimatorRun(vehicle, known_c_rr=0.04).feed(off(made, 0.06))
+    made = drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(6)], VEHICLE).readings
+    run = EstimatorRun(VEHICLE, known_c_rr=0.04).feed(off(made, 0.06))
     first = [e.c_rr for e in run.between(8, 45) if not e.reason]
     assert np.mean(first) == pytest.approx(0.04 - 0.06 / GRAVITY_MPS2, abs=1e-3)
     assert np.ptp(first) < 2e-3
@@ -394,24 +367,22 @@ def test_new_calibration_takes_effect_at_a_standstill_only() -> None:
 
 
 def test_calibration_from_before_is_used_at_once() -> None:
-    vehicle = machine()
     zero = -0.06 / GRAVITY_MPS2
     known = Calibration(zero, 0.0, ((1e-7, 0.0), (0.0, 1e-4)), START_NS - 10**10, 400)
-    readings = off(drive(FORWARDS, vehicle).readings, 0.06)
-    estimates = [e for e in EstimatorRun(vehicle, calibration=known).feed(readings).between(6, 14) if not e.reason]
+    readings = off(drive(FORWARDS, VEHICLE).readings, 0.06)
+    estimates = [e for e in EstimatorRun(VEHICLE, calibration=known).feed(readings).between(6, 14) if not e.reason]
     assert np.mean([e.c_rr for e in estimates]) == pytest.approx(0.04, abs=0.0015)
-    unknown = [e for e in EstimatorRun(vehicle).feed(readings).between(6, 14) if not e.reason]
+    unknown = [e for e in EstimatorRun(VEHICLE).feed(readings).between(6, 14) if not e.reason]
     assert np.mean([e.c_rr_var for e in estimates]) < 0.5 * np.mean([e.c_rr_var for e in unknown])
-    health = EstimatorRun(vehicle, calibration=known).feed(readings).estimator.health()["calibration"]
+    health = EstimatorRun(VEHICLE, calibration=known).feed(readings).estimator.health()["calibration"]
     assert health["age_s"] == pytest.approx(10 + 16, abs=0.5)
 
 
 def test_what_is_found_is_handed_on() -> None:
-    vehicle = machine()
-    run = EstimatorRun(vehicle).feed(off(cycles(vehicle, 2), 0.06))
+    run = EstimatorRun(VEHICLE).feed(off(cycles(VEHICLE, 2), 0.06))
     calibration = run.estimator.calibration
     assert calibration.zero == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.001)
-    again = EstimatorRun(vehicle, calibration=calibration).feed(drive([STAND], vehicle).readings).estimator
+    again = EstimatorRun(VEHICLE, calibration=calibration).feed(drive([STAND], VEHICLE).readings).estimator
     assert again.calibration.zero == calibration.zero
     assert again.health()["calibration"]["zero"] == calibration.zero
     assert again.health()["calibration"]["passages"] == calibration.passages
@@ -419,8 +390,7 @@ def test_what_is_found_is_handed_on() -> None:
 
 @pytest.mark.slow
 def test_scale_is_found_on_slopes() -> None:
-    vehicle = machine()
-    flat, steep = cycles(vehicle, 3), cycles(vehicle, 3, ahead_rad=0.2)
+    flat, steep = cycles(VEHICLE, 3), cycles(VEHICLE, 3, ahead_rad=0.2)
     shift = flat[-1].stamp_ns - START_NS + 10**9
     turned = {r.sensor: r for r in flat if isinstance(r, Encoder)}["wheels"]
     later = [
@@ -434,25 +404,24 @@ def test_scale_is_found_on_slopes() -> None:
         else replace(r, stamp_ns=r.stamp_ns + shift)
         for r in steep
     ]
-    health = EstimatorRun(vehicle).feed(off([*flat, *later], 0.03, torque=1.05)).estimator.health()["calibration"]
+    health = EstimatorRun(VEHICLE).feed(off([*flat, *later], 0.03, torque=1.05)).estimator.health()["calibration"]
     assert health["scale"] == pytest.approx(0.05 / 1.05, abs=0.012)
     assert health["zero"] == pytest.approx(-0.03 / GRAVITY_MPS2, abs=0.002)
     assert health["scale_std"] < 0.02
 
 
 def test_nothing_is_learnt_of_moments_that_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    vehicle = machine()
-    readings = off(cycles(vehicle, 1), 0.06)
-    some = EstimatorRun(vehicle).feed(readings)
+    readings = off(cycles(VEHICLE, 1), 0.06)
+    some = EstimatorRun(VEHICLE).feed(readings)
     monkeypatch.setattr(plausibility, "MIN_SPEED_MPS", 1.9)  # the machine is hardly ever so fast
-    few = EstimatorRun(vehicle).feed(readings)
+    few = EstimatorRun(VEHICLE).feed(readings)
     assert few.estimator.calibration.passages < some.estimator.calibration.passages
 
 
 # --- options ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mass", MASSES)
+@pytest.mark.parametrize("mass", ground.MASSES)
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_every_combination_runs(estimator: str, mass: str) -> None:
     vehicle = weighing()

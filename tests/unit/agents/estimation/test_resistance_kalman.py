@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents.estimation import resistance_kalman
-from agents.estimation.resistance import BalanceStep
+from agents.estimation.balance import BalanceStep
 from agents.estimation.resistance_kalman import FIRST_C_RR, FIRST_STD, NOISE, WALK, KalmanResistance
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
@@ -39,9 +39,7 @@ def fed(raw: Iterable[float]) -> KalmanResistance:
 
 
 def at_step(kalman: KalmanResistance, index: int) -> tuple[float, float]:
-    estimate = kalman.at(START_NS + index * STEP_NS)
-    assert estimate
-    return estimate
+    return kalman.at(START_NS + index * STEP_NS)
 
 
 def borders(kalman: KalmanResistance) -> list[int]:
@@ -327,7 +325,6 @@ def test_back_across_a_border_half_crossed() -> None:
         home.append(step)
     feed(kalman, home)
     estimate = kalman.at(home[-1].stamp_ns)
-    assert estimate
     assert estimate[0] == pytest.approx(0.03, abs=0.01)
 
 

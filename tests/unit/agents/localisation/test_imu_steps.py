@@ -22,7 +22,6 @@ def gather(gatherer: StepGatherer, vehicle: MachineConfig, readings: Iterable[Re
     dead_reckoning, steps = DeadReckoning(vehicle, 0.0), []
     for reading in readings:
         sensor = vehicle.sensor(reading.sensor)
-        assert sensor
         dead_reckoning.update(reading, sensor)
         step = gatherer.gather(reading, sensor, dead_reckoning)
         steps += [step] if step else []

@@ -5,37 +5,39 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.localisation.config import LocalisationConfig
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import ATTITUDE, BASE_STATES, SPEED, YAW, Layout
+from agents.localisation.localiser import LocalisationConfig
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Attitude, Encoder, Gps, Imu, Reading, Torque
+from protocol.machine.readings import Encoder, Gps, Imu, Reading, Torque
 from protocol.site.site_config import Projection
 from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import (
     PROJECTION,
     S_BEND,
+    START,
     START_NS,
+    VEHICLE,
     Drive,
     Ground,
     Leg,
     RunLocaliser,
+    after,
     changed_sensor,
     drive,
     fix,
     localiser,
     machine,
     simulated,
+    with_ahrs,
 )
 
 GYRO_BIAS = Layout(imus=1).gyro_bias(0)
 FILTERS = pytest.mark.parametrize("engine", ["ekf", "ukf"])
-START = (10.0, 20.0, 0.7)  # where made-up drives start
 
 
 def state(located: RunLocaliser) -> Floats:
-    assert located.belief
     return located.belief.x
 
 
@@ -47,10 +49,6 @@ def moved(reading: Reading, north_m: float) -> Reading:
     """A fix that lies further north."""
     assert isinstance(reading, Gps)
     return replace(reading, lat_deg=reading.lat_deg + north_m / 111_200)
-
-
-def after(reading: Reading, seconds: float) -> bool:
-    return reading.stamp_ns > START_NS + seconds * 1e9
 
 
 @pytest.mark.parametrize(  # each pair of choices once
@@ -80,11 +78,10 @@ def test_antenna_far_from_the_rear_axle_is_no_trouble() -> None:
 
 
 def test_nothing_that_was_driven_before_the_alignment_is_lost() -> None:
-    vehicle = machine()
-    made = drive([Leg(3), *S_BEND], vehicle)
-    located = localiser(vehicle)
+    made = drive([Leg(3), *S_BEND], VEHICLE)
+    located = localiser(VEHICLE)
     aligned_ns = next(r.stamp_ns for r in made.readings if located.run([r]) and located.is_aligned)
-    beliefs = localiser(vehicle).run(made.readings)
+    beliefs = localiser(VEHICLE).run(made.readings)
     assert aligned_ns > START_NS + 8 * 10**9
     assert beliefs[0].stamp_ns <= START_NS + 200_000_000
     stamps = [b.stamp_ns for b in beliefs]
@@ -93,26 +90,23 @@ def test_nothing_that_was_driven_before_the_alignment_is_lost() -> None:
 
 
 def test_no_pose_before_the_heading_is_known() -> None:
-    vehicle = machine()
-    located = localiser(vehicle)
-    assert located.run(drive([Leg(60)], vehicle).readings) == []  # a parked machine
-    straight = drive([Leg(4, 0.5), Leg(2)], vehicle, without=("gps-1",))
-    assert localiser(vehicle).run(straight.readings) == []
+    located = localiser(VEHICLE)
+    assert located.run(drive([Leg(60)], VEHICLE).readings) == []  # a parked machine
+    straight = drive([Leg(4, 0.5), Leg(2)], VEHICLE, without=("gps-1",))
+    assert localiser(VEHICLE).run(straight.readings) == []
     assert not located.is_aligned
 
 
 def test_reverse_driving_from_the_start_is_aligned_too() -> None:
-    vehicle = machine()
-    made = drive([Leg(4, -0.5), Leg(5), Leg(4, 0, 0.2), Leg(4)], vehicle)
-    assert max(position_errors(localiser(vehicle).run(made.readings), made)) < 0.3
+    made = drive([Leg(4, -0.5), Leg(5), Leg(4, 0, 0.2), Leg(4)], VEHICLE)
+    assert max(position_errors(localiser(VEHICLE).run(made.readings), made)) < 0.3
 
 
 def test_outlier_is_gated_and_counted() -> None:
-    vehicle = machine()
-    made = drive(S_BEND, vehicle)
+    made = drive(S_BEND, VEHICLE)
     outliers = [r.stamp_ns for r in made.readings if isinstance(r, Gps) and after(r, 16)][::10]
     readings = [moved(r, 60) if isinstance(r, Gps) and r.stamp_ns in outliers else r for r in made.readings]
-    located = localiser(vehicle)  # outliers far apart are not "in a row"
+    located = localiser(VEHICLE)  # outliers far apart are not "in a row"
     beliefs = located.run(readings)
     assert located.counters["gps-1_gated"] == len(outliers) >= 3
     assert located.counters["gps-1_relocked"] == 0
@@ -121,10 +115,9 @@ def test_outlier_is_gated_and_counted() -> None:
 
 def test_filter_opens_up_again_after_a_lock_out() -> None:
     """The receiver is 60 m off for good, as after a change of its datum: the filter resists, then follows."""
-    vehicle = machine()
-    made = drive([*S_BEND, Leg(10)], vehicle)
+    made = drive([*S_BEND, Leg(10)], VEHICLE)
     readings = [moved(r, 60) if isinstance(r, Gps) and after(r, 20) else r for r in made.readings]
-    located = localiser(vehicle)
+    located = localiser(VEHICLE)
     beliefs = located.run(readings)
     assert (located.counters["gps-1_gated"], located.counters["gps-1_relocked"]) == (15, 1)
     x, y, _ = made.at(beliefs[-1].stamp_ns)
@@ -179,9 +172,8 @@ def biased(readings: list[Reading], bias_radps: float) -> list[Reading]:
 
 
 def test_standstill_shows_the_gyro_bias() -> None:
-    vehicle = machine()
-    made = drive([*S_BEND, Leg(4, -0.5), Leg(6)], vehicle, without=("torque",))
-    located = localiser(vehicle)
+    made = drive([*S_BEND, Leg(4, -0.5), Leg(6)], VEHICLE, without=("torque",))
+    located = localiser(VEHICLE)
     located.run(biased(made.readings, 0.004))
     assert 80 <= located.counters["standstill_used"] <= 110
     assert state(located)[GYRO_BIAS] == pytest.approx(0.004, abs=1e-4)
@@ -189,9 +181,8 @@ def test_standstill_shows_the_gyro_bias() -> None:
 
 def test_turning_on_the_spot_is_no_gyro_bias() -> None:
     """An articulated loader that steers at rest turns its rear frame."""
-    vehicle = machine()
-    located = localiser(vehicle)
-    made = drive([*S_BEND, Leg(4, -0.5), Leg(3, 0.0, 0.1), Leg(1)], vehicle, without=("torque",))
+    located = localiser(VEHICLE)
+    made = drive([*S_BEND, Leg(4, -0.5), Leg(3, 0.0, 0.1), Leg(1)], VEHICLE, without=("torque",))
     located.run(made.readings)
     assert located.counters["standstill_gated"] >= 30
     assert located.counters["standstill_relocked"] == 0
@@ -201,10 +192,9 @@ def test_turning_on_the_spot_is_no_gyro_bias() -> None:
 
 def test_wheels_that_fall_silent_do_not_hold_the_machine() -> None:
     """The encoder dies at rest, and the machine drives off: GPS leads on, instead of a standstill for ever."""
-    vehicle = machine()
-    made = drive([*S_BEND, Leg(4, -0.5), Leg(3), Leg(4, 0.5), Leg(8)], vehicle)
+    made = drive([*S_BEND, Leg(4, -0.5), Leg(3), Leg(4, 0.5), Leg(8)], VEHICLE)
     readings = [r for r in made.readings if not (isinstance(r, Encoder) and after(r, 35))]
-    located = localiser(vehicle)
+    located = localiser(VEHICLE)
     beliefs = located.run(readings)
     assert located.counters["standstill_used"] <= 30
     assert located.counters["gps-1_gated"] == 0
@@ -212,10 +202,9 @@ def test_wheels_that_fall_silent_do_not_hold_the_machine() -> None:
 
 
 def test_dead_reckoning_grows_unsure_and_a_fix_makes_it_sure_again() -> None:
-    vehicle = machine()
-    made = drive([*S_BEND, Leg(20), Leg(2)], vehicle)
+    made = drive([*S_BEND, Leg(20), Leg(2)], VEHICLE)
     readings = [r for r in made.readings if not isinstance(r, Gps) or not after(r, 30) or after(r, 50)]
-    beliefs = localiser(vehicle).run(readings)
+    beliefs = localiser(VEHICLE).run(readings)
 
     def std_m(seconds: float) -> float:
         belief = next(b for b in beliefs if b.stamp_ns >= START_NS + seconds * 1e9)
@@ -226,10 +215,9 @@ def test_dead_reckoning_grows_unsure_and_a_fix_makes_it_sure_again() -> None:
 
 
 def test_steps_are_no_longer_than_step_s() -> None:
-    vehicle = machine()
-    made = drive(S_BEND, vehicle)
+    made = drive(S_BEND, VEHICLE)
     for step_s in (0.05, 0.2):
-        stamps = [b.stamp_ns for b in localiser(vehicle, step_s=step_s).run(made.readings)]
+        stamps = [b.stamp_ns for b in localiser(VEHICLE, step_s=step_s).run(made.readings)]
         assert max(np.diff(stamps)) <= (step_s + 0.021) * 1e9
 
 
@@ -267,7 +255,6 @@ def raw_square_error(projection: Projection, readings: list[Reading], track: Any
     since = track["stamp_ns"].astype(float) - float(START_NS)
     for gps in (r for r in readings if isinstance(r, Gps)):
         sensor = vehicle.sensor(gps.sensor)
-        assert sensor
         t = float(gps.stamp_ns) - float(START_NS)
         x, y = np.interp(t, since, track["x"]), np.interp(t, since, track["y"])
         yaw = float(np.interp(t, since, np.unwrap(track["yaw"])))
@@ -330,9 +317,8 @@ def test_first_fix_that_is_refused_does_not_count_as_heard() -> None:
 
 
 def test_fix_older_than_the_window_is_refused_and_counted() -> None:
-    vehicle = machine()
-    made = drive(S_BEND, vehicle)
-    located = localiser(vehicle, start=START)
+    made = drive(S_BEND, VEHICLE)
+    located = localiser(VEHICLE, start=START)
     located.run(arriving(made.readings, {"gps-1": 1.2}))
     assert located.counters["too_late"] > 100
     assert located.counters["gps-1_used"] < 10  # the last ones, after which nothing came
@@ -360,19 +346,8 @@ def test_a_given_start_may_lie_anywhere() -> None:
     assert abs(math.remainder(last.heading_rad - heading - math.pi, math.tau)) < 0.02
 
 
-def with_ahrs(made: Drive, off_rad: float) -> list[Reading]:
-    """An attitude reference 20 times a second whose heading is off."""
-    more = [
-        Attitude("ahrs", stamp, 0.0, 0.0, math.sin(half), math.cos(half), 1e-4, 1e-4, 1e-4)
-        for stamp, heading in zip(made.stamps_ns[::5], made.heading_rad[::5].tolist(), strict=True)
-        for half in [(heading + off_rad) / 2]
-    ]
-    return sorted([*made.readings, *more], key=lambda r: r.stamp_ns)
-
-
 def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores() -> None:
-    vehicle = machine()
-    vehicle = replace(vehicle, sensors=(*vehicle.sensors, SensorConfig("ahrs", "attitude")))
+    vehicle = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("ahrs", "attitude")))
     made = drive(S_BEND, vehicle)
     off, states, used = {}, {}, {}
     for profile in ("paper", "default"):
@@ -389,9 +364,8 @@ def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores(
 
 
 def test_each_of_two_imus_has_its_own_bias() -> None:
-    vehicle = machine()
     vehicle = replace(
-        vehicle, sensors=(*vehicle.sensors, SensorConfig("imu-2", "imu", Mount((0.5, 0.0, 1.0), (0.0, 0.0, 90.0))))
+        VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("imu-2", "imu", Mount((0.5, 0.0, 1.0), (0.0, 0.0, 90.0))))
     )
     made = drive([*S_BEND, Leg(4, -0.5), Leg(6)], vehicle)
     readings = [
@@ -407,16 +381,14 @@ def test_each_of_two_imus_has_its_own_bias() -> None:
 
 
 def test_one_imu_of_two_that_dies_is_no_trouble() -> None:
-    vehicle = machine()
-    vehicle = replace(vehicle, sensors=(*vehicle.sensors, SensorConfig("imu-2", "imu")))
+    vehicle = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("imu-2", "imu")))
     made = drive(S_BEND, vehicle)
     readings = [r for r in made.readings if r.sensor != "imu-2" or not after(r, 15)]
     assert max(position_errors(localiser(vehicle).run(readings), made)) < 0.3
 
 
 def test_imu_of_the_front_frame_without_articulation_is_refused_and_counted() -> None:
-    vehicle = machine()
-    vehicle = replace(vehicle, sensors=(*vehicle.sensors, SensorConfig("imu-front", "imu", frame=FRONT)))
+    vehicle = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("imu-front", "imu", frame=FRONT)))
     made = drive(S_BEND, vehicle)
     readings = [
         replace(r, gyro_z_radps=1.0) if isinstance(r, Imu) and r.sensor == "imu-front" else r for r in made.readings
@@ -430,9 +402,8 @@ def test_imu_of_the_front_frame_without_articulation_is_refused_and_counted() ->
 @FILTERS
 def test_slope_is_found_from_the_force(engine: str) -> None:
     """Uphill by 0.1 rad and leaning to the right by 0.05: nose up is negative pitch, left up is positive roll."""
-    vehicle = machine()
-    made = drive(S_BEND, vehicle, ground=Ground(ahead_rad=0.1, left_rad=0.05))
-    located = localiser(vehicle, filter=engine)
+    made = drive(S_BEND, VEHICLE, ground=Ground(ahead_rad=0.1, left_rad=0.05))
+    located = localiser(VEHICLE, filter=engine)
     located.run(made.readings)
     assert state(located)[ATTITUDE][:2] == pytest.approx([0.05, -0.1], abs=0.03)
 

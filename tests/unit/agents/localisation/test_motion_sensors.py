@@ -11,7 +11,7 @@ from agents.localisation import measurements
 from agents.localisation.filters.state import Layout
 from agents.localisation.headings import UNKNOWN_STD
 from agents.localisation.imu_steps import FilterStep, ImuMean, Turn
-from agents.localisation.motion_sensors import STANDSTILL_S, MotionSensors
+from agents.localisation.motion_sensors import ROLLING_S, STANDSTILL_S, MotionSensors, machine_speed, rolling_resistance
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.units import GRAVITY_MPS2
 
@@ -20,9 +20,7 @@ FORCE = np.array([0.06 * GRAVITY_MPS2, 0.0, GRAVITY_MPS2])
 IMU_STEP = replace(STEP, imu_means={"imu": ImuMean(np.zeros(3), FORCE)})
 
 
-def sensors(
-    *configured: SensorConfig, slip: float = 0.0, slip_soft: float = 0.0, step_s: float = 10.0
-) -> MotionSensors:
+def sensors(*configured: SensorConfig, slip: float = 0.0, slip_soft: float = 0.0) -> MotionSensors:
     machine = MachineConfig("truck", wheelbase_m=3.0, sensors=configured)
     return MotionSensors(machine, Layout(imus=1, wheel_scale=True), 10.0, slip, slip_soft)
 
@@ -90,3 +88,27 @@ def test_a_turn_without_any_source_is_counted() -> None:
     (turn,) = stated.turn(replace(STEP, turn=Turn(0.1, 1.0)))
     assert (deviations(turn.R), stated.turn_error_radps) == ([0.3], 0.3)
     assert not stated.counters
+
+
+@pytest.mark.parametrize(
+    ("wheel_mps", "traction", "speed_mps"), [(2.0, 0.1, 1.96), (-2.0, -0.1, -1.96), (2.0, -0.1, 2.04)]
+)
+def test_driven_wheels_turn_further_than_the_machine_moves_and_braked_ones_less(
+    wheel_mps: float, traction: float, speed_mps: float
+) -> None:
+    assert machine_speed(wheel_mps, traction, 0.2) == pytest.approx(speed_mps)
+
+
+@pytest.mark.parametrize("dt_s", [0.01, 0.05, 5.0])
+def test_rolling_resistance_is_what_neither_climbs_nor_accelerates(dt_s: float) -> None:
+    rolling = 0.0
+    for _ in range(round(10 * ROLLING_S / dt_s) + 1):
+        rolling = rolling_resistance(rolling, 0.15, 0.12 * GRAVITY_MPS2, dt_s)
+    assert rolling == pytest.approx(0.03, rel=1e-3)
+
+
+def test_rolling_resistance_follows_in_half_a_second() -> None:
+    rolling = np.float64(0.0)
+    for _ in range(round(ROLLING_S / 0.01)):
+        rolling = rolling_resistance(rolling, 0.1, 0.0, 0.01)
+    assert rolling == pytest.approx(0.1 * (1 - np.exp(-1)), rel=0.02)

@@ -22,8 +22,7 @@ def test_reading_within_its_limits_is_built(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
-    ("value", "reason"),
-    [(math.nan, Refusal.NOT_FINITE), (math.inf, Refusal.NOT_FINITE), (-1e30, Refusal.OUT_OF_RANGE)],
+    ("value", "reason"), [(math.nan, Refusal.NOT_FINITE), (math.inf, Refusal.NOT_FINITE), (-1e30, Refusal.OUT_OF_RANGE)]
 )
 def test_each_bad_value_is_named(kind, value, reason):
     for i, name in enumerate(columns(kind)):

@@ -8,38 +8,8 @@ from hypothesis import strategies as st
 
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
-from protocol.queries.answer_codec import (
-    decode_change,
-    decode_changes,
-    decode_error,
-    decode_history,
-    decode_info,
-    decode_machine,
-    decode_machines,
-    decode_point,
-    decode_region,
-    encode_change,
-    encode_changes,
-    encode_error,
-    encode_history,
-    encode_info,
-    encode_machine,
-    encode_machines,
-    encode_point,
-    encode_region,
-)
-from protocol.queries.answers import (
-    GroundChange,
-    HistoryAnswer,
-    HistorySpan,
-    MachineState,
-    MapInfo,
-    PointAnswer,
-    Region,
-    SampleCounts,
-    SiteInfo,
-    TrustAnswer,
-)
+from protocol.queries import answer_codec as codec
+from protocol.queries import answers
 from protocol.queries.commands import TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
 from protocol.queries.requests import (
@@ -147,7 +117,7 @@ def test_what_divides_parameters_survives_in_a_text():
 
 
 def test_bounds_of_an_answer_can_be_asked_again():
-    region = Region(np.array([0.5, 1.5]), np.array([-0.5]), 1.0, {}, 0, 1)  # its bounds are numpy's numbers
+    region = answers.Region(np.array([0.5, 1.5]), np.array([-0.5]), 1.0, {}, 0, 1)  # its bounds are numpy's numbers
     query = RegionQuery(region.bounds)
     assert parse_query("region", encode_query(query)).bounds == Bounds(0.0, -1.0, 2.0, 0.0)
     point = PointQuery(np.float64(1.5), np.float32(0.5))
@@ -237,8 +207,8 @@ def test_region_round_trip(columns, rows, west, data):
     flat = data.draw(st.lists(values, min_size=rows * columns, max_size=rows * columns))
     table = np.array(flat, np.float32).reshape(rows, columns)
     x_m, y_m = (west + np.arange(columns) + 0.5) * 0.5, (np.arange(rows) + 0.5) * 0.5
-    region = Region(x_m, y_m, 0.5, {"resistance": table}, 7, 8)
-    got = decode_region(encode_region(region))
+    region = answers.Region(x_m, y_m, 0.5, {"resistance": table}, 7, 8)
+    got = codec.decode_region(codec.encode_region(region))
     assert got["resistance"].tobytes() == table.tobytes()
     assert (got.x_m == region.x_m).all()
     assert (got.y_m == region.y_m).all()
@@ -247,8 +217,8 @@ def test_region_round_trip(columns, rows, west, data):
 
 def test_region_may_hold_layers_that_are_no_float32():
     table = np.arange(6, dtype=np.int64).reshape(3, 2).T  # nor in one piece
-    region = Region(np.arange(3) + 0.5, np.arange(2) + 0.5, 1.0, {"visits": table}, 0, 1)
-    assert decode_region(encode_region(region))["visits"].tolist() == table.tolist()
+    region = answers.Region(np.arange(3) + 0.5, np.arange(2) + 0.5, 1.0, {"visits": table}, 0, 1)
+    assert codec.decode_region(codec.encode_region(region))["visits"].tolist() == table.tolist()
 
 
 def region_table(**fields) -> bytes:
@@ -272,12 +242,13 @@ def region_table(**fields) -> bytes:
 )
 def test_malformed_region_is_refused(fields, reason):
     with pytest.raises(MessageError) as caught:
-        decode_region(region_table(**fields))
+        codec.decode_region(region_table(**fields))
     assert caught.value.reason is reason
 
 
 def test_point_keeps_unknown_as_nan():
-    got = decode_point(encode_point(PointAnswer(0.5, -0.5, {"resistance": math.nan, "visits": 3}, 7, 8)))
+    answer = answers.PointAnswer(0.5, -0.5, {"resistance": math.nan, "visits": 3}, 7, 8)
+    got = codec.decode_point(codec.encode_point(answer))
     assert math.isnan(got.values["resistance"])
     assert got.values["visits"] == 3.0
     assert (got.x_m, got.y_m, got.merged, got.stamp_ns) == (0.5, -0.5, 7, 8)
@@ -286,15 +257,15 @@ def test_point_keeps_unknown_as_nan():
 def test_point_whose_values_are_no_numbers_is_refused():
     table = {"x_m": 0.5, "y_m": 0.5, "values": {"resistance": "high"}, "merged": 1, "stamp_ns": 1}
     with pytest.raises(MessageError, match=r"values\.resistance"):
-        decode_point(pack(table))
+        codec.decode_point(pack(table))
 
 
 def test_history_round_trips_and_keeps_unknown_as_nan():
     spans = (
-        HistorySpan(10, 19, {"resistance": math.nan, "visits": 3}),
-        HistorySpan(30, 39, {"resistance": 0.5, "visits": 1.0}),
+        answers.HistorySpan(10, 19, {"resistance": math.nan, "visits": 3}),
+        answers.HistorySpan(30, 39, {"resistance": 0.5, "visits": 1.0}),
     )
-    got = decode_history(encode_history(HistoryAnswer(0.5, -0.5, spans, 7, 8)))
+    got = codec.decode_history(codec.encode_history(answers.HistoryAnswer(0.5, -0.5, spans, 7, 8)))
     assert (got.x_m, got.y_m, got.merged, got.stamp_ns) == (0.5, -0.5, 7, 8)
     assert [(span.first_ns, span.last_ns) for span in got.spans] == [(10, 19), (30, 39)]
     assert math.isnan(got.spans[0].values["resistance"])
@@ -313,14 +284,14 @@ def test_history_round_trips_and_keeps_unknown_as_nan():
 )
 def test_malformed_history_is_refused(spans, words):
     with pytest.raises(MessageError, match=words):
-        decode_history(pack({"x_m": 0.5, "y_m": 0.5, "spans": spans, "merged": 1, "stamp_ns": 1}))
+        codec.decode_history(pack({"x_m": 0.5, "y_m": 0.5, "spans": spans, "merged": 1, "stamp_ns": 1}))
 
 
-MACHINE = MachineState("a", True, "", "", 0, False, ("gain",), {"shift_m": 1.5}, 1, 7, 0, 5)
-CHANGE = GroundChange(1, 5, 6, (0.0, 0.0, 1.0, 2.0), 7, 0.25, None, None, None)
+MACHINE = answers.MachineState("a", True, "", "", 0, False, ("gain",), {"shift_m": 1.5}, 1, 7, 0, 5)
+CHANGE = answers.GroundChange(1, 5, 6, (0.0, 0.0, 1.0, 2.0), 7, 0.25, None, None, None)
 SITE = SiteConfig("pit", 48.0, 11.0, known_ground=(KnownGround("pad", 0.01, ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))),))
-INFO = MapInfo(
-    site=SiteInfo(**vars(SITE), frame=SITE.frame, crs=SITE.crs),
+INFO = answers.MapInfo(
+    site=answers.SiteInfo(**vars(SITE), frame=SITE.frame, crs=SITE.crs),
     journalled=5,
     merged=5,
     snapshot=0,
@@ -331,7 +302,7 @@ INFO = MapInfo(
     stamp_ns=9,
     wall_ns=10,
     version="1.0",
-    machines={"a": SampleCounts(1, 42, 0, 9)},
+    machines={"a": answers.SampleCounts(1, 42, 0, 9)},
     distrusted=("b",),
     counters={"refused_gap": 2},
     layers=("resistance",),
@@ -339,26 +310,26 @@ INFO = MapInfo(
 
 
 def test_records_round_trip():
-    assert decode_machines(encode_machines([MACHINE])) == [MACHINE]
-    assert decode_changes(encode_changes([CHANGE])) == [CHANGE]
-    assert decode_change(encode_change(CHANGE)) == CHANGE
-    assert decode_info(encode_info(INFO)) == INFO
-    assert decode_info(encode_info(replace(INFO, bounds=None))).bounds is None
-    answer = TrustAnswer(**vars(MACHINE), merged=3)
-    assert decode_machine(encode_machine(answer)) == answer
+    assert codec.decode_machines(codec.encode_machines([MACHINE])) == [MACHINE]
+    assert codec.decode_changes(codec.encode_changes([CHANGE])) == [CHANGE]
+    assert codec.decode_change(codec.encode_change(CHANGE)) == CHANGE
+    assert codec.decode_info(codec.encode_info(INFO)) == INFO
+    assert codec.decode_info(codec.encode_info(replace(INFO, bounds=None))).bounds is None
+    answer = answers.TrustAnswer(**vars(MACHINE), merged=3)
+    assert codec.decode_machine(codec.encode_machine(answer)) == answer
 
 
 def test_fields_of_a_newer_server_are_ignored():
-    assert decode_changes(encode_changes([{**asdict(CHANGE), "volume_m3": 4.0}])) == [CHANGE]
+    assert codec.decode_changes(codec.encode_changes([{**asdict(CHANGE), "volume_m3": 4.0}])) == [CHANGE]
     site = {**asdict(INFO.site), "datum": "WGS84"}
-    assert decode_info(encode_info({**asdict(INFO), "site": site, "load": 0.5})) == INFO
+    assert codec.decode_info(codec.encode_info({**asdict(INFO), "site": site, "load": 0.5})) == INFO
 
 
-@pytest.mark.parametrize("name", [item.name for item in fields(MapInfo)])
+@pytest.mark.parametrize("name", [item.name for item in fields(answers.MapInfo)])
 def test_info_without_a_field_is_refused(name):
     table = {key: value for key, value in asdict(INFO).items() if key != name}
     with pytest.raises(MessageError, match=f"info.{name}: missing"):
-        decode_info(encode_info(table))
+        codec.decode_info(codec.encode_info(table))
 
 
 @pytest.mark.parametrize(
@@ -380,15 +351,15 @@ def test_info_without_a_field_is_refused(name):
 )
 def test_info_of_other_types_is_refused(values, words):
     with pytest.raises(MessageError, match=words):
-        decode_info(encode_info({**asdict(INFO), **values}))
+        codec.decode_info(codec.encode_info({**asdict(INFO), **values}))
 
 
 def test_evidence_is_plain():
     with pytest.raises(MessageError, match="bytes is no plain value"):
-        decode_machines(encode_machines([{**asdict(MACHINE), "evidence": {"x": b"1"}}]))
+        codec.decode_machines(codec.encode_machines([{**asdict(MACHINE), "evidence": {"x": b"1"}}]))
 
 
-@pytest.mark.parametrize("decode", [decode_machines, decode_changes])
+@pytest.mark.parametrize("decode", [codec.decode_machines, codec.decode_changes])
 def test_a_table_whose_rows_are_no_maps_is_refused(decode):
     name = decode.__name__.removeprefix("decode_")
     with pytest.raises(MessageError, match=rf"{name}\[0\]: dict expected"):
@@ -397,10 +368,10 @@ def test_a_table_whose_rows_are_no_maps_is_refused(decode):
 
 def test_an_event_is_small():
     with pytest.raises(MessageError) as caught:
-        decode_change(encode_change({"bounds": [0.0] * 10_000}))
+        codec.decode_change(codec.encode_change({"bounds": [0.0] * 10_000}))
     assert caught.value.reason is Refusal.TOO_LARGE
 
 
 def test_error_round_trip():
-    error = decode_error(encode_error(QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")))
+    error = codec.decode_error(codec.encode_error(QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")))
     assert (error.reason, str(error)) == ("unknown_layer", "layer `x` is not known")

@@ -1,3 +1,4 @@
+import dataclasses
 import struct
 
 import msgpack
@@ -10,6 +11,7 @@ from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, Encoder, Imu, columns
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
+from protocol.queries.answers import PointAnswer, Region
 from protocol.wire import codec
 from protocol.wire.codec import decode_batch, encode_batch
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
@@ -330,41 +332,9 @@ DECODERS = {
     "info": answers.decode_info,
     "error": answers.decode_error,
 }
-FIELDS = [
-    "v",
-    "machine",
-    "spool_id",
-    "first_seq",
-    "n",
-    "frame",
-    "cols",
-    "lost_before",
-    "ack",
-    "watermark",
-    "row",
-    "trimmed",
-    "reason",
-    "problem",
-    "expected",
-    "sensors",
-    "sensor",
-    "kind",
-    "counter",
-    "last",
-    "stamp_ns",
-    "x_m",
-    "y_m",
-    "cov_xx_m2",
-    "values",
-    "info",
-    "layers",
-    "cell_m",
-    "columns",
-    "rows",
-    "west_m",
-    "south_m",
-    "merged",
-]
+RECORDS = (SampleBatch, Ack, Refused, SensorBundle, Pose, Health, PointAnswer, Region)
+FIELDS = ["v", "n", "cols", "ack", "sensors", "sensor", "kind", "info", "columns", "rows", "west_m", "south_m"]
+FIELDS += sorted({field.name for record in RECORDS for field in dataclasses.fields(record)} - {*FIELDS})
 plain = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5)
 plain |= st.binary(max_size=16) | st.sampled_from(["m-1", "encoder", 1, 0])
 wild = st.recursive(

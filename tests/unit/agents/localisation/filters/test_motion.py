@@ -67,7 +67,7 @@ def test_every_state_has_one_name() -> None:
 def test_the_papers_state_has_15_components_and_nothing_behind() -> None:
     assert PAPER.n == BASE_STATES
     assert [part.stop - part.start for part in (PAPER.gyro_biases, PAPER.wheel_scales, PAPER.gps_errors)] == [0, 0, 0]
-    assert PAPER.angles == ANGLES == tuple(range(ATTITUDE.start, ATTITUDE.stop))
+    assert tuple(range(ATTITUDE.start, ATTITUDE.stop)) == ANGLES
 
 
 def test_an_error_that_the_layout_has_not_is_refused() -> None:
