@@ -36,22 +36,19 @@ LINK_S = 1.0  # how long to wait for the router before starting without it
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
+    add = parser.add_argument
     add_network(parser)
-    parser.add_argument("--config", type=Path, help="file with machine, sensors and options (config/agent.toml)")
-    parser.add_argument("--site-file", type=Path, help="site file (config/site.toml); not needed with --log")
-    parser.add_argument("--name", help="name of the machine (overrides the config file)")
-    parser.add_argument("--spool", type=Path, required=True, help="file of the spool")
-    parser.add_argument("--audit", type=Path, help="file that lists every recorded sample, to prove that none is lost")
-    parser.add_argument("--calibration", type=Path, help="calibration file (default: beside the spool)")
-    parser.add_argument(
-        "--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)"
-    )
-    parser.add_argument("--log", type=Path, help="replay: manifest of the log")
-    parser.add_argument("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
-    parser.add_argument(
-        "--speed", type=not_negative, default=1.0, help="replay: speed relative to real time; 0 as fast as possible"
-    )
-    parser.add_argument(
+    add("--config", type=Path, help="file with machine, sensors and options (config/agent.toml)")
+    add("--site-file", type=Path, help="site file (config/site.toml); not needed with --log")
+    add("--name", help="name of the machine (overrides the config file)")
+    add("--spool", type=Path, required=True, help="file of the spool")
+    add("--audit", type=Path, help="file that lists every recorded sample, to prove that none is lost")
+    add("--calibration", type=Path, help="calibration file (default: beside the spool)")
+    add("--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)")
+    add("--log", type=Path, help="replay: manifest of the log")
+    add("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
+    add("--speed", type=not_negative, default=1.0, help="replay: speed relative to real time; 0 as fast as possible")
+    add(
         "--withhold",
         action="store_true",
         help="withhold part of the GPS fixes ([holdout]) and report the error against them",

@@ -24,8 +24,8 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> int:
     """Check what is given; 1 where something does not work."""
+    from sitegrid.doctor import Level
     from sitegrid.doctor.examine import examine
-    from sitegrid.doctor.findings import Level
 
     findings = examine(arguments)
     ok = all(finding.level != Level.FAIL for finding in findings)

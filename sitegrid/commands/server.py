@@ -31,16 +31,13 @@ METRICS_PORT = 9464
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
+    add = parser.add_argument
     add_network(parser)
-    parser.add_argument(
-        "--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)"
-    )
-    parser.add_argument("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
-    parser.add_argument("--config", type=Path, help="file with options (config/server.toml)")
-    parser.add_argument(
-        "--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register"
-    )
-    parser.add_argument(
+    add("--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)")
+    add("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
+    add("--config", type=Path, help="file with options (config/server.toml)")
+    add("--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register")
+    add(
         "--metrics",
         type=address,
         nargs="?",

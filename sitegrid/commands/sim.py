@@ -24,34 +24,25 @@ ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
+    add = parser.add_argument
     add_network(parser)
-    parser.add_argument("--config", type=Path, help="file with options (config/sim.toml)")
-    parser.add_argument(
-        "--scenario", help="name of a scenario, or the path of its .toml file (overrides the config file)"
-    )
-    parser.add_argument(
-        "--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)"
-    )
-    parser.add_argument(
-        "--preset", help="sensor error preset: paper, dgps, standalone, rtk or harsh (overrides the scenario)"
-    )
+    add("--config", type=Path, help="file with options (config/sim.toml)")
+    add("--scenario", help="name of a scenario, or the path of its .toml file (overrides the config file)")
+    add("--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)")
+    add("--preset", help="sensor error preset: paper, dgps, standalone, rtk or harsh (overrides the scenario)")
     for name, kind, what in (
         ("seconds", float, "simulated time in seconds; 0 runs until stopped"),
         ("speed", float, "speed relative to real time; 0 as fast as possible"),
         ("machines", int, "number of machines in the scenario's first fleet"),
         ("seed", int, "random seed"),
     ):
-        parser.add_argument(f"--{name}", type=kind, help=f"{what} (overrides the config file)")
-    parser.add_argument("--site", help="name of the site in keys (overrides the config file)")
-    parser.add_argument("--truth", type=Path, help="folder for the true map and the true tracks")
-    parser.add_argument(
-        "--record", type=Path, help="folder for log folders, one per machine; nothing is published then"
-    )
-    parser.add_argument("--all-sensors", action="store_true", help="use every GPS receiver and IMU of the machines")
-    parser.add_argument("--picture", type=Path, help="draw the site into this file (plan and perspective), then exit")
-    parser.add_argument(
-        "--write-configs", type=Path, help="write site.toml and one agent file per machine into this folder, then exit"
-    )
+        add(f"--{name}", type=kind, help=f"{what} (overrides the config file)")
+    add("--site", help="name of the site in keys (overrides the config file)")
+    add("--truth", type=Path, help="folder for the true map and the true tracks")
+    add("--record", type=Path, help="folder for log folders, one per machine; nothing is published then")
+    add("--all-sensors", action="store_true", help="use every GPS receiver and IMU of the machines")
+    add("--picture", type=Path, help="draw the site into this file (plan and perspective), then exit")
+    add("--write-configs", type=Path, help="write site.toml and one agent file per machine into this folder, then exit")
 
 
 def run(arguments: Namespace) -> int:

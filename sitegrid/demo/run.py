@@ -12,20 +12,18 @@ from evaluation.campaign.truth import position_rmse
 from evaluation.ground.truth import read_load_track
 from evaluation.maps.score import score, score_driven
 from mapserver.config import ServerConfig
-from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
+from mapserver.pictures.plotter import side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.queries.answers import Region
 from protocol.site.site_file import load_site
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.demo.log_replay import LogReplay
-from sitegrid.demo.parts import READY_S, start_agent, start_server, start_sim
+from sitegrid.demo.parts import READY_S, LogReplay, start_agent, start_server, start_sim
 from sitegrid.demo.plan import DemoPlan, make_plan
 from sitegrid.demo.report import make_report, print_report
-from sitegrid.pictures.draw import draw, draw_both
+from sitegrid.pictures.draw import draw, draw_both, draw_differences, truth_layers
 from sitegrid.pictures.tracks import TrackRecorder
-from sitegrid.pictures.truth_layers import truth_layers
 from sitegrid.process.children import Child, Children
 from sitegrid.process.lifetime import note, plain, say, stop_flag
 from sitegrid.process.progress import Display
@@ -120,11 +118,9 @@ def _whole(plan: DemoPlan) -> list[float]:
 def _draw(plan: DemoPlan, client: Client, tracks: TrackRecorder) -> tuple[Region, list[str]]:
     """Write the final pictures; returns the map and their files."""
     region = client.region(tuple(_whole(plan)))  # type: ignore[arg-type]
-    truth = truth_layers(TruthMap.load(plan.true_map), region)
-    lines = tracks.tracks()
     pictures = {
-        "map.png": draw_both(region, lines),
-        "difference.png": [draw_difference(region, truth, "resistance"), draw_difference(region, truth, "grade")],
+        "map.png": draw_both(region, tracks.tracks()),
+        "difference.png": draw_differences(region, plan.true_map),
     }
     for name, images in pictures.items():
         write_image(plan.out / name, side_by_side(images))

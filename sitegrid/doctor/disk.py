@@ -17,7 +17,7 @@ from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
-from sitegrid.doctor.findings import Finding, Level
+from sitegrid.doctor import Finding, Level
 
 FREE_FAIL, FREE_WARN = 64 * 2**20, 2**30
 WAITING_S = 3600.0  # samples that are older have not been taken for long
@@ -143,9 +143,8 @@ class StoreState:
 
 def read_store(folder: Path, now_s: float) -> StoreState:
     """The state of a store, also while a server uses it; StoreError where it cannot be used."""
-    from mapserver.evidence import (
-        snapshot,  # imported here: needs the `server` extra, which a machine's host does not have
-    )
+    # imported here: needs the `server` extra, which a machine's host does not have
+    from mapserver.evidence import snapshot
     from mapserver.ingest.store import JOURNAL_FILE
     from mapserver.journal.reader import JournalReader
     from mapserver.journal.schema import SCHEMA

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from protocol.errors import ConfigError
 from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, Identity, load_credentials
-from sitegrid.doctor.findings import Finding, Level
+from sitegrid.doctor import Finding, Level
 
 EXPIRES_DAYS = 30
 
@@ -94,9 +94,8 @@ def _name(certificate: Certificate, site: str, machine: str, who: str) -> Findin
         problem = f"identity.toml says {identity.name}, the certificate {certificate.common_name}"
         return Finding(Level.FAIL, "name", problem, "the files are of two folders: copy the whole folder again")
     if site and site != identity.site:
-        return Finding(
-            Level.FAIL, "name", f"the keys are for site {identity.site}, not {site}", "compare --site, --keys"
-        )
+        problem = f"the keys are for site {identity.site}, not {site}"
+        return Finding(Level.FAIL, "name", problem, "compare --site, --keys")
     if machine and identity.role == "machine" and machine != identity.name:
         return Finding(Level.FAIL, "name", f"the keys are those of {identity.name}, not of {machine}", "compare --keys")
     return Finding(Level.PASS, "name", f"the certificate is that of {who}")

@@ -26,7 +26,7 @@ from protocol.wire.codec import decode_health, decode_reply, encode_batch
 from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, open_session
-from sitegrid.doctor.findings import Finding, Level, skipped
+from sitegrid.doctor import Finding, Level, skipped
 
 ANSWER_S = 5.0
 LINK_S = 3.0

@@ -37,7 +37,7 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
 from sitegrid.doctor import disk, network
 from sitegrid.doctor.disk import SpoolState, StoreState
-from sitegrid.doctor.findings import Finding, Level
+from sitegrid.doctor import Finding, Level
 from sitegrid.doctor.keys import Certificate, check_certificate, read_certificate
 from sitegrid.doctor.network import RouterLink
 from tests.unit.records import map_info
