@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import zenoh
 
 from protocol.errors import ConfigError, LinkError
+from protocol.machine.log_folder import LogFolder, open_log
+from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire.credentials import SIGNING_FILE
@@ -27,8 +29,6 @@ if TYPE_CHECKING:
     from agents.delivery.link import Sign
     from agents.drivers import Driver
     from agents.presence import Owner
-    from protocol.machine.log_folder import LogFolder
-    from protocol.machine.machine_config import MachineConfig
 
 HELP = "run the localisation agent of one machine"
 LINK_S = 1.0  # how long to wait for the router before starting without it
@@ -48,17 +48,13 @@ def add_options(parser: ArgumentParser) -> None:
     add("--log", type=Path, help="replay: manifest of the log")
     add("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
     add("--speed", type=not_negative, default=1.0, help="replay: speed relative to real time; 0 as fast as possible")
-    add(
-        "--withhold",
-        action="store_true",
-        help="withhold part of the GPS fixes ([holdout]) and report the error against them",
-    )
+    withheld = "withhold part of the GPS fixes ([holdout]) and report the error against them"
+    add("--withhold", action="store_true", help=withheld)
 
 
 def run(arguments: Namespace) -> int:
     """Run until the stream ends or the process is stopped; the router may come and go."""
     from agents.agent import Agent
-    from protocol.machine.log_folder import open_log
 
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
@@ -151,7 +147,6 @@ def _driver(
 
 
 def _summary(machine: MachineConfig, report: dict[str, object]) -> str:
-    line = (
-        f"{machine.name}: {report['readings']} readings, {report['samples']} samples, delivered {report['delivered']}"
-    )
-    return f"{line}, withheld fixes {report['holdout']}" if report["holdout"] else line
+    line = f"{machine.name}: {report['readings']} readings, {report['samples']} samples"
+    withheld = f", withheld fixes {report['holdout']}" if report["holdout"] else ""
+    return f"{line}, delivered {report['delivered']}{withheld}"

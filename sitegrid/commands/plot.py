@@ -17,13 +17,8 @@ def add_options(parser: ArgumentParser) -> None:
     add_network(parser)
     add_site(parser)
     add("--out", type=Path, default=Path("map.png"), help="picture to write (default %(default)s)")
-    add(
-        "--bounds",
-        type=float,
-        nargs=4,
-        metavar=("W", "S", "E", "N"),
-        help="west, south, east, north in metres (default: the whole map)",
-    )
+    sides = "west, south, east, north in metres (default: the whole map)"
+    add("--bounds", type=float, nargs=4, metavar=("W", "S", "E", "N"), help=sides)
     add("--truth", type=Path, help="true map of a simulation (truth_map.npz): also draw the difference")
     add("--follow", action="store_true", help="redraw while machines drive, until stopped")
     add("--every", type=positive, default=1.0, help="seconds between two pictures (default %(default)s)")

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from mapserver.server import Server
 
 HELP = "run the map server of a site"
-METRICS_PORT = 9464
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -37,14 +36,9 @@ def add_options(parser: ArgumentParser) -> None:
     add("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
     add("--config", type=Path, help="file with options (config/server.toml)")
     add("--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register")
-    add(
-        "--metrics",
-        type=address,
-        nargs="?",
-        const=("127.0.0.1", METRICS_PORT),
-        metavar="[HOST:]PORT",
-        help=f"serve Prometheus metrics over HTTP; without a value at 127.0.0.1:{METRICS_PORT}",
-    )
+    usual = ("127.0.0.1", 9464)
+    exports = f"serve Prometheus metrics over HTTP; without a value at {usual[0]}:{usual[1]}"
+    add("--metrics", type=address, nargs="?", const=usual, metavar="[HOST:]PORT", help=exports)
 
 
 def run(arguments: Namespace) -> int:

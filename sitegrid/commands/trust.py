@@ -25,12 +25,8 @@ def add_decision(parser: ArgumentParser) -> None:
     """Options of every decision about a machine."""
     parser.add_argument("machine", metavar="MACHINE")
     add_site(parser)
-    parser.add_argument(
-        "--wait",
-        type=not_negative,
-        default=30.0,
-        help="seconds to wait until the map is folded again (default %(default)g)",
-    )
+    waits = "seconds to wait until the map is folded again (default %(default)g)"
+    parser.add_argument("--wait", type=not_negative, default=30.0, help=waits)
 
 
 def run(arguments: Namespace) -> int:
