@@ -65,7 +65,8 @@ def _add_kept(parser: ArgumentParser, drawn: str, seconds: float = 0) -> None:
     _add_seeds(parser, 12)
     add = parser.add_argument
     if seconds:
-        add("--seconds", type=positive, default=seconds, help="length of each recording (default %(default)g s)")
+        length = "length of each recording in seconds (default %(default)g)"
+        add("--seconds", type=positive, default=seconds, help=length)
     kept = "folder for recordings and results (default %(default)s)"
     add("--out", type=Path, default=Path("eval-output"), help=kept)
     add("--processes", type=count, help="number of parallel processes (default: one per core)")

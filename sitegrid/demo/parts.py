@@ -10,7 +10,7 @@ from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
 from protocol.machine.log_folder import LogFolder
 from sitegrid.client import connect
-from sitegrid.demo.plan import DemoPlan
+from sitegrid.demo.plan import SIM_OPTIONS, DemoPlan
 from sitegrid.pictures.draw import draw
 from sitegrid.pictures.tracks import TrackRecorder
 from sitegrid.process.children import Child, Children, wait_until
@@ -38,8 +38,7 @@ def start_agent(plan: DemoPlan, children: Children, config: Path) -> Child:
 
 def start_sim(plan: DemoPlan, children: Children) -> Child:
     """The simulator."""
-    c = plan.config
-    options = {name: getattr(c, name) for name in ("scenario", "world", "machines", "seed", "seconds", "speed")}
+    options = {name: getattr(plan.config, name) for name in SIM_OPTIONS}
     words = [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]
     return children.start("sim", "sim", "--endpoint", plan.endpoint, *words, "--truth", plan.truth, "--json")
 

@@ -16,6 +16,7 @@ from sim.scenario.tables import Scenario
 
 DEFAULT_MANIFEST = Path("evaluation/logs/rl_test1_husky/log.toml")
 DEFAULT_DATA = Path("../shared/data/rl_test1_husky")
+SIM_OPTIONS = ("scenario", "world", "machines", "seed", "seconds", "speed")  # those that the demo passes on
 
 
 @dataclass(frozen=True)
@@ -50,14 +51,7 @@ class DemoPlan:
 def make_plan(arguments: Namespace) -> DemoPlan:
     """The plan of the options; clears the folder of an earlier run and writes the machines' configurations."""
     try:
-        config = SimConfig(
-            scenario=arguments.scenario,
-            world=arguments.world,
-            machines=arguments.machines,
-            seed=arguments.seed,
-            seconds=arguments.seconds,
-            speed=arguments.speed,
-        )
+        config = SimConfig(**{name: getattr(arguments, name) for name in SIM_OPTIONS})
     except ValueError as error:
         raise ConfigError("sitegrid demo", str(error)) from None
     scenario = resolve(config)
@@ -71,10 +65,7 @@ def make_plan(arguments: Namespace) -> DemoPlan:
 
 def _log_of(arguments: Namespace) -> tuple[Path | None, Path | None]:
     """The log to replay: as asked for, or the default one where its data lies."""
-    if arguments.no_log:
-        return None, None
-    if arguments.log:
+    if arguments.log and not arguments.no_log:
         return arguments.log, arguments.data
-    if DEFAULT_MANIFEST.exists() and DEFAULT_DATA.exists():
-        return DEFAULT_MANIFEST, DEFAULT_DATA
-    return None, None
+    default = not arguments.no_log and DEFAULT_MANIFEST.exists() and DEFAULT_DATA.exists()
+    return (DEFAULT_MANIFEST, DEFAULT_DATA) if default else (None, None)

@@ -42,21 +42,17 @@ def make_report(
 
 def print_report(result: dict[str, Any]) -> None:
     """The report for people."""
+    r, driven = result, result["driven"]
+    rmse = ", ".join(f"{name} {value} m" for name, value in r["position_rmse_m"].items())
     print(
-        f"{result['machines']} machines drove {result['seconds']:g} s, recorded {result['samples_recorded']} samples;"
-    )
-    print(f"  merged {result['samples_merged']}, lost {result['lost']}, double {result['double']}")
-    wrong = (
-        f"resistance class wrong in {result['wrong_resistance_pct']} %, slope class in {result['wrong_grade_pct']} %"
-    )
-    print(f"  {result['cells']} cells are known: {wrong}")
-    driven = result["driven"]
-    print(
+        f"{r['machines']} machines drove {r['seconds']:g} s, recorded {r['samples_recorded']} samples;\n"
+        f"  merged {r['samples_merged']}, lost {r['lost']}, double {r['double']}\n"
+        f"  {r['cells']} cells are known: resistance class wrong in {r['wrong_resistance_pct']} %, "
+        f"slope class in {r['wrong_grade_pct']} %\n"
         f"  {driven['cells']} cells were truly driven: {driven['known_pct']} % are known, of these "
-        f"{driven['wrong_resistance_pct']} % wrong by resistance, {driven['wrong_grade_pct']} % by slope"
+        f"{driven['wrong_resistance_pct']} % wrong by resistance, {driven['wrong_grade_pct']} % by slope\n"
+        f"  position error (rms): {rmse}"
     )
-    rmse = ", ".join(f"{name} {value} m" for name, value in result["position_rmse_m"].items())
-    print(f"  position error (rms): {rmse}")
     if log := result["log"]:
         withheld = f"{log['withheld_rms_m']} m rms against {log['withheld_fixes']} withheld fixes"
         print(f"real log {log['name']}: {log['recorded']} samples, lost {log['lost']}, {withheld}")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentTypeError
 
 
 def count(text: str) -> int:
     """A whole number of 1 or more."""
     value = int(text)
     if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
+        raise ArgumentTypeError(f"{text} is not positive")
     return value
 
 
@@ -17,7 +17,7 @@ def days(text: str) -> int:
     """A whole number of days that a certificate may be valid."""
     value = count(text)
     if value > 3650:
-        raise argparse.ArgumentTypeError(f"{text} is more than 3650, the ten years of the authority")
+        raise ArgumentTypeError(f"{text} is more than 3650, the ten years of the authority")
     return value
 
 
@@ -25,7 +25,7 @@ def positive(text: str) -> float:
     """A finite number above 0."""
     value = float(text)
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
+        raise ArgumentTypeError(f"{text} is not positive")
     return value
 
 
@@ -33,7 +33,7 @@ def not_negative(text: str) -> float:
     """A finite number of 0 or more."""
     value = float(text)
     if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is negative")
+        raise ArgumentTypeError(f"{text} is negative")
     return value
 
 
@@ -41,7 +41,7 @@ def seed(text: str) -> int:
     """A whole number of 0 or more."""
     value = int(text)
     if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
+        raise ArgumentTypeError(f"{text} is negative")
     return value
 
 
@@ -49,7 +49,7 @@ def address(text: str) -> tuple[str, int]:
     """`9464`, of this host alone, or `0.0.0.0:9464`; port 0 takes a free one."""
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdecimal() and int(port) < 2**16):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither PORT nor HOST:PORT")
+        raise ArgumentTypeError(f"{text!r} is neither PORT nor HOST:PORT")
     return host or "127.0.0.1", int(port)
 
 
@@ -63,5 +63,5 @@ def withhold(text: str) -> tuple[float, float]:
     except ValueError:
         off_s = period_s = 0.0
     if not 0 < off_s < period_s < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither OFF/PERIOD in seconds, as 10/30, nor none")
+        raise ArgumentTypeError(f"{text!r} is neither OFF/PERIOD in seconds, as 10/30, nor none")
     return off_s, period_s

@@ -56,10 +56,8 @@ def _parts(record: logging.LogRecord) -> tuple[str, dict[str, Any]]:
 
 def _plain(value: Any) -> Any:
     """As JSON has it; anything else as text."""
-    is_plain = (
-        value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))
-    )
-    return value if is_plain else str(value)
+    is_plain = value is None or isinstance(value, bool | int | str)
+    return value if is_plain or (isinstance(value, float) and math.isfinite(value)) else str(value)
 
 
 def _time(record: logging.LogRecord) -> str:
