@@ -1,8 +1,4 @@
-"""The Python client of the map. It needs the base install only.
-
-with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
-    ground = site.region((0, 0, 200, 150), ["resistance"])
-"""
+"""The Python client of the map. It needs the base install only."""
 
 from __future__ import annotations
 
@@ -31,17 +27,14 @@ class Client:
 
     Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read).
     Arguments of several methods: layers: names, none for all. after: answer once this journal row is merged, and wait
-    for it at most wait_s [s]. Times are stamps, UTC in nanoseconds.
+    for it at most wait_s [s]. as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
+    Times are stamps, UTC in nanoseconds.
     """
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float = 10.0) -> None:
-        self.session = session
-        self.site = site
-        self._endpoint = endpoint
-        self._timeout_s = timeout_s
+        self.session, self.site = session, site
+        self._endpoint, self._timeout_s = endpoint, timeout_s
         self._listeners: list[Listener[GroundChange]] = []
-
-    # --- the map -----------------------------------------------------------------------------------------------------
 
     def point(
         self,
@@ -54,14 +47,10 @@ class Client:
         after: int = 0,
         wait_s: float = 10.0,
     ) -> PointAnswer:
-        """Layers of the cell at a position in `map`; NaN is unknown.
-
-        as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
-        """
+        """Layers of the cell at a position in `map`; NaN is unknown."""
         when, fresh = requests.When(as_of_ns, minus_ns), requests.Freshness(after, wait_s)
-        return answer_codec.decode_point(
-            self._ask(requests.PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when))
-        )
+        query = requests.PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when)
+        return answer_codec.decode_point(self._ask(query))
 
     def region(
         self,
@@ -73,10 +62,7 @@ class Client:
         after: int = 0,
         wait_s: float = 10.0,
     ) -> Region:
-        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates.
-
-        as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
-        """
+        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates."""
         box = bounds if isinstance(bounds, Bounds) else Bounds(*(float(v) for v in bounds))
         when, fresh = requests.When(as_of_ns, minus_ns), requests.Freshness(after, wait_s)
         return answer_codec.decode_region(self._ask(requests.RegionQuery(box, tuple(layers), fresh, when)))
@@ -97,16 +83,13 @@ class Client:
 
         from_ns, to_ns: both included; without them the newest 2000 spans until now. span_s: default one bucket.
         """
-        query = requests.HistoryQuery(
-            float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, requests.Freshness(after, wait_s)
-        )
+        fresh = requests.Freshness(after, wait_s)
+        query = requests.HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, fresh)
         return answer_codec.decode_history(self._ask(query)).spans
 
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
         return answer_codec.decode_info(self._ask(requests.InfoQuery(requests.Freshness(after, wait_s))))
-
-    # --- machines and changes ----------------------------------------------------------------------------------------
 
     def machines(self, *, after: int = 0, wait_s: float = 10.0) -> list[MachineState]:
         """What the server knows of each machine: whether it is trusted, why, and what it sent."""

@@ -63,19 +63,11 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
-        agent = Agent(
-            session,
-            site,
-            machine,
-            config,
-            _places(arguments),
-            withhold=arguments.withhold,
-            owner=owner,
-            sign=_signer(arguments.keys),
-        )
+        places, sign, withhold = _places(arguments), _signer(arguments.keys), arguments.withhold
+        agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign)
         opened.callback(agent.close)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
-        report = agent.run(_driver(arguments, log, session, site, machine), stop.is_set, wait=stop.wait)
+        report = agent.run(_driver(arguments, log, session, site.name, machine.name), stop.is_set, wait=stop.wait)
     say({"ended": plain(report)}) if arguments.json else note(_summary(machine, report))
     return 0 if report["delivered"] or stop.is_set() else 1
 
@@ -135,15 +127,13 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
     return log.site, machine, config
 
 
-def _driver(
-    arguments: Namespace, log: LogFolder | None, session: zenoh.Session, site: SiteConfig, machine: MachineConfig
-) -> Driver:
+def _driver(arguments: Namespace, log: LogFolder | None, session: zenoh.Session, site: str, machine: str) -> Driver:
     from agents.drivers.replay import Replay
     from agents.drivers.zenoh import ZenohDriver
 
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)
-    return ZenohDriver(session, site.name, machine.name)
+    return ZenohDriver(session, site, machine)
 
 
 def _summary(machine: MachineConfig, report: dict[str, object]) -> str:

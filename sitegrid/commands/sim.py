@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from argparse import ArgumentParser, Namespace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,13 +63,9 @@ def run(arguments: Namespace) -> int:
         return _record(config, arguments, stop)
     if arguments.write_configs or arguments.picture:
         return 0
-    report = publish(
-        config,
-        join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name),
-        stop,
-        on_progress=(lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None,
-        truth_dir=arguments.truth,
-    )
+    settings = join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name)
+    tell = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
+    report = publish(config, settings, stop, on_progress=tell, truth_dir=arguments.truth)
     if arguments.json:
         say({"ended": dataclasses.asdict(report)})
     else:
@@ -80,16 +77,10 @@ def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> i
     from sim.config import resolve
     from sim.recorder import record
 
-    display = Display("machines drive", headless=arguments.json)
     seconds = resolve(config).seconds
-    with display:
-        simulator = record(
-            config,
-            arguments.record,
-            arguments.truth,
-            on_progress=lambda now_s: display.show(now_s, seconds, "recording"),
-            stop=stop,
-        )
+    with Display("machines drive", headless=arguments.json) as display:
+        show = partial(display.show, total_s=seconds, what="recording")
+        simulator = record(config, arguments.record, arguments.truth, on_progress=show, stop=stop)
     say({"recorded": str(arguments.record), "machines": len(simulator.machines), "seconds": simulator.simulated_s})
     return 0
 

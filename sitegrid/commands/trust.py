@@ -41,9 +41,7 @@ def decide(arguments: Namespace, command: Callable[[Client], TrustAnswer]) -> in
     """Give the command, wait until the map follows, print what is known of the machine then."""
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         machine = command(client)
-    if arguments.json:
-        say(plain(machine))
-        return 0
     state = "is trusted" if machine.trusted else "is left out of the map"
-    print(f"{machine.name} {state}, as of journal row {machine.merged}")
+    line = f"{machine.name} {state}, as of journal row {machine.merged}"
+    say(plain(machine)) if arguments.json else print(line)
     return 0

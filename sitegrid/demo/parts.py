@@ -11,8 +11,7 @@ from mapserver.config import ServerConfig
 from protocol.machine.log_folder import LogFolder
 from sitegrid.client import connect
 from sitegrid.demo.plan import SIM_OPTIONS, DemoPlan
-from sitegrid.pictures.draw import draw
-from sitegrid.pictures.tracks import TrackRecorder
+from sitegrid.pictures.draw import TrackRecorder, draw
 from sitegrid.process.children import Child, Children, wait_until
 
 READY_S = 30.0

@@ -124,14 +124,12 @@ def check_server(site: str, info: MapInfo | None, *, is_there: bool, role: str =
         behind = f", merged only up to {info.merged}" if info.merged != info.journalled else ""
         return Finding(Level.PASS, "server", text + behind)
     if is_there:
-        problem = f"site {site}: a map server is there, but does not answer"
         advice = "the router denies the question (see `sitegrid keys list`), or the server hangs"
-        return Finding(Level.FAIL, "server", problem, advice)
-    problem = f"site {site}: the router knows of no map server"
+        return Finding(Level.FAIL, "server", f"site {site}: a map server is there, but does not answer", advice)
     advice = "start `sitegrid server`, or compare the name of the site"
     if role:
         advice += "; or these keys are revoked, or not in its register, and it shows them nothing"
-    return Finding(Level.FAIL, "server", problem, advice)
+    return Finding(Level.FAIL, "server", f"site {site}: the router knows of no map server", advice)
 
 
 def check_site(site: SiteConfig, info: MapInfo) -> Finding:
@@ -204,14 +202,14 @@ def receive_health(session: zenoh.Session, site: str, machine: str) -> Health | 
     """The health report of a running agent; None if none comes in, or it cannot be read."""
     with session.declare_subscriber(keys.health(site, machine), zenoh.handlers.RingChannel(1)) as subscriber:
         end_s = time.monotonic() + HEALTH_S
-        while time.monotonic() < end_s:
-            if sample := subscriber.try_recv():
-                try:
-                    return decode_health(sample.payload.to_bytes())
-                except MessageError:
-                    return None
+        while not (sample := subscriber.try_recv()):
+            if time.monotonic() >= end_s:
+                return None
             time.sleep(0.05)
-    return None
+    try:
+        return decode_health(sample.payload.to_bytes())
+    except MessageError:
+        return None
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | None = None) -> bytes | None:

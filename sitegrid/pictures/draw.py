@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import threading
 from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+import zenoh
 
 from mapserver.pictures.frame import Image
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.arrays import Floats32
-from protocol.errors import ConfigError, LinkError, QueryError
+from protocol.errors import ConfigError, LinkError, MessageError, QueryError
 from protocol.queries.answers import Region
 from protocol.site.geometry import Bounds
+from protocol.wire import keys
+from protocol.wire.codec import decode_pose
+from protocol.wire.messages import Pose
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.pictures.tracks import TrackRecorder
 from sitegrid.process.lifetime import note, say, stop_flag
 
+MAX_POSES = 50_000  # of one machine: nearly three hours at 5 Hz
 LAYERS = ("resistance", "grade_east", "grade_north")
 
 
@@ -107,3 +112,39 @@ def _cut(values: Floats32, row: int, column: int, shape: tuple[int, ...]) -> Flo
     if bottom > top and right > left:
         out[top:bottom, left:right] = values[row + top : row + bottom, column + left : column + right]
     return out
+
+
+class TrackRecorder:
+    """Subscribes to the poses of a site."""
+
+    def __init__(self, session: zenoh.Session, site: str) -> None:
+        self._lock = threading.Lock()
+        self._poses: dict[str, list[Pose]] = {}
+        self._subscriber = session.declare_subscriber(keys.poses_all(site), self._on_pose)
+
+    def poses(self) -> dict[str, list[Pose]]:
+        """All poses so far, by machine."""
+        with self._lock:
+            return {name: list(poses) for name, poses in sorted(self._poses.items())}
+
+    def tracks(self) -> list[Track]:
+        """All poses so far, as lines to draw."""
+        return [
+            Track(name, np.array([p.x_m for p in poses]), np.array([p.y_m for p in poses]))
+            for name, poses in self.poses().items()
+        ]
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def _on_pose(self, sample: zenoh.Sample) -> None:
+        try:
+            pose = decode_pose(sample.payload.to_bytes())
+        except MessageError:  # a pose that cannot be read is not drawn
+            return
+        with self._lock:
+            poses = self._poses.setdefault(pose.machine, [])
+            poses.append(pose)
+            if len(poses) > MAX_POSES:
+                del poses[: MAX_POSES // 10]

@@ -40,14 +40,10 @@ class Child:
             start_new_session=True,  # Ctrl-C reaches the parent alone, which ends its children in order
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
         )
+        self.pid = self._process.pid
         self._lines: queue.Queue[dict[str, Any]] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
 
     @property
     def code(self) -> int | None:
@@ -56,12 +52,7 @@ class Child:
 
     def lines(self) -> list[dict[str, Any]]:
         """JSON lines that have come in since the last call."""
-        lines = []
-        while True:
-            try:
-                lines.append(self._lines.get_nowait())
-            except queue.Empty:
-                return lines
+        return [self._lines.get_nowait() for _ in range(self._lines.qsize())]  # this thread alone takes them
 
     def expect(self, key: str, timeout_s: float) -> dict[str, Any]:
         """Wait for a line that has `key`; ProcessError if the process ends or the time is up first."""
