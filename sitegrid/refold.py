@@ -79,10 +79,9 @@ def _build(arguments: Namespace, sources: list[SampleSource], site: SiteConfig, 
     """Make the store beside its place, and put it there when it is complete."""
     config, text = _config(arguments)
     part = arguments.out.with_name(f"{arguments.out.name}.part")
-    try:
-        part.mkdir(parents=True)
-    except FileExistsError:
-        raise ConfigError(part, "is left from a fold that was killed; remove it") from None
+    if part.exists():
+        raise ConfigError(part, "is left from a fold that was killed; remove it")
+    part.mkdir(parents=True)
     try:
         copier = _copy(part, sources, site, selection, headless=arguments.json)
         (part / SITE_FILE).write_text(site_toml(site), encoding="utf-8")

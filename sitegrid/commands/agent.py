@@ -24,7 +24,6 @@ from sitegrid.process.lifetime import note, plain, say, stop_flag
 from sitegrid.security.join import join
 
 if TYPE_CHECKING:
-    from agents.agent import Places
     from agents.config import AgentConfig
     from agents.delivery.link import Sign
     from agents.drivers import Driver
@@ -54,7 +53,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> int:
     """Run until the stream ends or the process is stopped; the router may come and go."""
-    from agents.agent import Agent
+    from agents.agent import Agent, Places
 
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
@@ -63,7 +62,8 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
-        places, sign, withhold = _places(arguments), _signer(arguments.keys), arguments.withhold
+        places = Places(arguments.spool, arguments.audit, _calibration(arguments))
+        sign, withhold = _signer(arguments.keys), arguments.withhold
         agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign)
         opened.callback(agent.close)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
@@ -84,11 +84,10 @@ def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) 
     """Refuse to start while another agent of the same name runs."""
     from agents.presence import find_namesake, this_process
 
-    owner = this_process()
     if other := find_namesake(session, site, machine):
         problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"
         raise LinkError(endpoint, problem)
-    return owner
+    return this_process()
 
 
 def _signer(keys: Path | None) -> Sign | None:
@@ -101,12 +100,9 @@ def _signer(keys: Path | None) -> Sign | None:
     return Signer(file.read_bytes()).sign
 
 
-def _places(arguments: Namespace) -> Places:
-    """Files of the agent; the calibration lies beside the spool, if nothing else is asked for."""
-    from agents.agent import Places
-
-    calibration = arguments.calibration or arguments.spool.with_suffix(".calibration.json")
-    return Places(arguments.spool, arguments.audit, calibration)
+def _calibration(arguments: Namespace) -> Path:
+    """The calibration lies beside the spool, if nothing else is asked for."""
+    return Path(arguments.calibration or arguments.spool.with_suffix(".calibration.json"))
 
 
 def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig, MachineConfig, AgentConfig]:

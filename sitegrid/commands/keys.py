@@ -14,16 +14,8 @@ from protocol.wire.keys import check_name
 from sitegrid.options.groups import add_action
 from sitegrid.options.values import days
 from sitegrid.process.lifetime import say
-from sitegrid.security.register import (
-    REGISTER_FILE,
-    ROLES,
-    ROUTER,
-    Register,
-    RegisterEntry,
-    common_name,
-    load_register,
-    save_register,
-)
+from sitegrid.security import register as registers
+from sitegrid.security.register import REGISTER_FILE, ROLES, ROUTER, Register, RegisterEntry
 
 HELP = "make, list and revoke the certificates of a site"
 THIS_HOST = ("localhost", "127.0.0.1")
@@ -89,7 +81,7 @@ def _add(arguments: Namespace, now: datetime) -> None:
     from sitegrid.security.key_folder import AUTHORITY, certify
 
     folder, name = arguments.dir, check_name(arguments.name, "keys add")
-    register = load_register(folder)
+    register = registers.load_register(folder)
     known = register.names.get(name)
     if name == AUTHORITY:
         raise ConfigError("keys add", f"{name!r} is the folder of the authority; choose another name")
@@ -114,14 +106,14 @@ def _role(arguments: Namespace, known: RegisterEntry | None) -> str:
 
 
 def _revoke(arguments: Namespace, _: datetime) -> None:
-    register = load_register(arguments.dir).without(arguments.name)
-    save_register(arguments.dir, register)
+    register = registers.load_register(arguments.dir).without(arguments.name)
+    registers.save_register(arguments.dir, register)
     line = f"{arguments.name} is let in no more once the router has this {REGISTER_FILE}; it takes that up by itself"
     _tell(arguments, line, name=arguments.name, revoked=True)
 
 
 def _list(arguments: Namespace, now: datetime) -> None:
-    register = load_register(arguments.dir)
+    register = registers.load_register(arguments.dir)
     rows = [_row(name, entry, now) for name, entry in sorted(register.names.items())]
     if arguments.json:
         say({"site": register.site, "hosts": register.hosts, "names": rows})
@@ -133,7 +125,12 @@ def _list(arguments: Namespace, now: datetime) -> None:
 def _row(name: str, entry: RegisterEntry, now: datetime) -> dict[str, Any]:
     state = "revoked" if entry.revoked else "expired" if entry.expires < now else "valid"
     plain = {"name": name, "role": entry.role, "expires": entry.expires.isoformat(), "state": state}
-    return {**plain, "revoked": entry.revoked, "serial": entry.serial, "common_name": common_name(name, entry.issue)}
+    return {
+        **plain,
+        "revoked": entry.revoked,
+        "serial": entry.serial,
+        "registers.common_name": registers.common_name(name, entry.issue),
+    }
 
 
 def _tell(arguments: Namespace, line: str, **values: Any) -> None:

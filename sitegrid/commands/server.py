@@ -56,9 +56,8 @@ def run(arguments: Namespace) -> int:
         warm_up(config.fold)
         session = open_session(join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name))
         opened.callback(session.close)
-        server = opened.enter_context(
-            closing(Server(session, arguments.store, site, config, time.time_ns, _verifier(arguments.signed)))
-        )
+        server = Server(session, arguments.store, site, config, time.time_ns, _verifier(arguments.signed))
+        opened.callback(server.close)
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:
             ready["metrics"] = _export(opened, session, server, site.name, arguments)

@@ -66,10 +66,8 @@ def run(arguments: Namespace) -> int:
     settings = join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name)
     tell = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
     report = publish(config, settings, stop, on_progress=tell, truth_dir=arguments.truth)
-    if arguments.json:
-        say({"ended": dataclasses.asdict(report)})
-    else:
-        note(f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings")
+    line = f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings"
+    say({"ended": dataclasses.asdict(report)}) if arguments.json else note(line)
     return 0
 
 

@@ -24,9 +24,6 @@ WAITING_S = 3600.0  # samples that are older have not been taken for long
 TAIL_ROWS = 20_000  # journal rows that a restart folds in some seconds
 
 
-# --- space -----------------------------------------------------------------------------------------------------------
-
-
 def free_bytes(path: Path) -> int:
     """Free space for a file or folder that may not be there yet."""
     place = path.absolute()
@@ -43,9 +40,6 @@ def check_disk(what: str, free: int) -> Finding:
     if free < FREE_WARN:
         return Finding(Level.WARN, f"{what} disk", message, "make room")
     return Finding(Level.PASS, f"{what} disk", message)
-
-
-# --- spool -----------------------------------------------------------------------------------------------------------
 
 
 class InUseError(StoreError):
@@ -122,9 +116,6 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
 def _table_of(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     table = values.get(name)
     return table if isinstance(table, Mapping) else {}
-
-
-# --- store -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

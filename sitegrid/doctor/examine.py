@@ -96,17 +96,13 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
     is_there = info is not None or network.is_answered(session, keys.map_query(subject.site, "info"))
     findings = [network.check_server(subject.site, info, is_there=is_there, role=role)]
     if info is not None:
-        findings += _compared(subject.site_file, info, asked_ns)
+        site = subject.site_file
+        findings += [
+            network.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
+            network.check_clock(*network.offset_of(info, asked_ns), site),
+            network.check_version(package_version(), info.version),
+        ]
     return [*findings, _permission(subject, session, info)]
-
-
-def _compared(site: SiteConfig | None, info: MapInfo, asked_ns: tuple[int, int]) -> list[Finding]:
-    """What only a comparison with the map server shows."""
-    return [
-        network.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
-        network.check_clock(*network.offset_of(info, asked_ns), site),
-        network.check_version(package_version(), info.version),
-    ]
 
 
 def _permission(subject: Subject, session: zenoh.Session, info: MapInfo | None) -> Finding:

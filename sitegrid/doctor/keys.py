@@ -16,11 +16,7 @@ EXPIRES_DAYS = 30
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a folder of keys holds.
-
-    common_name: as the certificate says. signed: by the authority beside it. fits: with the private key. mode: of the
-    key's file.
-    """
+    """common_name: as it says. signed: by the authority beside it. fits: to the private key. mode: of the key file."""
 
     identity: Identity
     common_name: str

@@ -193,9 +193,8 @@ def check_permission(machine: str, answer: Ack | Refused | None, *, is_there: bo
         return Finding(Level.FAIL, "permission", problem, "start `sitegrid server`, or compare the name of the site")
     problem = f"a map server is there, but gives no answer to batches of {machine}"
     denied = "the router denies it: a machine may send under the name of its keys alone"
-    return Finding(
-        Level.FAIL, "permission", problem, denied if has_keys else "the router denies it, or the server hangs"
-    )
+    advice = denied if has_keys else "the router denies it, or the server hangs"
+    return Finding(Level.FAIL, "permission", problem, advice)
 
 
 def receive_health(session: zenoh.Session, site: str, machine: str) -> Health | None:

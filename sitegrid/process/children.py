@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -106,26 +107,19 @@ class Child:
                 self._lines.put(table)
 
 
-class Children:
+class Children(ExitStack):
     """All children of a run; leaving the block ends them, the youngest first."""
 
     def __init__(self, log_folder: Path | None = None) -> None:
+        super().__init__()
         self._log_folder = log_folder
-        self._children: list[Child] = []
 
     def start(self, name: str, *words: str | Path | float) -> Child:
         """Start `sitegrid <words>`."""
         errors = self._log_folder / f"{name}.log" if self._log_folder else None
         child = Child(name, [str(word) for word in words], errors)
-        self._children.append(child)
+        self.callback(child.stop)
         return child
-
-    def __enter__(self) -> Children:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for child in reversed(self._children):
-            child.stop()
 
 
 def wait_until(is_so: Callable[[], bool], timeout_s: float, what: str) -> None:

@@ -61,5 +61,4 @@ def _plain(value: Any) -> Any:
 
 
 def _time(record: logging.LogRecord) -> str:
-    text = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-    return text.replace("+00:00", "Z")
+    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

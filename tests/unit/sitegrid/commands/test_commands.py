@@ -44,7 +44,7 @@ def test_sim_options_go_over_the_config(tmp_path: Path):
     assert resolve(over).machine_names == ("loader-1",)
 
 
-def test_sim_records_log_folders_and_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_sim_records_log_folders_and_truth(tmp_path: Path, capsys):
     logs, truth = tmp_path / "logs", tmp_path / "truth"
     words = ["--record", str(logs), "--truth", str(truth), "--seconds", "2", "--machines", "2"]
     assert main(["sim", *words]) == 0
@@ -65,7 +65,7 @@ def test_sim_writes_what_agents_need(tmp_path: Path):
 
 
 @pytest.mark.slow  # it waits for a router
-def test_sim_publishes_nothing_without_a_router(capsys: pytest.CaptureFixture[str]):
+def test_sim_publishes_nothing_without_a_router(capsys):
     assert main(["sim", "--endpoint", free_endpoint(), "--seconds", "1"]) == 1
     assert "start one with `sitegrid router`" in capsys.readouterr().err
 
@@ -108,7 +108,7 @@ def test_a_site_file_may_be_a_manifest():
     assert load_site(MANIFEST).name == "husky-lot"
 
 
-def test_server_refuses_an_unknown_option(files: Path, capsys: pytest.CaptureFixture[str]):
+def test_server_refuses_an_unknown_option(files: Path, capsys):
     options = files / "server.toml"
     options.write_text("[fold]\nbuckets = 3\n")
     words = ["--site-file", str(files / "site.toml"), "--store", str(files / "store"), "--config", str(options)]
@@ -117,7 +117,7 @@ def test_server_refuses_an_unknown_option(files: Path, capsys: pytest.CaptureFix
     assert not (files / "store").exists()
 
 
-def test_router_says_where_it_cannot_listen(capsys: pytest.CaptureFixture[str]):
+def test_router_says_where_it_cannot_listen(capsys):
     assert main(["router", "--insecure", "--listen", "tcp/192.0.2.1:7447"]) == 1
     assert "tcp/192.0.2.1:7447: cannot listen here" in capsys.readouterr().err
 

@@ -45,7 +45,7 @@ def certificate(folder: Path, name: str) -> x509.Certificate:
     return x509.load_pem_x509_certificate((folder / name / "cert.pem").read_bytes())
 
 
-def refused(capsys: pytest.CaptureFixture[str], folder: Path, action: str, *words: str) -> str:
+def refused(capsys, folder: Path, action: str, *words: str) -> str:
     """The one line of an error."""
     capsys.readouterr()
     assert act(folder, action, *words) == 1
@@ -121,7 +121,7 @@ def test_serial_numbers_are_random(folder: Path):
 # --- commands --------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_is_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_nothing_is_overwritten(folder: Path, capsys):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert "is not empty" in refused(capsys, folder, "init")
     assert "--renew makes it a new one" in refused(capsys, folder, "add", "server")
@@ -130,24 +130,22 @@ def test_nothing_is_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("name", ["Loader", "a.2", "a/b", "*", "", "a b", "ä"])
-def test_odd_names_are_refused(folder: Path, name: str, capsys: pytest.CaptureFixture[str]):
+def test_odd_names_are_refused(folder: Path, name: str, capsys):
     assert "is not a name" in refused(capsys, folder, "add", name)
 
 
-def test_the_authority_is_no_machine(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_authority_is_no_machine(folder: Path, capsys):
     assert "choose another name" in refused(capsys, folder, "add", "authority")
 
 
 @pytest.mark.parametrize("host", ["bad host", "a..b", "-x", "höst", "x" * 64, ""])
-def test_an_odd_host_is_refused_before_anything_is_written(
-    tmp_path: Path, host: str, capsys: pytest.CaptureFixture[str]
-):
+def test_an_odd_host_is_refused_before_anything_is_written(tmp_path: Path, host: str, capsys):
     assert main(["keys", "init", "--dir", str(tmp_path / "keys"), f"--host={host}"]) == 1
     assert "neither the name of a host" in capsys.readouterr().err
     assert not (tmp_path / "keys").exists()
 
 
-def test_renewed_keys_keep_name_and_role(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_renewed_keys_keep_name_and_role(folder: Path, capsys):
     assert act(folder, "add", "guest", "--role", "visitor") == 0
     before = load_register(folder).names["guest"]
     assert act(folder, "add", "guest", "--renew", "--days", "9") == 0
@@ -163,7 +161,7 @@ def test_renewed_keys_keep_name_and_role(folder: Path, capsys: pytest.CaptureFix
     assert "router.site" in hosts.get_values_for_type(x509.DNSName)
 
 
-def test_a_revoked_name_comes_back_as_another(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_revoked_name_comes_back_as_another(folder: Path, capsys):
     assert act(folder, "add", "loader-1") == 0
     for issue in (2, 3):
         assert act(folder, "revoke", "loader-1") == 0
@@ -175,14 +173,14 @@ def test_a_revoked_name_comes_back_as_another(folder: Path, capsys: pytest.Captu
     assert load_register(folder).names["loader-1"].role == "visitor"
 
 
-def test_revoke_says_what_cannot_be(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_revoke_says_what_cannot_be(folder: Path, capsys):
     assert "not in the register" in refused(capsys, folder, "revoke", "nobody")
     assert "make a new folder" in refused(capsys, folder, "revoke", "router")
     assert act(folder, "revoke", "server") == 0
     assert "takes that up by itself" in capsys.readouterr().out
 
 
-def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys):
     assert act(folder, "add", "loader-1") == 0
     assert act(folder, "revoke", "loader-1") == 0
     register = load_register(folder)
@@ -205,7 +203,7 @@ def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys: pytest.Ca
     assert "old                      visitor  2026-01-30  expired" in capsys.readouterr().out
 
 
-def test_a_folder_without_register_or_authority_says_what_to_do(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_folder_without_register_or_authority_says_what_to_do(folder: Path, capsys):
     (folder / "authority" / "key.pem").unlink()
     assert "lies where `sitegrid keys init` ran" in refused(capsys, folder, "add", "loader-1")
     assert "loader-1" not in load_register(folder).names
@@ -224,9 +222,7 @@ def test_wrong_usage_exits_with_2():
         assert build_parser().parse_args(["keys", "add", "x", "--role", role]).role == role
 
 
-def test_without_cryptography_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_without_cryptography_it_says_what_to_install(tmp_path: Path, monkeypatch, capsys):
     for name in ("certificates", "key_folder"):
         monkeypatch.delitem(sys.modules, f"sitegrid.security.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
@@ -459,7 +455,7 @@ def test_an_expired_certificate_is_named_before_the_router_refuses_it(folder: Pa
     ],
 )
 def test_every_command_looks_at_its_keys(
-    folder: Path, root: Path, words: tuple[str, ...], problem: str, monkeypatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, root: Path, words: tuple[str, ...], problem: str, monkeypatch, capsys
 ):
     assert act(folder, "add", "a") == 0
     monkeypatch.chdir(root)
@@ -489,7 +485,7 @@ def test_what_counts_as_this_host(endpoint: str, is_so: bool):
     assert is_loopback(endpoint) == is_so
 
 
-def test_the_router_needs_keys_or_this_host(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_router_needs_keys_or_this_host(folder: Path, capsys):
     assert main(["router", "--listen", "tcp/0.0.0.0:0"]) == 1
     assert "or say --insecure" in capsys.readouterr().err
     assert main(["router", "--keys", str(folder), "--listen", "tcp/0.0.0.0:0"]) == 1

@@ -49,7 +49,7 @@ class Nothing:
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> tuple[list[tuple[Any, ...]], Stop]:
+def drawn(monkeypatch) -> tuple[list[tuple[Any, ...]], Stop]:
     pictures: list[tuple[Any, ...]] = []
     stop = Stop()
     monkeypatch.setattr(draw, "stop_flag", lambda: stop)
@@ -80,11 +80,11 @@ def test_replay_takes_its_speed(husky_data: Path):
     manifest = ROOT / DEFAULT_MANIFEST
     words = ["agent", "--spool", "x", "--driver", "replay", "--log", str(manifest), "--speed", "7"]
     log = open_log(manifest, husky_data)
-    driver = agent._driver(build_parser().parse_args(words), log, None, log.site, log.machine)
+    driver = agent._driver(build_parser().parse_args(words), log, None, log.site.name, log.machine.name)
     assert driver._speed == 7
 
 
-def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch):
     options, site = tmp_path / "server.toml", tmp_path / "site.toml"
     options.write_text("query_threads = 5\n[fold]\nstd_cap_m = 2.0\n")
     site.write_text('name = "pit"\norigin_lat_deg = 49.0\norigin_lon_deg = 8.0\n')
@@ -112,4 +112,4 @@ def test_the_demo_keeps_off_the_seeds_that_reports_are_made_on():
 @pytest.mark.parametrize(("words", "expected"), [([], "a.calibration.json"), (["--calibration", "b.json"], "b.json")])
 def test_agent_keeps_its_calibration_beside_the_spool_or_where_it_is_told(words: list[str], expected: str) -> None:
     arguments = build_parser().parse_args(["agent", "--spool", "a.db", *words])
-    assert agent._places(arguments).calibration == Path(expected)
+    assert agent._calibration(arguments) == Path(expected)
