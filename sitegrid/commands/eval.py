@@ -8,15 +8,12 @@ from dataclasses import asdict
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sitegrid.options.groups import Subparsers, add_action
 from sitegrid.options.values import count, positive, seed, withhold
 from sitegrid.process.lifetime import note, plain, say
 from sitegrid.process.progress import Display
-
-if TYPE_CHECKING:
-    from evaluation.campaign.experiment import Runner
 
 HELP = "run the accuracy experiments"
 Report = dict[str, Any]  # plain values by name; lists of rows are tables
@@ -116,8 +113,8 @@ def _merge(arguments: Namespace) -> Report:
     return _experiment(arguments, "machines drive, their samples are merged", work, "evaluation.maps.plots")
 
 
-def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Any, Any]], plots: str) -> Report:
-    """Run an experiment with its progress shown, and draw its pictures where they are asked for."""
+def _experiment(arguments: Namespace, title: str, work: Callable[..., tuple[Any, Any]], plots: str) -> Report:
+    """Run an experiment with its progress shown, and draw its pictures where they are asked for. work: of a Runner."""
     from evaluation.campaign.experiment import Runner
     from evaluation.campaign.workers import cores
 

@@ -27,6 +27,7 @@ x509 = pytest.importorskip("cryptography.x509", reason="cryptography is not inst
 
 NOW = datetime(2026, 1, 31, tzinfo=UTC)
 SITE = "paper"
+AGENT_FILES = ("--site-file", "config/site.toml", "--config", "config/agent.toml")
 
 
 @pytest.fixture
@@ -435,20 +436,7 @@ def test_an_expired_certificate_is_named_before_the_router_refuses_it(folder: Pa
     [
         (("server", "--site-file", "config/site.toml", "--store", "x"), "for role 'machine', 'server' is needed"),
         (("sim", "--site", SITE), "for role 'machine', 'sim' is needed"),
-        (
-            (
-                "agent",
-                "--site-file",
-                "config/site.toml",
-                "--config",
-                "config/agent.toml",
-                "--name",
-                "b",
-                "--spool",
-                "x",
-            ),
-            "for name 'a', 'b' is needed",
-        ),
+        (("agent", *AGENT_FILES, "--name", "b", "--spool", "x"), "for name 'a', 'b' is needed"),
         (("query", "--site", "north", "info"), "for site 'paper', 'north' is needed"),
         (("plot", "--site", "north"), "for site 'paper', 'north' is needed"),
         (("trust", "a", "--site", "north"), "for site 'paper', 'north' is needed"),

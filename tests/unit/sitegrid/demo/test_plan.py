@@ -10,8 +10,7 @@ from protocol.errors import ConfigError
 from protocol.site.site_file import load_site
 from sitegrid.cli import build_parser
 from sitegrid.demo import plan as planning
-from sitegrid.demo.parts import start_sim
-from sitegrid.demo.plan import DEFAULT_MANIFEST, DemoPlan, make_plan
+from sitegrid.demo.plan import DEFAULT_MANIFEST, DemoPlan, make_plan, start_sim
 from tests.paths import ROOT
 
 
