@@ -16,16 +16,14 @@ from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
-from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.options.groups import add_network
 from sitegrid.options.values import not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
-from sitegrid.security.join import join
+from sitegrid.security.join import join, signer
 
 if TYPE_CHECKING:
     from agents.config import AgentConfig
-    from agents.delivery.link import Sign
     from agents.drivers import Driver
     from agents.presence import Owner
 
@@ -63,12 +61,12 @@ def run(arguments: Namespace) -> int:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
         places = Places(arguments.spool, arguments.audit, _calibration(arguments))
-        sign, withhold = _signer(arguments.keys), arguments.withhold
+        sign, withhold = signer(arguments.keys), arguments.withhold
         agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign)
         opened.callback(agent.close)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
         report = agent.run(_driver(arguments, log, session, site.name, machine.name), stop.is_set, wait=stop.wait)
-    say({"ended": plain(report)}) if arguments.json else note(_summary(machine, report))
+    say({"ended": plain(report)}) if arguments.json else note(_summary(machine.name, report))
     return 0 if report["delivered"] or stop.is_set() else 1
 
 
@@ -88,16 +86,6 @@ def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) 
         problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"
         raise LinkError(endpoint, problem)
     return this_process()
-
-
-def _signer(keys: Path | None) -> Sign | None:
-    """What signs the machine's batches, if its folder of keys has a signing key."""
-    file = keys / SIGNING_FILE if keys else None
-    if not file or not file.is_file():
-        return None
-    from sitegrid.security.signing import Signer  # imported here: only machines with keys need `cryptography`
-
-    return Signer(file.read_bytes()).sign
 
 
 def _calibration(arguments: Namespace) -> Path:
@@ -132,7 +120,7 @@ def _driver(arguments: Namespace, log: LogFolder | None, session: zenoh.Session,
     return ZenohDriver(session, site, machine)
 
 
-def _summary(machine: MachineConfig, report: dict[str, object]) -> str:
-    line = f"{machine.name}: {report['readings']} readings, {report['samples']} samples"
+def _summary(machine: str, report: dict[str, object]) -> str:
+    line = f"{machine}: {report['readings']} readings, {report['samples']} samples"
     withheld = f", withheld fixes {report['holdout']}" if report["holdout"] else ""
     return f"{line}, delivered {report['delivered']}{withheld}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ssl
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,34 +34,25 @@ def read_certificate(folder: Path) -> Certificate:
     from cryptography.exceptions import InvalidSignature
     from cryptography.x509.oid import NameOID
 
-    identity = load_credentials(folder).identity
+    identity, fits, signed = load_credentials(folder).identity, False, False
     try:
         certificate, authority = (
             x509.load_pem_x509_certificate((folder / name).read_bytes()) for name in (CERTIFICATE_FILE, AUTHORITY_FILE)
         )
         names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
         mode = (folder / KEY_FILE).stat().st_mode
-        fits = _fits(folder)
+        with suppress(ssl.SSLError):  # OpenSSL compares key and certificate when it loads both
+            ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(folder / CERTIFICATE_FILE, folder / KEY_FILE)
+            fits = True
     except OSError as error:
         raise ConfigError(folder, f"cannot be read ({error.strerror}): run as the user that it belongs to") from None
     except ValueError as error:
         raise ConfigError(folder, f"holds no usable certificate ({error}): copy the whole folder again") from None
-    try:
+    with suppress(InvalidSignature, ValueError, TypeError):
         certificate.verify_directly_issued_by(authority)
         signed = True
-    except (InvalidSignature, ValueError, TypeError):
-        signed = False
     valid = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     return Certificate(identity, str(names[0].value) if names else "", *valid, signed, fits, mode)
-
-
-def _fits(folder: Path) -> bool:
-    """Whether the private key is that of the certificate; OpenSSL compares them when it loads both."""
-    try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(folder / CERTIFICATE_FILE, folder / KEY_FILE)
-    except ssl.SSLError:
-        return False
-    return True
 
 
 def check_certificate(certificate: Certificate, now: datetime, site: str = "", machine: str = "") -> list[Finding]:

@@ -23,10 +23,10 @@ from protocol.site.site_config import SiteConfig
 from protocol.version import UNKNOWN
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_reply, encode_batch
-from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.doctor import Finding, Level, skipped
+from sitegrid.security.join import signer
 
 ANSWER_S = 5.0
 LINK_S = 3.0
@@ -175,7 +175,7 @@ def ask_permission(
     key = keys.ingest(site, machine)
     batch = encode_batch(SampleBatch(machine, secrets.randbits(64) or 1, 1, empty(), frame))
     try:
-        data = _ask(session, key, batch, _signature(folder, key, batch))
+        data = _ask(session, key, batch, sign(key, batch) if (sign := signer(folder)) else None)
         return decode_reply(data) if data else None
     except MessageError as error:
         return Refused(error.reason, f"its answer cannot be read: {error}")
@@ -216,11 +216,3 @@ def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | N
         if reply.ok is not None:
             return reply.ok.payload.to_bytes()
     return None
-
-
-def _signature(folder: Path | None, key: str, payload: bytes) -> bytes | None:
-    if folder is None or not (folder / SIGNING_FILE).is_file():
-        return None
-    from sitegrid.security.signing import Signer  # imported here: needs the `security` extra
-
-    return Signer((folder / SIGNING_FILE).read_bytes()).sign(key, payload)
