@@ -74,9 +74,8 @@ def test_certificates_say_who_and_what_for(folder: Path):
         issued = certificate(folder, name)
         assert issued.subject.rfc4514_string() == f"CN={name}"
         assert issued.public_key().curve.name == "secp256r1"
-        assert [use._name for use in issued.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value] == [
-            purpose
-        ]
+        uses = issued.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+        assert [use._name for use in uses] == [purpose]
         assert not issued.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
         issued.verify_directly_issued_by(certificate(folder, "authority"))
     hosts = certificate(folder, "router").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -193,12 +192,8 @@ def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys):
     assert listed["site"] == SITE
     rows = {row["name"]: row for row in listed["names"]}
     states = {name: (row["role"], row["state"], row["revoked"]) for name, row in rows.items()}
-    assert states == {
-        "loader-1": ("machine", "revoked", True),
-        "old": ("visitor", "expired", False),
-        "router": ("router", "valid", False),
-        "server": ("server", "valid", False),
-    }
+    of_site = {name: (name, "valid", False) for name in ("router", "server")}
+    assert states == {"loader-1": ("machine", "revoked", True), "old": ("visitor", "expired", False), **of_site}
     assert rows["old"]["expires"] == "2026-01-30T00:00:00+00:00"
     assert act(folder, "list") == 0
     assert "old                      visitor  2026-01-30  expired" in capsys.readouterr().out
@@ -370,9 +365,8 @@ def test_rules_follow_the_certificate_and_end_with_it():
     assert subjects["loader-1"] == ["loader-1.2"]
     assert "loader-2" not in subjects
     assert not may("loader-2", "query", keys.map_query(SITE, "info"), register=register)
-    assert "router" not in {
-        s["id"] for s in access_control(REGISTER.with_entry("router", RegisterEntry("router", "3", NOW)))["subjects"]
-    }
+    with_router = REGISTER.with_entry("router", RegisterEntry("router", "3", NOW))
+    assert "router" not in {s["id"] for s in access_control(with_router)["subjects"]}
 
 
 def test_limits_never_touch_what_is_acknowledged():
@@ -452,25 +446,14 @@ def test_every_command_looks_at_its_keys(
     assert not (root / "x").exists()
 
 
-@pytest.mark.parametrize(
-    ("endpoint", "is_so"),
-    [
-        ("tcp/127.0.0.1:7447", True),
-        ("tcp/127.9.9.9:0", True),
-        ("tcp/localhost:7447", True),
-        ("tcp/[::1]:7447", True),
-        ("tcp/0.0.0.0:7447", False),
-        ("tcp/[::]:7447", False),
-        ("tcp/10.0.0.5:7447", False),
-        ("tcp/router:7447", False),
-        ("tcp/localhost.evil.org:7447", False),
-        ("udp/127.0.0.1:7447", False),
-        ("tcp/127.0.0.1:7447#bind=0.0.0.0:7447", False),
-        ("tcp/", False),
-    ],
-)
-def test_what_counts_as_this_host(endpoint: str, is_so: bool):
-    assert is_loopback(endpoint) == is_so
+THIS_HOST = ("tcp/127.0.0.1:7447", "tcp/127.9.9.9:0", "tcp/localhost:7447", "tcp/[::1]:7447")
+OTHERS = ("tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.5:7447", "tcp/router:7447", "tcp/localhost.evil.org:7447")
+DOUBTFUL = ("udp/127.0.0.1:7447", "tcp/127.0.0.1:7447#bind=0.0.0.0:7447", "tcp/")
+
+
+@pytest.mark.parametrize("endpoint", [*THIS_HOST, *OTHERS, *DOUBTFUL])
+def test_what_counts_as_this_host(endpoint: str):
+    assert is_loopback(endpoint) == (endpoint in THIS_HOST)
 
 
 def test_the_router_needs_keys_or_this_host(folder: Path, capsys):

@@ -7,6 +7,7 @@ import threading
 from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -27,19 +28,10 @@ from tests.unit.records import machine_state
 
 WAIT_S = 20.0
 T0 = 1_750_000_000_000_000_000
+FOUND = {"trusted": False, "by": "audit", "since_ns": T0 + 60 * 10**9, "contradicts": True, "reasons": ("gain",)}
 MACHINES = [
     machine_state("a", samples=1200, lost=3, newest_ns=T0),
-    machine_state(
-        "b",
-        trusted=False,
-        by="audit",
-        since_ns=T0 + 60 * 10**9,
-        contradicts=True,
-        reasons=("gain",),
-        evidence={"gain": 1.6},
-        samples=7,
-        newest_ns=T0,
-    ),
+    machine_state("b", **FOUND, evidence={"gain": 1.6}, samples=7, newest_ns=T0),
 ]
 CHANGE = GroundChange(4, T0, T0 + 60 * 10**9, (10.0, -20.0, 40.0, 12.5), 615, 0.25, 0.008, None, None)
 
@@ -246,15 +238,9 @@ def test_changes_are_a_line_each(server: FakeServer, capsys):
     assert server.asked == [ChangesQuery(3), ChangesQuery(0)]
 
 
-class NoChanges:
-    """A client of a site without changes."""
-
-    def changes(self, after: int) -> list[object]:
-        return []
-
-
 def test_no_changes_are_said():
-    _, lines = query._changes(NoChanges(), Namespace(follow=False, after=0), ())  # type: ignore[arg-type]
+    client = SimpleNamespace(changes=lambda after: [])
+    _, lines = query._changes(client, Namespace(follow=False, after=0), ())  # type: ignore[arg-type]
     assert lines == ["no change of the ground was found"]
 
 
