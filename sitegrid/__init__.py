@@ -22,25 +22,8 @@ from protocol.version import package_version
 from sitegrid.client import Client, connect
 from sitegrid.listener import Listener
 
-__all__ = [
-    "Bounds",
-    "Client",
-    "ConfigError",
-    "GroundChange",
-    "HistorySpan",
-    "KnownGround",
-    "LinkError",
-    "Listener",
-    "MachineState",
-    "MapInfo",
-    "MessageError",
-    "PointAnswer",
-    "QueryError",
-    "Region",
-    "SampleCounts",
-    "SiteInfo",
-    "SitegridError",
-    "TrustAnswer",
-    "connect",
-]
+__all__ = ["Client", "Listener", "connect"]
+__all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
+__all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
+__all__ += ["Bounds", "KnownGround", "SampleCounts", "SiteInfo"]
 __version__ = package_version()

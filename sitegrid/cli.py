@@ -17,17 +17,8 @@ from sitegrid import commands
 from sitegrid.options.groups import add_command
 from sitegrid.process.logs import start_logging
 
-EXTRAS = {
-    "numba": "server",
-    "cv2": "server",
-    "filterpy": "agent",
-    "pyproj": "agent",
-    "rich": "sim",
-    "pybullet": "sim",
-    "scipy": "eval",
-    "matplotlib": "eval",
-    "cryptography": "security",
-}
+EXTRAS = {"numba": "server", "cv2": "server", "filterpy": "agent", "pyproj": "agent", "rich": "sim", "pybullet": "sim"}
+EXTRAS |= {"scipy": "eval", "matplotlib": "eval", "cryptography": "security"}
 
 
 def main(words: Sequence[str] | None = None) -> int:

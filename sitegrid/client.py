@@ -1,45 +1,17 @@
-"""The Python client of the map. It needs the base install only.
-
-with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
-    ground = site.region((0, 0, 200, 150), ["resistance"])
-"""
+"""The Python client of the map. It needs the base install only."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 
 import zenoh
 
 from protocol.errors import LinkError
-from protocol.queries.answer_codec import (
-    decode_change,
-    decode_changes,
-    decode_error,
-    decode_history,
-    decode_info,
-    decode_machine,
-    decode_machines,
-    decode_point,
-    decode_region,
-)
+from protocol.queries import answer_codec, requests
 from protocol.queries.answers import GroundChange, HistorySpan, MachineState, MapInfo, PointAnswer, Region, TrustAnswer
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
-from protocol.queries.requests import (
-    NOW,
-    ChangesQuery,
-    Freshness,
-    HistoryQuery,
-    InfoQuery,
-    MachinesQuery,
-    MapQuery,
-    PointQuery,
-    RegionQuery,
-    When,
-    encode_query,
-)
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
@@ -55,17 +27,14 @@ class Client:
 
     Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read).
     Arguments of several methods: layers: names, none for all. after: answer once this journal row is merged, and wait
-    for it at most wait_s [s]. Times are stamps, UTC in nanoseconds.
+    for it at most wait_s [s]. as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
+    Times are stamps, UTC in nanoseconds.
     """
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float = 10.0) -> None:
-        self.session = session
-        self.site = site
-        self._endpoint = endpoint
-        self._timeout_s = timeout_s
+        self.session, self.site = session, site
+        self._endpoint, self._timeout_s = endpoint, timeout_s
         self._listeners: list[Listener[GroundChange]] = []
-
-    # --- the map -----------------------------------------------------------------------------------------------------
 
     def point(
         self,
@@ -78,12 +47,10 @@ class Client:
         after: int = 0,
         wait_s: float = 10.0,
     ) -> PointAnswer:
-        """Layers of the cell at a position in `map`; NaN is unknown.
-
-        as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
-        """
-        when, fresh = When(as_of_ns, minus_ns), Freshness(after, wait_s)
-        return decode_point(self._ask(PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when)))
+        """Layers of the cell at a position in `map`; NaN is unknown."""
+        when, fresh = requests.When(as_of_ns, minus_ns), requests.Freshness(after, wait_s)
+        query = requests.PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when)
+        return answer_codec.decode_point(self._ask(query))
 
     def region(
         self,
@@ -95,13 +62,10 @@ class Client:
         after: int = 0,
         wait_s: float = 10.0,
     ) -> Region:
-        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates.
-
-        as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
-        """
+        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates."""
         box = bounds if isinstance(bounds, Bounds) else Bounds(*(float(v) for v in bounds))
-        when, fresh = When(as_of_ns, minus_ns), Freshness(after, wait_s)
-        return decode_region(self._ask(RegionQuery(box, tuple(layers), fresh, when)))
+        when, fresh = requests.When(as_of_ns, minus_ns), requests.Freshness(after, wait_s)
+        return answer_codec.decode_region(self._ask(requests.RegionQuery(box, tuple(layers), fresh, when)))
 
     def history(
         self,
@@ -119,29 +83,28 @@ class Client:
 
         from_ns, to_ns: both included; without them the newest 2000 spans until now. span_s: default one bucket.
         """
-        query = HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, Freshness(after, wait_s))
-        return decode_history(self._ask(query)).spans
+        fresh = requests.Freshness(after, wait_s)
+        query = requests.HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, fresh)
+        return answer_codec.decode_history(self._ask(query)).spans
 
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
-        return decode_info(self._ask(InfoQuery(Freshness(after, wait_s))))
-
-    # --- machines and changes ----------------------------------------------------------------------------------------
+        return answer_codec.decode_info(self._ask(requests.InfoQuery(requests.Freshness(after, wait_s))))
 
     def machines(self, *, after: int = 0, wait_s: float = 10.0) -> list[MachineState]:
         """What the server knows of each machine: whether it is trusted, why, and what it sent."""
-        return decode_machines(self._ask(MachinesQuery(Freshness(after, wait_s))))
+        return answer_codec.decode_machines(self._ask(requests.MachinesQuery(requests.Freshness(after, wait_s))))
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with an id beyond `after`: when, where, how many cells, from what to what."""
-        return decode_changes(self._ask(ChangesQuery(after)))
+        return answer_codec.decode_changes(self._ask(requests.ChangesQuery(after)))
 
     def on_change(self, callback: Callable[[GroundChange], object]) -> Listener[GroundChange]:
         """Call `callback`, on a thread of its own, with each change that is found or grows, until the handle is closed.
 
         Events are not repeated: ask `changes` for what was before, or was missed.
         """
-        listener = Listener(self.session, keys.changed(self.site), decode_change, callback)
+        listener = Listener(self.session, keys.changed(self.site), answer_codec.decode_change, callback)
         self._listeners.append(listener)
         return listener
 
@@ -169,20 +132,20 @@ class Client:
     def __enter__(self) -> Client:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _ask(self, query: MapQuery) -> bytes:
+    def _ask(self, query: requests.MapQuery) -> bytes:
         wait_s = query.fresh.wait_s if query.fresh.after else 0.0
-        if isinstance(query, HistoryQuery) or (isinstance(query, PointQuery | RegionQuery) and query.when != NOW):
+        if isinstance(query, requests.HistoryQuery) or (
+            isinstance(query, requests.PointQuery | requests.RegionQuery) and query.when != requests.NOW
+        ):
             wait_s += PAST_S
-        return self._get(keys.map_query(self.site, query.name), encode_query(query), wait_s)
+        return self._get(keys.map_query(self.site, query.name), requests.encode_query(query), wait_s)
 
     def _command(self, command: TrustCommand) -> TrustAnswer:
         key = keys.admin(self.site, command.name)
-        return decode_machine(self._get(key, encode_command(command), command.wait_s))
+        return answer_codec.decode_machine(self._get(key, encode_command(command), command.wait_s))
 
     def _get(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
         selector = zenoh.Selector(key, selector_of(parameters)) if parameters else zenoh.Selector(key)
@@ -190,7 +153,7 @@ class Client:
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
             if reply.err is not None and (text := reply.err.payload.to_bytes()) != TIMED_OUT:
-                raise decode_error(text)
+                raise answer_codec.decode_error(text)
         problem = f"no map server answers for site {self.site!r}: start one with `sitegrid server`, or check the name"
         if self._endpoint.startswith("tls/"):
             problem += "; or these keys may not ask this (see docs/security.md)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import threading
@@ -39,7 +40,9 @@ class Listener(Generic[T]):
             return
         self._closed = True
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
-        self._drop_waiting()
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._waiting.get_nowait()
         self._waiting.put(None)
         if self._thread is not threading.current_thread():
             self._thread.join()
@@ -49,13 +52,6 @@ class Listener(Generic[T]):
             self._waiting.put_nowait(sample.payload.to_bytes())
         except queue.Full:
             log.warning("event dropped key=%s waiting=%d", sample.key_expr, MOST_WAITING)
-
-    def _drop_waiting(self) -> None:
-        try:
-            while True:
-                self._waiting.get_nowait()
-        except queue.Empty:
-            return
 
     def _run(self) -> None:
         while (data := self._waiting.get()) is not None:

@@ -66,46 +66,44 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         sources = [source for path in arguments.archives for source in _sources(path, selection, opened)]
         site = _site(sources, arguments)
-        config, config_text = _config(arguments)
-        if unknown := sorted(selection.without - {name for source in sources for name in source.machines}):
-            known = ", ".join(sorted({name for source in sources for name in source.machines}))
-            raise ConfigError("--without", f"{unknown[0]!r} is no machine of these archives; they are: {known}")
-        summary = _build(arguments, sources, site, config, config_text, selection)
+        known = {name for source in sources for name in source.machines}
+        if unknown := sorted(selection.without - known):
+            problem = f"{unknown[0]!r} is no machine of these archives; they are: {', '.join(sorted(known))}"
+            raise ConfigError("--without", problem)
+        summary = _build(arguments, sources, site, selection)
     say(summary) if arguments.json else print("\n".join(_lines(summary)))
     return 0
 
 
-def _build(
-    arguments: Namespace,
-    sources: list[SampleSource],
-    site: SiteConfig,
-    config: ServerConfig,
-    text: str,
-    selection: Selection,
-) -> dict[str, Any]:
+def _build(arguments: Namespace, sources: list[SampleSource], site: SiteConfig, selection: Selection) -> dict[str, Any]:
     """Make the store beside its place, and put it there when it is complete."""
+    config, text = _config(arguments)
     part = arguments.out.with_name(f"{arguments.out.name}.part")
-    try:
-        part.mkdir(parents=True)
-    except FileExistsError:
-        raise ConfigError(part, "is left from a fold that was killed; remove it") from None
+    if part.exists():
+        raise ConfigError(part, "is left from a fold that was killed; remove it")
+    part.mkdir(parents=True)
     try:
         copier = _copy(part, sources, site, selection, headless=arguments.json)
         (part / SITE_FILE).write_text(site_toml(site), encoding="utf-8")
         (part / CONFIG_FILE).write_text(text, encoding="utf-8")
-        info = _fold(part, site, config)
+        with closing(Store(part, site, config, time.time_ns)) as store:  # folds the journal as a server would
+            store.save_snapshot()  # to start from
+            info = store.info()
         part.replace(arguments.out)
     except BaseException:
         shutil.rmtree(part)
         raise
+    machines: Counter[str] = Counter()
+    for (machine, _), samples in copier.kept.items():
+        machines[machine] += samples
     return {
         "store": str(arguments.out),
         "archives": len(sources),
         "rows": info["journalled"],
-        "samples": copier.kept.total(),
+        "samples": machines.total(),
         "excluded": dict(copier.excluded),
         "too_unsure": info["samples_too_unsure"],
-        "machines": _by_machine(copier.kept),
+        "machines": dict(sorted(machines.items())),
         "cells": info["cells"],
         "cell_m": site.cell_m,
     }
@@ -123,11 +121,9 @@ def _sources(path: Path, selection: Selection, opened: ExitStack) -> Iterator[Sa
     if not files:
         raise ConfigError(path, f"holds neither Parquet files nor a {JOURNAL_FILE}")
     for file in map(ArchiveFile, files):
-        header, rows = file.header, file.read(selection=in_time)
-        machines = frozenset(header.machines)
-        yield SampleSource(
-            file.path, header.site.name, header.frame, header.site, machines, file.samples, file.first_received_ns, rows
-        )
+        header, site, rows = file.header, file.header.site, file.read(selection=in_time)
+        contents = (frozenset(header.machines), file.samples, file.first_received_ns, rows)
+        yield SampleSource(file.path, site.name, header.frame, site, *contents)
 
 
 def _store(path: Path, selection: Selection, opened: ExitStack) -> SampleSource:
@@ -138,9 +134,8 @@ def _store(path: Path, selection: Selection, opened: ExitStack) -> SampleSource:
     machines = frozenset(machine for machine, _ in watermarks)
     first_ns = first.received_ns if first else 0
     rows = history_rows(history, selection=selection)
-    return SampleSource(
-        path, journal.site, journal.frame, _site_of(path), machines, samples, first_ns, rows, watermarks
-    )
+    site = _site_of(path)
+    return SampleSource(path, journal.site, journal.frame, site, machines, samples, first_ns, rows, watermarks)
 
 
 def _site_of(store: Path) -> SiteConfig | None:
@@ -206,20 +201,6 @@ def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: 
     if not copier.kept.total():
         raise ConfigError("sitegrid fold", f"no sample is left: {json.dumps(copier.excluded)} are excluded")
     return copier
-
-
-def _fold(part: Path, site: SiteConfig, config: ServerConfig) -> dict[str, Any]:
-    """Fold the new journal as a server would, and leave a snapshot to start from."""
-    with closing(Store(part, site, config, time.time_ns)) as store:
-        store.save_snapshot()
-        return store.info()
-
-
-def _by_machine(kept: Mapping[SpoolKey, int]) -> dict[str, int]:
-    machines: Counter[str] = Counter()
-    for (machine, _), samples in kept.items():
-        machines[machine] += samples
-    return dict(sorted(machines.items()))
 
 
 def _lines(summary: Mapping[str, Any]) -> list[str]:

@@ -12,23 +12,20 @@ from typing import TYPE_CHECKING
 import zenoh
 
 from protocol.errors import ConfigError, LinkError
+from protocol.machine.log_folder import LogFolder, open_log
+from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
-from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.options.groups import add_network
 from sitegrid.options.values import not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
-from sitegrid.security.join import join
+from sitegrid.security.join import join, signer
 
 if TYPE_CHECKING:
-    from agents.agent import Places
     from agents.config import AgentConfig
-    from agents.delivery.link import Sign
     from agents.drivers import Driver
     from agents.presence import Owner
-    from protocol.machine.log_folder import LogFolder
-    from protocol.machine.machine_config import MachineConfig
 
 HELP = "run the localisation agent of one machine"
 LINK_S = 1.0  # how long to wait for the router before starting without it
@@ -36,32 +33,25 @@ LINK_S = 1.0  # how long to wait for the router before starting without it
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
+    add = parser.add_argument
     add_network(parser)
-    parser.add_argument("--config", type=Path, help="file with machine, sensors and options (config/agent.toml)")
-    parser.add_argument("--site-file", type=Path, help="site file (config/site.toml); not needed with --log")
-    parser.add_argument("--name", help="name of the machine (overrides the config file)")
-    parser.add_argument("--spool", type=Path, required=True, help="file of the spool")
-    parser.add_argument("--audit", type=Path, help="file that lists every recorded sample, to prove that none is lost")
-    parser.add_argument("--calibration", type=Path, help="calibration file (default: beside the spool)")
-    parser.add_argument(
-        "--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)"
-    )
-    parser.add_argument("--log", type=Path, help="replay: manifest of the log")
-    parser.add_argument("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
-    parser.add_argument(
-        "--speed", type=not_negative, default=1.0, help="replay: speed relative to real time; 0 as fast as possible"
-    )
-    parser.add_argument(
-        "--withhold",
-        action="store_true",
-        help="withhold part of the GPS fixes ([holdout]) and report the error against them",
-    )
+    add("--config", type=Path, help="file with machine, sensors and options (config/agent.toml)")
+    add("--site-file", type=Path, help="site file (config/site.toml); not needed with --log")
+    add("--name", help="name of the machine (overrides the config file)")
+    add("--spool", type=Path, required=True, help="file of the spool")
+    add("--audit", type=Path, help="file that lists every recorded sample, to prove that none is lost")
+    add("--calibration", type=Path, help="calibration file (default: beside the spool)")
+    add("--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)")
+    add("--log", type=Path, help="replay: manifest of the log")
+    add("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
+    add("--speed", type=not_negative, default=1.0, help="replay: speed relative to real time; 0 as fast as possible")
+    withheld = "withhold part of the GPS fixes ([holdout]) and report the error against them"
+    add("--withhold", action="store_true", help=withheld)
 
 
 def run(arguments: Namespace) -> int:
     """Run until the stream ends or the process is stopped; the router may come and go."""
-    from agents.agent import Agent
-    from protocol.machine.log_folder import open_log
+    from agents.agent import Agent, Places
 
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
@@ -70,20 +60,13 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
-        agent = Agent(
-            session,
-            site,
-            machine,
-            config,
-            _places(arguments),
-            withhold=arguments.withhold,
-            owner=owner,
-            sign=_signer(arguments.keys),
-        )
+        places = Places(arguments.spool, arguments.audit, _calibration(arguments))
+        sign, withhold = signer(arguments.keys), arguments.withhold
+        agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign)
         opened.callback(agent.close)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
-        report = agent.run(_driver(arguments, log, session, site, machine), stop.is_set, wait=stop.wait)
-    say({"ended": plain(report)}) if arguments.json else note(_summary(machine, report))
+        report = agent.run(_driver(arguments, log, session, site.name, machine.name), stop.is_set, wait=stop.wait)
+    say({"ended": plain(report)}) if arguments.json else note(_summary(machine.name, report))
     return 0 if report["delivered"] or stop.is_set() else 1
 
 
@@ -99,29 +82,15 @@ def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) 
     """Refuse to start while another agent of the same name runs."""
     from agents.presence import find_namesake, this_process
 
-    owner = this_process()
     if other := find_namesake(session, site, machine):
         problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"
         raise LinkError(endpoint, problem)
-    return owner
+    return this_process()
 
 
-def _signer(keys: Path | None) -> Sign | None:
-    """What signs the machine's batches, if its folder of keys has a signing key."""
-    file = keys / SIGNING_FILE if keys else None
-    if not file or not file.is_file():
-        return None
-    from sitegrid.security.signing import Signer  # imported here: only machines with keys need `cryptography`
-
-    return Signer(file.read_bytes()).sign
-
-
-def _places(arguments: Namespace) -> Places:
-    """Files of the agent; the calibration lies beside the spool, if nothing else is asked for."""
-    from agents.agent import Places
-
-    calibration = arguments.calibration or arguments.spool.with_suffix(".calibration.json")
-    return Places(arguments.spool, arguments.audit, calibration)
+def _calibration(arguments: Namespace) -> Path:
+    """The calibration lies beside the spool, if nothing else is asked for."""
+    return Path(arguments.calibration or arguments.spool.with_suffix(".calibration.json"))
 
 
 def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig, MachineConfig, AgentConfig]:
@@ -142,19 +111,16 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
     return log.site, machine, config
 
 
-def _driver(
-    arguments: Namespace, log: LogFolder | None, session: zenoh.Session, site: SiteConfig, machine: MachineConfig
-) -> Driver:
+def _driver(arguments: Namespace, log: LogFolder | None, session: zenoh.Session, site: str, machine: str) -> Driver:
     from agents.drivers.replay import Replay
     from agents.drivers.zenoh import ZenohDriver
 
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)
-    return ZenohDriver(session, site.name, machine.name)
+    return ZenohDriver(session, site, machine)
 
 
-def _summary(machine: MachineConfig, report: dict[str, object]) -> str:
-    line = (
-        f"{machine.name}: {report['readings']} readings, {report['samples']} samples, delivered {report['delivered']}"
-    )
-    return f"{line}, withheld fixes {report['holdout']}" if report["holdout"] else line
+def _summary(machine: str, report: dict[str, object]) -> str:
+    line = f"{machine}: {report['readings']} readings, {report['samples']} samples"
+    withheld = f", withheld fixes {report['holdout']}" if report["holdout"] else ""
+    return f"{line}, delivered {report['delivered']}{withheld}"

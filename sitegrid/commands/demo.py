@@ -12,25 +12,18 @@ HELP = "run the whole system in simulation and draw the maps"
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument(
-        "--seconds", type=positive, default=240.0, help="simulated time in seconds (default %(default)s)"
-    )
-    parser.add_argument("--speed", type=positive, default=4.0, help="speed relative to real time (default %(default)s)")
-    parser.add_argument("--scenario", default="paper_site", help="scenario to simulate (default %(default)s)")
-    parser.add_argument(
-        "--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)"
-    )
-    parser.add_argument(
-        "--machines", type=int, help="number of machines in the scenario's first fleet (overrides the scenario)"
-    )
-    parser.add_argument("--seed", type=int, help="random seed (overrides the scenario)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores (default %(default)s)"
-    )
-    parser.add_argument("--headless", action="store_true", help="no live display; print plain lines")
-    parser.add_argument("--log", type=Path, help="manifest of a real log, which another agent replays")
-    parser.add_argument("--data", type=Path, help="folder with the CSV files of that log")
-    parser.add_argument("--no-log", action="store_true", help="do not replay a log, even if the default log exists")
+    add = parser.add_argument
+    add("--seconds", type=positive, default=240.0, help="simulated time in seconds (default %(default)s)")
+    add("--speed", type=positive, default=4.0, help="speed relative to real time (default %(default)s)")
+    add("--scenario", default="paper_site", help="scenario to simulate (default %(default)s)")
+    add("--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)")
+    add("--machines", type=int, help="number of machines in the scenario's first fleet (overrides the scenario)")
+    add("--seed", type=int, help="random seed (overrides the scenario)")
+    add("--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores (default %(default)s)")
+    add("--headless", action="store_true", help="no live display; print plain lines")
+    add("--log", type=Path, help="manifest of a real log, which another agent replays")
+    add("--data", type=Path, help="folder with the CSV files of that log")
+    add("--no-log", action="store_true", help="do not replay a log, even if the default log exists")
 
 
 def run(arguments: Namespace) -> int:

@@ -6,6 +6,7 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 from pathlib import Path
 
+from sitegrid.doctor import Level
 from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import say
 
@@ -25,13 +26,9 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Check what is given; 1 where something does not work."""
     from sitegrid.doctor.examine import examine
-    from sitegrid.doctor.findings import Level
 
     findings = examine(arguments)
     ok = all(finding.level != Level.FAIL for finding in findings)
-    if arguments.json:
-        say({"ok": ok, "findings": [asdict(finding) for finding in findings]})
-    else:
-        for finding in findings:
-            print(finding)
+    table = {"ok": ok, "findings": [asdict(finding) for finding in findings]}
+    say(table) if arguments.json else print(*findings, sep="\n")
     return 0 if ok else 1

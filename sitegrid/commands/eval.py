@@ -8,15 +8,12 @@ from dataclasses import asdict
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sitegrid.options.groups import Subparsers, add_action
 from sitegrid.options.values import count, positive, seed, withhold
 from sitegrid.process.lifetime import note, plain, say
 from sitegrid.process.progress import Display
-
-if TYPE_CHECKING:
-    from evaluation.campaign.experiment import Runner
 
 HELP = "run the accuracy experiments"
 Report = dict[str, Any]  # plain values by name; lists of rows are tables
@@ -26,64 +23,51 @@ SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command: those of each experiment."""
-    experiments = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
-    physics = add_action(
-        experiments, "physics", "compare the simulator with mechanics, and its two worlds with each other"
-    )
+    experiments = parser.add_subparsers(metavar="WHAT", required=True)
+    physics = _add(experiments, _physics, "compare the simulator with mechanics, and its two worlds with each other")
     _add_seeds(physics, 3)
-    parity = add_action(experiments, "parity", "compare final poses with those that robot_localization's tests expect")
-    parity.add_argument(
-        "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
-    )
-    table = add_action(experiments, "localisation", "repeat the paper's table on simulated recordings")
-    _add_recorded(table, 1200.0)
+    parity = _add(experiments, _parity, "compare final poses with those that robot_localization's tests expect")
+    folders = "folder with the folders rl_test1_husky, rl_test2_jackal"
+    parity.add_argument("--data", type=Path, required=True, help=folders)
+    table = _add(experiments, _localisation, "repeat the paper's table on simulated recordings")
+    _add_kept(table, "errors over time, tracks and the table", 1200.0)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
-    table.add_argument("--plots", type=Path, help="folder to draw errors over time, tracks and the table into")
-    ground = add_action(
-        experiments, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work"
-    )
-    _add_recorded(ground, 600.0)
-    ground.add_argument("--plots", type=Path, help="folder to draw estimates along the track, errors by place into")
-    merge = add_action(experiments, "merge", "compare this map merge with other methods")
-    _add_kept(merge)
+    ground = _add(experiments, _ground, "measure the accuracy of rolling resistance and gradient of loaders at work")
+    _add_kept(ground, "estimates along the track, errors by place", 600.0)
+    merge = _add(experiments, _merge, "compare this map merge with other methods")
+    _add_kept(merge, "the maps of the first seed and the table")
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
-    merge.add_argument("--plots", type=Path, help="folder to draw the maps of the first seed and the table into")
-    _add_log(experiments)
+    _add_log(_add(experiments, _log, "replay a real log and compare with withheld fixes or with its ground truth"))
 
 
-def _add_log(experiments: Subparsers) -> None:
-    log = add_action(experiments, "log", "replay a real log and compare with withheld fixes or with its ground truth")
-    log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
-    log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
-    log.add_argument(
-        "--withhold",
-        action="append",
-        type=withhold,
-        metavar="OFF/PERIOD",
-        help="OFF seconds without GPS in every PERIOD seconds; may be repeated (default none, 1/10, 10/30, 30/60)",
-    )
-    log.add_argument("--gps", type=count, help="number of GPS receivers to use")
-    log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="filter (default %(default)s)")
-    log.add_argument(
-        "--profile", choices=("default", "paper"), default="default", help="filter profile (default %(default)s)"
-    )
+def _add(experiments: Subparsers, evaluate: Callable[[Namespace], Report], summary: str) -> ArgumentParser:
+    parser = add_action(experiments, evaluate.__name__.removeprefix("_"), summary)
+    parser.set_defaults(evaluate=evaluate)
+    return parser
 
 
-def _add_recorded(parser: ArgumentParser, seconds: float) -> None:
-    """Options of what runs on recordings that are kept."""
-    _add_kept(parser)
-    parser.add_argument(
-        "--seconds", type=positive, default=seconds, help="length of each recording in seconds (default %(default)g)"
-    )
+def _add_log(parser: ArgumentParser) -> None:
+    add = parser.add_argument
+    add("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
+    add("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
+    pattern = "OFF seconds without GPS in every PERIOD seconds; may be repeated (default none, 1/10, 10/30, 30/60)"
+    add("--withhold", action="append", type=withhold, metavar="OFF/PERIOD", help=pattern)
+    add("--gps", type=count, help="number of GPS receivers to use")
+    add("--filter", choices=("ekf", "ukf"), default="ukf", help="filter (default %(default)s)")
+    add("--profile", choices=("default", "paper"), default="default", help="filter profile (default %(default)s)")
 
 
-def _add_kept(parser: ArgumentParser) -> None:
-    """Options of what keeps its results by seed."""
+def _add_kept(parser: ArgumentParser, drawn: str, seconds: float = 0) -> None:
+    """Options of what keeps its results by seed. seconds: of each recording, where their length can be chosen."""
     _add_seeds(parser, 12)
-    parser.add_argument(
-        "--out", type=Path, default=Path("eval-output"), help="folder for recordings and results (default %(default)s)"
-    )
-    parser.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
+    add = parser.add_argument
+    if seconds:
+        length = "length of each recording in seconds (default %(default)g)"
+        add("--seconds", type=positive, default=seconds, help=length)
+    kept = "folder for recordings and results (default %(default)s)"
+    add("--out", type=Path, default=Path("eval-output"), help=kept)
+    add("--processes", type=count, help="number of parallel processes (default: one per core)")
+    add("--plots", type=Path, help=f"folder to draw {drawn} into")
 
 
 def _add_seeds(parser: ArgumentParser, usual: int) -> None:
@@ -93,19 +77,8 @@ def _add_seeds(parser: ArgumentParser, usual: int) -> None:
 
 def run(arguments: Namespace) -> int:
     """Run one evaluation and print its report."""
-    evaluations = {
-        "physics": _physics,
-        "localisation": _localisation,
-        "ground": _ground,
-        "merge": _merge,
-        "log": _log,
-        "parity": _parity,
-    }
-    report = evaluations[arguments.what](arguments)
-    if arguments.json:
-        say(plain(report))
-    else:
-        print("\n\n".join(_lines(report)))
+    report = arguments.evaluate(arguments)
+    say(plain(report)) if arguments.json else print("\n\n".join(_lines(report)))
     return 0
 
 
@@ -140,8 +113,8 @@ def _merge(arguments: Namespace) -> Report:
     return _experiment(arguments, "machines drive, their samples are merged", work, "evaluation.maps.plots")
 
 
-def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Any, Any]], plots: str) -> Report:
-    """Run an experiment with its progress shown, and draw its pictures where they are asked for."""
+def _experiment(arguments: Namespace, title: str, work: Callable[..., tuple[Any, Any]], plots: str) -> Report:
+    """Run an experiment with its progress shown, and draw its pictures where they are asked for. work: of a Runner."""
     from evaluation.campaign.experiment import Runner
     from evaluation.campaign.workers import cores
 

@@ -13,21 +13,16 @@ HELP = "build a new store from archives, with other parameters"
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument(
-        "archives", type=Path, nargs="+", metavar="ARCHIVE", help="a Parquet file, a folder of them, or a store"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="STORE", help="folder of the new store")
-    parser.add_argument("--site-file", type=Path, help="site file, if the archives hold no site (site.toml)")
-    parser.add_argument(
-        "--cell", type=positive, metavar="M", help="edge of a cell in metres (default: that of the site)"
-    )
-    parser.add_argument("--config", type=Path, help="file with options (config/server.toml)")
-    parser.add_argument(
-        "--without", action="append", default=[], metavar="MACHINE", help="exclude this machine; may be repeated"
-    )
+    add = parser.add_argument
+    add("archives", type=Path, nargs="+", metavar="ARCHIVE", help="a Parquet file, a folder of them, or a store")
+    add("--out", type=Path, required=True, metavar="STORE", help="folder of the new store")
+    add("--site-file", type=Path, help="site file, if the archives hold no site (site.toml)")
+    add("--cell", type=positive, metavar="M", help="edge of a cell in metres (default: that of the site)")
+    add("--config", type=Path, help="file with options (config/server.toml)")
+    add("--without", action="append", default=[], metavar="MACHINE", help="exclude this machine; may be repeated")
     for name, what in (("from", "at or after T"), ("until", "before T")):
         summary = f"only samples with a stamp {what}; T: {STAMP_HELP}"
-        parser.add_argument(f"--{name}", type=parse_stamp, dest=f"{name}_ns", metavar="T", help=summary)
+        add(f"--{name}", type=parse_stamp, dest=f"{name}_ns", metavar="T", help=summary)
 
 
 def run(arguments: Namespace) -> int:

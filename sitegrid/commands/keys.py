@@ -14,16 +14,8 @@ from protocol.wire.keys import check_name
 from sitegrid.options.groups import add_action
 from sitegrid.options.values import days
 from sitegrid.process.lifetime import say
-from sitegrid.security.register import (
-    REGISTER_FILE,
-    ROLES,
-    ROUTER,
-    Register,
-    RegisterEntry,
-    common_name,
-    load_register,
-    save_register,
-)
+from sitegrid.security import register as registers
+from sitegrid.security.register import REGISTER_FILE, ROLES, ROUTER, Register, RegisterEntry
 
 HELP = "make, list and revoke the certificates of a site"
 THIS_HOST = ("localhost", "127.0.0.1")
@@ -32,31 +24,30 @@ HOST_LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command: those of each action."""
-    actions = parser.add_subparsers(metavar="ACTION", required=True, dest="action")
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
     init = add_action(actions, "init", "make the site's authority, and the keys of its router and map server")
     init.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
     init.add_argument("--host", nargs="+", action="extend", default=[], help="names and addresses of the router")
     add = add_action(actions, "add", "make keys for a machine or another participant")
     add.add_argument("--role", choices=ROLES, help="role, which says what it may do (default machine)")
-    add.add_argument(
-        "--renew", action="store_true", help="make a new certificate for a name that has one; the old one stays valid"
-    )
+    renew = "make a new certificate for a name that has one; the old one stays valid"
+    add.add_argument("--renew", action="store_true", help=renew)
     revoke = add_action(actions, "revoke", "revoke the access of a name")
+    show = add_action(actions, "list", "list who has access, and until when")
+    lifetime = "days that the certificate is valid (default %(default)s)"
+    for action in (init, add):
+        action.add_argument("--days", type=days, default=365, help=lifetime)
     for action in (add, revoke):
         action.add_argument("name", metavar="MACHINE")
-    for action in (init, add):
-        action.add_argument(
-            "--days", type=days, default=365, help="days that the certificate is valid (default %(default)s)"
-        )
-    for action in (init, add, revoke, add_action(actions, "list", "list who has access, and until when")):
-        action.add_argument(
-            "--dir", type=Path, default=Path("keys"), help="folder with all keys of the site (default %(default)s)"
-        )
+    for action, act in ((init, _init), (add, _add), (revoke, _revoke), (show, _list)):
+        folder = "folder with all keys of the site (default %(default)s)"
+        action.add_argument("--dir", type=Path, default=Path("keys"), help=folder)
+        action.set_defaults(act=act)
 
 
 def run(arguments: Namespace) -> int:
     """Make, revoke or list keys."""
-    _ACTIONS[arguments.action](arguments, datetime.now(UTC).replace(microsecond=0))
+    arguments.act(arguments, datetime.now(UTC).replace(microsecond=0))
     return 0
 
 
@@ -72,9 +63,8 @@ def _init(arguments: Namespace, now: datetime) -> None:
     register = Register(site, hosts, {})
     for name in (ROUTER, "server"):
         register = certify(folder, register, name, name, now + timedelta(days=arguments.days), now)
-    _tell(
-        arguments, f"{folder}: keys of site {site}; the router is reached as {', '.join(hosts)}", site=site, hosts=hosts
-    )
+    line = f"{folder}: keys of site {site}; the router is reached as {', '.join(hosts)}"
+    _tell(arguments, line, site=site, hosts=hosts)
 
 
 def _host(text: str) -> str:
@@ -91,7 +81,7 @@ def _add(arguments: Namespace, now: datetime) -> None:
     from sitegrid.security.key_folder import AUTHORITY, certify
 
     folder, name = arguments.dir, check_name(arguments.name, "keys add")
-    register = load_register(folder)
+    register = registers.load_register(folder)
     known = register.names.get(name)
     if name == AUTHORITY:
         raise ConfigError("keys add", f"{name!r} is the folder of the authority; choose another name")
@@ -116,14 +106,14 @@ def _role(arguments: Namespace, known: RegisterEntry | None) -> str:
 
 
 def _revoke(arguments: Namespace, _: datetime) -> None:
-    register = load_register(arguments.dir).without(arguments.name)
-    save_register(arguments.dir, register)
+    register = registers.load_register(arguments.dir).without(arguments.name)
+    registers.save_register(arguments.dir, register)
     line = f"{arguments.name} is let in no more once the router has this {REGISTER_FILE}; it takes that up by itself"
     _tell(arguments, line, name=arguments.name, revoked=True)
 
 
 def _list(arguments: Namespace, now: datetime) -> None:
-    register = load_register(arguments.dir)
+    register = registers.load_register(arguments.dir)
     rows = [_row(name, entry, now) for name, entry in sorted(register.names.items())]
     if arguments.json:
         say({"site": register.site, "hosts": register.hosts, "names": rows})
@@ -135,11 +125,13 @@ def _list(arguments: Namespace, now: datetime) -> None:
 def _row(name: str, entry: RegisterEntry, now: datetime) -> dict[str, Any]:
     state = "revoked" if entry.revoked else "expired" if entry.expires < now else "valid"
     plain = {"name": name, "role": entry.role, "expires": entry.expires.isoformat(), "state": state}
-    return {**plain, "revoked": entry.revoked, "serial": entry.serial, "common_name": common_name(name, entry.issue)}
+    return {
+        **plain,
+        "revoked": entry.revoked,
+        "serial": entry.serial,
+        "registers.common_name": registers.common_name(name, entry.issue),
+    }
 
 
 def _tell(arguments: Namespace, line: str, **values: Any) -> None:
     say(values) if arguments.json else print(line)
-
-
-_ACTIONS = {"init": _init, "add": _add, "revoke": _revoke, "list": _list}

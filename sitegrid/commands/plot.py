@@ -13,22 +13,16 @@ HELP = "draw the map, once or live"
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
+    add = parser.add_argument
     add_network(parser)
     add_site(parser)
-    parser.add_argument("--out", type=Path, default=Path("map.png"), help="picture to write (default %(default)s)")
-    parser.add_argument(
-        "--bounds",
-        type=float,
-        nargs=4,
-        metavar=("W", "S", "E", "N"),
-        help="west, south, east, north in metres (default: the whole map)",
-    )
-    parser.add_argument("--truth", type=Path, help="true map of a simulation (truth_map.npz): also draw the difference")
-    parser.add_argument("--follow", action="store_true", help="redraw while machines drive, until stopped")
-    parser.add_argument(
-        "--every", type=positive, default=1.0, help="seconds between two pictures (default %(default)s)"
-    )
-    parser.add_argument("--pictures", type=int, default=0, help="with --follow: exit after this many pictures")
+    add("--out", type=Path, default=Path("map.png"), help="picture to write (default %(default)s)")
+    sides = "west, south, east, north in metres (default: the whole map)"
+    add("--bounds", type=float, nargs=4, metavar=("W", "S", "E", "N"), help=sides)
+    add("--truth", type=Path, help="true map of a simulation (truth_map.npz): also draw the difference")
+    add("--follow", action="store_true", help="redraw while machines drive, until stopped")
+    add("--every", type=positive, default=1.0, help="seconds between two pictures (default %(default)s)")
+    add("--pictures", type=int, default=0, help="with --follow: exit after this many pictures")
 
 
 def run(arguments: Namespace) -> int:

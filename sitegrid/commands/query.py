@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,17 @@ import numpy as np
 
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
-from protocol.queries.answers import GroundChange, MachineState, Region
+from protocol.queries.answers import GroundChange, MachineState
 from sitegrid.client import Client, connect
-from sitegrid.options.groups import Subparsers, add_action, add_network, add_site
+from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.times import HELP as TIME_HELP
 from sitegrid.options.times import SiteTime, parse_time, utc_text
 from sitegrid.options.values import positive
 from sitegrid.process.lifetime import plain, say, stop_flag, wait
 
 HELP = "ask the map"
+Answer = tuple[Any, Iterable[str]]  # a table for programs, None where all is printed already; lines for people
+Ask = Callable[[Client, Namespace, tuple[str, ...]], Answer]  # the names are layers
 HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of a table for people, unless named
 
 
@@ -29,39 +31,36 @@ def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add_network(parser)
     add_site(parser)
-    parser.add_argument(
-        "--after",
-        type=int,
-        default=0,
-        help="wait until this journal row is in the map; for changes: list those after this number",
-    )
+    after = "wait until this journal row is in the map; for changes: list those after this number"
+    parser.add_argument("--after", type=int, default=0, help=after)
     parser.add_argument("--layers", default="", help="layers, comma-separated; default all")
-    queries = parser.add_subparsers(metavar="QUERY", required=True, dest="ask")
-    point = _add_query(queries, "point", "the cell at a position, in metres")
-    _add_place(point)
+    queries = parser.add_subparsers(metavar="QUERY", required=True)
+    point = _add_query(queries, _point, "the cell at a position, in metres")
+    _add_numbers(point, "x_m", "y_m")
     _add_when(point)
-    region = _add_query(queries, "region", "a rectangle of cells, in metres")
-    for side in ("west_m", "south_m", "east_m", "north_m"):
-        region.add_argument(side, type=float)
+    region = _add_query(queries, _region, "a rectangle of cells, in metres")
+    _add_numbers(region, "west_m", "south_m", "east_m", "north_m")
     region.add_argument("--out", type=Path, help="write coordinates and layers into this .npz file")
     _add_when(region)
-    history = _add_query(queries, "history", "the cell at a position over time")
-    _add_place(history)
+    history = _add_query(queries, _history, "the cell at a position over time")
+    _add_numbers(history, "x_m", "y_m")
     _add_times(history, ("from", "samples from this time on"), ("to", "samples up to this time; default the newest"))
     history.add_argument("--span", type=positive, metavar="SECONDS", help="length of one span; default 5 minutes")
-    _add_query(queries, "machines", "state of each machine: samples, trust, reasons")
-    changes = _add_query(queries, "changes", "list of ground changes: place and time")
+    _add_query(queries, _machines, "state of each machine: samples, trust, reasons")
+    changes = _add_query(queries, _changes, "list of ground changes: place and time")
     changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
-    _add_query(queries, "info", "state of the map and its server")
+    _add_query(queries, _info, "state of the map and its server")
 
 
-def _add_query(queries: Subparsers, name: str, summary: str) -> ArgumentParser:
-    return add_action(queries, name, summary, summary[0].upper() + summary[1:] + ".")
+def _add_query(queries: Subparsers, ask: Ask, summary: str) -> ArgumentParser:
+    query = add_action(queries, ask.__name__.removeprefix("_"), summary, sentence(summary))
+    query.set_defaults(ask=ask)
+    return query
 
 
-def _add_place(query: ArgumentParser) -> None:
-    query.add_argument("x_m", type=float)
-    query.add_argument("y_m", type=float)
+def _add_numbers(query: ArgumentParser, *names: str) -> None:
+    for name in names:
+        query.add_argument(name, type=float)
 
 
 def _add_when(query: ArgumentParser) -> None:
@@ -81,23 +80,21 @@ def run(arguments: Namespace) -> int:
     """Ask once and print the answer; changes, while they are followed, until stopped."""
     layers = tuple(part for part in arguments.layers.split(",") if part)
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
-        _ASKS[arguments.ask](client, arguments, layers)
+        table, lines = arguments.ask(client, arguments, layers)
+    if table is not None:
+        say(plain(table)) if arguments.json else print(*lines, sep="\n")
     return 0
 
 
-def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> None:
+def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
-    answer = client.point(arguments.x_m, arguments.y_m, layers, **when, after=arguments.after)
-    if arguments.json:
-        row = {"x_m": answer.x_m, "y_m": answer.y_m, **answer.values}
-        say(plain({**row, "merged": answer.merged, "stamp_ns": answer.stamp_ns}))
-        return
-    print(f"cell at {answer.x_m:g}, {answer.y_m:g} m{_as_of(when, answer.stamp_ns)}")
-    for name, value in answer.values.items():
-        print(f"  {name:18} {_value(value)}")
+    point = client.point(arguments.x_m, arguments.y_m, layers, **when, after=arguments.after)
+    table = {"x_m": point.x_m, "y_m": point.y_m, **point.values, "merged": point.merged, "stamp_ns": point.stamp_ns}
+    head = f"cell at {point.x_m:g}, {point.y_m:g} m{_as_of(when, point.stamp_ns)}"
+    return table, [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
 
 
-def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> None:
+def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
     sides = (arguments.west_m, arguments.south_m, arguments.east_m, arguments.north_m)
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
     try:
@@ -108,37 +105,31 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> No
         arrays: dict[str, Any] = {"x_m": region.x_m, "y_m": region.y_m, **region.layers}
         np.savez_compressed(arguments.out, **arrays)
     summary = {name: _statistics(values) for name, values in region.layers.items()}
-    if arguments.json:
-        size = {"columns": len(region.x_m), "rows": len(region.y_m)}
-        say(plain({**size, "merged": region.merged, "stamp_ns": region.stamp_ns, "layers": summary}))
-        return
-    print(f"{_size(region)}{_as_of(when, region.stamp_ns)}, journal row {region.merged}")
+    size = {"columns": len(region.x_m), "rows": len(region.y_m)}
+    b = region.bounds
+    place = f"{b.west_m:g}..{b.east_m:g} x {b.south_m:g}..{b.north_m:g} m, {region.cell_m:g} m cells"
+    lines = [f"{place}{_as_of(when, region.stamp_ns)}, journal row {region.merged}"]
     for name, row in summary.items():
         span = f"min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
-        print(f"  {name:18} {row['known']:7d} known   {span}")
+        lines.append(f"  {name:18} {row['known']:7d} known   {span}")
+    return {**size, "merged": region.merged, "stamp_ns": region.stamp_ns, "layers": summary}, lines
 
 
-def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> None:
+def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
     layers = layers or (() if arguments.json else HISTORY_LAYERS)
     times = _stamps(client, **{"from": arguments.from_time, "to": arguments.to_time})
     spans = client.history(arguments.x_m, arguments.y_m, layers, **times, span_s=arguments.span, after=arguments.after)
-    if arguments.json:
-        rows = [{"first_ns": span.first_ns, "last_ns": span.last_ns, **span.values} for span in spans]
-        say(plain({"spans": rows}))
-        return
+    table = {"spans": [{"first_ns": s.first_ns, "last_ns": s.last_ns, **s.values} for s in spans]}
     if not spans:
-        print("nobody was there")
-        return
-    names = list(spans[0].values)
-    _table(["from (UTC)", *names], ([utc_text(s.first_ns), *(_value(s.values[name]) for name in names)] for s in spans))
+        return table, ["nobody was there"]
+    rows = ([utc_text(s.first_ns), *map(_value, s.values.values())] for s in spans)
+    return table, _table(["from (UTC)", *spans[0].values], rows)
 
 
-def _machines(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
+def _machines(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     machines = client.machines(after=arguments.after)
-    if arguments.json:
-        say(plain({"machines": machines}))
-        return
-    _table(["machine", "trusted", "since", "samples", "lost", "newest", "why"], map(_machine_row, machines))
+    head = ["machine", "trusted", "since", "samples", "lost", "newest", "why"]
+    return {"machines": machines}, _table(head, map(_machine_row, machines))
 
 
 def _machine_row(machine: MachineState) -> list[str]:
@@ -149,18 +140,12 @@ def _machine_row(machine: MachineState) -> list[str]:
     return [machine.name, trusted, since, *counts, utc_text(machine.newest_ns), reasons or "-"]
 
 
-def _changes(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
+def _changes(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     if arguments.follow:
         _follow_changes(client, arguments)
-        return
+        return None, ()
     changes = client.changes(arguments.after)
-    if arguments.json:
-        say(plain({"changes": changes}))
-        return
-    for change in changes:
-        print(_change_line(change))
-    if not changes:
-        print("no change of the ground was found")
+    return {"changes": changes}, [*map(_change_line, changes)] or ["no change of the ground was found"]
 
 
 def _follow_changes(client: Client, arguments: Namespace) -> None:
@@ -181,38 +166,25 @@ def _change_line(change: GroundChange) -> str:
     west, south, east, north = change.bounds
     parts = [f"{change.id}: {utc_text(change.first_ns)} to {utc_text(change.last_ns)}"]
     parts += [f"{west:g}..{east:g} x {south:g}..{north:g} m", f"{change.cells} cells"]
-    values = {
-        "resistance": (change.resistance_before, change.resistance_after),
-        "grade": (change.grade_before, change.grade_after),
-    }
-    for name, (before, after) in values.items():
+    resistance = ("resistance", change.resistance_before, change.resistance_after)
+    for name, before, after in (resistance, ("grade", change.grade_before, change.grade_after)):
         if before is not None or after is not None:
             parts.append(f"{name} {_value(before)} -> {_value(after)}")
     return "  ".join(parts)
 
 
-def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> None:
+def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     info = client.info(after=arguments.after)
-    if arguments.json:
-        say(plain(info))
-        return
-    print(f"site {info.site.name}: {info.cells} cells known, bounds {info.bounds and list(info.bounds)}")
-    print(f"  journal row {info.journalled}, merged {info.merged}, snapshot {info.snapshot}")
-    print(f"  samples merged {info.samples_merged}, too unsure of their place {info.samples_too_unsure}")
-    for name, sent in sorted(info.machines.items()):
-        print(f"  {name}: {sent.samples} samples, {sent.lost} lost, {sent.spools} spools")
-    for name, count in sorted(info.counters.items()):
-        print(f"  {name}: {count}")
-
-
-_ASKS = {
-    "point": _point,
-    "region": _region,
-    "history": _history,
-    "machines": _machines,
-    "changes": _changes,
-    "info": _info,
-}
+    return info, [
+        f"site {info.site.name}: {info.cells} cells known, bounds {info.bounds and list(info.bounds)}",
+        f"  journal row {info.journalled}, merged {info.merged}, snapshot {info.snapshot}",
+        f"  samples merged {info.samples_merged}, too unsure of their place {info.samples_too_unsure}",
+        *(
+            f"  {name}: {m.samples} samples, {m.lost} lost, {m.spools} spools"
+            for name, m in sorted(info.machines.items())
+        ),
+        *(f"  {name}: {count}" for name, count in sorted(info.counters.items())),
+    ]
 
 
 def _stamps(client: Client, **times: SiteTime | None) -> dict[str, Any]:
@@ -235,11 +207,10 @@ def _value(value: float | None) -> str:
     return "unknown" if value is None or math.isnan(value) else f"{value:.4g}"
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     lines = [head, *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    for line in lines:
-        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+    return ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
 
 
 def _statistics(values: Floats32) -> dict[str, float]:
@@ -247,8 +218,3 @@ def _statistics(values: Floats32) -> dict[str, float]:
     if not known.size:
         return {"known": 0, "min": math.nan, "mean": math.nan, "max": math.nan}
     return {"known": known.size, "min": float(known.min()), "mean": float(known.mean()), "max": float(known.max())}
-
-
-def _size(region: Region) -> str:
-    b = region.bounds
-    return f"{b.west_m:g}..{b.east_m:g} x {b.south_m:g}..{b.north_m:g} m, {region.cell_m:g} m cells"

@@ -24,9 +24,8 @@ def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("--listen", default=DEFAULT_ENDPOINT, help="endpoint to listen on (default %(default)s)")
     safety = parser.add_mutually_exclusive_group()
-    safety.add_argument(
-        "--keys", type=Path, metavar="KEYS", help="folder with the site's keys; the default endpoint is tls/... then"
-    )
+    keys = "folder with the site's keys; the default endpoint is tls/... then"
+    safety.add_argument("--keys", type=Path, metavar="KEYS", help=keys)
     safety.add_argument("--insecure", action="store_true", help="accept connections from other hosts without keys")
 
 
@@ -47,8 +46,8 @@ def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None
         advice = "pass --keys (`sitegrid keys init`), listen on tcp/127.0.0.1:7447, or say --insecure"
         raise ConfigError(endpoint, f"anyone on the network could read and write the map: {advice}")
     session = open_session(SessionConfig(endpoint, mode="router"))
-    security = "none: this host only" if on_this_host else "none: open to everyone who gets here"
-    say({"ready": "router", "endpoint": endpoint, "security": security})
+    reach = "this host only" if on_this_host else "open to everyone who gets here"
+    say({"ready": "router", "endpoint": endpoint, "security": f"none: {reach}"})
     wait(stop)
     session.close()  # type: ignore[no-untyped-call]
 

@@ -26,28 +26,19 @@ if TYPE_CHECKING:
     from mapserver.server import Server
 
 HELP = "run the map server of a site"
-METRICS_PORT = 9464
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
+    add = parser.add_argument
     add_network(parser)
-    parser.add_argument(
-        "--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)"
-    )
-    parser.add_argument("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
-    parser.add_argument("--config", type=Path, help="file with options (config/server.toml)")
-    parser.add_argument(
-        "--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register"
-    )
-    parser.add_argument(
-        "--metrics",
-        type=address,
-        nargs="?",
-        const=("127.0.0.1", METRICS_PORT),
-        metavar="[HOST:]PORT",
-        help=f"serve Prometheus metrics over HTTP; without a value at 127.0.0.1:{METRICS_PORT}",
-    )
+    add("--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)")
+    add("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
+    add("--config", type=Path, help="file with options (config/server.toml)")
+    add("--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register")
+    usual = ("127.0.0.1", 9464)
+    exports = f"serve Prometheus metrics over HTTP; without a value at {usual[0]}:{usual[1]}"
+    add("--metrics", type=address, nargs="?", const=usual, metavar="[HOST:]PORT", help=exports)
 
 
 def run(arguments: Namespace) -> int:
@@ -65,9 +56,8 @@ def run(arguments: Namespace) -> int:
         warm_up(config.fold)
         session = open_session(join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name))
         opened.callback(session.close)
-        server = opened.enter_context(
-            closing(Server(session, arguments.store, site, config, time.time_ns, _verifier(arguments.signed)))
-        )
+        server = Server(session, arguments.store, site, config, time.time_ns, _verifier(arguments.signed))
+        opened.callback(server.close)
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:
             ready["metrics"] = _export(opened, session, server, site.name, arguments)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from argparse import ArgumentParser, Namespace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,34 +25,25 @@ ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
+    add = parser.add_argument
     add_network(parser)
-    parser.add_argument("--config", type=Path, help="file with options (config/sim.toml)")
-    parser.add_argument(
-        "--scenario", help="name of a scenario, or the path of its .toml file (overrides the config file)"
-    )
-    parser.add_argument(
-        "--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)"
-    )
-    parser.add_argument(
-        "--preset", help="sensor error preset: paper, dgps, standalone, rtk or harsh (overrides the scenario)"
-    )
+    add("--config", type=Path, help="file with options (config/sim.toml)")
+    add("--scenario", help="name of a scenario, or the path of its .toml file (overrides the config file)")
+    add("--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)")
+    add("--preset", help="sensor error preset: paper, dgps, standalone, rtk or harsh (overrides the scenario)")
     for name, kind, what in (
         ("seconds", float, "simulated time in seconds; 0 runs until stopped"),
         ("speed", float, "speed relative to real time; 0 as fast as possible"),
         ("machines", int, "number of machines in the scenario's first fleet"),
         ("seed", int, "random seed"),
     ):
-        parser.add_argument(f"--{name}", type=kind, help=f"{what} (overrides the config file)")
-    parser.add_argument("--site", help="name of the site in keys (overrides the config file)")
-    parser.add_argument("--truth", type=Path, help="folder for the true map and the true tracks")
-    parser.add_argument(
-        "--record", type=Path, help="folder for log folders, one per machine; nothing is published then"
-    )
-    parser.add_argument("--all-sensors", action="store_true", help="use every GPS receiver and IMU of the machines")
-    parser.add_argument("--picture", type=Path, help="draw the site into this file (plan and perspective), then exit")
-    parser.add_argument(
-        "--write-configs", type=Path, help="write site.toml and one agent file per machine into this folder, then exit"
-    )
+        add(f"--{name}", type=kind, help=f"{what} (overrides the config file)")
+    add("--site", help="name of the site in keys (overrides the config file)")
+    add("--truth", type=Path, help="folder for the true map and the true tracks")
+    add("--record", type=Path, help="folder for log folders, one per machine; nothing is published then")
+    add("--all-sensors", action="store_true", help="use every GPS receiver and IMU of the machines")
+    add("--picture", type=Path, help="draw the site into this file (plan and perspective), then exit")
+    add("--write-configs", type=Path, help="write site.toml and one agent file per machine into this folder, then exit")
 
 
 def run(arguments: Namespace) -> int:
@@ -71,17 +63,11 @@ def run(arguments: Namespace) -> int:
         return _record(config, arguments, stop)
     if arguments.write_configs or arguments.picture:
         return 0
-    report = publish(
-        config,
-        join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name),
-        stop,
-        on_progress=(lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None,
-        truth_dir=arguments.truth,
-    )
-    if arguments.json:
-        say({"ended": dataclasses.asdict(report)})
-    else:
-        note(f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings")
+    settings = join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name)
+    tell = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
+    report = publish(config, settings, stop, on_progress=tell, truth_dir=arguments.truth)
+    line = f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings"
+    say({"ended": dataclasses.asdict(report)}) if arguments.json else note(line)
     return 0
 
 
@@ -89,16 +75,10 @@ def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> i
     from sim.config import resolve
     from sim.recorder import record
 
-    display = Display("machines drive", headless=arguments.json)
     seconds = resolve(config).seconds
-    with display:
-        simulator = record(
-            config,
-            arguments.record,
-            arguments.truth,
-            on_progress=lambda now_s: display.show(now_s, seconds, "recording"),
-            stop=stop,
-        )
+    with Display("machines drive", headless=arguments.json) as display:
+        show = partial(display.show, total_s=seconds, what="recording")
+        simulator = record(config, arguments.record, arguments.truth, on_progress=show, stop=stop)
     say({"recorded": str(arguments.record), "machines": len(simulator.machines), "seconds": simulator.simulated_s})
     return 0
 

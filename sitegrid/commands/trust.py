@@ -25,12 +25,8 @@ def add_decision(parser: ArgumentParser) -> None:
     """Options of every decision about a machine."""
     parser.add_argument("machine", metavar="MACHINE")
     add_site(parser)
-    parser.add_argument(
-        "--wait",
-        type=not_negative,
-        default=30.0,
-        help="seconds to wait until the map is folded again (default %(default)g)",
-    )
+    waits = "seconds to wait until the map is folded again (default %(default)g)"
+    parser.add_argument("--wait", type=not_negative, default=30.0, help=waits)
 
 
 def run(arguments: Namespace) -> int:
@@ -45,9 +41,7 @@ def decide(arguments: Namespace, command: Callable[[Client], TrustAnswer]) -> in
     """Give the command, wait until the map follows, print what is known of the machine then."""
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         machine = command(client)
-    if arguments.json:
-        say(plain(machine))
-        return 0
     state = "is trusted" if machine.trusted else "is left out of the map"
-    print(f"{machine.name} {state}, as of journal row {machine.merged}")
+    line = f"{machine.name} {state}, as of journal row {machine.merged}"
+    say(plain(machine)) if arguments.json else print(line)
     return 0

@@ -1,20 +1,29 @@
-"""What the demo runs, and where its files lie."""
+"""What the demo runs, where its files lie, and its processes, each its own `sitegrid` command."""
 
 from __future__ import annotations
 
 import shutil
 from argparse import Namespace
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+from evaluation.audit import audit_store
+from mapserver.config import ServerConfig
 from protocol.errors import ConfigError
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig, resolve, write_configs
 from sim.scenario.tables import Scenario
+from sitegrid.client import connect
+from sitegrid.pictures.draw import TrackRecorder, draw
+from sitegrid.process.children import Child, Children, wait_until
 
 DEFAULT_MANIFEST = Path("evaluation/logs/rl_test1_husky/log.toml")
 DEFAULT_DATA = Path("../shared/data/rl_test1_husky")
+READY_S = 30.0
+LOG_SPEED = 20.0  # times real time
+SIM_OPTIONS = ("scenario", "world", "machines", "seed", "seconds", "speed")  # those that the demo passes on
 
 
 @dataclass(frozen=True)
@@ -49,14 +58,7 @@ class DemoPlan:
 def make_plan(arguments: Namespace) -> DemoPlan:
     """The plan of the options; clears the folder of an earlier run and writes the machines' configurations."""
     try:
-        config = SimConfig(
-            scenario=arguments.scenario,
-            world=arguments.world,
-            machines=arguments.machines,
-            seed=arguments.seed,
-            seconds=arguments.seconds,
-            speed=arguments.speed,
-        )
+        config = SimConfig(**{name: getattr(arguments, name) for name in SIM_OPTIONS})
     except ValueError as error:
         raise ConfigError("sitegrid demo", str(error)) from None
     scenario = resolve(config)
@@ -70,10 +72,61 @@ def make_plan(arguments: Namespace) -> DemoPlan:
 
 def _log_of(arguments: Namespace) -> tuple[Path | None, Path | None]:
     """The log to replay: as asked for, or the default one where its data lies."""
-    if arguments.no_log:
-        return None, None
-    if arguments.log:
+    if arguments.log and not arguments.no_log:
         return arguments.log, arguments.data
-    if DEFAULT_MANIFEST.exists() and DEFAULT_DATA.exists():
-        return DEFAULT_MANIFEST, DEFAULT_DATA
-    return None, None
+    default = not arguments.no_log and DEFAULT_MANIFEST.exists() and DEFAULT_DATA.exists()
+    return (DEFAULT_MANIFEST, DEFAULT_DATA) if default else (None, None)
+
+
+def start_server(plan: DemoPlan, children: Children, name: str, site_file: Path) -> Child:
+    """A map server, ready."""
+    store = plan.work / ("store" if name == "server" else f"store-{name}")
+    words = ("server", "--endpoint", plan.endpoint, "--site-file", site_file, "--store", store)
+    child = children.start(name, *words)
+    child.expect("ready", READY_S)
+    return child
+
+
+def start_agent(plan: DemoPlan, children: Children, config: Path) -> Child:
+    """The agent of one machine of the simulation."""
+    name = config.stem
+    files = ("--spool", plan.work / f"{name}.db", "--audit", plan.work / f"{name}.audit")
+    base = ("agent", "--endpoint", plan.endpoint, "--site-file", plan.site_file, "--config", config)
+    return children.start(name, *base, *files, "--json")
+
+
+def start_sim(plan: DemoPlan, children: Children) -> Child:
+    """The simulator."""
+    options = {name: getattr(plan.config, name) for name in SIM_OPTIONS}
+    words = [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]
+    return children.start("sim", "sim", "--endpoint", plan.endpoint, *words, "--truth", plan.truth, "--json")
+
+
+class LogReplay:
+    """A real log, replayed by an agent of its own into a site with a map server of its own."""
+
+    def __init__(self, plan: DemoPlan, log: LogFolder, children: Children) -> None:
+        assert plan.manifest is not None
+        self._site = log.site
+        self._machine = log.machine.name
+        self._server = start_server(plan, children, "log-server", plan.manifest)
+        self._client = connect(plan.endpoint, log.site.name)
+        self._tracks = TrackRecorder(self._client.session, log.site.name)
+        files = ("--spool", plan.work / "log.db", "--audit", plan.work / "log.audit")
+        source = ("--driver", "replay", "--log", plan.manifest, "--data", log.data, "--speed", LOG_SPEED)
+        words = ("agent", "--endpoint", plan.endpoint, *source, *files, "--withhold", "--json")
+        self._agent = children.start("log-agent", *words)
+
+    def finish(self, plan: DemoPlan) -> dict[str, Any]:
+        """Wait for the agent, draw its map, compare with its audit file."""
+        report = self._agent.expect("ended", 300.0)["ended"]
+        wait_until(lambda: self._client.info().merged == self._client.info().journalled, READY_S, "log-server")
+        picture = plan.out / "log-map.png"
+        draw(self._client, picture, None, self._tracks.tracks())
+        self._tracks.close()
+        self._client.close()
+        self._server.stop()
+        audits = {self._machine: plan.work / "log.audit"}
+        audit = audit_store(audits, plan.work / "store-log-server", self._site, ServerConfig())
+        withheld = {f"withheld_{key}": value for key, value in report["holdout"].items()}
+        return {"name": self._machine, **asdict(audit), **withheld, "picture": str(picture)}

@@ -5,27 +5,23 @@ from __future__ import annotations
 import threading
 import time
 from argparse import Namespace
+from dataclasses import asdict
 from typing import Any
 
-from evaluation.audit import audit_store
+from evaluation.audit import AuditResult, audit_store
 from evaluation.campaign.truth import position_rmse
 from evaluation.ground.truth import read_load_track
-from evaluation.maps.score import score, score_driven
+from evaluation.maps.score import DrivenScore, MapScore, score, score_driven
 from mapserver.config import ServerConfig
-from mapserver.pictures.plotter import draw_difference, side_by_side, write_image
+from mapserver.pictures.plotter import side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.queries.answers import Region
 from protocol.site.site_file import load_site
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.demo.log_replay import LogReplay
-from sitegrid.demo.parts import READY_S, start_agent, start_server, start_sim
-from sitegrid.demo.plan import DemoPlan, make_plan
-from sitegrid.demo.report import make_report, print_report
-from sitegrid.pictures.draw import draw, draw_both
-from sitegrid.pictures.tracks import TrackRecorder
-from sitegrid.pictures.truth_layers import truth_layers
+from sitegrid.demo.plan import READY_S, DemoPlan, LogReplay, make_plan, start_agent, start_server, start_sim
+from sitegrid.pictures.draw import TrackRecorder, draw, draw_both, draw_differences, truth_layers
 from sitegrid.process.children import Child, Children
 from sitegrid.process.lifetime import note, plain, say, stop_flag
 from sitegrid.process.progress import Display
@@ -42,7 +38,7 @@ def run(arguments: Namespace) -> int:
         note("stopped; everything is ended")
         return 130
     result["wall_s"] = round(time.monotonic() - began_s, 1)
-    say(plain(result)) if arguments.json else print_report(result)
+    say(plain(result)) if arguments.json else _print(result)
     return 0 if result["lost"] == result["double"] == 0 else 1
 
 
@@ -74,7 +70,7 @@ def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: D
     folder = plan.truth / TRACKS_FOLDER
     driven = [read_load_track(folder / f"{m.name}.csv", m.load_centre_m).place_m for m in machines]
     scores = score(region, truth), score_driven(region, truth, driven)
-    return make_report(plan, audit, scores, rmse_m, pictures, log_report)
+    return _report(plan, audit, scores, rmse_m, pictures, log_report)
 
 
 def _watch(
@@ -120,12 +116,59 @@ def _whole(plan: DemoPlan) -> list[float]:
 def _draw(plan: DemoPlan, client: Client, tracks: TrackRecorder) -> tuple[Region, list[str]]:
     """Write the final pictures; returns the map and their files."""
     region = client.region(tuple(_whole(plan)))  # type: ignore[arg-type]
-    truth = truth_layers(TruthMap.load(plan.true_map), region)
-    lines = tracks.tracks()
     pictures = {
-        "map.png": draw_both(region, lines),
-        "difference.png": [draw_difference(region, truth, "resistance"), draw_difference(region, truth, "grade")],
+        "map.png": draw_both(region, tracks.tracks()),
+        "difference.png": draw_differences(region, plan.true_map),
     }
     for name, images in pictures.items():
         write_image(plan.out / name, side_by_side(images))
     return region, [str(plan.out / name) for name in pictures]
+
+
+def _report(
+    plan: DemoPlan,
+    audit: AuditResult,
+    scores: tuple[MapScore, DrivenScore],
+    rmse_m: dict[str, float],
+    pictures: list[str],
+    log: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """The report as a table. rmse_m: position error of each machine. log: the report of the replayed log."""
+    whole, driven = scores
+    log_lost, log_double = (log["lost"], log["double"]) if log else (0, 0)
+    return {
+        "machines": len(plan.configs),
+        "seconds": plan.scenario.seconds,
+        "seed": plan.scenario.seed,
+        "samples_recorded": audit.recorded,
+        "samples_merged": audit.merged,
+        "lost": audit.lost + log_lost,
+        "double": audit.double + log_double,
+        "unrecorded": audit.unrecorded,
+        "cells": whole.cells,
+        "wrong_resistance_pct": round(whole.wrong_resistance_pct, 2),
+        "wrong_grade_pct": round(whole.wrong_grade_pct, 2),
+        "driven": {name: round(v, 2) if isinstance(v, float) else v for name, v in asdict(driven).items()},
+        "position_rmse_m": {name: round(value, 2) for name, value in rmse_m.items()},
+        "pictures": [*pictures, *([log["picture"]] if log else [])],
+        "log": log,
+    }
+
+
+def _print(result: dict[str, Any]) -> None:
+    """The report for people."""
+    r, driven = result, result["driven"]
+    rmse = ", ".join(f"{name} {value} m" for name, value in r["position_rmse_m"].items())
+    print(
+        f"{r['machines']} machines drove {r['seconds']:g} s, recorded {r['samples_recorded']} samples;\n"
+        f"  merged {r['samples_merged']}, lost {r['lost']}, double {r['double']}\n"
+        f"  {r['cells']} cells are known: resistance class wrong in {r['wrong_resistance_pct']} %, "
+        f"slope class in {r['wrong_grade_pct']} %\n"
+        f"  {driven['cells']} cells were truly driven: {driven['known_pct']} % are known, of these "
+        f"{driven['wrong_resistance_pct']} % wrong by resistance, {driven['wrong_grade_pct']} % by slope\n"
+        f"  position error (rms): {rmse}"
+    )
+    if log := result["log"]:
+        withheld = f"{log['withheld_rms_m']} m rms against {log['withheld_fixes']} withheld fixes"
+        print(f"real log {log['name']}: {log['recorded']} samples, lost {log['lost']}, {withheld}")
+    print("pictures:", *result["pictures"], sep="\n  ")

@@ -17,14 +17,11 @@ from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
-from sitegrid.doctor.findings import Finding, Level
+from sitegrid.doctor import Finding, Level
 
 FREE_FAIL, FREE_WARN = 64 * 2**20, 2**30
 WAITING_S = 3600.0  # samples that are older have not been taken for long
 TAIL_ROWS = 20_000  # journal rows that a restart folds in some seconds
-
-
-# --- space -----------------------------------------------------------------------------------------------------------
 
 
 def free_bytes(path: Path) -> int:
@@ -43,9 +40,6 @@ def check_disk(what: str, free: int) -> Finding:
     if free < FREE_WARN:
         return Finding(Level.WARN, f"{what} disk", message, "make room")
     return Finding(Level.PASS, f"{what} disk", message)
-
-
-# --- spool -----------------------------------------------------------------------------------------------------------
 
 
 class InUseError(StoreError):
@@ -124,9 +118,6 @@ def _table_of(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return table if isinstance(table, Mapping) else {}
 
 
-# --- store -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class StoreState:
     """A store. snapshot_row, snapshot_age_s: of the newest snapshot, 0 and infinity where there is none."""
@@ -143,9 +134,8 @@ class StoreState:
 
 def read_store(folder: Path, now_s: float) -> StoreState:
     """The state of a store, also while a server uses it; StoreError where it cannot be used."""
-    from mapserver.evidence import (
-        snapshot,  # imported here: needs the `server` extra, which a machine's host does not have
-    )
+    # imported here: needs the `server` extra, which a machine's host does not have
+    from mapserver.evidence import snapshot
     from mapserver.ingest.store import JOURNAL_FILE
     from mapserver.journal.reader import JournalReader
     from mapserver.journal.schema import SCHEMA

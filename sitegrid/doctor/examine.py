@@ -17,9 +17,7 @@ from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials
-from protocol.wire.keys import check_name
-from sitegrid.doctor import disk, network
-from sitegrid.doctor.findings import Finding, Level, skipped
+from sitegrid.doctor import Finding, Level, disk, network, skipped
 from sitegrid.doctor.keys import check_certificate, read_certificate
 from sitegrid.security.join import join
 
@@ -32,14 +30,11 @@ OF_SERVER = ("server", "clock", "version", "permission")  # checks that need the
 class Subject:
     """What is examined, as far as it is known. machine: empty where these keys send no samples."""
 
-    endpoint: str
+    options: Namespace
     site: str
     machine: str
-    keys: Path | None
     identity: Identity | None
     site_file: SiteConfig | None
-    spool: Path | None
-    store: Path | None
 
 
 def examine(arguments: Namespace) -> list[Finding]:
@@ -55,11 +50,10 @@ def _subject(arguments: Namespace, identity: Identity | None) -> Subject:
     machine = arguments.machine or ""
     if not machine and (identity is None or identity.role == "machine"):
         machine = identity.name if identity else ANYBODY
-    site = check_name(arguments.site or named, "--site")
+    site = keys.check_name(arguments.site or named, "--site")
     if machine:
-        check_name(machine, "--machine")
-    files = (arguments.keys, identity, site_file, arguments.spool, arguments.store)
-    return Subject(arguments.endpoint, site, machine, *files)
+        keys.check_name(machine, "--machine")
+    return Subject(arguments, site, machine, identity, site_file)
 
 
 def _keys(arguments: Namespace) -> tuple[list[Finding], Subject | None]:
@@ -79,7 +73,7 @@ def _keys(arguments: Namespace) -> tuple[list[Finding], Subject | None]:
 
 
 def _network(subject: Subject) -> list[Finding]:
-    link, session = network.open_link(join(subject.endpoint, subject.keys, network.LINK_S))
+    link, session = network.open_link(join(subject.options.endpoint, subject.options.keys, network.LINK_S))
     if session is None:
         rest = [skipped(name, "no way to the router") for name in OF_SERVER]
         return [network.check_link(link), *rest, *_spool(subject, None)]
@@ -102,17 +96,13 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
     is_there = info is not None or network.is_answered(session, keys.map_query(subject.site, "info"))
     findings = [network.check_server(subject.site, info, is_there=is_there, role=role)]
     if info is not None:
-        findings += _compared(subject.site_file, info, asked_ns)
+        site = subject.site_file
+        findings += [
+            network.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
+            network.check_clock(*network.offset_of(info, asked_ns), site),
+            network.check_version(package_version(), info.version),
+        ]
     return [*findings, _permission(subject, session, info)]
-
-
-def _compared(site: SiteConfig | None, info: MapInfo, asked_ns: tuple[int, int]) -> list[Finding]:
-    """What only a comparison with the map server shows."""
-    return [
-        network.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
-        network.check_clock(*network.offset_of(info, asked_ns), site),
-        network.check_version(package_version(), info.version),
-    ]
 
 
 def _permission(subject: Subject, session: zenoh.Session, info: MapInfo | None) -> Finding:
@@ -120,15 +110,16 @@ def _permission(subject: Subject, session: zenoh.Session, info: MapInfo | None) 
         return skipped("permission", "these keys send no samples")
     if not (site := subject.site_file or (info and info.site)):
         return skipped("permission", "give --site-file FILE, for the server does not say the site's frame")
-    answer = network.ask_permission(session, subject.site, subject.machine, site.frame, subject.keys)
+    keys_folder = subject.options.keys
+    answer = network.ask_permission(session, subject.site, subject.machine, site.frame, keys_folder)
     is_there = answer is not None or network.is_answered(session, keys.ingest(subject.site, subject.machine))
-    return network.check_permission(subject.machine, answer, is_there=is_there, has_keys=subject.keys is not None)
+    return network.check_permission(subject.machine, answer, is_there=is_there, has_keys=keys_folder is not None)
 
 
 def _spool(subject: Subject, session: zenoh.Session | None) -> list[Finding]:
-    if subject.spool is None:
+    if (path := subject.options.spool) is None:
         return [skipped("spool", "give --spool FILE")]
-    return [_spool_itself(subject, subject.spool, session), _space("spool", subject.spool)]
+    return [_spool_itself(subject, path, session), disk.check_disk("spool", disk.free_bytes(path))]
 
 
 def _spool_itself(subject: Subject, path: Path, session: zenoh.Session | None) -> Finding:
@@ -152,8 +143,4 @@ def _store(folder: Path | None, site: SiteConfig | None) -> list[Finding]:
         store = disk.check_store(disk.read_store(folder, time.time()), site)
     except SitegridError as error:
         store = Finding(Level.FAIL, "store", str(error))
-    return [store, _space("store", folder)]
-
-
-def _space(what: str, path: Path) -> Finding:
-    return disk.check_disk(what, disk.free_bytes(path))
+    return [store, disk.check_disk("store", disk.free_bytes(folder))]

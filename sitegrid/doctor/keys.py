@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import ssl
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from protocol.errors import ConfigError
 from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, Identity, load_credentials
-from sitegrid.doctor.findings import Finding, Level
+from sitegrid.doctor import Finding, Level
 
 EXPIRES_DAYS = 30
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a folder of keys holds.
-
-    common_name: as the certificate says. signed: by the authority beside it. fits: with the private key. mode: of the
-    key's file.
-    """
+    """common_name: as it says. signed: by the authority beside it. fits: to the private key. mode: of the key file."""
 
     identity: Identity
     common_name: str
@@ -37,34 +34,25 @@ def read_certificate(folder: Path) -> Certificate:
     from cryptography.exceptions import InvalidSignature
     from cryptography.x509.oid import NameOID
 
-    identity = load_credentials(folder).identity
+    identity, fits, signed = load_credentials(folder).identity, False, False
     try:
         certificate, authority = (
             x509.load_pem_x509_certificate((folder / name).read_bytes()) for name in (CERTIFICATE_FILE, AUTHORITY_FILE)
         )
         names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
         mode = (folder / KEY_FILE).stat().st_mode
-        fits = _fits(folder)
+        with suppress(ssl.SSLError):  # OpenSSL compares key and certificate when it loads both
+            ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(folder / CERTIFICATE_FILE, folder / KEY_FILE)
+            fits = True
     except OSError as error:
         raise ConfigError(folder, f"cannot be read ({error.strerror}): run as the user that it belongs to") from None
     except ValueError as error:
         raise ConfigError(folder, f"holds no usable certificate ({error}): copy the whole folder again") from None
-    try:
+    with suppress(InvalidSignature, ValueError, TypeError):
         certificate.verify_directly_issued_by(authority)
         signed = True
-    except (InvalidSignature, ValueError, TypeError):
-        signed = False
     valid = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     return Certificate(identity, str(names[0].value) if names else "", *valid, signed, fits, mode)
-
-
-def _fits(folder: Path) -> bool:
-    """Whether the private key is that of the certificate; OpenSSL compares them when it loads both."""
-    try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(folder / CERTIFICATE_FILE, folder / KEY_FILE)
-    except ssl.SSLError:
-        return False
-    return True
 
 
 def check_certificate(certificate: Certificate, now: datetime, site: str = "", machine: str = "") -> list[Finding]:
@@ -94,9 +82,8 @@ def _name(certificate: Certificate, site: str, machine: str, who: str) -> Findin
         problem = f"identity.toml says {identity.name}, the certificate {certificate.common_name}"
         return Finding(Level.FAIL, "name", problem, "the files are of two folders: copy the whole folder again")
     if site and site != identity.site:
-        return Finding(
-            Level.FAIL, "name", f"the keys are for site {identity.site}, not {site}", "compare --site, --keys"
-        )
+        problem = f"the keys are for site {identity.site}, not {site}"
+        return Finding(Level.FAIL, "name", problem, "compare --site, --keys")
     if machine and identity.role == "machine" and machine != identity.name:
         return Finding(Level.FAIL, "name", f"the keys are those of {identity.name}, not of {machine}", "compare --keys")
     return Finding(Level.PASS, "name", f"the certificate is that of {who}")

@@ -23,10 +23,10 @@ from protocol.site.site_config import SiteConfig
 from protocol.version import UNKNOWN
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_reply, encode_batch
-from protocol.wire.credentials import SIGNING_FILE
 from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, open_session
-from sitegrid.doctor.findings import Finding, Level, skipped
+from sitegrid.doctor import Finding, Level, skipped
+from sitegrid.security.join import signer
 
 ANSWER_S = 5.0
 LINK_S = 3.0
@@ -124,14 +124,12 @@ def check_server(site: str, info: MapInfo | None, *, is_there: bool, role: str =
         behind = f", merged only up to {info.merged}" if info.merged != info.journalled else ""
         return Finding(Level.PASS, "server", text + behind)
     if is_there:
-        problem = f"site {site}: a map server is there, but does not answer"
         advice = "the router denies the question (see `sitegrid keys list`), or the server hangs"
-        return Finding(Level.FAIL, "server", problem, advice)
-    problem = f"site {site}: the router knows of no map server"
+        return Finding(Level.FAIL, "server", f"site {site}: a map server is there, but does not answer", advice)
     advice = "start `sitegrid server`, or compare the name of the site"
     if role:
         advice += "; or these keys are revoked, or not in its register, and it shows them nothing"
-    return Finding(Level.FAIL, "server", problem, advice)
+    return Finding(Level.FAIL, "server", f"site {site}: the router knows of no map server", advice)
 
 
 def check_site(site: SiteConfig, info: MapInfo) -> Finding:
@@ -177,7 +175,7 @@ def ask_permission(
     key = keys.ingest(site, machine)
     batch = encode_batch(SampleBatch(machine, secrets.randbits(64) or 1, 1, empty(), frame))
     try:
-        data = _ask(session, key, batch, _signature(folder, key, batch))
+        data = _ask(session, key, batch, sign(key, batch) if (sign := signer(folder)) else None)
         return decode_reply(data) if data else None
     except MessageError as error:
         return Refused(error.reason, f"its answer cannot be read: {error}")
@@ -195,23 +193,22 @@ def check_permission(machine: str, answer: Ack | Refused | None, *, is_there: bo
         return Finding(Level.FAIL, "permission", problem, "start `sitegrid server`, or compare the name of the site")
     problem = f"a map server is there, but gives no answer to batches of {machine}"
     denied = "the router denies it: a machine may send under the name of its keys alone"
-    return Finding(
-        Level.FAIL, "permission", problem, denied if has_keys else "the router denies it, or the server hangs"
-    )
+    advice = denied if has_keys else "the router denies it, or the server hangs"
+    return Finding(Level.FAIL, "permission", problem, advice)
 
 
 def receive_health(session: zenoh.Session, site: str, machine: str) -> Health | None:
     """The health report of a running agent; None if none comes in, or it cannot be read."""
     with session.declare_subscriber(keys.health(site, machine), zenoh.handlers.RingChannel(1)) as subscriber:
         end_s = time.monotonic() + HEALTH_S
-        while time.monotonic() < end_s:
-            if sample := subscriber.try_recv():
-                try:
-                    return decode_health(sample.payload.to_bytes())
-                except MessageError:
-                    return None
+        while not (sample := subscriber.try_recv()):
+            if time.monotonic() >= end_s:
+                return None
             time.sleep(0.05)
-    return None
+    try:
+        return decode_health(sample.payload.to_bytes())
+    except MessageError:
+        return None
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | None = None) -> bytes | None:
@@ -219,11 +216,3 @@ def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | N
         if reply.ok is not None:
             return reply.ok.payload.to_bytes()
     return None
-
-
-def _signature(folder: Path | None, key: str, payload: bytes) -> bytes | None:
-    if folder is None or not (folder / SIGNING_FILE).is_file():
-        return None
-    from sitegrid.security.signing import Signer  # imported here: needs the `security` extra
-
-    return Signer((folder / SIGNING_FILE).read_bytes()).sign(key, payload)

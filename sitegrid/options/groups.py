@@ -13,7 +13,7 @@ Subparsers: TypeAlias = "_SubParsersAction[ArgumentParser]"  # argparse has no p
 
 def add_command(commands: Subparsers, name: str, summary: str) -> ArgumentParser:
     """Add `sitegrid NAME`, with the options of every command."""
-    parser: ArgumentParser = commands.add_parser(name, help=summary, description=_sentence(summary))
+    parser: ArgumentParser = commands.add_parser(name, help=summary, description=sentence(summary))
     parser.add_argument("--json", action="store_true", help="print JSON for machines")
     parser.add_argument("--verbose", action="store_true", help="log normal events too, not only warnings and errors")
     return parser
@@ -30,12 +30,8 @@ def add_action(actions: Subparsers, name: str, summary: str, description: str | 
 def add_network(parser: ArgumentParser) -> None:
     """Options of a command that connects to the router."""
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="router to connect to (default %(default)s)")
-    parser.add_argument(
-        "--keys",
-        type=Path,
-        metavar="FOLDER",
-        help="folder with the keys of this process (see `sitegrid keys`); the default endpoint is tls/... then",
-    )
+    keys = "folder with the keys of this process (see `sitegrid keys`); the default endpoint is tls/... then"
+    parser.add_argument("--keys", type=Path, metavar="FOLDER", help=keys)
 
 
 def add_site(parser: ArgumentParser) -> None:
@@ -43,5 +39,6 @@ def add_site(parser: ArgumentParser) -> None:
     parser.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
 
 
-def _sentence(summary: str) -> str:
+def sentence(summary: str) -> str:
+    """A summary as a description."""
     return summary[0].upper() + summary[1:] + "."

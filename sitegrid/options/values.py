@@ -2,54 +2,44 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentTypeError
 
 
 def count(text: str) -> int:
     """A whole number of 1 or more."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
-    return value
+    _require(int(text) >= 1, f"{text} is not positive")
+    return int(text)
 
 
 def days(text: str) -> int:
     """A whole number of days that a certificate may be valid."""
-    value = count(text)
-    if value > 3650:
-        raise argparse.ArgumentTypeError(f"{text} is more than 3650, the ten years of the authority")
-    return value
-
-
-def positive(text: str) -> float:
-    """A finite number above 0."""
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
-    return value
-
-
-def not_negative(text: str) -> float:
-    """A finite number of 0 or more."""
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
+    _require(count(text) <= 3650, f"{text} is more than 3650, the ten years of the authority")
+    return int(text)
 
 
 def seed(text: str) -> int:
     """A whole number of 0 or more."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
+    _require(int(text) >= 0, f"{text} is negative")
+    return int(text)
+
+
+def positive(text: str) -> float:
+    """A finite number above 0."""
+    _require(0 < float(text) < float("inf"), f"{text} is not positive")
+    return float(text)
+
+
+def not_negative(text: str) -> float:
+    """A finite number of 0 or more."""
+    _require(0 <= float(text) < float("inf"), f"{text} is negative")
+    return float(text)
 
 
 def address(text: str) -> tuple[str, int]:
     """`9464`, of this host alone, or `0.0.0.0:9464`; port 0 takes a free one."""
     host, _, port = text.rpartition(":")
-    if not (port.isascii() and port.isdecimal() and int(port) < 2**16):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither PORT nor HOST:PORT")
+    is_port = port.isascii() and port.isdecimal() and int(port) < 2**16
+    _require(is_port, f"{text!r} is neither PORT nor HOST:PORT")
     return host or "127.0.0.1", int(port)
 
 
@@ -62,6 +52,10 @@ def withhold(text: str) -> tuple[float, float]:
         off_s, period_s = float(off), float(period)
     except ValueError:
         off_s = period_s = 0.0
-    if not 0 < off_s < period_s < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither OFF/PERIOD in seconds, as 10/30, nor none")
+    _require(0 < off_s < period_s < float("inf"), f"{text!r} is neither OFF/PERIOD in seconds, as 10/30, nor none")
     return off_s, period_s
+
+
+def _require(is_so: bool, problem: str) -> None:  # noqa: FBT001 - a condition
+    if not is_so:
+        raise ArgumentTypeError(problem)

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import threading
 from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+import zenoh
 
 from mapserver.pictures.frame import Image
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
-from protocol.errors import ConfigError, LinkError, QueryError
+from protocol.arrays import Floats32
+from protocol.errors import ConfigError, LinkError, MessageError, QueryError
 from protocol.queries.answers import Region
 from protocol.site.geometry import Bounds
+from protocol.wire import keys
+from protocol.wire.codec import decode_pose
+from protocol.wire.messages import Pose
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.pictures.tracks import TrackRecorder
-from sitegrid.pictures.truth_layers import truth_layers
 from sitegrid.process.lifetime import note, say, stop_flag
 
+MAX_POSES = 50_000  # of one machine: nearly three hours at 5 Hz
 LAYERS = ("resistance", "grade_east", "grade_north")
 
 
@@ -54,17 +59,11 @@ def draw(
 ) -> Region:
     """Ask for the map and write its picture; with a true map the difference beside it."""
     region = client.region(_bounds(client, bounds), LAYERS)
-    row = draw_both(region, tracks)
-    images = [side_by_side(row)]
-    if truth:
-        layers = truth_layers(TruthMap.load(truth), region)
-        images = [
-            side_by_side(row),
-            side_by_side([draw_difference(region, layers, k) for k in ("resistance", "grade")]),
-        ]
-    write_image(out, images[0])
-    for image in images[1:]:
-        write_image(out.with_stem(f"{out.stem}-difference"), image)
+    image = side_by_side(draw_both(region, tracks))
+    difference = side_by_side(draw_differences(region, truth)) if truth else None
+    write_image(out, image)
+    if difference is not None:
+        write_image(out.with_stem(f"{out.stem}-difference"), difference)
     return region
 
 
@@ -73,6 +72,12 @@ def draw_both(region: Region, tracks: list[Track]) -> list[Image]:
     has_torque = np.isfinite(region["resistance"]).any() or not np.isfinite(region["grade_east"]).any()
     title = "Rolling resistance" if has_torque else "Rolling resistance: unknown, no machine measures drive torque"
     return [draw_resistance(region, tracks, title), draw_grade(region, tracks)]
+
+
+def draw_differences(region: Region, truth: Path) -> list[Image]:
+    """How far resistance and grade are from a true map."""
+    layers = truth_layers(TruthMap.load(truth), region)
+    return [draw_difference(region, layers, name) for name in ("resistance", "grade")]
 
 
 def _bounds(client: Client, given: list[float] | None) -> Bounds:
@@ -88,3 +93,58 @@ def _bounds(client: Client, given: list[float] | None) -> Bounds:
         return Bounds(0, 0, 16 * cell_m, 16 * cell_m)
     west, south, east, north = (cell * cell_m for cell in cells)
     return Bounds(west, south, east, north)
+
+
+def truth_layers(truth: TruthMap, region: Region) -> dict[str, Floats32]:
+    """True layers on the cells of a region, NaN beyond the simulated site."""
+    if abs(truth.cell_m - region.cell_m) > 1e-9:
+        raise ConfigError("--truth", f"has cells of {truth.cell_m:g} m, the map of {region.cell_m:g} m")
+    column = round((region.bounds.west_m - truth.west_m) / truth.cell_m)
+    row = round((region.bounds.south_m - truth.south_m) / truth.cell_m)
+    layers = {"resistance": truth.c_rr, "grade_east": truth.grade_east, "grade_north": truth.grade_north}
+    return {name: _cut(values, row, column, region[next(iter(region.layers))].shape) for name, values in layers.items()}
+
+
+def _cut(values: Floats32, row: int, column: int, shape: tuple[int, ...]) -> Floats32:
+    out = np.full(shape, np.nan, np.float32)
+    top, left = max(0, -row), max(0, -column)
+    bottom, right = min(shape[0], values.shape[0] - row), min(shape[1], values.shape[1] - column)
+    if bottom > top and right > left:
+        out[top:bottom, left:right] = values[row + top : row + bottom, column + left : column + right]
+    return out
+
+
+class TrackRecorder:
+    """Subscribes to the poses of a site."""
+
+    def __init__(self, session: zenoh.Session, site: str) -> None:
+        self._lock = threading.Lock()
+        self._poses: dict[str, list[Pose]] = {}
+        self._subscriber = session.declare_subscriber(keys.poses_all(site), self._on_pose)
+
+    def poses(self) -> dict[str, list[Pose]]:
+        """All poses so far, by machine."""
+        with self._lock:
+            return {name: list(poses) for name, poses in sorted(self._poses.items())}
+
+    def tracks(self) -> list[Track]:
+        """All poses so far, as lines to draw."""
+        return [
+            Track(name, np.array([p.x_m for p in poses]), np.array([p.y_m for p in poses]))
+            for name, poses in self.poses().items()
+        ]
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def _on_pose(self, sample: zenoh.Sample) -> None:
+        try:
+            pose = decode_pose(sample.payload.to_bytes())
+        except MessageError:  # a pose that cannot be read is not drawn
+            return
+        with self._lock:
+            poses = self._poses.setdefault(pose.machine, [])
+            poses.append(pose)
+            if len(poses) > MAX_POSES:
+                del poses[: MAX_POSES // 10]

@@ -11,8 +11,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from protocol.errors import SitegridError
@@ -41,14 +41,10 @@ class Child:
             start_new_session=True,  # Ctrl-C reaches the parent alone, which ends its children in order
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
         )
+        self.pid = self._process.pid
         self._lines: queue.Queue[dict[str, Any]] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
 
     @property
     def code(self) -> int | None:
@@ -57,12 +53,7 @@ class Child:
 
     def lines(self) -> list[dict[str, Any]]:
         """JSON lines that have come in since the last call."""
-        lines = []
-        while True:
-            try:
-                lines.append(self._lines.get_nowait())
-            except queue.Empty:
-                return lines
+        return [self._lines.get_nowait() for _ in range(self._lines.qsize())]  # this thread alone takes them
 
     def expect(self, key: str, timeout_s: float) -> dict[str, Any]:
         """Wait for a line that has `key`; ProcessError if the process ends or the time is up first."""
@@ -116,28 +107,19 @@ class Child:
                 self._lines.put(table)
 
 
-class Children:
+class Children(ExitStack):
     """All children of a run; leaving the block ends them, the youngest first."""
 
     def __init__(self, log_folder: Path | None = None) -> None:
+        super().__init__()
         self._log_folder = log_folder
-        self._children: list[Child] = []
 
     def start(self, name: str, *words: str | Path | float) -> Child:
         """Start `sitegrid <words>`."""
         errors = self._log_folder / f"{name}.log" if self._log_folder else None
         child = Child(name, [str(word) for word in words], errors)
-        self._children.append(child)
+        self.callback(child.stop)
         return child
-
-    def __enter__(self) -> Children:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for child in reversed(self._children):
-            child.stop()
 
 
 def wait_until(is_so: Callable[[], bool], timeout_s: float, what: str) -> None:

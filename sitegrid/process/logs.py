@@ -56,12 +56,9 @@ def _parts(record: logging.LogRecord) -> tuple[str, dict[str, Any]]:
 
 def _plain(value: Any) -> Any:
     """As JSON has it; anything else as text."""
-    is_plain = (
-        value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))
-    )
-    return value if is_plain else str(value)
+    is_plain = value is None or isinstance(value, bool | int | str)
+    return value if is_plain or (isinstance(value, float) and math.isfinite(value)) else str(value)
 
 
 def _time(record: logging.LogRecord) -> str:
-    text = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-    return text.replace("+00:00", "Z")
+    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -36,16 +36,35 @@ class Grant:
 
 def grant(role: str, site: str, name: str) -> Grant:
     """What the holder of a role may do under its name."""
-    return _GRANTS[role](site, name)
+    map_all, poses, health = _whole(site, "map"), keys.poses_all(site), keys.health_all(site)
+    asks, alive = keys.map_queries_all(site), (keys.alive(site, name),)
+    visitor = Grant(subscribe=(map_all, poses, health), query=(asks,), watch=(keys.alive_all(site),))
+    grants = {
+        "machine": Grant(
+            publish=(_whole(site, "machine", name),),
+            subscribe=(keys.sensors(site, name), map_all, _whole(site, "base")),
+            query=(keys.ingest(site, name), asks, *alive),
+            answer=alive,  # who holds the name, if a second one comes
+            alive=alive,
+            watch=alive,
+        ),
+        "visitor": visitor,
+        "admin": replace(visitor, query=(asks, keys.admin_all(site))),
+        "server": Grant(
+            publish=(map_all,),
+            subscribe=(poses, health),
+            answer=(keys.ingest_all(site), asks, keys.admin_all(site)),
+            watch=(keys.alive_all(site),),
+        ),
+        "sim": Grant(publish=(_sensors_all(site),)),
+    }
+    return grants[role]
 
 
 def router_settings(register: Register) -> dict[str, Any]:
     """The settings of the router's session, from the register."""
-    return {
-        "access_control": access_control(register),
-        "low_pass_filter": size_limits(register.site),
-        "downsampling": [_rate_limits(register.site)],
-    }
+    limits = {"low_pass_filter": size_limits(register.site), "downsampling": [_rate_limits(register.site)]}
+    return {"access_control": access_control(register), **limits}
 
 
 def access_control(register: Register) -> dict[str, Any]:
@@ -56,13 +75,8 @@ def access_control(register: Register) -> dict[str, Any]:
         rules += own
         subjects.append({"id": name, "cert_common_names": [common_name(name, entry.issue)]})
         policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
+    access = {"rules": rules, "subjects": subjects, "policies": policies}
+    return {"enabled": True, "default_permission": "deny", **access}
 
 
 def size_limits(site: str) -> list[dict[str, Any]]:
@@ -111,55 +125,12 @@ def _rules(name: str, site: str, granted: Grant) -> list[dict[str, Any]]:
             "id": f"{name} {number}",
             "permission": "allow",
             "flows": [flow],
-            "messages": list(messages),
-            "key_exprs": list(expressions),
+            "messages": [*messages],
+            "key_exprs": [*keys_],
         }
-        for number, (flow, messages, expressions) in enumerate(flows)
-        if expressions
+        for number, (flow, messages, keys_) in enumerate(flows)
+        if keys_
     ]
-
-
-# --- roles -----------------------------------------------------------------------------------------------------------
-
-
-def _machine(site: str, name: str) -> Grant:
-    return Grant(
-        publish=(_whole(site, "machine", name),),
-        subscribe=(keys.sensors(site, name), _whole(site, "map"), _whole(site, "base")),
-        query=(keys.ingest(site, name), keys.map_queries_all(site), keys.alive(site, name)),
-        answer=(keys.alive(site, name),),  # who holds the name, if a second one comes
-        alive=(keys.alive(site, name),),
-        watch=(keys.alive(site, name),),
-    )
-
-
-def _visitor(site: str, _: str) -> Grant:
-    return Grant(
-        subscribe=(_whole(site, "map"), keys.poses_all(site), keys.health_all(site)),
-        query=(keys.map_queries_all(site),),
-        watch=(keys.alive_all(site),),
-    )
-
-
-def _admin(site: str, name: str) -> Grant:
-    visitor = _visitor(site, name)
-    return replace(visitor, query=(*visitor.query, keys.admin_all(site)))
-
-
-def _server(site: str, _: str) -> Grant:
-    return Grant(
-        publish=(_whole(site, "map"),),
-        subscribe=(keys.poses_all(site), keys.health_all(site)),
-        answer=(keys.ingest_all(site), keys.map_queries_all(site), keys.admin_all(site)),
-        watch=(keys.alive_all(site),),
-    )
-
-
-def _sim(site: str, _: str) -> Grant:
-    return Grant(publish=(_sensors_all(site),))
-
-
-_GRANTS = {"machine": _machine, "visitor": _visitor, "admin": _admin, "server": _server, "sim": _sim}
 
 
 def _whole(site: str, *parts: str) -> str:

@@ -17,6 +17,14 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 EARLY = timedelta(minutes=10)  # valid from before now: the clocks of machines differ
+UNUSED = (
+    "content_commitment",
+    "key_encipherment",
+    "data_encipherment",
+    "key_agreement",
+    "encipher_only",
+    "decipher_only",
+)
 
 
 @dataclass(frozen=True)
@@ -36,9 +44,7 @@ def make_authority(site: str, begins: datetime, expires: datetime) -> KeyPair:
     """Make the authority of a site: it signs certificates, and no further authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"sitegrid {site} authority")
-    builder = _builder(name, name, key, begins, expires)
-    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-    builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
+    builder = _builder(name, name, key, begins, expires, is_authority=True)
     return _pair(builder.sign(key, hashes.SHA256()), key)
 
 
@@ -53,9 +59,8 @@ def issue(
     issuer = _certificate(authority)
     signer = serialization.load_pem_private_key(authority.key, None)
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
-    builder = _builder(_name(common_name), issuer.subject, key, begins, min(expires, issuer.not_valid_after_utc))
-    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-    builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
+    expires = min(expires, issuer.not_valid_after_utc)
+    builder = _builder(_name(common_name), issuer.subject, key, begins, expires, is_authority=False)
     purpose = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
     builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
     origin = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
@@ -75,30 +80,26 @@ def _certificate(pair: KeyPair) -> x509.Certificate:
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, begins: datetime, expires: datetime
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    begins: datetime,
+    expires: datetime,
+    *,
+    is_authority: bool,
 ) -> x509.CertificateBuilder:
     builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
     builder = builder.serial_number(x509.random_serial_number())
     builder = builder.not_valid_before(begins - EARLY).not_valid_after(expires)
-    return builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    builder = builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    path_length = 0 if is_authority else None
+    builder = builder.add_extension(x509.BasicConstraints(ca=is_authority, path_length=path_length), critical=True)
+    uses = dict.fromkeys(UNUSED, False) | dict.fromkeys(("key_cert_sign", "crl_sign"), is_authority)
+    return builder.add_extension(x509.KeyUsage(digital_signature=not is_authority, **uses), critical=True)
 
 
 def _name(common_name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
-
-
-def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=not signs_certificates,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
 
 
 def _host(host: str) -> x509.GeneralName:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 from ipaddress import ip_address
 from pathlib import Path
 
 from protocol.errors import ConfigError
-from protocol.wire.credentials import check_valid, load_credentials
+from protocol.wire.credentials import SIGNING_FILE, check_valid, load_credentials
 from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT, SessionConfig
 
 
@@ -30,6 +31,16 @@ def join(
         return SessionConfig(with_keys(endpoint), wait_s=wait_s, credentials=credentials)
     except ValueError as error:
         raise ConfigError("network", str(error)) from None
+
+
+def signer(keys: Path | None) -> Callable[[str, bytes], bytes] | None:
+    """What signs a machine's batches, from key expression and payload, if its folder of keys has a signing key."""
+    file = keys / SIGNING_FILE if keys else None
+    if not file or not file.is_file():
+        return None
+    from sitegrid.security.signing import Signer  # imported here: only machines with keys need `cryptography`
+
+    return Signer(file.read_bytes()).sign
 
 
 def with_keys(endpoint: str) -> str:

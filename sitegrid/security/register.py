@@ -111,10 +111,8 @@ def write_private(path: Path, data: bytes) -> None:
 
 def register_toml(register: Register) -> str:
     """The register as TOML."""
-    lines = [
-        "# Who is let in. Written by `sitegrid keys`.",
-        *toml_lines({"site": register.site, "hosts": list(register.hosts)}),
-    ]
+    lines = ["# Who is let in. Written by `sitegrid keys`."]
+    lines += toml_lines({"site": register.site, "hosts": list(register.hosts)})
     for name, entry in sorted(register.names.items()):
         lines += ["", f"[names.{name}]", *toml_lines({"role": entry.role, "serial": entry.serial})]
         lines += [f"expires = {entry.expires.astimezone(UTC):%Y-%m-%dT%H:%M:%SZ}"]

@@ -54,6 +54,12 @@ class SiteRun:
         for config in self.configs:
             self.start_agent(config)
 
+    def start(self) -> tuple[Child, Child, Child]:
+        """Everything; returns the router, the server and the simulator."""
+        router, server = self.start_router(), self.start_server()
+        self.start_agents()
+        return router, server, self.start_sim()
+
     def start_sim(self) -> Child:
         names = ("seconds", "speed", "machines", "seed", "world")
         words = [w for name in names for w in (f"--{name}", getattr(self.sim, name))]
@@ -70,9 +76,20 @@ class SiteRun:
     def end_of_agents(self) -> dict[str, dict]:
         return {name: agent.expect("ended", 90.0)["ended"] for name, agent in self.agents.items()}
 
+    def delivered(self) -> dict[str, dict]:
+        """The agents' reports at their end; all has been delivered."""
+        reports = self.end_of_agents()
+        assert all(report["delivered"] for report in reports.values())
+        return reports
+
     def audit(self) -> AuditResult:
         audits = {path.stem: self.folder / f"{path.stem}.audit" for path in self.configs}
         return audit_store(audits, self.folder / "store", load_site(self.site_file), ServerConfig())
+
+    def audit_without_loss(self) -> AuditResult:
+        result = self.audit()
+        assert (result.lost, result.double, result.unrecorded) == (0, 0, 0)
+        return result
 
 
 def kill(child: Child) -> None:

@@ -192,14 +192,8 @@ def test_a_loss_fails_the_suite_and_an_error_in_one_fault_lets_the_others_run(tm
     assert command.main(["--json", "--seconds", "1"]) == 1
     lines = capsys.readouterr().out.splitlines()
     result = json.loads(lines[-1])
-    assert {key: result[key] for key in ("kills", "recorded", "merged", "lost", "double", "ok")} == {
-        "kills": 7,
-        "recorded": 9,
-        "merged": 8,
-        "lost": 1,
-        "double": 0,
-        "ok": False,
-    }
+    expected = {"kills": 7, "recorded": 9, "merged": 8, "lost": 1, "double": 0, "ok": False}
+    assert {key: result[key] for key in expected} == expected
     assert "RuntimeError: broke" in result["faults"][1]["problems"][0]
     assert any("skipped: not permitted" in line for line in lines)
 

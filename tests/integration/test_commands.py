@@ -31,10 +31,7 @@ def last_json(text: str) -> dict:
 @pytest.fixture
 def mapped(site_run: SiteRun) -> SiteRun:
     """A site with a map, its server still running."""
-    site_run.start_router()
-    site_run.start_server()
-    site_run.start_agents()
-    site_run.start_sim()
+    site_run.start()
     site_run.end_of_agents()
     return site_run
 

@@ -56,13 +56,8 @@ def end(child: Child) -> None:
     assert took_s < END_S, f"{child.name} took {took_s:.1f} s to end"
 
 
-@contextlib.contextmanager
-def session_of(endpoint: str) -> Iterator[zenoh.Session]:
-    session = open_session(SessionConfig(endpoint))
-    try:
-        yield session
-    finally:
-        session.close()
+def session_of(endpoint: str) -> closing[zenoh.Session]:
+    return closing(open_session(SessionConfig(endpoint)))
 
 
 def drive(n: int, seed: int, first_s: int = 0) -> np.ndarray:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -69,10 +70,16 @@ class Guarded:
     def settings(self, name: str) -> SessionConfig:
         return SessionConfig(self.endpoint, credentials=load_credentials(self.keys / name))
 
-    @contextlib.contextmanager
-    def session(self, name: str) -> Iterator[zenoh.Session]:
-        with closing(open_session(self.settings(name))) as session:
-            yield session
+    def session(self, name: str) -> closing[zenoh.Session]:
+        return closing(open_session(self.settings(name)))
+
+    def drive(self, spool: Path, seconds: float) -> tuple[Child, Child]:
+        """The agent of a machine, and the simulator that moves it."""
+        files = ("--spool", spool, "--site-file", self.site_file, "--config", self.configs[0])
+        agent = self.children.start("agent", "agent", *self.network("loader-1"), *files, "--json")
+        agent.expect("ready", READY_S)
+        words = ("--machines", 1, "--seed", 1, "--world", "fast", "--seconds", seconds, "--speed", 10, "--json")
+        return agent, self.children.start("sim", "sim", *self.network("sim"), *words)
 
     def still_works(self) -> str:
         """Raises unless a visitor still reads the map; returns whom a failed assertion is about."""
@@ -85,14 +92,6 @@ class Guarded:
         rows = np.ones(1, SAMPLE_DTYPE)
         rows["cov_xy_m2"] = 0.0
         return encode_batch(SampleBatch(machine, time.time_ns(), 1, rows, load_site(self.site_file).frame))
-
-
-@contextlib.contextmanager
-def closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
-    try:
-        yield session
-    finally:
-        session.close()
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +108,11 @@ def answers(session: zenoh.Session, key: str, payload: bytes = b"", **options: A
 
 def acknowledged(session: zenoh.Session, key: str, batch: bytes) -> list[bool]:
     return [isinstance(decode_reply(data), Ack) for data in answers(session, key, batch)]
+
+
+def is_taken(site: Guarded, session: zenoh.Session, machine: str) -> bool:
+    """Whether a batch of a machine is acknowledged, once."""
+    return acknowledged(session, keys.ingest(SITE, machine), site.batch(machine)) == [True]
 
 
 @contextlib.contextmanager
@@ -138,17 +142,12 @@ def test_a_machine_gets_its_acknowledgements_from_the_map_server(guarded: Guarde
     with guarded.session("loader-1") as session, connect(guarded.endpoint, keys=guarded.keys / "loader-1") as client:
         before = client.info().journalled
         for _ in range(200):  # faster than any rate limit: these never fall under one
-            assert acknowledged(session, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
+            assert is_taken(guarded, session, "loader-1")
         assert client.info(after=before + 200).journalled == before + 200
 
 
 def test_agent_and_simulator_work_with_keys_as_without(guarded: Guarded, tmp_path: Path):
-    config = guarded.configs[0]
-    files = ("--spool", tmp_path / "spool.db", "--site-file", guarded.site_file, "--config", config)
-    agent = guarded.children.start("agent", "agent", *guarded.network("loader-1"), *files, "--json")
-    agent.expect("ready", READY_S)
-    words = ("--machines", 1, "--seed", 1, "--world", "fast", "--seconds", 15, "--speed", 10, "--json")
-    sim = guarded.children.start("sim", "sim", *guarded.network("sim"), *words)
+    agent, sim = guarded.drive(tmp_path / "spool.db", 15)
     with guarded.session("guest") as session, listening(session, keys.poses_all(SITE)) as poses:
         report = agent.expect("ended", READY_S)["ended"]
         wait_until(lambda: len(poses) > 5, 5.0, "a visitor sees poses")
@@ -169,11 +168,7 @@ def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_
             assert decode_reply(reply).reason == "wrong_machine", site.still_works()
         (reply,) = answers(session, key, batch, attachment=mine)
         assert isinstance(decode_reply(reply), Ack)
-    files = ("--spool", tmp_path / "spool.db", "--site-file", site.site_file, "--config", site.configs[0])
-    agent = site.children.start("agent", "agent", *site.network("loader-1"), *files, "--json")
-    agent.expect("ready", READY_S)
-    words = ("--machines", 1, "--seed", 1, "--world", "fast", "--seconds", 10, "--speed", 10, "--json")
-    site.children.start("sim", "sim", *site.network("sim"), *words)
+    agent, _ = site.drive(tmp_path / "spool.db", 10)
     report = agent.expect("ended", READY_S)["ended"]
     assert report["delivered"], f"agent pid {agent.pid}, server pid {site.server.pid}"
     assert report["samples"] > 10
@@ -198,7 +193,7 @@ def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
 
 def test_only_an_admin_commands(guarded: Guarded):
     with guarded.session("loader-1") as loader:
-        assert acknowledged(loader, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
+        assert is_taken(guarded, loader, "loader-1")
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "boss") as client:
         assert client.trust("loader-1", "seen to").trusted
 
@@ -206,14 +201,16 @@ def test_only_an_admin_commands(guarded: Guarded):
 # --- who has no name that counts -------------------------------------------------------------------------------------
 
 
-def with_certificate(guarded: Guarded, folder: Path, authority: Any, days: float) -> Credentials:
-    """The name of a machine that is let in, with a certificate of another making."""
+def with_certificate(
+    guarded: Guarded, folder: Path, authority: Any, days: float, name: str = "loader-1"
+) -> Credentials:
+    """The keys of a machine that is let in, with a certificate of another making."""
     now = datetime.now(UTC)
-    pair = certificates.issue(authority, "loader-1", now - 2 * DAY, now + days * DAY)
+    pair = certificates.issue(authority, name, now - 2 * DAY, now + days * DAY)
     shutil.copytree(guarded.keys / "loader-1", folder)
     (folder / "cert.pem").write_bytes(pair.certificate)
     (folder / "key.pem").write_bytes(pair.key)
-    return Credentials(folder, Identity(SITE, "loader-1", "machine", now + DAY))
+    return Credentials(folder, Identity(SITE, name, "machine", now + DAY))
 
 
 def own_authority(guarded: Guarded) -> Any:
@@ -267,13 +264,9 @@ def test_without_a_certificate_nobody_gets_in(guarded: Guarded):
 
 
 def test_a_name_that_is_not_in_the_register_may_nothing(guarded: Guarded, tmp_path: Path):
-    shutil.copytree(guarded.keys / "guest", tmp_path / "unknown")
-    pair = certificates.issue(own_authority(guarded), "unknown", datetime.now(UTC), datetime.now(UTC) + DAY)
-    (tmp_path / "unknown" / "cert.pem").write_bytes(pair.certificate)
-    (tmp_path / "unknown" / "key.pem").write_bytes(pair.key)
-    with closing(
-        open_session(SessionConfig(guarded.endpoint, credentials=load_credentials(tmp_path / "unknown")))
-    ) as session:
+    credentials = with_certificate(guarded, tmp_path / "unknown", own_authority(guarded), days=1, name="unknown")
+    unknown = SessionConfig(guarded.endpoint, credentials=credentials)
+    with closing(open_session(unknown)) as session:
         assert answers(session, keys.map_query(SITE, "info")) == [], guarded.still_works()
 
 
@@ -397,7 +390,7 @@ def test_a_fake_map_server_is_never_asked(guarded: Guarded, mode: str):
             replies = answers(loader, keys.map_query(SITE, "info"), target=target)
             assert len(replies) == 1
             assert b"a lie" not in replies
-        assert acknowledged(loader, keys.ingest(SITE, "loader-1"), guarded.batch("loader-1")) == [True]
+        assert is_taken(guarded, loader, "loader-1")
         assert asked == [], guarded.still_works()
         for queryable in lies:
             queryable.undeclare()
@@ -442,24 +435,16 @@ def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, chil
     stolen = tmp_path / "stolen"
     shutil.copytree(site.keys / "loader-1", stolen)
     with site.session("loader-1") as loader, site.session("loader-2") as other:
-        assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == [True]
+        assert is_taken(site, loader, "loader-1")
         site.make_keys("revoke", "loader-1")
         assert site.router.expect("reloaded", 10.0)["names"] == len(ROLES), f"router pid {site.router.pid}"
-        wait_until(
-            lambda: acknowledged(other, keys.ingest(SITE, "loader-2"), site.batch("loader-2")) == [True],
-            20.0,
-            "others go on",
-        )
+        wait_until(lambda: is_taken(site, other, "loader-2"), 20.0, "others go on")
         wait_until(lambda: bool(loader.info.routers_zid()), 10.0, "the link is there again")
         assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == []
     site.make_keys("add", "loader-1")
     site.router.expect("reloaded", 10.0)
     with site.session("loader-1") as repaired:
-        wait_until(
-            lambda: acknowledged(repaired, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == [True],
-            20.0,
-            "back under the same name",
-        )
+        wait_until(lambda: is_taken(site, repaired, "loader-1"), 20.0, "back under the same name")
     old = SessionConfig(site.endpoint, credentials=load_credentials(stolen))
     with closing(open_session(old)) as session:
         assert answers(session, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == []
@@ -488,9 +473,8 @@ def answers_again(guarded: Guarded) -> bool:
 def test_without_keys_the_router_stays_on_this_host(children: Children):
     port = free_endpoint().rpartition(":")[2]
     words = ["router", "--listen", f"tcp/0.0.0.0:{port}"]
-    done = subprocess.run(
-        [sys.executable, "-m", "sitegrid.cli", *words], capture_output=True, text=True, timeout=30, check=False
-    )
+    command = [sys.executable, "-m", "sitegrid.cli", *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
     assert "--keys" in done.stderr

@@ -17,9 +17,7 @@ pytestmark = pytest.mark.processes
 
 
 def test_several_machines_merge_into_one_grid(site_run: SiteRun):
-    router, server = site_run.start_router(), site_run.start_server()
-    site_run.start_agents()
-    sim = site_run.start_sim()
+    router, server, sim = site_run.start()
     pids = [child.pid for child in (router, server, sim, *site_run.agents.values())]
     assert len({*pids, os.getpid()}) == 7
     with site_run.connect() as client:
@@ -27,8 +25,7 @@ def test_several_machines_merge_into_one_grid(site_run: SiteRun):
         during = client.info()
         assert sim.code is None, "the query is answered while machines drive"
         assert client.point(0.0, 0.0, after=during.journalled).merged >= during.journalled
-        reports = site_run.end_of_agents()
-        assert all(report["delivered"] for report in reports.values())
+        reports = site_run.delivered()
         info = client.info()
         region = client.region((0, 0, 200, 150), ["resistance", "visits"])
     assert set(info.machines) == set(site_run.agents)
@@ -38,63 +35,47 @@ def test_several_machines_merge_into_one_grid(site_run: SiteRun):
     assert np.nanmax(region["visits"]) >= 1
     assert np.isnan(region["visits"][~known]).any()
     server.stop()
-    result = site_run.audit()
-    assert (result.lost, result.double, result.unrecorded) == (0, 0, 0)
+    result = site_run.audit_without_loss()
     assert result.recorded == result.merged > 300
 
 
 def test_a_server_killed_in_mid_run_loses_nothing(site_run: SiteRun):
-    site_run.start_router()
-    server = site_run.start_server()
-    site_run.start_agents()
-    sim = site_run.start_sim()
+    _, server, sim = site_run.start()
     with site_run.connect() as client:
         site_run.wait_merged(client, 60)
         kill(server)
         assert sim.code is None
         again = site_run.start_server()
         assert again.pid != server.pid
-        reports = site_run.end_of_agents()
+        reports = site_run.delivered()
         site_run.wait_merged(client, 1)
-    assert all(report["delivered"] for report in reports.values())
     assert again.stop() == 0
-    result = site_run.audit()
-    assert (result.lost, result.double, result.unrecorded) == (0, 0, 0)
+    result = site_run.audit_without_loss()
     assert result.recorded == sum(report["samples"] for report in reports.values())
 
 
 def test_an_agent_killed_in_mid_run_loses_nothing_that_it_recorded(site_run: SiteRun):
-    site_run.start_router()
-    server = site_run.start_server()
-    site_run.start_agents()
-    sim = site_run.start_sim()
+    _, server, sim = site_run.start()
     config = site_run.configs[0]
     with site_run.connect() as client:
         site_run.wait_merged(client, 60)
         kill(site_run.agents[config.stem])
         assert sim.code is None
         site_run.start_agent(config)
-        reports = site_run.end_of_agents()
-    assert all(report["delivered"] for report in reports.values())
+        site_run.delivered()
     server.stop()
-    result = site_run.audit()
-    assert (result.lost, result.double, result.unrecorded) == (0, 0, 0)
+    site_run.audit_without_loss()
 
 
 def test_a_router_killed_in_mid_run_loses_nothing(site_run: SiteRun):
-    router = site_run.start_router()
-    server = site_run.start_server()
-    site_run.start_agents()
-    site_run.start_sim()
+    router, server, _ = site_run.start()
     with site_run.connect() as client:
         site_run.wait_merged(client, 60)
     kill(router)
     site_run.start_router()
-    reports = site_run.end_of_agents()
-    assert all(report["delivered"] for report in reports.values())
+    site_run.delivered()
     server.stop()
-    result = site_run.audit()
-    assert (result.lost, result.double, result.unrecorded) == (0, 0, 0)
+    site_run.audit_without_loss()
 
 
 def test_two_sites_do_not_mix(tmp_path, children: Children):

@@ -9,23 +9,10 @@ from protocol.site.site_config import SiteConfig
 
 
 def map_info(site: SiteConfig, **values: Any) -> MapInfo:
-    defaults: dict[str, Any] = {
-        "site": SiteInfo(**vars(site), frame=site.frame, crs=site.crs),
-        "journalled": 0,
-        "merged": 0,
-        "snapshot": 0,
-        "samples_merged": 0,
-        "samples_too_unsure": 0,
-        "cells": 0,
-        "bounds": None,
-        "stamp_ns": 0,
-        "wall_ns": 0,
-        "version": "1.0",
-        "machines": {},
-        "distrusted": (),
-        "counters": {},
-        "layers": (),
-    }
+    zeros = ("journalled", "merged", "snapshot", "samples_merged", "samples_too_unsure", "cells", "stamp_ns", "wall_ns")
+    defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
+    defaults |= {"site": SiteInfo(**vars(site), frame=site.frame, crs=site.crs), "version": "1.0", "bounds": None}
+    defaults |= {"machines": {}, "distrusted": (), "counters": {}, "layers": ()}
     return MapInfo(**(defaults | values))
 
 

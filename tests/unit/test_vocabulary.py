@@ -37,23 +37,15 @@ REPLACED = {
     "referred": "anchored",
     "dead": "dead_reckoning",
 }
-WHOLE = {
-    "found": "a noun that says what it is",
-    "of": "a noun that says what it is",
-    "gives": "measures",
-    "says": "measures",
-}
+WHOLE = dict.fromkeys(("found", "of"), "a noun that says what it is") | dict.fromkeys(("gives", "says"), "measures")
 PAIRS = {("left", "out"): "excluded", ("put", "aside"): "quarantine"}
 # Of the field, or of the language.
 COMPOUNDS = {
-    ("dead", "reckoning"),
-    ("dead", "reckoned"),
-    ("data", "sheet"),
-    ("data", "sheets"),
-    ("give", "way"),
-    ("half", "way"),
-    ("other", "way"),
-    ("both", "ways"),
+    tuple(compound.split())
+    for compound in (
+        *("dead reckoning", "dead reckoned", "data sheet", "data sheets"),
+        *("give way", "half way", "other way", "both ways"),
+    )
 }
 
 

@@ -20,7 +20,7 @@ COMMANDS = (
 )
 
 
-def test_help_names_every_command(capsys: pytest.CaptureFixture[str]):
+def test_help_names_every_command(capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["--help"])
     assert end.value.code == 0
@@ -29,7 +29,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_each_command_has_help_and_a_module(command: str, capsys: pytest.CaptureFixture[str]):
+def test_each_command_has_help_and_a_module(command: str, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main([command, "--help"])
     assert end.value.code == 0
@@ -45,7 +45,7 @@ def test_help_imports_only_the_base_install():
     assert {"sitegrid", "zenoh"} <= packages
 
 
-def test_errors_are_one_line_or_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_errors_are_one_line_or_json(monkeypatch, capsys):
     def fail(_: object) -> int:
         raise ConfigError("site.toml", "broken")
 
@@ -56,7 +56,7 @@ def test_errors_are_one_line_or_json(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert json.loads(capsys.readouterr().err) == {"error": "site.toml: broken"}
 
 
-def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_a_missing_extra_is_named(monkeypatch, capsys):
     def fail(_: object) -> int:
         raise ModuleNotFoundError("No module named 'numba'", name="numba")
 
@@ -65,7 +65,7 @@ def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert "pip install 'sitegrid[server]'" in capsys.readouterr().err
 
 
-def test_a_bug_is_not_hidden(monkeypatch: pytest.MonkeyPatch):
+def test_a_bug_is_not_hidden(monkeypatch):
     def fail(_: object) -> int:
         raise ModuleNotFoundError("No module named 'ours'", name="ours")
 
@@ -74,7 +74,7 @@ def test_a_bug_is_not_hidden(monkeypatch: pytest.MonkeyPatch):
         cli.main(["router"])
 
 
-def test_verbose_raises_the_log_level(monkeypatch: pytest.MonkeyPatch):
+def test_verbose_raises_the_log_level(monkeypatch):
     levels = []
     monkeypatch.setattr(logging, "basicConfig", lambda **options: levels.append(options["level"]))
     monkeypatch.setattr("sitegrid.commands.router.run", lambda _: 0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from argparse import ArgumentTypeError
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +28,6 @@ from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import refold as fold
 from sitegrid.cli import main
-from sitegrid.options.times import parse_stamp
 from tests.unit.mapserver.data import same_evidence
 
 pytest.importorskip("pyarrow.parquet")
@@ -163,9 +161,7 @@ def test_options_are_taken_and_written_beside_the_store(store: Path, tmp_path: P
     assert (tmp_path / "newer" / "server.toml").read_text() == text
 
 
-def test_machines_are_excluded_and_their_progress_is_kept(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_machines_are_excluded_and_their_progress_is_kept(store: Path, tmp_path: Path, capsys):
     assert run(store, "--out", tmp_path / "new", "--without", "a", "--without", "c", "--json") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["excluded"] == {"machine": 240, "time": 0, "twice": 0}
@@ -178,7 +174,7 @@ def test_machines_are_excluded_and_their_progress_is_kept(
     again.close()
 
 
-def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsys):
     span = ("--from", "2026-01-01T00:01:40", "--until", "2026-01-01T01:05+01:00")  # samples 10 to 29
     assert run(store, "--out", tmp_path / "new", *span, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
@@ -220,7 +216,7 @@ def test_files_folders_and_stores_are_folded(store: Path, tmp_path: Path):
     again.close()
 
 
-def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, capsys):
     """Also where batches were cut differently, and where a file is named twice."""
     other = make_store(tmp_path / "other", "ab", batch=30, archived=1)
     file = min((store / FOLDER).glob("*.parquet"))
@@ -246,7 +242,7 @@ def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tm
     assert received == sorted(received)
 
 
-def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Path, capsys):
     other = make_store(tmp_path / "other", "b", batch=30, changed=76)
     assert run(store, other, "--out", tmp_path / "new") == 1
     error = capsys.readouterr().err
@@ -266,14 +262,14 @@ def test_known_ground_is_kept(tmp_path: Path):
 # --- refusals --------------------------------------------------------------------------------------------------------
 
 
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+def refused(capsys, *words: object) -> str:
     assert run(*words) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     return error
 
 
-def test_a_place_that_is_taken_is_refused(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_place_that_is_taken_is_refused(store: Path, tmp_path: Path, capsys):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "something").touch()
     for out in (tmp_path / "full", tmp_path / "full" / "something"):
@@ -285,7 +281,7 @@ def test_a_place_that_is_taken_is_refused(store: Path, tmp_path: Path, capsys: p
     assert (tmp_path / "new.part").exists()
 
 
-def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys):
     moved = make_store(tmp_path / "moved", "a", site=replace(SITE, origin_lat_deg=48.1), archived=1)
     named = make_store(tmp_path / "named", "a", site=replace(SITE, name="quarry"))
     out = ("--out", tmp_path / "new")
@@ -297,7 +293,7 @@ def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys: pytest.Cap
     assert not (tmp_path / "new").exists()
 
 
-def test_a_journal_alone_needs_a_site_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_journal_alone_needs_a_site_file(tmp_path: Path, capsys):
     folder = make_store(tmp_path / "store", "a")
     site_file = (folder / "site.toml").rename(tmp_path / "pit.toml")
     assert "give --site-file" in refused(capsys, folder, "--out", tmp_path / "new")
@@ -319,13 +315,13 @@ def test_a_journal_alone_needs_a_site_file(tmp_path: Path, capsys: pytest.Captur
     ],
 )
 def test_what_makes_no_sense_is_refused_and_leaves_nothing(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], problem: str
+    store: Path, tmp_path: Path, capsys, words: tuple[str, ...], problem: str
 ):
     assert problem in refused(capsys, store, "--out", tmp_path / "new", *words)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_archive_is_refused(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_what_is_no_archive_is_refused(store: Path, tmp_path: Path, capsys):
     out = ("--out", tmp_path / "new")
     (tmp_path / "nothing").mkdir()
     assert "no such file or folder" in refused(capsys, store, tmp_path / "nowhere", *out)
@@ -339,22 +335,10 @@ def test_what_is_no_archive_is_refused(store: Path, tmp_path: Path, capsys: pyte
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("text", ["", "yesterday", "12:00", "2026-13-01", "-2h", "1969-12-31"])
-def test_a_time_that_is_none_is_refused(text: str):
-    with pytest.raises(ArgumentTypeError, match=r"no time: ISO 8601|not between the years"):
-        parse_stamp(text)
-
-
-def test_times_are_utc_where_no_zone_is_given():
-    texts = ("2026-01-01", "2026-01-01T00:00Z", "2026-01-01T02:00+02:00", str(T0))
-    assert {parse_stamp(text) for text in texts} == {T0}
-    assert parse_stamp("2026-01-01T00:00:01.5") == T0 + 3 * S // 2
-
-
 # --- what is shown ---------------------------------------------------------------------------------------------------
 
 
-def test_people_read_what_became_of_the_samples(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_people_read_what_became_of_the_samples(store: Path, tmp_path: Path, capsys):
     assert run(store, "--out", tmp_path / "new", "--without", "b") == 0
     printed = capsys.readouterr()
     assert "240 samples in 12 journal rows" in printed.out
@@ -368,7 +352,7 @@ def test_people_read_what_became_of_the_samples(store: Path, tmp_path: Path, cap
     ("terminal", "as_json", "shown"), [(True, False, True), (False, False, False), (True, True, False)]
 )
 def test_progress_is_shown_on_a_terminal(
-    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, terminal: bool, as_json: bool, shown: bool
+    store: Path, tmp_path: Path, monkeypatch, *, terminal: bool, as_json: bool, shown: bool
 ):
     seen = []
     monkeypatch.setattr(fold, "COMMIT_ROWS", 6)

@@ -32,7 +32,7 @@ def parse(*words: str) -> argparse.Namespace:
     return cli.build_parser().parse_args(["eval", *words])
 
 
-def test_options_of_an_experiment_reach_it(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_options_of_an_experiment_reach_it(monkeypatch, capsys):
     from evaluation.positions import table
 
     asked = []
@@ -79,7 +79,7 @@ def test_bad_options_are_usage_errors(words: tuple[str, ...]):
     assert end.value.code == 2
 
 
-def test_a_log_that_the_pipeline_cannot_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_log_that_the_pipeline_cannot_run_is_one_line(tmp_path: Path, capsys):
     (tmp_path / "log.toml").write_text(MANIFEST)
     (tmp_path / "wheels.csv").write_text("t,l,r\n1,0,0\n")
     assert cli.main(["eval", "log", str(tmp_path), "--gps", "1"]) == 1
@@ -94,7 +94,7 @@ def test_tables_for_people_line_up_without_lists():
     assert text.splitlines() == ["   a  bb", "   1   -", "22.5   x"]
 
 
-def test_physics_still_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_physics_still_runs(monkeypatch, capsys):
     from evaluation import physics
 
     monkeypatch.setattr(physics, "run", lambda seeds, on_progress: {"rows": [{"seeds": len(seeds)}], "tours": []})

@@ -27,6 +27,7 @@ x509 = pytest.importorskip("cryptography.x509", reason="cryptography is not inst
 
 NOW = datetime(2026, 1, 31, tzinfo=UTC)
 SITE = "paper"
+AGENT_FILES = ("--site-file", "config/site.toml", "--config", "config/agent.toml")
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def certificate(folder: Path, name: str) -> x509.Certificate:
     return x509.load_pem_x509_certificate((folder / name / "cert.pem").read_bytes())
 
 
-def refused(capsys: pytest.CaptureFixture[str], folder: Path, action: str, *words: str) -> str:
+def refused(capsys, folder: Path, action: str, *words: str) -> str:
     """The one line of an error."""
     capsys.readouterr()
     assert act(folder, action, *words) == 1
@@ -73,9 +74,8 @@ def test_certificates_say_who_and_what_for(folder: Path):
         issued = certificate(folder, name)
         assert issued.subject.rfc4514_string() == f"CN={name}"
         assert issued.public_key().curve.name == "secp256r1"
-        assert [use._name for use in issued.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value] == [
-            purpose
-        ]
+        uses = issued.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+        assert [use._name for use in uses] == [purpose]
         assert not issued.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
         issued.verify_directly_issued_by(certificate(folder, "authority"))
     hosts = certificate(folder, "router").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -121,7 +121,7 @@ def test_serial_numbers_are_random(folder: Path):
 # --- commands --------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_is_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_nothing_is_overwritten(folder: Path, capsys):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert "is not empty" in refused(capsys, folder, "init")
     assert "--renew makes it a new one" in refused(capsys, folder, "add", "server")
@@ -130,24 +130,22 @@ def test_nothing_is_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("name", ["Loader", "a.2", "a/b", "*", "", "a b", "ä"])
-def test_odd_names_are_refused(folder: Path, name: str, capsys: pytest.CaptureFixture[str]):
+def test_odd_names_are_refused(folder: Path, name: str, capsys):
     assert "is not a name" in refused(capsys, folder, "add", name)
 
 
-def test_the_authority_is_no_machine(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_authority_is_no_machine(folder: Path, capsys):
     assert "choose another name" in refused(capsys, folder, "add", "authority")
 
 
 @pytest.mark.parametrize("host", ["bad host", "a..b", "-x", "höst", "x" * 64, ""])
-def test_an_odd_host_is_refused_before_anything_is_written(
-    tmp_path: Path, host: str, capsys: pytest.CaptureFixture[str]
-):
+def test_an_odd_host_is_refused_before_anything_is_written(tmp_path: Path, host: str, capsys):
     assert main(["keys", "init", "--dir", str(tmp_path / "keys"), f"--host={host}"]) == 1
     assert "neither the name of a host" in capsys.readouterr().err
     assert not (tmp_path / "keys").exists()
 
 
-def test_renewed_keys_keep_name_and_role(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_renewed_keys_keep_name_and_role(folder: Path, capsys):
     assert act(folder, "add", "guest", "--role", "visitor") == 0
     before = load_register(folder).names["guest"]
     assert act(folder, "add", "guest", "--renew", "--days", "9") == 0
@@ -163,7 +161,7 @@ def test_renewed_keys_keep_name_and_role(folder: Path, capsys: pytest.CaptureFix
     assert "router.site" in hosts.get_values_for_type(x509.DNSName)
 
 
-def test_a_revoked_name_comes_back_as_another(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_revoked_name_comes_back_as_another(folder: Path, capsys):
     assert act(folder, "add", "loader-1") == 0
     for issue in (2, 3):
         assert act(folder, "revoke", "loader-1") == 0
@@ -175,14 +173,14 @@ def test_a_revoked_name_comes_back_as_another(folder: Path, capsys: pytest.Captu
     assert load_register(folder).names["loader-1"].role == "visitor"
 
 
-def test_revoke_says_what_cannot_be(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_revoke_says_what_cannot_be(folder: Path, capsys):
     assert "not in the register" in refused(capsys, folder, "revoke", "nobody")
     assert "make a new folder" in refused(capsys, folder, "revoke", "router")
     assert act(folder, "revoke", "server") == 0
     assert "takes that up by itself" in capsys.readouterr().out
 
 
-def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys):
     assert act(folder, "add", "loader-1") == 0
     assert act(folder, "revoke", "loader-1") == 0
     register = load_register(folder)
@@ -194,18 +192,14 @@ def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys: pytest.Ca
     assert listed["site"] == SITE
     rows = {row["name"]: row for row in listed["names"]}
     states = {name: (row["role"], row["state"], row["revoked"]) for name, row in rows.items()}
-    assert states == {
-        "loader-1": ("machine", "revoked", True),
-        "old": ("visitor", "expired", False),
-        "router": ("router", "valid", False),
-        "server": ("server", "valid", False),
-    }
+    of_site = {name: (name, "valid", False) for name in ("router", "server")}
+    assert states == {"loader-1": ("machine", "revoked", True), "old": ("visitor", "expired", False), **of_site}
     assert rows["old"]["expires"] == "2026-01-30T00:00:00+00:00"
     assert act(folder, "list") == 0
     assert "old                      visitor  2026-01-30  expired" in capsys.readouterr().out
 
 
-def test_a_folder_without_register_or_authority_says_what_to_do(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_folder_without_register_or_authority_says_what_to_do(folder: Path, capsys):
     (folder / "authority" / "key.pem").unlink()
     assert "lies where `sitegrid keys init` ran" in refused(capsys, folder, "add", "loader-1")
     assert "loader-1" not in load_register(folder).names
@@ -224,9 +218,7 @@ def test_wrong_usage_exits_with_2():
         assert build_parser().parse_args(["keys", "add", "x", "--role", role]).role == role
 
 
-def test_without_cryptography_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_without_cryptography_it_says_what_to_install(tmp_path: Path, monkeypatch, capsys):
     for name in ("certificates", "key_folder"):
         monkeypatch.delitem(sys.modules, f"sitegrid.security.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
@@ -373,9 +365,8 @@ def test_rules_follow_the_certificate_and_end_with_it():
     assert subjects["loader-1"] == ["loader-1.2"]
     assert "loader-2" not in subjects
     assert not may("loader-2", "query", keys.map_query(SITE, "info"), register=register)
-    assert "router" not in {
-        s["id"] for s in access_control(REGISTER.with_entry("router", RegisterEntry("router", "3", NOW)))["subjects"]
-    }
+    with_router = REGISTER.with_entry("router", RegisterEntry("router", "3", NOW))
+    assert "router" not in {s["id"] for s in access_control(with_router)["subjects"]}
 
 
 def test_limits_never_touch_what_is_acknowledged():
@@ -439,27 +430,14 @@ def test_an_expired_certificate_is_named_before_the_router_refuses_it(folder: Pa
     [
         (("server", "--site-file", "config/site.toml", "--store", "x"), "for role 'machine', 'server' is needed"),
         (("sim", "--site", SITE), "for role 'machine', 'sim' is needed"),
-        (
-            (
-                "agent",
-                "--site-file",
-                "config/site.toml",
-                "--config",
-                "config/agent.toml",
-                "--name",
-                "b",
-                "--spool",
-                "x",
-            ),
-            "for name 'a', 'b' is needed",
-        ),
+        (("agent", *AGENT_FILES, "--name", "b", "--spool", "x"), "for name 'a', 'b' is needed"),
         (("query", "--site", "north", "info"), "for site 'paper', 'north' is needed"),
         (("plot", "--site", "north"), "for site 'paper', 'north' is needed"),
         (("trust", "a", "--site", "north"), "for site 'paper', 'north' is needed"),
     ],
 )
 def test_every_command_looks_at_its_keys(
-    folder: Path, root: Path, words: tuple[str, ...], problem: str, monkeypatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, root: Path, words: tuple[str, ...], problem: str, monkeypatch, capsys
 ):
     assert act(folder, "add", "a") == 0
     monkeypatch.chdir(root)
@@ -468,28 +446,17 @@ def test_every_command_looks_at_its_keys(
     assert not (root / "x").exists()
 
 
-@pytest.mark.parametrize(
-    ("endpoint", "is_so"),
-    [
-        ("tcp/127.0.0.1:7447", True),
-        ("tcp/127.9.9.9:0", True),
-        ("tcp/localhost:7447", True),
-        ("tcp/[::1]:7447", True),
-        ("tcp/0.0.0.0:7447", False),
-        ("tcp/[::]:7447", False),
-        ("tcp/10.0.0.5:7447", False),
-        ("tcp/router:7447", False),
-        ("tcp/localhost.evil.org:7447", False),
-        ("udp/127.0.0.1:7447", False),
-        ("tcp/127.0.0.1:7447#bind=0.0.0.0:7447", False),
-        ("tcp/", False),
-    ],
-)
-def test_what_counts_as_this_host(endpoint: str, is_so: bool):
-    assert is_loopback(endpoint) == is_so
+THIS_HOST = ("tcp/127.0.0.1:7447", "tcp/127.9.9.9:0", "tcp/localhost:7447", "tcp/[::1]:7447")
+OTHERS = ("tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.5:7447", "tcp/router:7447", "tcp/localhost.evil.org:7447")
+DOUBTFUL = ("udp/127.0.0.1:7447", "tcp/127.0.0.1:7447#bind=0.0.0.0:7447", "tcp/")
 
 
-def test_the_router_needs_keys_or_this_host(folder: Path, capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize("endpoint", [*THIS_HOST, *OTHERS, *DOUBTFUL])
+def test_what_counts_as_this_host(endpoint: str):
+    assert is_loopback(endpoint) == (endpoint in THIS_HOST)
+
+
+def test_the_router_needs_keys_or_this_host(folder: Path, capsys):
     assert main(["router", "--listen", "tcp/0.0.0.0:0"]) == 1
     assert "or say --insecure" in capsys.readouterr().err
     assert main(["router", "--keys", str(folder), "--listen", "tcp/0.0.0.0:0"]) == 1

@@ -76,20 +76,20 @@ class Reply:
 
 
 @pytest.fixture
-def session(monkeypatch: pytest.MonkeyPatch) -> Session:
+def session(monkeypatch) -> Session:
     session = Session()
     monkeypatch.setattr(query, "connect", lambda endpoint, site, **_: Client(session, endpoint, site))  # type: ignore[arg-type]
     return session
 
 
-def test_a_time_that_cannot_be_counted_names_its_option(session: Session, capsys: pytest.CaptureFixture[str]):
+def test_a_time_that_cannot_be_counted_names_its_option(session: Session, capsys):
     session.now_ns = 0
     assert main(["query", "point", "1", "2", "--as-of", "-2h"]) == 1
     assert "sitegrid: --as-of: the site has no samples yet" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("option", "ask"), [("--as-of", "point"), ("--minus", "point"), ("--to", "history")])
-def test_a_bad_time_is_a_usage_error_that_names_its_option(capsys: pytest.CaptureFixture[str], option: str, ask: str):
+def test_a_bad_time_is_a_usage_error_that_names_its_option(capsys, option: str, ask: str):
     with pytest.raises(SystemExit) as end:
         main(["query", ask, "1", "2", option, "yesterday"])
     assert end.value.code == 2
@@ -149,7 +149,7 @@ def test_the_python_client_passes_every_argument(session: Session):
     assert [span.first_ns for span in spans] == [T0, T0 + 300 * S]
 
 
-def test_people_see_the_time_of_an_answer(session: Session, capsys: pytest.CaptureFixture[str]):
+def test_people_see_the_time_of_an_answer(session: Session, capsys):
     def first_line(*words: str) -> str:
         assert main(["query", *words]) == 0
         return capsys.readouterr().out.splitlines()[0]
@@ -162,7 +162,7 @@ def test_people_see_the_time_of_an_answer(session: Session, capsys: pytest.Captu
     assert "as of 2025-06-15 15:06:00Z, minus that of 2025-06-15 15:05:00Z, journal row 17" in line
 
 
-def test_machines_see_stamps(session: Session, capsys: pytest.CaptureFixture[str], tmp_path: Path):
+def test_machines_see_stamps(session: Session, capsys, tmp_path: Path):
     main(["query", "point", "1", "2", "--as-of", "-1h", "--json"])
     answer = json.loads(capsys.readouterr().out)
     assert answer == {"x_m": 0.5, "y_m": 1.5, "visits": 2.0, "merged": 17, "stamp_ns": T0 - 3600 * S}
@@ -174,7 +174,7 @@ def test_machines_see_stamps(session: Session, capsys: pytest.CaptureFixture[str
     assert spans[0] == {"first_ns": T0, "last_ns": T0 + 299, "resistance": 0.25, "age_s": None}
 
 
-def test_a_history_is_a_table_for_people(session: Session, capsys: pytest.CaptureFixture[str]):
+def test_a_history_is_a_table_for_people(session: Session, capsys):
     main(["query", "history", "1", "2"])
     assert capsys.readouterr().out.splitlines() == [
         "from (UTC)            resistance  age_s",

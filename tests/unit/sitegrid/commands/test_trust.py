@@ -7,6 +7,7 @@ import threading
 from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -27,19 +28,10 @@ from tests.unit.records import machine_state
 
 WAIT_S = 20.0
 T0 = 1_750_000_000_000_000_000
+FOUND = {"trusted": False, "by": "audit", "since_ns": T0 + 60 * 10**9, "contradicts": True, "reasons": ("gain",)}
 MACHINES = [
     machine_state("a", samples=1200, lost=3, newest_ns=T0),
-    machine_state(
-        "b",
-        trusted=False,
-        by="audit",
-        since_ns=T0 + 60 * 10**9,
-        contradicts=True,
-        reasons=("gain",),
-        evidence={"gain": 1.6},
-        samples=7,
-        newest_ns=T0,
-    ),
+    machine_state("b", **FOUND, evidence={"gain": 1.6}, samples=7, newest_ns=T0),
 ]
 CHANGE = GroundChange(4, T0, T0 + 60 * 10**9, (10.0, -20.0, 40.0, 12.5), 615, 0.25, 0.008, None, None)
 
@@ -202,7 +194,7 @@ def test_a_callback_may_close_its_own_listener(server: FakeServer, client: Clien
 # --- from the command line -------------------------------------------------------------------------------------------
 
 
-def test_trust_and_distrust_reach_the_server(server: FakeServer, capsys: pytest.CaptureFixture[str]):
+def test_trust_and_distrust_reach_the_server(server: FakeServer, capsys):
     assert sitegrid(server, "distrust", "b", "--reason", "hit a wall; 3 m off", "--wait", "5") == 0
     assert capsys.readouterr().out == "b is left out of the map, as of journal row 17\n"
     assert sitegrid(server, "trust", "b") == 0
@@ -225,7 +217,7 @@ def test_commands_need_their_words(words: list[str]):
     assert end.value.code == 2
 
 
-def test_machines_are_a_table_for_people(server: FakeServer, capsys: pytest.CaptureFixture[str]):
+def test_machines_are_a_table_for_people(server: FakeServer, capsys):
     assert sitegrid(server, "query", "machines") == 0
     head, first, second = capsys.readouterr().out.splitlines()
     assert head.split() == ["machine", "trusted", "since", "samples", "lost", "newest", "why"]
@@ -236,7 +228,7 @@ def test_machines_are_a_table_for_people(server: FakeServer, capsys: pytest.Capt
     assert server.asked[-1] == MachinesQuery(Freshness(3))
 
 
-def test_changes_are_a_line_each(server: FakeServer, capsys: pytest.CaptureFixture[str]):
+def test_changes_are_a_line_each(server: FakeServer, capsys):
     assert sitegrid(server, "query", "--after", "3", "changes") == 0
     assert capsys.readouterr().out == (
         "4: 2025-06-15 15:06:40Z to 2025-06-15 15:07:40Z  10..40 x -20..12.5 m  615 cells  resistance 0.25 -> 0.008\n"
@@ -246,22 +238,14 @@ def test_changes_are_a_line_each(server: FakeServer, capsys: pytest.CaptureFixtu
     assert server.asked == [ChangesQuery(3), ChangesQuery(0)]
 
 
-class NoChanges:
-    """A client of a site without changes."""
-
-    def changes(self, after: int) -> list[object]:
-        return []
-
-
-def test_no_changes_are_said(capsys: pytest.CaptureFixture[str]):
-    query._changes(NoChanges(), Namespace(follow=False, after=0, json=False), ())  # type: ignore[arg-type]
-    assert capsys.readouterr().out == "no change of the ground was found\n"
+def test_no_changes_are_said():
+    client = SimpleNamespace(changes=lambda after: [])
+    _, lines = query._changes(client, Namespace(follow=False, after=0), ())  # type: ignore[arg-type]
+    assert lines == ["no change of the ground was found"]
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-def test_changes_are_followed_until_stopped(
-    server: FakeServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], as_json: bool
-):
+def test_changes_are_followed_until_stopped(server: FakeServer, monkeypatch, capsys, as_json: bool):
     """The change that is known, then one that is found while following."""
     stop = threading.Event()
     monkeypatch.setattr(query, "stop_flag", lambda: stop)

@@ -10,8 +10,7 @@ from protocol.errors import ConfigError
 from protocol.site.site_file import load_site
 from sitegrid.cli import build_parser
 from sitegrid.demo import plan as planning
-from sitegrid.demo.parts import start_sim
-from sitegrid.demo.plan import DEFAULT_MANIFEST, DemoPlan, make_plan
+from sitegrid.demo.plan import DEFAULT_MANIFEST, DemoPlan, make_plan, start_sim
 from tests.paths import ROOT
 
 
@@ -60,7 +59,7 @@ def test_an_earlier_run_is_cleared_away(tmp_path: Path):
     assert not old.exists()
 
 
-def test_the_default_log_is_used_only_where_its_data_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_default_log_is_used_only_where_its_data_lies(tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert plan_of(tmp_path).log is None
     manifest = ROOT / DEFAULT_MANIFEST

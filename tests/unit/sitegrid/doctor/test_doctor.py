@@ -27,6 +27,7 @@ from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.answer_codec import encode_info
+from protocol.queries.answers import MapInfo
 from protocol.queries.requests import InfoQuery
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
@@ -35,9 +36,8 @@ from protocol.wire.credentials import Identity
 from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
-from sitegrid.doctor import disk, network
+from sitegrid.doctor import Finding, Level, disk, network
 from sitegrid.doctor.disk import SpoolState, StoreState
-from sitegrid.doctor.findings import Finding, Level
 from sitegrid.doctor.keys import Certificate, check_certificate, read_certificate
 from sitegrid.doctor.network import RouterLink
 from tests.unit.records import map_info
@@ -57,90 +57,9 @@ def samples(n: int) -> np.ndarray:
     return rows
 
 
-# --- network ---------------------------------------------------------------------------------------------------------
+# --- judgements: pure functions --------------------------------------------------------------------------------------
 
-
-@pytest.mark.parametrize(
-    ("link", "level", "words"),
-    [
-        (RouterLink("tcp/a:1", 0.012), Level.PASS, "answers in 12 ms"),
-        (RouterLink("tcp/a:1", None, listens=False), Level.FAIL, "nothing listens at tcp/a:1; start `sitegrid router`"),
-        (RouterLink("tcp/a:1", None, listens=True), Level.FAIL, "pass --keys"),
-        (RouterLink("tls/a:1", None, listens=True, has_keys=True), Level.FAIL, "these keys may be of another site"),
-    ],
-)
-def test_router(link: RouterLink, level: Level, words: str):
-    finding = network.check_link(link)
-    assert (finding.level, words in str(finding)) == (level, True)
-
-
-def test_an_empty_answer_of_the_server_is_told_apart():
-    assert network.check_server("pit", INFO, is_there=True).level is Level.PASS
-    behind = network.check_server("pit", replace(INFO, merged=10), is_there=True)
-    assert "journal row 12, merged only up to 10" in behind.message
-    denied = network.check_server("pit", None, is_there=True, role="visitor")
-    assert denied.level is Level.FAIL
-    assert "the router denies the question" in denied.advice
-    absent = network.check_server("pit", None, is_there=False)
-    assert "start `sitegrid server`" in absent.advice
-    assert "revoked" not in absent.advice
-    assert "revoked" in network.check_server("pit", None, is_there=False, role="machine").advice
-
-
-def test_site_files_are_compared():
-    assert network.check_site(SITE, INFO).level is Level.PASS
-    moved = network.check_site(replace(SITE, origin_lat_deg=48.1), INFO)
-    assert moved.level is Level.FAIL
-    assert SITE.frame in moved.message
-    assert network.check_site(replace(SITE, name="hill"), INFO).level is Level.FAIL
-
-
-@pytest.mark.parametrize(
-    ("answer", "is_there", "has_keys", "level", "words"),
-    [
-        (Ack(0, 0, 0), True, False, Level.PASS, "batches of loader-1 are taken"),
-        (Refused(Refusal.WRONG_FRAME, "compare"), True, False, Level.FAIL, "(wrong_frame): compare"),
-        (None, False, False, Level.FAIL, "start `sitegrid server`"),
-        (None, True, True, Level.FAIL, "under the name of its keys alone"),
-        (None, True, False, Level.FAIL, "denies it, or the server hangs"),
-    ],
-)
-def test_permission(answer: Any, is_there: bool, has_keys: bool, level: Level, words: str):
-    finding = network.check_permission("loader-1", answer, is_there=is_there, has_keys=has_keys)
-    assert (finding.level, words in str(finding)) == (level, True)
-
-
-@pytest.mark.parametrize(
-    ("offset_s", "error_s", "site", "level", "words"),
-    [
-        (0.4, 0.01, None, Level.PASS, "0.40 s ahead of"),
-        (-0.4, 0.01, None, Level.PASS, "0.40 s behind"),
-        (1.2, 0.1, None, Level.WARN, "NTP"),
-        (1.2, 0.3, None, Level.PASS, "+-0.30"),
-        (-90.0, 0.1, WALL, Level.WARN, "90.00 s behind"),
-        (6.0, 0.1, WALL, Level.FAIL, "refused beyond 5 s"),
-        (6.0, 0.1, SITE, Level.WARN, "6.00 s ahead"),
-        (5.05, 0.1, WALL, Level.WARN, "5.05 s ahead"),
-    ],
-)
-def test_clock(offset_s: float, error_s: float, site: SiteConfig | None, level: Level, words: str):
-    finding = network.check_clock(offset_s, error_s, site)
-    assert (finding.level, words in str(finding)) == (level, True)
-
-
-def test_the_offset_is_taken_at_the_middle_of_the_question():
-    asked_ns = (10 * 10**9, 12 * 10**9)
-    assert network.offset_of(replace(INFO, wall_ns=8 * 10**9), asked_ns) == (3.0, 1.0)
-
-
-def test_versions():
-    assert network.check_version("1.0", "1.0").level is Level.PASS
-    assert network.check_version("1.0", "1.1").level is Level.WARN
-    assert network.check_version("1.0", "unknown").level is Level.SKIP
-
-
-# --- keys ------------------------------------------------------------------------------------------------------------
-
+PASS, WARN, FAIL, SKIP = Level.PASS, Level.WARN, Level.FAIL, Level.SKIP
 GOOD = Certificate(
     Identity("pit", "loader-1", "machine", NOW + timedelta(days=90)),
     "loader-1",
@@ -150,57 +69,116 @@ GOOD = Certificate(
     fits=True,
     mode=0o100600,
 )
+STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
+HEALTHY = {"spool": {"depth": 3, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
 
 
-def level_of(certificate: Certificate, check: str, **given: str) -> tuple[Level, str]:
-    finding = next(f for f in check_certificate(certificate, NOW, **given) if f.check == check)
-    return finding.level, str(finding)
+def router(took_s: float | None, **link: bool) -> Finding:
+    return network.check_link(RouterLink("tcp/a:1", took_s, **link))
 
 
-def test_a_good_certificate_passes():
-    findings = check_certificate(GOOD, NOW, "pit", "loader-1")
-    assert [f.level for f in findings] == [Level.PASS] * 3
+def server(info: MapInfo | None, *, is_there: bool, role: str = "") -> Finding:
+    return network.check_server("pit", info, is_there=is_there, role=role)
 
 
-@pytest.mark.parametrize(
-    ("change", "level", "words"),
-    [
-        ({"expires": NOW + timedelta(days=30, hours=1)}, Level.PASS, "valid until"),
-        ({"expires": NOW + timedelta(days=29)}, Level.WARN, "29 days more; make a new one with `sitegrid keys add"),
-        ({"expires": NOW - timedelta(seconds=1)}, Level.FAIL, "expired on 2026-06-01"),
-        ({"begins": NOW + timedelta(minutes=1)}, Level.FAIL, "set this host's clock"),
-    ],
-)
-def test_validity(change: dict[str, Any], level: Level, words: str):
-    actual, text = level_of(replace(GOOD, **change), "certificate")
-    assert (actual, words in text) == (level, True)
+def permission(answer: Ack | Refused | None, *, is_there: bool = True, has_keys: bool = False) -> Finding:
+    return network.check_permission("loader-1", answer, is_there=is_there, has_keys=has_keys)
 
 
-@pytest.mark.parametrize(
-    ("common_name", "given", "level"),
-    [
-        ("loader-1.2", {}, Level.PASS),
-        ("loader-1.x", {}, Level.FAIL),
-        ("loader-2", {}, Level.FAIL),
-        ("loader-1", {"site": "hill"}, Level.FAIL),
-        ("loader-1", {"machine": "loader-2"}, Level.FAIL),
-    ],
-)
-def test_names(common_name: str, given: dict[str, str], level: Level):
-    assert level_of(replace(GOOD, common_name=common_name), "name", **given)[0] is level
+def certificate(check: str, given: dict[str, str] | None = None, **change: Any) -> Finding:
+    findings = check_certificate(replace(GOOD, **change), NOW, **(given or {}))
+    return next(finding for finding in findings if finding.check == check)
+
+
+def spool(depth: int, dropped: int = 0, quarantined: int = 0, *, oldest_ns: int = 0, age_s: int = 0) -> Finding:
+    return disk.check_spool(SpoolState(depth, dropped, quarantined, oldest_ns), NOW_NS + age_s * 10**9)
+
+
+def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
+    return disk.check_store(replace(STORE, **change), site)
 
 
 @pytest.mark.parametrize(
-    ("change", "level", "words"),
+    ("finding", "level", "words"),
     [
-        ({"signed": False}, Level.FAIL, "ca.pem has not signed cert.pem"),
-        ({"fits": False}, Level.FAIL, "key.pem is not the key of cert.pem"),
-        ({"mode": 0o100640}, Level.WARN, "mode 640"),
+        (router(0.012), PASS, "answers in 12 ms"),
+        (router(None, listens=False), FAIL, "nothing listens at tcp/a:1; start `sitegrid router`"),
+        (router(None, listens=True), FAIL, "pass --keys"),
+        (router(None, listens=True, has_keys=True), FAIL, "these keys may be of another site"),
+        (server(INFO, is_there=True), PASS, "journal row 12"),
+        (server(replace(INFO, merged=10), is_there=True), PASS, "journal row 12, merged only up to 10"),
+        (server(None, is_there=True, role="visitor"), FAIL, "; the router denies the question"),
+        (server(None, is_there=False), FAIL, "start `sitegrid server`"),
+        (server(None, is_there=False, role="machine"), FAIL, "revoked"),
+        (network.check_site(SITE, INFO), PASS, "as the map server has it"),
+        (network.check_site(replace(SITE, origin_lat_deg=48.1), INFO), FAIL, SITE.frame),
+        (network.check_site(replace(SITE, name="hill"), INFO), FAIL, "this is hill"),
+        (permission(Ack(0, 0, 0)), PASS, "batches of loader-1 are taken"),
+        (permission(Refused(Refusal.WRONG_FRAME, "compare")), FAIL, "(wrong_frame): compare"),
+        (permission(None, is_there=False), FAIL, "start `sitegrid server`"),
+        (permission(None, has_keys=True), FAIL, "under the name of its keys alone"),
+        (permission(None), FAIL, "denies it, or the server hangs"),
+        (network.check_clock(0.4, 0.01, None), PASS, "0.40 s ahead of"),
+        (network.check_clock(-0.4, 0.01, None), PASS, "0.40 s behind"),
+        (network.check_clock(1.2, 0.1, None), WARN, "NTP"),
+        (network.check_clock(1.2, 0.3, None), PASS, "+-0.30"),
+        (network.check_clock(-90.0, 0.1, WALL), WARN, "90.00 s behind"),
+        (network.check_clock(6.0, 0.1, WALL), FAIL, "refused beyond 5 s"),
+        (network.check_clock(6.0, 0.1, SITE), WARN, "6.00 s ahead"),
+        (network.check_clock(5.05, 0.1, WALL), WARN, "5.05 s ahead"),
+        (network.check_version("1.0", "1.0"), PASS, "1.0 on both sides"),
+        (network.check_version("1.0", "1.1"), WARN, "update the older side"),
+        (network.check_version("1.0", "unknown"), SKIP, "without being installed"),
+        (certificate("certificate", expires=NOW + timedelta(days=30, hours=1)), PASS, "valid until"),
+        (certificate("certificate", expires=NOW + timedelta(days=29)), WARN, "29 days more; make a new one with `site"),
+        (certificate("certificate", expires=NOW - timedelta(seconds=1)), FAIL, "expired on 2026-06-01"),
+        (certificate("certificate", begins=NOW + timedelta(minutes=1)), FAIL, "set this host's clock"),
+        (certificate("name", {"site": "pit", "machine": "loader-1"}), PASS, "machine loader-1 of site pit"),
+        (certificate("name", common_name="loader-1.2"), PASS, "machine loader-1 of site pit"),
+        (certificate("name", common_name="loader-1.x"), FAIL, "the files are of two folders"),
+        (certificate("name", common_name="loader-2"), FAIL, "the files are of two folders"),
+        (certificate("name", {"site": "hill"}), FAIL, "compare --site, --keys"),
+        (certificate("name", {"machine": "loader-2"}), FAIL, "compare --keys"),
+        (certificate("authority"), PASS, "ca.pem has signed cert.pem"),
+        (certificate("authority", signed=False), FAIL, "ca.pem has not signed cert.pem"),
+        (certificate("authority", fits=False), FAIL, "key.pem is not the key of cert.pem"),
+        (certificate("authority", mode=0o100640), WARN, "mode 640"),
+        (disk.check_disk("spool", 2**25), FAIL, "make room now"),
+        (disk.check_disk("spool", 2**29), WARN, "make room"),
+        (disk.check_disk("spool", 2**31), PASS, "2.0 GiB are free"),
+        (spool(0), PASS, "0 samples wait; 0 were dropped, 0 quarantined"),
+        (spool(5, oldest_ns=NOW_NS, age_s=600), PASS, "the oldest is of 10 min ago"),
+        (spool(5, oldest_ns=NOW_NS, age_s=4 * 3600), WARN, "4 h ago; 0 were dropped, 0 quarantined; start its agent"),
+        (spool(0, dropped=3), WARN, "raise max_samples"),
+        (spool(0, quarantined=2), WARN, "table `quarantine`"),
+        (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait"),
+        (disk.check_health("loader-1", {**HEALTHY, "uplink": {"problem": "no answer"}}), WARN, "; no answer"),
+        (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
+        # what others say may be anything
+        (disk.check_health("loader-1", {}), PASS, "? samples wait"),
+        (disk.check_health("loader-1", {"spool": 7, "uplink": "no"}), PASS, "? samples wait"),
+        (disk.check_health("loader-1", {"spool": [], "spool_problem": None}), PASS, "? samples wait"),
+        (store(), PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
+        (store(None, snapshot_row=0, snapshot_age_s=math.inf), PASS, "no snapshot"),
+        (store(None, last_row=30_000), WARN, "a restart folds 26000 rows"),
+        (store(frame="0"), FAIL, "choose another --store"),
+        (store(replace(SITE, name="hill")), FAIL, "choose another --store"),
     ],
 )
-def test_chain(change: dict[str, Any], level: Level, words: str):
-    actual, text = level_of(replace(GOOD, **change), "authority")
-    assert (actual, words in text) == (level, True)
+def test_what_is_found_is_judged(finding: Finding, level: Level, words: str):
+    assert (finding.level, words in str(finding)) == (level, True), str(finding)
+
+
+def test_only_who_has_keys_is_told_of_revoking():
+    assert "revoked" not in str(server(None, is_there=False))
+
+
+def test_the_offset_is_taken_at_the_middle_of_the_question():
+    asked_ns = (10 * 10**9, 12 * 10**9)
+    assert network.offset_of(replace(INFO, wall_ns=8 * 10**9), asked_ns) == (3.0, 1.0)
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -257,57 +235,8 @@ def test_keys_that_soon_expire_are_told_of_and_their_name_is_used(key_folder: Pa
 # --- disk ------------------------------------------------------------------------------------------------------------
 
 
-def test_free_space(tmp_path: Path):
-    levels = [disk.check_disk("spool", free).level for free in (2**25, 2**29, 2**31)]
-    assert levels == [Level.FAIL, Level.WARN, Level.PASS]
+def test_free_space_is_that_of_the_folder_to_be(tmp_path: Path):
     assert disk.free_bytes(tmp_path / "not" / "there" / "yet.db") > 0
-
-
-@pytest.mark.parametrize(
-    ("state", "age_s", "level", "words"),
-    [
-        (SpoolState(0, 0, 0, 0), 0, Level.PASS, "0 samples wait; 0 were dropped, 0 quarantined"),
-        (SpoolState(5, 0, 0, NOW_NS), 600, Level.PASS, "the oldest is of 10 min ago"),
-        (SpoolState(5, 0, 0, NOW_NS), 4 * 3600, Level.WARN, "4 h ago; 0 were dropped, 0 quarantined; start its agent"),
-        (SpoolState(0, 3, 0, 0), 0, Level.WARN, "raise max_samples"),
-        (SpoolState(0, 0, 2, 0), 0, Level.WARN, "table `quarantine`"),
-    ],
-)
-def test_spool(state: SpoolState, age_s: int, level: Level, words: str):
-    finding = disk.check_spool(state, NOW_NS + age_s * 10**9)
-    assert (finding.level, words in str(finding)) == (level, True)
-
-
-def test_an_agent_that_runs_is_taken_at_its_word():
-    good = {"spool": {"depth": 3, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
-    assert disk.check_health("loader-1", good).level is Level.PASS
-    stuck = disk.check_health("loader-1", {**good, "uplink": {"problem": "no answer"}})
-    assert (stuck.level, stuck.advice) == (Level.WARN, "no answer")
-    lost = disk.check_health("loader-1", {**good, "spool": {"depth": 3, "dropped": 1}})
-    assert lost.level is Level.WARN
-
-
-def test_what_others_say_may_be_anything():
-    for values in ({}, {"spool": 7, "uplink": "no"}, {"spool": [], "spool_problem": None}):
-        assert disk.check_health("loader-1", values).level is Level.PASS
-
-
-STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
-
-
-@pytest.mark.parametrize(
-    ("state", "site", "level", "words"),
-    [
-        (STORE, SITE, Level.PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
-        (replace(STORE, snapshot_row=0, snapshot_age_s=math.inf), None, Level.PASS, "no snapshot"),
-        (replace(STORE, last_row=30_000), None, Level.WARN, "a restart folds 26000 rows"),
-        (replace(STORE, frame="0"), SITE, Level.FAIL, "choose another --store"),
-        (replace(STORE, site="hill"), SITE, Level.FAIL, "choose another --store"),
-    ],
-)
-def test_store(state: StoreState, site: SiteConfig | None, level: Level, words: str):
-    finding = disk.check_store(state, site)
-    assert (finding.level, words in str(finding)) == (level, True)
 
 
 def test_a_spool_is_read_without_a_trace(tmp_path: Path):
@@ -467,7 +396,7 @@ def test_silence_of_a_server_that_is_there_is_called_a_denial(site: Site, capsys
     assert findings["permission"].message == "a map server is there, but gives no answer to batches of doctor"
 
 
-def test_clock_and_version_of_the_server_are_compared(site: Site, capsys, monkeypatch: pytest.MonkeyPatch):
+def test_clock_and_version_of_the_server_are_compared(site: Site, capsys, monkeypatch):
     monkeypatch.setattr("sitegrid.doctor.examine.package_version", lambda: "1.0")
     info = replace(INFO, wall_ns=time.time_ns() - 3600 * 10**9, version="0.9")
     with answering(site, keys.map_query("pit", InfoQuery.name), encode_info(info)):

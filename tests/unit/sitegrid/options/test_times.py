@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
-from sitegrid.options.times import SiteTime, parse_time, utc_text
+from sitegrid.options.times import SiteTime, parse_stamp, parse_time, utc_text
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
 S = 10**9
@@ -75,3 +75,8 @@ def test_a_bad_time_is_refused_by_what_it_is(text: str, words: str):
 def test_a_time_before_1970_names_its_option():
     with pytest.raises(ConfigError, match="--minus: so long before the site's now, 2025-06-15 15:06:40Z, is before"):
         parse_time("-99999d").stamp("--minus", lambda: T0)
+
+
+def test_a_stamp_does_not_count_back_from_the_sites_now():
+    with pytest.raises(ArgumentTypeError, match="'-2h' is no time: ISO 8601"):
+        parse_stamp("-2h")

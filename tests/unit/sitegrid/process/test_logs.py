@@ -65,9 +65,7 @@ def test_people_read_one_line_per_event():
 
 
 @pytest.mark.parametrize(("terminal", "read"), [(True, lambda s: "event one=1" in s), (False, json.loads)])
-def test_a_terminal_decides(
-    terminal: bool, read: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_a_terminal_decides(terminal: bool, read: Callable[[str], Any], monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])

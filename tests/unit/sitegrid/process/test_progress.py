@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import sys
 
-import pytest
-
 from sitegrid.process import progress
 from sitegrid.process.progress import Display
 
@@ -16,7 +14,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_gets_a_bar_and_headless_gets_lines(monkeypatch: pytest.MonkeyPatch):
+def test_a_terminal_gets_a_bar_and_headless_gets_lines(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with Display("machines drive", headless=False) as display:
         display.show(5, 10, "7 samples, 3 cells")
@@ -27,7 +25,7 @@ def test_a_terminal_gets_a_bar_and_headless_gets_lines(monkeypatch: pytest.Monke
     assert "5 of 10 s, 7 samples, 3 cells" in sys.stderr.getvalue()
 
 
-def test_plain_lines_come_now_and_then_only(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_plain_lines_come_now_and_then_only(monkeypatch, capsys):
     now = iter([100.0, 100.0, 101.0, 106.0, 106.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
     display = Display("machines drive", headless=True)

@@ -8,7 +8,7 @@ import pytest
 from protocol.errors import ConfigError
 from protocol.queries.answers import Region
 from sim.truth import TruthMap
-from sitegrid.pictures.truth_layers import truth_layers
+from sitegrid.pictures.draw import truth_layers
 
 
 def region(west: float, south: float, columns: int, rows: int, cell_m: float = 1.0) -> Region:
