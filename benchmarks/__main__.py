@@ -6,15 +6,46 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from benchmarks import filter as filters
 from benchmarks import ingest, merge, merge_memory, merge_restart, sim
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 
-SAMPLES, SECONDS, STEPS, RUNS = 20_000, 20.0, 1000, 5
-MERGED, JOURNALLED = 200_000, 20_000_000
+
+def _count(word: str) -> int:
+    if (count := int(word)) < 1:
+        raise argparse.ArgumentTypeError("must be positive")
+    return count
+
+
+def _positive(word: str) -> float:
+    if not 0 < (number := float(word)) < math.inf:
+        raise argparse.ArgumentTypeError("must be positive")
+    return number
+
+
+OPTIONS = {
+    "runs": ("N", _count, "of each variant; the median counts"),
+    "samples": ("N", _count, "in a run, or a journal"),
+    "steps": ("N", _count, "in a run"),
+    "hours": ("H", _positive, "of work"),
+    "seconds": ("S", _positive, "simulated, in a run"),
+}
+# Of each: what runs it, what it measures, and its options, named as the parameters of `run`, with their defaults.
+BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
+    "merge": (
+        merge.run,
+        "samples that the server folds into its grid, and plain sums",
+        {"runs": 5, "samples": 200_000},
+    ),
+    "memory": (merge_memory.run, "memory that a day of work on 1 km2 takes of the map server", {"hours": HOURS}),
+    "restart": (merge_restart.run, "time to open a store with a long journal", {"samples": 20_000_000}),
+    "ingest": (ingest.run, "samples that the server takes, from bytes to the grid", {"runs": 5, "samples": 20_000}),
+    "sim": (sim.run, "simulated time of small and large fleets, sensors on", {"runs": 5, "seconds": 20.0}),
+    "filter": (filters.run, "steps of the filters, and a whole agent's CPU and memory", {"runs": 5, "steps": 1000}),
+}
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -30,55 +61,18 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """A sub-command for each benchmark, so that an option that does nothing for it is refused.
-
-    Options are named as the parameters of the benchmark's `run`.
-    """
+    """A sub-command for each benchmark, so that an option that does nothing for it is refused."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure how fast the parts are.")
     names = parser.add_subparsers(required=True, metavar="NAME", help="what to measure:")
-    merges = names.add_parser("merge", help="samples that the map server folds into its grid, and plain sums")
-    memories = names.add_parser("memory", help="memory that a day of work on 1 km2 takes of the map server")
-    restarts = names.add_parser("restart", help="time in which the map server opens a store with a long journal")
-    ingests = names.add_parser("ingest", help="samples that the map server takes, from their bytes to the grid")
-    sims = names.add_parser("sim", help="simulated time of small and large fleets, sensors on")
-    steps = names.add_parser("filter", help="steps of the localisation filters, and a whole agent's CPU and memory")
-    runs = {
-        merges: merge.run,
-        memories: merge_memory.run,
-        restarts: merge_restart.run,
-        ingests: ingest.run,
-        sims: sim.run,
-        steps: filters.run,
-    }
-    for benchmark, run in runs.items():
+    for name, (run, what, options) in BENCHMARKS.items():
+        benchmark = names.add_parser(name, help=what)
         benchmark.set_defaults(run=run)
         benchmark.add_argument("--json", action="store_true", help="print one JSON object")
-    for benchmark in (merges, ingests, sims, steps):
-        benchmark.add_argument(
-            "--runs", metavar="N", type=_count, default=RUNS, help="of each variant; the median counts (%(default)s)"
-        )
-    for benchmark, default in ((merges, MERGED), (ingests, SAMPLES), (restarts, JOURNALLED)):
-        benchmark.add_argument(
-            "--samples", metavar="N", type=_count, default=default, help="in a run, or a journal (%(default)s)"
-        )
-    memories.add_argument("--hours", metavar="H", type=_positive, default=HOURS, help="of work (%(default)s)")
-    sims.add_argument(
-        "--seconds", metavar="S", type=_positive, default=SECONDS, help="simulated, in a run (%(default)s)"
-    )
-    steps.add_argument("--steps", metavar="N", type=_count, default=STEPS, help="in a run (%(default)s)")
+        for option, default in options.items():
+            metavar, kind, meaning = OPTIONS[option]
+            text = f"{meaning} (%(default)s)"
+            benchmark.add_argument(f"--{option}", metavar=metavar, type=kind, default=default, help=text)
     return parser
-
-
-def _count(word: str) -> int:
-    if (count := int(word)) < 1:
-        raise argparse.ArgumentTypeError("must be positive")
-    return count
-
-
-def _positive(word: str) -> float:
-    if not 0 < (number := float(word)) < math.inf:
-        raise argparse.ArgumentTypeError("must be positive")
-    return number
 
 
 if __name__ == "__main__":

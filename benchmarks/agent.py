@@ -8,13 +8,12 @@ from __future__ import annotations
 import json
 import math
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 from agents.pipeline import Pipeline, PipelineConfig
+from benchmarks.measure import in_child, memory_mb
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Imu, Reading
 from protocol.site.site_config import Projection, SiteConfig
@@ -31,12 +30,7 @@ SECONDS = 60
 
 def measured(runs: int) -> dict[str, float | int]:
     """Run the agent's core in processes of its own; the median of the runs counts."""
-    command = [sys.executable, "-m", "benchmarks.agent", str(SECONDS)]
-    root = Path(__file__).parent.parent
-    runs_figures = [
-        json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603 # itself
-        for _ in range(runs)
-    ]
+    runs_figures = [in_child("benchmarks.agent", str(SECONDS)) for _ in range(runs)]
     cpu, memory = (statistics.median(each[name] for each in runs_figures) for name in ("cpu_percent", "memory_mb"))
     return {"seconds": SECONDS, "cpu_percent": round(cpu, 2), "memory_mb": round(memory, 1)}
 
@@ -97,13 +91,7 @@ def main() -> None:
         cpu_s += time.process_time() - start_s
     if pipeline.pose is None:
         raise SystemExit("the agent found no pose: nothing was measured")
-    print(json.dumps({"cpu_percent": 100 * cpu_s / seconds, "memory_mb": _peak_mb()}))
-
-
-def _peak_mb() -> float:
-    """Most memory resident so far; the kernel's own figure, since getrusage counts the parent's before exec too."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+    print(json.dumps({"cpu_percent": 100 * cpu_s / seconds, "memory_mb": memory_mb("VmHWM") * 1e6 / 2**20}))
 
 
 if __name__ == "__main__":

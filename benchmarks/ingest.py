@@ -24,20 +24,16 @@ def run(samples: int, runs: int) -> Report:
     """Measure every size of batch and group, each run on a new store."""
     rows = track(samples)
     with tempfile.TemporaryDirectory() as folder:
-        Store(Path(folder) / "warm", SITE, ServerConfig(), _now_ns).grid.fold(rows[:1], "loader-1")  # compiled
+        Store(Path(folder) / "warm", SITE, ServerConfig(), lambda: START_NS).grid.fold(rows[:1], "loader-1")  # compiled
         cases = {f"{size} {group}": (size, group) for size in BATCHES for group in GROUPS}
         variants = {name: _variant(Path(folder), name, rows, *case) for name, case in cases.items()}
         seconds = medians(variants, runs)
-
-    def commits(size: int, group: int) -> int:
-        return math.ceil(math.ceil(samples / size) / group)
-
     figures = [
         {
             "batch": size,
             "batches_per_commit": group,
             "samples_per_s": round(samples / seconds[name]),
-            "ms_per_commit": round(seconds[name] / commits(size, group) * 1e3, 3),
+            "ms_per_commit": round(seconds[name] / math.ceil(math.ceil(samples / size) / group) * 1e3, 3),
         }
         for name, (size, group) in cases.items()
     ]
@@ -46,12 +42,13 @@ def run(samples: int, runs: int) -> Report:
 
 def _variant(folder: Path, name: str, rows: Table, size: int, group: int) -> Callable[[], float]:
     """Send all samples through a new store; the clock runs from the first byte to the last acknowledgement."""
-    batches = [_encode(rows[first : first + size], first + 1) for first in range(0, len(rows), size)]
+    sent = (SampleBatch("loader-1", 1, i + 1, rows[i : i + size], SITE.frame) for i in range(0, len(rows), size))
+    batches = [Incoming(batch.machine, encode_batch(batch)) for batch in sent]
     groups = [batches[first : first + group] for first in range(0, len(batches), group)]
 
     def work() -> float:
         with tempfile.TemporaryDirectory(dir=folder, prefix=name.replace(" ", "-")) as path:
-            store = Store(Path(path), SITE, ServerConfig(), _now_ns)
+            store = Store(Path(path), SITE, ServerConfig(), lambda: START_NS)
             seconds = timed(lambda: _take(store, groups))
             store.close()
         return seconds
@@ -63,12 +60,3 @@ def _take(store: Store, groups: list[list[Incoming]]) -> None:
     for group in groups:
         if not all(isinstance(answer, Ack) for answer in store.commit(group)):
             raise RuntimeError("the store refused a batch")
-
-
-def _encode(rows: Table, first_seq: int) -> Incoming:
-    batch = SampleBatch("loader-1", 1, first_seq, rows, SITE.frame)
-    return Incoming(batch.machine, encode_batch(batch))
-
-
-def _now_ns() -> int:
-    return START_NS

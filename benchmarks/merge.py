@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from benchmarks.measure import SIDE_M, Report, machine, medians, scattered, timed, track
-from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, Polars, Sums
+from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, Polars
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Table
@@ -37,22 +37,17 @@ class Variant:
     shares: Mapping[str, int] = field(default_factory=dict)
 
 
-def _soft() -> Fold:
-    return partial(Grid(1.0, FoldConfig()).fold, machine="loader-1")
-
-
-def _plain(kind: Callable[[int], Sums]) -> Fold:
-    return kind(int(SIDE_M)).fold
-
-
+SIDE = int(SIDE_M)
 BENCH = "pip install 'sitegrid[bench]'"
 VARIANTS = {
-    "soft_votes": Variant(_soft, shares={"track": 10, "random": 100}),
-    "hard_votes": Variant(partial(_plain, HardVotes)),
-    YARDSTICK: Variant(partial(_plain, AddAt)),
-    "boost_histogram": Variant(partial(_plain, BoostHistogram), BENCH),
-    "polars group-by": Variant(partial(_plain, Polars), BENCH),
-    "duckdb group-by": Variant(partial(_plain, DuckDb), BENCH),
+    "soft_votes": Variant(
+        lambda: partial(Grid(1.0, FoldConfig()).fold, machine="loader-1"), shares={"track": 10, "random": 100}
+    ),
+    "hard_votes": Variant(lambda: HardVotes(SIDE).fold),
+    YARDSTICK: Variant(lambda: AddAt(SIDE).fold),
+    "boost_histogram": Variant(lambda: BoostHistogram(SIDE).fold, BENCH),
+    "polars group-by": Variant(lambda: Polars(SIDE).fold, BENCH),
+    "duckdb group-by": Variant(lambda: DuckDb(SIDE).fold, BENCH),
 }
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -44,12 +43,13 @@ def measured(hours: float) -> dict[str, float]:
         grid.fold(rows, name)
     resident_mb = memory_mb()
     blocks = [pages for _, _, pages in grid.state().blocks]
+    evidence_bytes = sum(map(_bytes, blocks))
     row = {
         "samples": grid.folded,
         "pages": sum(len(pages.table) for pages in blocks),
         "cells": grid.known_cells(),
-        "bytes_per_cell_and_bucket": round(_bytes_per_cell(blocks), 1),
-        "evidence_mb": round(sum(map(_bytes, blocks)) / MB, 1),
+        "bytes_per_cell_and_bucket": round(evidence_bytes / max(1, sum(len(pages.marks) for pages in blocks)), 1),
+        "evidence_mb": round(evidence_bytes / MB, 1),
         "resident_mb": round(max(resident_mb, memory_mb()), 1),  # with all pages packed, or with blocks open
     }
     return row | _snapshot(grid)
@@ -58,11 +58,6 @@ def measured(hours: float) -> dict[str, float]:
 def _bytes(pages: CompactPages) -> int:
     """Bytes of the pages of one block, with their Python objects."""
     return pages.nbytes + sys.getsizeof(pages) + len(pages.__slots__) * sys.getsizeof(np.empty(0))
-
-
-def _bytes_per_cell(blocks: Sequence[CompactPages]) -> float:
-    """Bytes of pages per cell that has evidence in them."""
-    return sum(map(_bytes, blocks)) / max(1, sum(len(pages.marks) for pages in blocks))
 
 
 def _snapshot(grid: Grid) -> dict[str, float]:

@@ -23,7 +23,6 @@ from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import SNAPSHOT_ROWS
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Admission
-from protocol.arrays import Table
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch
 
@@ -72,7 +71,8 @@ def build(folder: Path, rows: int) -> None:
     sent: Counter[str] = Counter()
     journal.begin()
     for number, (name, batch) in enumerate(islice(batches(), rows), start=1):
-        journal.append(_admission(name, sent[name] + 1, batch), START_NS)
+        new = SampleBatch(name, 1, sent[name] + 1, batch, SITE.frame)
+        journal.append(Admission(new, trimmed=0, lost=0), START_NS)
         sent[name] += len(batch)
         if number <= rows - TAIL_ROWS:
             grid.fold(batch, name)
@@ -93,10 +93,6 @@ def open_timed(folder: Path) -> Report:
     rows = {"journalled": store.journalled, "merged": store.merged, "snapshot_row": store.snapshot_row}
     store.close()
     return {"open_s": open_s, "open_cpu_s": open_cpu_s, **rows}
-
-
-def _admission(name: str, first_seq: int, rows: Table) -> Admission:
-    return Admission(SampleBatch(name, 1, first_seq, rows, SITE.frame), trimmed=0, lost=0)
 
 
 if __name__ == "__main__":

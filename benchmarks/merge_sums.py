@@ -8,7 +8,8 @@ imported where they are used.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from typing import Any
 
 import numba
 import numpy as np
@@ -18,32 +19,33 @@ from protocol.arrays import Floats, Ints, Table
 QUERY = "SELECT cell, count(*) AS n, sum(value) AS s, sum(value * value) AS q FROM samples GROUP BY cell"
 
 
-class Sums(Protocol):
+class Sums(ABC):
     """Sums over the cells of a site of side * side cells of 1 m, its corner at 0, 0."""
-
-    def fold(self, rows: Table) -> None:
-        """Add samples, all of them on the site."""
-        ...
-
-    def sums(self) -> Floats:
-        """Count, sum and sum of squares of c_rr (side * side, 3), row by row from the south."""
-        ...
-
-
-class HardVotes:
-    """A loop in numba over interleaved cells."""
 
     def __init__(self, side: int) -> None:
         self._side = side
-        self._sums = np.zeros((side * side, 3))
+        self._sums: Floats = np.zeros((side * side, 3))
+
+    @abstractmethod
+    def fold(self, rows: Table) -> None:
+        """Add samples, all of them on the site."""
+
+    def sums(self) -> Floats:
+        """Count, sum and sum of squares of c_rr (side * side, 3), row by row from the south."""
+        return self._sums
+
+    def _columns(self, rows: Table) -> tuple[Ints, Floats]:
+        """Number of the cell that each sample lies in, and its c_rr."""
+        cell = rows["y_m"].astype(np.int64) * self._side + rows["x_m"].astype(np.int64)
+        return cell, rows["c_rr"].astype(np.float64)
+
+
+class HardVotes(Sums):
+    """A loop in numba over interleaved cells."""
 
     def fold(self, rows: Table) -> None:
         """See Sums."""
         _add(rows, self._sums.reshape(-1), self._side)
-
-    def sums(self) -> Floats:
-        """See Sums."""
-        return self._sums
 
 
 @numba.njit(cache=True, nogil=True)
@@ -63,26 +65,23 @@ def _add(rows: Any, sums: Any, side: int) -> None:
         sums[at + two] += value * value
 
 
-class AddAt:
+class AddAt(Sums):
     """np.add.at, once per sum."""
 
     def __init__(self, side: int) -> None:
-        self._side = side
-        self._sums = np.zeros((3, side * side))
+        super().__init__(side)
+        self._sums = np.zeros((3, side * side)).T  # each sum in one piece
 
     def fold(self, rows: Table) -> None:
         """See Sums."""
-        cell, value = _columns(rows, self._side)
-        np.add.at(self._sums[0], cell, 1.0)
-        np.add.at(self._sums[1], cell, value)
-        np.add.at(self._sums[2], cell, value * value)
-
-    def sums(self) -> Floats:
-        """See Sums."""
-        return self._sums.T
+        cell, value = self._columns(rows)
+        counts, sums, squares = self._sums.T
+        np.add.at(counts, cell, 1.0)
+        np.add.at(sums, cell, value)
+        np.add.at(squares, cell, value * value)
 
 
-class BoostHistogram:
+class BoostHistogram(Sums):
     """A histogram with a mean per bin: count, mean, and sum of squared deviations in one fill."""
 
     def __init__(self, side: int) -> None:
@@ -103,52 +102,36 @@ class BoostHistogram:
         return np.stack([n, n * mean, deviations + n * mean * mean], axis=1)
 
 
-class Polars:
+class Polars(Sums):
     """A group-by of polars for each batch."""
 
     def __init__(self, side: int) -> None:
         import polars as pl
 
+        super().__init__(side)
         self._pl = pl
-        self._side = side
-        self._sums = np.zeros((side * side, 3))
 
     def fold(self, rows: Table) -> None:
         """See Sums."""
-        cell, value = _columns(rows, self._side)
+        cell, value = self._columns(rows)
         c = self._pl.col("value")
         frame = self._pl.DataFrame({"cell": cell, "value": value})
         groups = frame.group_by("cell").agg(self._pl.len(), c.sum().alias("s"), (c * c).sum().alias("q"))
         self._sums[groups["cell"].to_numpy()] += groups.select("len", "s", "q").to_numpy()
 
-    def sums(self) -> Floats:
-        """See Sums."""
-        return self._sums
 
-
-class DuckDb:
+class DuckDb(Sums):
     """A group-by of DuckDB for each batch."""
 
     def __init__(self, side: int) -> None:
         import duckdb
 
+        super().__init__(side)
         self._connection = duckdb.connect()
-        self._side = side
-        self._sums = np.zeros((side * side, 3))
 
     def fold(self, rows: Table) -> None:
         """See Sums."""
-        cell, value = _columns(rows, self._side)
+        cell, value = self._columns(rows)
         self._connection.register("samples", {"cell": cell, "value": value})
         groups = self._connection.execute(QUERY).fetchnumpy()
         self._sums[groups["cell"]] += np.stack([groups["n"], groups["s"], groups["q"]], axis=1)
-
-    def sums(self) -> Floats:
-        """See Sums."""
-        return self._sums
-
-
-def _columns(rows: Table, side: int) -> tuple[Ints, Floats]:
-    """Number of the cell that each sample lies in, and its c_rr."""
-    cell = rows["y_m"].astype(np.int64) * side + rows["x_m"].astype(np.int64)
-    return cell, rows["c_rr"].astype(np.float64)

@@ -9,17 +9,17 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import zenoh
 
 from mapserver.config import ServerConfig
 from mapserver.follower.follower import Follower
-from mapserver.ingest.store import JOURNAL_FILE, Incoming, Verify
+from mapserver.ingest.store import Incoming, Store, Verify
 from mapserver.ingest.writer import Writer
 from mapserver.query.answers import Answers, reads_past
 from protocol.errors import ConfigError, QueryError
 from protocol.queries.answer_codec import encode_change, encode_error
+from protocol.queries.answers import GroundChange
 from protocol.queries.parameters import split_selector
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
@@ -30,7 +30,7 @@ log = logging.getLogger("mapserver")
 
 
 class Server:
-    """Serves one site over an open session until closed."""
+    """Serves one site over an open session until closed. answers: the map, for callers in this process."""
 
     def __init__(
         self,
@@ -42,12 +42,12 @@ class Server:
         verify: Verify | None = None,
     ) -> None:
         """verify: of signed batches, see Store; without it signatures are not asked for."""
-        self._writer = Writer(folder, site, config, now_ns, verify)
+        self._writer = Writer(Store(folder, site, config, now_ns, verify))
         self._changed = session.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
-        self._follower = Follower(self._writer, folder, site, config, self._publish, now_ns)
-        self._answers = Answers(self._writer, self._follower, site, config, folder / JOURNAL_FILE)
+        self._follower = Follower(self._writer, self._publish)
+        self.answers = Answers(self._writer, self._follower)
         self._threads = ThreadPoolExecutor(config.query_threads, thread_name_prefix="query")
         # One each: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
         self._past_thread = ThreadPoolExecutor(1, thread_name_prefix="past")
@@ -57,11 +57,6 @@ class Server:
             session.declare_queryable(keys.map_queries_all(site.name), self._on_query),
             session.declare_queryable(keys.admin_all(site.name), self._on_command),
         ]
-
-    @property
-    def answers(self) -> Answers:
-        """The map, for callers in this process."""
-        return self._answers
 
     @property
     def failed(self) -> bool:
@@ -98,11 +93,11 @@ class Server:
     def _on_query(self, query: zenoh.Query) -> None:
         name, parameters = _asked(query)
         threads = self._past_thread if reads_past(name, parameters) else self._threads
-        threads.submit(self._reply, query, lambda: self._answers.answer(name, parameters))
+        threads.submit(self._reply, query, lambda: self.answers.answer(name, parameters))
 
     def _on_command(self, query: zenoh.Query) -> None:
         name, parameters = _asked(query)
-        self._command_thread.submit(self._reply, query, lambda: self._answers.obey(name, parameters))
+        self._command_thread.submit(self._reply, query, lambda: self.answers.obey(name, parameters))
 
     def _reply(self, query: zenoh.Query, answer: Callable[[], bytes]) -> None:
         with query:
@@ -117,7 +112,7 @@ class Server:
                 log.exception("query failed query=%s", query.key_expr)
                 query.reply_err(encode_error(QueryError("internal", f"the server failed: {error}")))
 
-    def _publish(self, change: dict[str, Any]) -> None:
+    def _publish(self, change: GroundChange) -> None:
         self._changed.put(encode_change(change))
 
 

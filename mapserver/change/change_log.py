@@ -7,7 +7,7 @@ change, which is then larger.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -16,10 +16,10 @@ import numpy as np
 from mapserver.change.detection import ChangeConfig, cuts
 from mapserver.change.validity import image_of, valid_pages
 from mapserver.evidence import cells as ev
-from mapserver.evidence.sums import evidence
-from mapserver.evidence.timeline import Block, TimedPage
+from mapserver.evidence.timeline import Block, TimedPage, evidence
 from mapserver.layers import cell_layers
 from protocol.arrays import Bools, Floats32, Ints
+from protocol.queries.answers import GroundChange
 from protocol.site.geometry import BLOCK_CELLS
 
 KIND = "change"  # of the journal's events
@@ -29,36 +29,6 @@ NEAR_CELLS = 8.0
 _BEFORE_AFTER = ("resistance", "grade")
 
 
-@dataclass(frozen=True)
-class GroundChange:
-    """One change of the ground.
-
-    id: its number. first_ns, last_ns: it took place between them, cell by cell. bounds: west, south, east, north [m].
-    cells: how many are known to be changed. resistance, grade before and after: medians, None where not known.
-    """
-
-    id: int
-    first_ns: int
-    last_ns: int
-    bounds: tuple[float, float, float, float]
-    cells: int
-    resistance_before: float | None = None
-    resistance_after: float | None = None
-    grade_before: float | None = None
-    grade_after: float | None = None
-
-    @property
-    def values(self) -> dict[str, Any]:
-        """As plain values."""
-        return {**asdict(self), "bounds": list(self.bounds)}
-
-    @classmethod
-    def from_values(cls, values: Mapping[str, Any]) -> GroundChange:
-        """Undo `values`."""
-        west, south, east, north = values["bounds"]
-        return cls(**{**values, "bounds": (west, south, east, north)})
-
-
 class ChangeLog:
     """Changes of one site. kept: plain values of those from before, the newest of each number last."""
 
@@ -66,7 +36,7 @@ class ChangeLog:
         self, cell_m: float, change: ChangeConfig, read: cell_layers.ReadConfig, kept: Iterable[Mapping[str, Any]] = ()
     ) -> None:
         self._cell_m, self._config, self._read = cell_m, change, read
-        self._changes = {values["id"]: GroundChange.from_values(values) for values in kept}
+        self._changes = {values["id"]: GroundChange(**{**values, "bounds": tuple(values["bounds"])}) for values in kept}
         self._logged: dict[Block, Ints] = {}  # changed_ns of cells that are part of a change already
         self._members: dict[int, set[tuple[int, int]]] = {number: set() for number in self._changes}
 

@@ -13,7 +13,7 @@ from mapserver.evidence.fold_kernels import fold_sorted
 from mapserver.evidence.pages import CELL, PackedPages, frozen
 from mapserver.evidence.sample_kernels import locate, split, weigh
 from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
-from protocol.arrays import Bools, Ints, Table
+from protocol.arrays import AnyArray, Bools, Ints, Table
 
 MOST_SHARES = 1 << 24  # of stencils that are weighed at once, 64 MB
 MOST_VOTES = 1 << 20  # that are packed at once, 8 MB
@@ -21,19 +21,13 @@ MOST_PAGES = 1 << 14  # likewise
 _VOTES_OF_CELL = 7  # two bins of each of three values, and one sector
 
 
-class Scratch:
-    """One block unpacked, where kernels sum; zero between folds. One thread uses it."""
+Scratch = tuple[AnyArray, ...]
 
-    def __init__(self) -> None:
-        self.counts = np.zeros(ev.COUNTS * ev.CELLS, np.uint32)
-        self.lines = np.zeros(ev.COUNTS, np.int32)
-        self.visits, self.machines = np.zeros(ev.CELLS, np.uint64), np.zeros(ev.CELLS, np.uint64)
-        self.newest = np.zeros(ev.CELLS, np.int64)
 
-    @property
-    def arrays(self) -> tuple[Any, ...]:
-        """As the kernel takes them."""
-        return self.counts, self.lines, self.visits, self.machines, self.newest
+def scratch_block() -> Scratch:
+    """One block unpacked, where kernels sum (counts, lines, visits, machines, newest stamps); zero between folds."""
+    counts, lines = np.zeros(ev.COUNTS * ev.CELLS, np.uint32), np.zeros(ev.COUNTS, np.int32)
+    return counts, lines, *(np.zeros(ev.CELLS, kind) for kind in (np.uint64, np.uint64, np.int64))
 
 
 def fold(
@@ -72,7 +66,7 @@ def _pages(
     cells: Table = np.empty(min(area, len(pages) * ev.CELLS) + ev.CELLS, CELL)
     done = 0
     while done < len(keys):
-        done, n, used, filled = fold_sorted(done, keys, touching, samples, scratch.arrays, pages, votes, cells)
+        done, n, used, filled = fold_sorted(done, keys, touching, samples, scratch, pages, votes, cells)
         yield from _by_block(pages[:n], votes[:used], cells[:filled])
 
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold import Scratch, fold
+from mapserver.evidence.fold import fold, scratch_block
 from mapserver.evidence.pages import CompactPages, Page
-from mapserver.evidence.sums import evidence
-from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline
+from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
 from mapserver.evidence.votes import FoldConfig, is_foldable, name_hash
 from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -70,7 +69,7 @@ class Grid:
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
-        self._scratch, self._space = Scratch(), Space()
+        self._scratch, self._space = scratch_block(), Space()
         self._rows: AnyArray = np.empty(waiting_rows, _RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
         self._waiting, self._weight = 0, 0

@@ -33,11 +33,6 @@ class Page:
     votes: Table
     cells: Table
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of its arrays."""
-        return self.votes.nbytes + self.cells.nbytes
-
     def add_to(self, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints) -> None:
         """Add to counts (COUNTS * 256,), bitmaps (256, 2), newest_ns (256,)."""
         counts[self.votes["place"]] += self.votes["count"]
@@ -58,12 +53,6 @@ class PackedPages:
     table: Ints
     votes: NDArray[np.unsignedinteger[Any]]
     cells: Table
-
-    @classmethod
-    def from_page(cls, tier: int, index: int, page: Page) -> PackedPages:
-        """One page alone."""
-        votes = page.votes["count"].astype(np.uint64) << np.uint64(16) | page.votes["place"]
-        return cls(np.array([(tier, index, 0, len(votes), 0, len(page.cells))]), votes, page.cells)
 
     def items(self) -> Iterator[tuple[int, int, Page]]:
         """Tier, index on it, and page."""

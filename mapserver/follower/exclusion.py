@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Mapping
+from dataclasses import asdict
 
 from mapserver.evidence.grid import REFOLD_ROWS, Grid
-from mapserver.evidence.votes import FoldConfig
 from mapserver.ingest.writer import Writer
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
@@ -27,11 +27,8 @@ class Exclusion:
 
     name = "exclusion"
 
-    def __init__(
-        self, writer: Writer, reader: JournalReader, cell_m: float, fold: FoldConfig, ending: threading.Event
-    ) -> None:
-        self._writer, self._reader, self._history = writer, reader, History.beside(reader)
-        self._cell_m, self._fold, self._ending = cell_m, fold, ending
+    def __init__(self, writer: Writer, reader: JournalReader, ending: threading.Event) -> None:
+        self._writer, self._reader, self._ending = writer, reader, ending
         self._decisions = TrustDecisions(reader.events(KIND))
         self._requested: list[TrustDecision] = []
         self._unfolded: list[TrustDecision] = []  # kept with the journal, but not in the map yet
@@ -52,7 +49,9 @@ class Exclusion:
             return self._decisions.newest(machine)
 
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
-        """Have decided what the audit may decide."""
+        """Have decided what the audit may decide, which may be nothing: `machines` names its verdicts in any case."""
+        if not self._writer.config.trust.exclude:
+            return
         with self._changed:
             self._requested += self._decisions.judge(verdicts, stamp_ns)
 
@@ -79,7 +78,7 @@ class Exclusion:
             self._changed.notify_all()
 
     def _keep(self, decision: TrustDecision) -> None:
-        self._writer.run(lambda store: store.journal.append_event(KIND, decision.stamp_ns, decision.body))
+        self._writer.run(lambda store: store.journal.append_event(KIND, decision.stamp_ns, asdict(decision)))
         values = (decision.machine, decision.trusted, decision.by, decision.reason)
         log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
         with self._changed:
@@ -89,8 +88,8 @@ class Exclusion:
 
     def _fold_again(self, excluded: frozenset[str]) -> None:
         until = self._reader.last_row
-        grid = Grid(self._cell_m, self._fold, REFOLD_ROWS)
-        for row in history_rows(self._history, until=until, selection=Selection(without=excluded)):
+        grid = Grid(self._writer.site.cell_m, self._writer.config.fold, REFOLD_ROWS)
+        for row in history_rows(History.beside(self._reader), until=until, selection=Selection(without=excluded)):
             grid.fold(row.rows, row.machine)
             if self._ending.is_set():
                 return

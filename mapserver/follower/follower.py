@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
-from mapserver.config import ServerConfig
-from mapserver.follower.archiving import Archiving
-from mapserver.follower.audit import Audit
-from mapserver.follower.changes import ChangeSearch, Publish
 from mapserver.follower.exclusion import Exclusion
+from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Publish
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.reader import JournalReader
-from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
-from protocol.site.site_config import SiteConfig
+from protocol.queries.answers import GroundChange
 
 TURN_S = 1.0  # between two turns: how late a change of the ground is published
 log = logging.getLogger("mapserver.follower.follower")
@@ -28,28 +22,17 @@ log = logging.getLogger("mapserver.follower.follower")
 class Follower:
     """Machines and changes of one site. All but the thread itself is for any thread.
 
-    publish: is given each change, as plain values, when it is new or grows.
+    publish: is given each change when it is new or grows.
     """
 
-    def __init__(
-        self,
-        writer: Writer,
-        folder: Path,
-        site: SiteConfig,
-        config: ServerConfig,
-        publish: Publish,
-        now_ns: Callable[[], int],
-    ) -> None:
+    def __init__(self, writer: Writer, publish: Publish) -> None:
         self._writer = writer
-        self._reader = reader = JournalReader(folder / JOURNAL_FILE)
+        self._reader = reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._wake, self._ending = threading.Event(), threading.Event()
-        self._exclusion = Exclusion(writer, reader, site.cell_m, config.fold, self._ending)
-        auditor = Auditor(site.cell_m, config.fold)
-        report = self._exclusion.judge if config.trust.exclude else _only_named
-        self._audit = Audit(writer, reader, auditor, config.trust.judge_s, report, self._interrupted)
-        self._changes = ChangeSearch(writer, reader, site.cell_m, config, publish, self._ending)
-        archiving = Archiving(writer, reader, site, config.store.archive_after_h, now_ns, self._ending)
-        self._jobs = (self._audit, self._exclusion, self._changes, archiving)
+        self._exclusion = Exclusion(writer, reader, self._ending)
+        self._audit = Audit(writer, reader, self._exclusion.judge, self._interrupted)
+        self._changes = ChangeSearch(writer, reader, publish, self._ending)
+        self._jobs = (self._audit, self._exclusion, self._changes, Archiving(writer, reader, self._ending))
         self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
         self._thread.start()
 
@@ -57,8 +40,8 @@ class Follower:
         """Machines whose rows are not in the map."""
         return self._exclusion.excluded()
 
-    def changes(self, after: int = 0) -> list[dict[str, Any]]:
-        """Changes of the ground with a number beyond `after`, as plain values."""
+    def changes(self, after: int = 0) -> list[GroundChange]:
+        """Changes of the ground with a number beyond `after`."""
         return self._changes.changes(after)
 
     def machines(self) -> list[dict[str, Any]]:
@@ -128,7 +111,3 @@ class Follower:
                     log.exception("follower failed job=%s", job.name)
             self._wake.wait(TURN_S)
             self._wake.clear()
-
-
-def _only_named(verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
-    """Decide nothing on verdicts; `machines` shows them."""

@@ -30,8 +30,6 @@ from protocol.wire.messages import Ack, Refused, SampleBatch
 
 JOURNAL_FILE = "journal.db"
 LOCK_FILE = "lock"
-
-
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
 
@@ -59,14 +57,11 @@ class Store:
         verify: Verify | None = None,
     ) -> None:
         """verify: raises MessageError unless a batch is signed by its machine."""
-        self.site = site
+        self.site, self.config, self.folder, self.now_ns = site, config, folder, now_ns
         self._verify = verify
-        self.config = config
         self.counters: Counter[str] = Counter()
         self.commits, self.commit_s = 0, 0.0
         self.newest_ns = 0
-        self._folder = folder
-        self._now_ns = now_ns
         with ExitStack() as opened:
             opened.enter_context(_hold(folder))
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
@@ -122,7 +117,7 @@ class Store:
         state = grid.state()
 
         def write() -> None:
-            snapshot.save(self._folder, row, state, self.site.cell_m, self.config.fold, excluded)
+            snapshot.save(self.folder, row, state, self.site.cell_m, self.config.fold, excluded)
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
                 self.snapshot_row = row
 
@@ -152,7 +147,7 @@ class Store:
             "cells": self.grid.known_cells(),
             "bounds": self.grid.bounds(),
             "stamp_ns": self.newest_ns,
-            "wall_ns": self._now_ns(),
+            "wall_ns": self.now_ns(),
             "version": package_version(),
             "machines": self.machines(),
             "distrusted": sorted(self.excluded),
@@ -174,13 +169,13 @@ class Store:
         try:
             if self._verify:
                 self._check_signature(self._verify, incoming)
-            batch = parse(incoming.payload, incoming.machine, self.site, self._now_ns)
+            batch = parse(incoming.payload, incoming.machine, self.site, self.now_ns)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
         new = len(admission.batch.rows) > 0
-        row = self.journal.append(admission, self._now_ns()) if new else self.journalled
+        row = self.journal.append(admission, self.now_ns()) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
         return Ack(admission.watermark, row, admission.trimmed), admission
@@ -208,7 +203,7 @@ class Store:
 
     def _fold_tail(self, grid: Grid, merged: int, excluded: frozenset[str]) -> None:
         """Fold what a grid does not hold yet."""
-        history = History(self.journal, Archive(self._folder / FOLDER))
+        history = History(self.journal, Archive(self.folder / FOLDER))
         for row in history_rows(history, after=merged, selection=Selection(without=excluded)):
             grid.fold(row.rows, row.machine)
 

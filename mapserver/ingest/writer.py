@@ -9,19 +9,15 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
-from mapserver.config import ServerConfig
-from mapserver.ingest.store import Incoming, Store, Verify
+from mapserver.ingest.store import Incoming, Store
 from protocol.errors import QueryError, Refusal
-from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import Ack, Refused
 
 T = TypeVar("T")
 Reply = Callable[[Ack | Refused], None]
 log = logging.getLogger("mapserver.ingest.writer")
-
 
 QUEUE_BATCHES = 256  # so many batches may wait before machines have to send again later; some MB
 GROUP_BATCHES = 64  # committed together at most: one sync to disk for all of them
@@ -37,21 +33,15 @@ class _Work:
 
 
 class Writer:
-    """Owns a Store on a thread of its own.
+    """Owns a Store on a thread of its own, from here on; site, config, folder, now_ns: of the store.
 
     `submit` and `run` may be called from any thread; both return at once or wait for the owner, never touch the store.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        site: SiteConfig,
-        config: ServerConfig,
-        now_ns: Callable[[], int],
-        verify: Verify | None = None,
-    ) -> None:
-        self._snapshot_s = config.store.snapshot_s
-        self._store = Store(folder, site, config, now_ns, verify)
+    def __init__(self, store: Store) -> None:
+        self.site, self.config, self.folder, self.now_ns = store.site, store.config, store.folder, store.now_ns
+        self._snapshot_s = self.config.store.snapshot_s
+        self._store = store
         self._batches: queue.Queue[tuple[Incoming, Reply] | _Work | None] = queue.Queue()
         self._waiting = threading.Semaphore(QUEUE_BATCHES)
         self._overloaded = 0

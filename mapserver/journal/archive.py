@@ -7,20 +7,29 @@ compared with them, and they are forgotten then.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
-from dataclasses import fields
-from itertools import zip_longest
+from dataclasses import asdict, fields
+from datetime import UTC, datetime
+from itertools import chain, zip_longest
 from pathlib import Path
+from typing import Any, BinaryIO
 
-from mapserver.journal.archive_file import NAME, ArchiveFile, row_range
-from mapserver.journal.archive_writer import HOUR_NS, TEMPORARY, write_file
+import numpy as np
+
+from mapserver.journal.archive_file import KEY, NAME, ArchiveFile, ArchiveHeader, arrow, row_range, seal
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import ALL, JournalRow, Selection
 from protocol.errors import StoreError
+from protocol.files import sync_folder, whole_file
+from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 
 FOLDER = "archive"  # in the folder of a store
 FILE_SAMPLES = 2_000_000  # about; an hour with more is cut into several files
+GROUP_SAMPLES = 50_000  # of a row group, about: a batch is never cut
+HOUR_NS = 3_600_000_000_000
+TEMPORARY = "next.parquet.tmp"
 
 
 class Archive:
@@ -111,3 +120,87 @@ def _compare(path: Path, journal: JournalReader, archived: int) -> None:
 def _plain(row: JournalRow) -> tuple[object, ...]:
     values = {field.name: getattr(row, field.name) for field in fields(row)}
     return tuple((values | {"rows": row.rows.tobytes()}).values())
+
+
+def write_file(folder: Path, site: SiteConfig, rows: Iterator[JournalRow]) -> Path | None:
+    """Write rows to a new file that survives a power cut once it has its name; None where there are none.
+
+    The file is complete under a temporary name first: its own name has its last row, which is not known before.
+    """
+    first = next(rows, None)
+    if first is None:
+        return None
+    temporary = folder / TEMPORARY
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole_file(temporary) as file:
+            last_row = write_parquet(file, site, chain([first], rows))
+            seal(file)
+        hour = datetime.fromtimestamp(first.received_ns // HOUR_NS * 3600, UTC).strftime("%Y-%m-%dT%H")
+        path = folder / f"{hour}_{first.row:06d}-{last_row:06d}.parquet"
+        temporary.rename(path)
+        sync_folder(folder)
+    except OSError as error:
+        raise StoreError(folder, f"cannot be written: {error}") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def write_parquet(file: BinaryIO, site: SiteConfig, rows: Iterator[JournalRow]) -> int:
+    """Write rows, row group by row group; returns the last one's number."""
+    delta = dict.fromkeys(("seq", "row", "stamp_ns"), "DELTA_BINARY_PACKED")
+    options = {
+        "compression": "zstd",
+        "use_dictionary": ["machine", "spool_id", "received_ns"],
+        # Never a dictionary for samples: it would take every NaN for the same. Split by byte they also shrink better.
+        "column_encoding": dict.fromkeys(COLUMNS, "BYTE_STREAM_SPLIT") | delta,
+        "write_page_checksum": True,
+        "write_page_index": True,
+    }
+    machines: set[str] = set()
+    with arrow("parquet").ParquetWriter(file, _schema(), **options) as writer:
+        for group in _groups(rows):
+            writer.write_table(_table(group))
+            machines |= {row.machine for row in group}
+        header = ArchiveHeader(site, site.frame, site.crs, tuple(sorted(machines)))
+        writer.add_key_value_metadata({KEY: json.dumps(asdict(header))})
+    return group[-1].row
+
+
+def _groups(rows: Iterator[JournalRow]) -> Iterator[list[JournalRow]]:
+    """Batches of one row group each."""
+    group: list[JournalRow] = []
+    samples = 0
+    for row in rows:
+        group.append(row)
+        samples += len(row.rows)
+        if samples >= GROUP_SAMPLES:
+            yield group
+            group, samples = [], 0
+    if group:
+        yield group
+
+
+def _schema() -> Any:
+    pa = arrow()
+    types = {"machine": pa.string(), "spool_id": pa.uint64()}
+    types |= dict.fromkeys(("seq", "row", "received_ns"), pa.int64())
+    types |= {name: pa.from_numpy_dtype(SAMPLE_DTYPE[name]) for name in COLUMNS}
+    return pa.schema([pa.field(name, kind, nullable=False) for name, kind in types.items()])
+
+
+def _table(group: list[JournalRow]) -> Any:
+    """One line per sample."""
+    samples = np.concatenate([row.rows for row in group])
+    lengths = [len(row.rows) for row in group]
+    batch = np.repeat(np.arange(len(group)), lengths)
+    columns: dict[str, Any] = {
+        "machine": np.array([row.machine for row in group], object)[batch],
+        "spool_id": np.array([row.spool_id for row in group], np.uint64)[batch],
+        "seq": np.concatenate([row.first_seq + np.arange(len(row.rows)) for row in group]),
+        "row": np.array([row.row for row in group], np.int64)[batch],
+        "received_ns": np.array([row.received_ns for row in group], np.int64)[batch],
+    }
+    columns |= {name: np.ascontiguousarray(samples[name]) for name in COLUMNS}
+    return arrow().table(columns, schema=_schema())

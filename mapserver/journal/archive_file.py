@@ -181,9 +181,8 @@ def _read(path: Path, last: int | None = None) -> bytes:
 def _header(path: Path, metadata: dict[bytes, bytes]) -> ArchiveHeader:
     table = json.loads(metadata[KEY])
     if table["schema"] != SCHEMA:
-        raise StoreError(
-            path, f"has schema {table['schema']}, this version knows {SCHEMA}; read it with the version that wrote it"
-        )
+        problem = f"has schema {table['schema']}, this version knows {SCHEMA}"
+        raise StoreError(path, f"{problem}; read it with the version that wrote it")
     return from_table(ArchiveHeader, table, str(path))
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from bisect import bisect_right, insort
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from heapq import heapify, heappop, heappush
+from heapq import merge
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -26,16 +27,17 @@ def merged(sources: Sequence[tuple[str, int, Iterator[JournalRow]]]) -> Iterator
     sources: names, when the first row was received, and the rows; these are not touched before their time comes, so
     that thousands of files may follow each other.
     """
-    waiting = [((first_ns,), i, name, None, rows) for i, (name, first_ns, rows) in enumerate(sources)]
-    heap: list[tuple[tuple[Any, ...], int, str, JournalRow | None, Iterator[JournalRow]]] = [*waiting]
-    heapify(heap)
-    while heap:
-        _, i, name, row, rows = heappop(heap)
+
+    def keyed(
+        name: str, first_ns: int, rows: Iterator[JournalRow]
+    ) -> Iterator[tuple[tuple[Any, ...], str, JournalRow | None]]:
+        yield (first_ns,), name, None
+        for row in rows:
+            yield (row.received_ns, row.machine, row.spool_id, row.first_seq, len(row.rows)), name, row
+
+    for _, name, row in merge(*(keyed(*source) for source in sources), key=itemgetter(0)):
         if row:
             yield name, row
-        if row := next(rows, None):
-            key = (row.received_ns, row.machine, row.spool_id, row.first_seq, len(row.rows))
-            heappush(heap, (key, i, name, row, rows))
 
 
 class Copier:
@@ -96,10 +98,8 @@ class Copier:
             for seq in range(max(row.first_seq, old_first), min(last, old_last) + 1):
                 if row.rows[seq - row.first_seq].tobytes() != old[seq - old_first].tobytes():
                     sample = f"sample {seq} of {row.machine}, spool {row.spool_id:016x}"
-                    problem = (
-                        f"{sample}, is another in a further archive; find out which is right, and leave the other out"
-                    )
-                    raise StoreError(origin, problem)
+                    problem = "is another in a further archive; find out which is right, and leave the other out"
+                    raise StoreError(origin, f"{sample}, {problem}")
                 new[seq - row.first_seq] = False
         return new
 

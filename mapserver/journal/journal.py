@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mapserver.journal.reader import ROWS_AT_ONCE, JournalQueries
+from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
 from mapserver.journal.rows import Admission, Watermark, checksum, extent_checksum, pack
-from mapserver.journal.schema import SCHEMA, TABLES
 from protocol.errors import StoreError
 
 _WAL_LIMIT = 64 * 2**20
@@ -109,15 +108,10 @@ class Journal(JournalQueries):
     def append_event(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> int:
         """Commit an event, outside of any other transaction; returns its number."""
         text = json.dumps(body, allow_nan=False)
-        self.begin()
-        try:
+        with self._transaction():
             number = self._number("SELECT COALESCE(MAX(id), 0) + 1 FROM events")
             values = (number, kind, stamp_ns, text)
             self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
-            self.commit()
-        except (sqlite3.Error, StoreError):
-            self.rollback()
-            raise
         return number
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
@@ -127,15 +121,10 @@ class Journal(JournalQueries):
         """
         archived = self.archived_row
         last = max(archived, min(until, archived + most, self.last_row))
-        self.begin()
-        try:
+        with self._transaction():
             for table in ("journal", "extent"):
                 self._db.execute(f"DELETE FROM {table} WHERE row <= ?", (last,))  # noqa: S608 # one of two constants
             self._db.execute("REPLACE INTO meta VALUES ('archived_row', ?)", (str(last),))
-            self.commit()
-        except sqlite3.Error:
-            self.rollback()
-            raise
         return last
 
     def shrink(self, most_pages: int = 100) -> int:
@@ -154,6 +143,16 @@ class Journal(JournalQueries):
         """Fold the write-ahead log into the file and close."""
         self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         self._db.close()
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self.begin()
+        try:
+            yield
+            self.commit()
+        except (sqlite3.Error, StoreError):
+            self.rollback()
+            raise
 
     def _create_or_check(self, site: str, frame: str) -> None:
         expected = {"schema": str(SCHEMA), "site": site, "frame": frame}

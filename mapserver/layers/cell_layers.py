@@ -19,7 +19,7 @@ import numpy as np
 from mapserver.evidence import cells as ev
 from mapserver.layers.gap_filling import AREA_LAYERS, Area
 from mapserver.layers.statistics import linear_count, ratio, robust_centre, robust_spread
-from protocol.arrays import AnyArray, Bools, Floats, Floats32
+from protocol.arrays import AnyArray, Floats, Floats32
 from protocol.config import require_positive
 from protocol.errors import QueryError, Refusal
 from protocol.site import ground_classes
@@ -132,7 +132,8 @@ def grade_std(cells: CellEvidence) -> Floats:
 
 def slope_class(cells: CellEvidence) -> Floats:
     """0 flat, 1 slope (the paper's: steeper than 7.5 degrees)."""
-    return _known_class(ground_classes.slope_class(*cells.gradient))
+    classes = ground_classes.slope_class(*cells.gradient)
+    return np.where(classes == ground_classes.UNKNOWN, np.nan, classes.astype(np.float64))
 
 
 def heading(cells: CellEvidence) -> Floats:
@@ -206,7 +207,8 @@ def read(evidence: ev.Evidence, names: Sequence[str], config: ReadConfig, now_ns
     """Derive layers of cells, each (blocks, 256), NaN where the evidence is too thin. now_ns: the site's now."""
     metres = evidence.weight
     known = (metres > 0) & (metres >= config.min_weight_m * ev.WEIGHT_UNITS_PER_M)
-    cells = CellEvidence(_cells(evidence, known), now_ns, config)
+    known_cells = {field.name: getattr(evidence, field.name)[known] for field in dataclasses.fields(evidence)}
+    cells = CellEvidence(ev.Evidence(**known_cells), now_ns, config)
     out = {name: np.full(known.shape, np.nan, np.float32) for name in names}
     for name, values in out.items():
         values[known] = LAYERS[name](cells)
@@ -259,12 +261,3 @@ def _class_votes(cells: CellEvidence) -> Floats:
 def _seconds_ago(stamp_ns: AnyArray, now_ns: int) -> Floats:
     """Time since stamps [s], not below 0; NaN where either is 0, which means not known."""
     return np.where((stamp_ns > 0) & (now_ns > 0), np.maximum(now_ns - stamp_ns, 0) / 1e9, np.nan)
-
-
-def _known_class(classes: AnyArray) -> Floats:
-    return np.where(classes == ground_classes.UNKNOWN, np.nan, classes.astype(np.float64))
-
-
-def _cells(evidence: ev.Evidence, which: Bools) -> ev.Evidence:
-    """Evidence (cells, ...) of some of the cells."""
-    return ev.Evidence(**{f.name: getattr(evidence, f.name)[which] for f in dataclasses.fields(evidence)})

@@ -109,17 +109,15 @@ def _smooth(image: Floats, kernel: Floats) -> Floats:
 
 # --- the layers -----------------------------------------------------------------------------------------------
 
-Windows = Mapping[str, Floats]  # layers by name, (rows, columns)
-
 
 @dataclass(frozen=True)
 class Area:
     """What an area layer is derived from.
 
-    layers: those that it needs. reach_m, boundaries: fill_reach_m and boundaries of the read options.
+    layers: those that it needs, (rows, columns). reach_m, boundaries: fill_reach_m and boundaries of the read options.
     """
 
-    layers: Windows
+    layers: Mapping[str, Floats]
     cell_m: float
     reach_m: float
     boundaries: tuple[float, ...]

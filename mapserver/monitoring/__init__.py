@@ -1,1 +1,1 @@
-"""The server in numbers, for Prometheus: what it collects, agents' health, HTTP."""
+"""The server in numbers, for Prometheus: what it collects, HTTP."""

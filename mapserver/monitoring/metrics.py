@@ -1,4 +1,4 @@
-"""Metrics of the server: a collector that asks the server each time that Prometheus does.
+"""Metrics of the server: a collector that asks the server each time that Prometheus does, and the health of its agents.
 
 Names follow https://prometheus.io/docs/practices/naming/: base units, `_total` for what only grows until a restart.
 """
@@ -8,17 +8,66 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import zenoh
 from prometheus_client import Metric
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
-from mapserver.monitoring.health import ReceivedHealth
+from protocol.errors import ConfigError, MessageError
+from protocol.wire import keys
+from protocol.wire.codec import MAX_SMALL_BYTES, decode_health
 
+MOST_AGENTS = 1000  # names are free to choose where there are no keys
 _REFUSED, _REFUSED_QUERY = "refused_", "refused_query_"
+Family = GaugeMetricFamily | CounterMetricFamily
 Values = float | Mapping[str, float]  # of one metric, or by the value of its label
+
+
+@dataclass(frozen=True)
+class ReceivedHealth:
+    """The newest health of one agent: its values, and the server's clock when it came in [s since 1970]."""
+
+    values: Mapping[str, Any]
+    received_s: float
+
+
+class HealthListener:
+    """Keeps the newest health of every agent of a site as bytes until somebody asks: callbacks only move bytes."""
+
+    def __init__(self, session: zenoh.Session, site: str, clock: Callable[[], float] = time.time) -> None:
+        self._clock = clock
+        self._newest: dict[str, tuple[bytes, float]] = {}
+        self._subscriber = session.declare_subscriber(keys.health_all(site), self._on_health)
+
+    def received(self) -> dict[str, ReceivedHealth]:
+        """By machine, without health that cannot be read, or that came under the key of another machine."""
+        readable = {}
+        for name, (data, received_s) in sorted(self._newest.copy().items()):
+            try:
+                health = decode_health(data)
+            except MessageError:
+                continue
+            if health.machine == name:
+                readable[name] = ReceivedHealth(health.values, received_s)
+        return readable
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def _on_health(self, sample: zenoh.Sample) -> None:
+        try:
+            machine = keys.machine_of(str(sample.key_expr))
+        except ConfigError:  # a wildcard names no machine
+            return
+        data = sample.payload.to_bytes()
+        if len(data) <= MAX_SMALL_BYTES and (machine in self._newest or len(self._newest) < MOST_AGENTS):
+            self._newest[machine] = (data, self._clock())
 
 
 class ServerCollector(Collector):
@@ -45,11 +94,8 @@ class ServerCollector(Collector):
         start_s = time.perf_counter()
         info = self._info()
         turn_s = time.perf_counter() - start_s
-        yield InfoMetricFamily(
-            "sitegrid",
-            "Site and version of the server.",
-            {"site": str(info["site"]["name"]), "version": self._version},
-        )
+        labels = {"site": str(info["site"]["name"]), "version": self._version}
+        yield InfoMetricFamily("sitegrid", "Site and version of the server.", labels)
         yield from _server(info)
         yield from _machines(info)
         yield from _agent_health(self._agents())
@@ -144,23 +190,16 @@ def _problems(agents: Mapping[str, ReceivedHealth]) -> Metric:
     return metric
 
 
-def _gauge(name: str, what: str, values: Values, label: str = "machine") -> Metric:
-    return _filled(GaugeMetricFamily, name, what, values, label)
-
-
-def _counter(name: str, what: str, values: Values, label: str = "machine") -> Metric:
-    return _filled(CounterMetricFamily, name, what, values, label)
-
-
-def _filled(
-    family: type[GaugeMetricFamily] | type[CounterMetricFamily], name: str, what: str, values: Values, label: str
-) -> Metric:
+def _filled(family: type[Family], name: str, what: str, values: Values, label: str = "machine") -> Metric:
     if not isinstance(values, Mapping):
         return family(name, what, value=values)
     metric = family(name, what, labels=[label])
     for text, value in sorted(values.items()):
         metric.add_metric([text], value)
     return metric
+
+
+_gauge, _counter = partial(_filled, GaugeMetricFamily), partial(_filled, CounterMetricFamily)
 
 
 def _without(counters: Mapping[str, int], prefix: str) -> dict[str, int]:

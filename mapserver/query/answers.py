@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mapserver.config import ServerConfig
 from mapserver.follower.follower import Follower
+from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.history import SpanEvidence
 from mapserver.journal.rows import Selection
@@ -18,69 +17,47 @@ from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
 from protocol.errors import QueryError, Refusal
-from protocol.queries.answer_codec import (
-    encode_changes,
-    encode_history,
-    encode_info,
-    encode_machine,
-    encode_machines,
-    encode_point,
-    encode_region,
-)
+from protocol.queries import answer_codec as codec
+from protocol.queries import requests
 from protocol.queries.answers import HistoryAnswer, HistorySpan, PointAnswer, Region
 from protocol.queries.commands import TrustCommand, parse_command
-from protocol.queries.requests import (
-    MAX_SPANS,
-    ChangesQuery,
-    HistoryQuery,
-    MachinesQuery,
-    MapQuery,
-    PointQuery,
-    RegionQuery,
-    When,
-    check_size,
-    parse_query,
-)
+from protocol.queries.requests import MAX_SPANS, HistoryQuery, MapQuery, PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds, CellWindow
-from protocol.site.site_config import SiteConfig
 
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 
 
 class Answers:
-    """Answers the queries of one map, from any thread. journal: where the past is read."""
+    """Answers the queries of one map, from any thread."""
 
-    def __init__(
-        self, writer: Writer, follower: Follower, site: SiteConfig, config: ServerConfig, journal: Path
-    ) -> None:
-        self._writer = writer
-        self._follower = follower
-        self._site = site
-        self._config = config
-        self._past = PastMaps(journal, site.cell_m, config)
+    def __init__(self, writer: Writer, follower: Follower) -> None:
+        self._writer, self._follower = writer, follower
+        self._site, self._config = writer.site, writer.config
+        self._past = PastMaps(writer.folder / JOURNAL_FILE, self._site.cell_m, self._config)
 
     def answer(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and answer one query; QueryError says what is wrong with it."""
-        query = parse_query(name, parameters)
+        query = requests.parse_query(name, parameters)
         self._writer.wait_merged(query.fresh.after, query.fresh.wait_s)
         return self._encode(query)
 
     def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and carry out one command; QueryError says what is wrong with it."""
-        return encode_machine(self.trust(parse_command(name, parameters)))
+        return codec.encode_machine(self.trust(parse_command(name, parameters)))
 
     def _encode(self, query: MapQuery) -> bytes:
-        if isinstance(query, PointQuery):
-            return encode_point(self.point(query))
-        if isinstance(query, RegionQuery):
-            return encode_region(self.region(query))
-        if isinstance(query, HistoryQuery):
-            return encode_history(self.history(query))
-        if isinstance(query, MachinesQuery):
-            return encode_machines(self._follower.machines())
-        if isinstance(query, ChangesQuery):
-            return encode_changes(self._follower.changes(query.after))
-        return encode_info(self.info())
+        match query:
+            case PointQuery():
+                return codec.encode_point(self.point(query))
+            case RegionQuery():
+                return codec.encode_region(self.region(query))
+            case HistoryQuery():
+                return codec.encode_history(self.history(query))
+            case requests.MachinesQuery():
+                return codec.encode_machines(self._follower.machines())
+            case requests.ChangesQuery():
+                return codec.encode_changes(self._follower.changes(query.after))
+        return codec.encode_info(self.info())
 
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
@@ -118,7 +95,7 @@ class Answers:
         return CellWindow(window.column, window.row, 1, 1)
 
     def _read(self, window: CellWindow, names: tuple[str, ...], when: When) -> Region:
-        check_size(window.columns, window.rows)
+        requests.check_size(window.columns, window.rows)
         if when.minus_ns is None:
             return self._map(window, cell_layers.select(names), when.as_of_ns)
         names = _with_difference(names)

@@ -13,8 +13,7 @@ from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
-from mapserver.evidence.sums import evidence
-from mapserver.evidence.timeline import Block
+from mapserver.evidence.timeline import Block, evidence
 from mapserver.ingest.store import Store
 from mapserver.journal.history import History, SpanEvidence, grid_as_of, point_history
 from mapserver.journal.reader import JournalReader

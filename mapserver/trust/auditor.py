@@ -19,17 +19,7 @@ import numpy as np
 from mapserver.evidence.votes import FoldConfig, is_foldable
 from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
 from mapserver.trust.comparison import ComparedMap, Difference, compare, reverse
-from mapserver.trust.judgement import (
-    AGREE,
-    DISAGREE,
-    GROUND,
-    UNKNOWN,
-    ClockLeads,
-    Judgement,
-    Reason,
-    judge,
-    outvoted,
-)
+from mapserver.trust.judgement import AGREE, DISAGREE, GROUND, UNKNOWN, ClockLeads, Judgement, Reason, judge, outvoted
 from protocol.arrays import Ints, Table
 
 # Standard errors that are added to each limit: a vote may be doubtful where several are needed, a verdict may not.
@@ -63,11 +53,6 @@ class Auditor:
         self._fold = fold or FoldConfig()
         self._maps: dict[str, CoarseMap] = {}
         self._clocks = ClockLeads()
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of all machines' maps."""
-        return sum(coarse.nbytes for coarse in self._maps.values())
 
     def add(self, machine: str, rows: Table) -> None:
         """Add samples of one machine, as they lie in a journal row; rows in the order of the journal.

@@ -108,12 +108,6 @@ class CoarseMap:
         self._variance = 0  # sum of metres times variance of position, and of metres, over all time
         self._metres = 0
 
-    @property
-    def nbytes(self) -> int:
-        """Size of all arrays."""
-        waiting = sum(codes.nbytes + sums.nbytes for codes, sums in self._pending)
-        return self._codes.nbytes + self._sums.nbytes + waiting
-
     def add(self, rows: Table) -> None:
         """Add samples; those without resistance, and those of a machine that stands, say nothing about the ground."""
         metres = np.rint(rows["distance_m"] * np.float64(UNITS_PER_M)).astype(np.int64)

@@ -7,7 +7,7 @@ waits for the same verdict several times, so that a doubtful machine does not go
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 from mapserver.journal.rows import Event
@@ -20,7 +20,7 @@ DISTRUST_AFTER, TRUST_AFTER = 2, 4  # verdicts in a row
 
 @dataclass(frozen=True)
 class TrustDecision:
-    """What was decided about a machine. by: the audit or a person; evidence: plain values."""
+    """What was decided about a machine, as an event keeps it. by: the audit or a person; evidence: plain values."""
 
     machine: str
     trusted: bool
@@ -28,11 +28,6 @@ class TrustDecision:
     reason: str
     stamp_ns: int
     evidence: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def body(self) -> dict[str, Any]:
-        """As an event keeps it."""
-        return asdict(self)
 
 
 class TrustDecisions:

@@ -80,8 +80,7 @@ def _verifier(keys: Path | None) -> Verify | None:
 def _export(opened: ExitStack, session: zenoh.Session, server: Server, site: str, arguments: Namespace) -> str:
     """Show metrics for as long as the server runs; returns where."""
     from mapserver.monitoring.exporter import Exporter
-    from mapserver.monitoring.health import HealthListener
-    from mapserver.monitoring.metrics import ServerCollector
+    from mapserver.monitoring.metrics import HealthListener, ServerCollector
 
     health = opened.enter_context(closing(HealthListener(session, site)))
     collector = ServerCollector(server.answers.info, health.received, arguments.store, package_version())

@@ -137,8 +137,7 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     # imported here: needs the `server` extra, which a machine's host does not have
     from mapserver.evidence import snapshot
     from mapserver.ingest.store import JOURNAL_FILE
-    from mapserver.journal.reader import JournalReader
-    from mapserver.journal.schema import SCHEMA
+    from mapserver.journal.reader import SCHEMA, JournalReader
 
     if not (folder / JOURNAL_FILE).is_file():
         raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")

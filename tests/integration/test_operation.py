@@ -21,8 +21,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.journal.archive import archive
-from mapserver.journal.archive_writer import HOUR_NS
+from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
 from protocol.machine.samples import SAMPLE_DTYPE

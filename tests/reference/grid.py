@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,7 @@ def settled(evidence: Evidence, config: FoldConfig) -> Evidence:
     spans, keeps = tiers.spans_ns.tolist(), tiers.keeps.tolist()
     kept: Evidence = {}
     for cell, by_span in evidence.items():
-        here = {span: _copied(one) for span, one in by_span.items()}
+        here = {span: replace(one, counts=one.counts.copy()) for span, one in by_span.items()}
         for tier, keep in enumerate(keeps[:-1]):
             old = sorted((index for at, index in here if at == tier), reverse=True)[keep:]
             for index in old:
@@ -103,10 +103,6 @@ def of_grid(grid: Grid) -> Evidence:
 def plain(evidence: Evidence) -> dict[Cell, dict[Span, tuple[bytes, int, int, int]]]:
     """To compare."""
     return {cell: {span: one.plain() for span, one in spans.items()} for cell, spans in evidence.items()}
-
-
-def _copied(one: CellEvidence) -> CellEvidence:
-    return CellEvidence(one.counts.copy(), one.visits, one.machines, one.newest_ns)
 
 
 def _planes(bins: NDArray[np.int64], shares: NDArray[np.int64], sector: int) -> list[tuple[int, int]]:

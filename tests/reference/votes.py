@@ -41,11 +41,6 @@ class Votes:
     bucket: Ints
     bits: NDArray[np.uint64]
 
-    @property
-    def middle(self) -> Ints:
-        """Column and row (n, 2) of the cell that a sample lies in."""
-        return np.floor(self.place).astype(np.int64)
-
 
 def prepare(rows: Table, machine: str, cell_m: float, config: FoldConfig) -> Votes:
     """Turn foldable samples of one machine into votes."""

@@ -55,11 +55,3 @@ def test_the_agents_readings_come_at_their_rates_and_give_a_pose() -> None:
     pose = pipeline.pose
     assert pose is not None
     assert math.dist((pose.x_m, pose.y_m), agent.place(agent.progress(20)[0])[:2]) < 1.0
-
-
-@pytest.mark.parametrize("words", [["filter", "--samples", "5"], ["filter", "--steps", "0"], ["merge", "--steps", "5"]])
-def test_an_option_that_does_nothing_or_makes_no_sense_is_refused(words, capsys) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 2
-    assert words[1] in capsys.readouterr().err

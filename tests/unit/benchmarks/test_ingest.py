@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from benchmarks.__main__ import main
+from benchmarks.__main__ import BENCHMARKS, OPTIONS, main
 
 
 def test_ingest_prints_one_json_object(capsys):
@@ -21,25 +21,13 @@ def test_without_json_a_table_is_printed(capsys):
     assert len({len(line) for line in lines}) == 1
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["merge", "--samples", "-1"],
-        ["merge", "--runs", "0"],
-        ["merge", "--hours", "1"],
-        ["memory", "--hours", "0"],
-        ["memory", "--hours", "inf"],
-        ["memory", "--samples", "100"],
-        ["memory", "--runs", "1"],
-        ["restart", "--samples", "0"],
-        ["restart", "--runs", "1"],
-        ["restart", "--hours", "1"],
-        ["query"],
-        [],
-    ],
-)
-def test_wrong_usage_ends_with_two(words, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 2
-    assert "usage" in capsys.readouterr().err
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_an_option_that_does_nothing_or_makes_no_sense_is_refused(name, capsys):
+    taken = BENCHMARKS[name][2]
+    wrong = [(option, "5") for option in OPTIONS.keys() - taken.keys()]
+    wrong += [(option, value) for option in taken for value in ("0", "-1", "nan", "inf")]
+    for words in ([], ["query"], *([name, f"--{option}", value] for option, value in wrong)):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        assert ended.value.code == 2, words
+        assert "usage" in capsys.readouterr().err

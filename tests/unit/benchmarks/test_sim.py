@@ -26,29 +26,3 @@ def test_sim_prints_one_json_object_with_a_row_for_every_fleet(monkeypatch, caps
     assert [row["goal"] for row in rows] == [20.0, 40.0]
     figures = [row[name] for row in rows for name in ("sim_seconds_per_cpu_second", "start_up_cpu_s")]
     assert all(math.isfinite(figure) and figure > 0 for figure in figures)
-
-
-def test_sim_prints_a_table(monkeypatch, capsys) -> None:
-    monkeypatch.setattr(sim, "CASES", SMALL[1:])
-    main(["sim", "--seconds", "0.1", "--runs", "1"])
-    names, row = (line.split() for line in capsys.readouterr().out.splitlines())
-    assert names[:4] == ["world", "machines", "give_way", "sim_seconds_per_cpu_second"]
-    assert row[:3] == ["fast", "3", "False"]
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["sim", "--samples", "100"],
-        ["merge", "--seconds", "5"],
-        ["ingest", "--seconds", "5"],
-        ["sim", "--seconds", "0"],
-        ["sim", "--seconds", "nan"],
-        ["sim", "--runs", "0"],
-    ],
-)
-def test_an_option_that_does_nothing_or_makes_no_sense_is_refused(words, capsys) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 2
-    assert words[1] in capsys.readouterr().err

@@ -1,7 +1,7 @@
 import shutil
 import sqlite3
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -234,7 +234,7 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
 def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, tmp_path):
     shutil.copytree(clean[0], tmp_path / "store")
     store = Store(tmp_path / "store", SITE, CONFIG, lambda: 1)
-    store.journal.append_event(KIND, 1, TrustDecision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1).body)
+    store.journal.append_event(KIND, 1, asdict(TrustDecision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1)))
     store.close()
     store = Store(tmp_path / "store", SITE, CONFIG, lambda: 1)
     assert store.excluded == {"b"}

@@ -162,6 +162,10 @@ def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = S
     return Store(folder, site, config, now_ns)
 
 
+def open_writer(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Writer:
+    return Writer(open_store(folder, config, site))
+
+
 class Replies:
     """Collects the answers to batches, in the order in which they come."""
 

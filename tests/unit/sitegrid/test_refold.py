@@ -13,8 +13,7 @@ import pytest
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.journal.archive import FOLDER, archive
-from mapserver.journal.archive_writer import HOUR_NS
+from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow

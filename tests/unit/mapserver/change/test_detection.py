@@ -107,10 +107,6 @@ def test_the_kind_of_a_cell_is_the_median_of_all_its_votes():
 # --- limits ----------------------------------------------------------------------------------------------------------
 
 
-def test_detect_off_keeps_everything():
-    assert firsts(passes(0.04, 0.2), replace(CONFIG, detect=False)) == [0]
-
-
 def test_medians_nearer_than_bins_are_no_change():
     old = float(ev.RESISTANCE_CENTRES[8])
     assert firsts(passes(old, old * np.exp((BINS + 0.1) * BIN))) == [1]

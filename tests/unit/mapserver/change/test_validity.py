@@ -8,7 +8,7 @@ from mapserver.change.detection import ChangeConfig, cuts
 from mapserver.change.validity import around, clusters, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.sums import evidence
+from mapserver.evidence.timeline import evidence
 from mapserver.evidence.votes import FoldConfig
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import ReadConfig
@@ -79,15 +79,6 @@ def test_a_repaved_area_is_seen_after_one_pass_and_the_rest_stays(place):
     assert not now.changed_ns[outside].any()
     assert now.weight[inside].max() < 2 * ev.WEIGHT_UNITS_PER_M  # of one pass
     assert now.weight[outside].min() > (PASSES - 2) * ev.WEIGHT_UNITS_PER_M  # of all
-
-
-def test_the_time_of_the_change_lies_between_the_last_old_and_the_first_new_sample():
-    now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
-    changed = now.changed_ns[inside]
-    last_old = NOW_NS + (PASSES - 2) * HOUR_NS
-    assert (changed >= last_old).all()
-    assert (changed <= NOW_NS + (PASSES - 1) * HOUR_NS).all()
-    assert (changed <= now.newest_ns[inside]).all()
 
 
 def test_after_a_pause_a_change_is_dated_where_the_first_new_bucket_begins():

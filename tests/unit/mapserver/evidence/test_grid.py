@@ -72,6 +72,11 @@ def test_evidence_comes_in_the_order_asked_for_as_a_copy():
     grid = folded(samples(2, x_m=[8.0, 24.0], distance_m=[1.0, 2.0]))
     evidence = grid.evidence([(1, 0), (5, 5), (0, 0)])
     assert evidence.weight.sum(axis=1).tolist() == [2 * 4096, 0, 4096]
+    assert evidence.counts.shape == (3, 256, ev.COUNTS)
+    assert evidence.bitmaps.shape == (3, 256, 2)
+    assert evidence.newest_ns.shape == evidence.changed_ns.shape == (3, 256)
+    assert not evidence.changed_ns.any()
+    assert grid.evidence([]).counts.shape == (0, 256, ev.COUNTS)
     evidence.counts[:] = 0
     evidence.bitmaps[:] = 0
     assert same(grid, folded(samples(2, x_m=[8.0, 24.0], distance_m=[1.0, 2.0])))
@@ -103,14 +108,6 @@ def test_state_is_a_copy():
     for at, (votes, cells) in zip(state.pages, before, strict=True):
         assert np.array_equal(at.page.votes, votes)
         assert np.array_equal(at.page.cells, cells)
-
-
-def test_many_blocks_keep_their_evidence_while_room_is_made():
-    x = np.arange(-50, 50) * 40.0
-    grid = Grid(1.0, FoldConfig())
-    for i in range(len(x)):
-        grid.fold(samples(1, x_m=x[i], distance_m=1 + i % 7), "a")
-    assert same(grid, folded(samples(100, x_m=x, distance_m=1 + np.arange(100) % 7, stamp_ns=NOW_NS)))
 
 
 @pytest.mark.parametrize("cell_m", [0.05, 1.0, 100.0])
@@ -198,14 +195,6 @@ def test_blocks_are_touched_once_until_they_are_folded_into_again():
 def test_a_sample_that_adds_nothing_touches_nothing():
     grid = folded(samples(2, x_m=[8.0, 40.0], distance_m=[0.0, 1.0], cov_xx_m2=[0.0, 100.0]))
     assert grid.take_touched(9) == []
-
-
-def test_pages_are_counted():
-    grid = folded(
-        samples(3, x_m=[8.5, 40.5, 40.5], cov_xx_m2=0, cov_yy_m2=0, stamp_ns=NOW_NS + np.array([0, 0, 3600]) * 10**9)
-    )
-    assert grid.known_cells() == 2
-    assert len(grid.state().pages) == 3
 
 
 def test_chunks_hold_every_block_once():

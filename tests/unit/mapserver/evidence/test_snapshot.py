@@ -100,14 +100,7 @@ def test_a_snapshot_of_another_schema_is_passed_over(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"bucket_s": 60.0},
-        {"std_cap_m": 2.0},
-        {"keep_buckets": 5},
-        {"keep_hours": 5},
-        {"keep_days": 5},
-    ],
+    "change", [{"bucket_s": 60.0}, {"std_cap_m": 2.0}, {"keep_buckets": 5}, {"keep_hours": 5}, {"keep_days": 5}]
 )
 def test_a_snapshot_of_other_parameters_is_passed_over(tmp_path, change):
     assert snapshot.load(save(tmp_path, 1), 1.0, replace(FOLD, **change)) is None

@@ -14,6 +14,7 @@ from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from tests.reference.grid import by_definition, of_grid, plain
+from tests.unit.mapserver.data import same
 
 CONFIG = FoldConfig()
 DAY_NS = 86_400 * 10**9
@@ -45,12 +46,6 @@ def grid_of(parts: Batches, waiting_rows: int = LIVE_ROWS, cell_m: float = 1.0) 
     return grid
 
 
-def digest(grid: Grid) -> list[tuple[object, ...]]:
-    state = grid.state()
-    pages = [(at.x, at.y, at.tier, at.index, at.page.votes.tobytes(), at.page.cells.tobytes()) for at in state.pages]
-    return [*pages, (state.folded, state.skipped, state.newest_ns)]
-
-
 @pytest.mark.parametrize(("seed", "days", "cell_m"), [(1, 0.01, 1.0), (2, 3.0, 2.0), (3, 30.0, 1.0), (4, 400.0, 4.0)])
 def test_every_page_is_as_the_definition_says(seed: int, days: float, cell_m: float) -> None:
     parts = batches(seed, n=80, days=days)
@@ -64,7 +59,7 @@ def test_every_page_is_as_the_definition_says(seed: int, days: float, cell_m: fl
 def test_how_many_samples_wait_and_in_which_order_they_come_does_not_matter(seed: int, days: float, rows: int) -> None:
     parts = batches(seed, days=days)
     shuffled = [parts[i] for i in np.random.default_rng(seed).permutation(len(parts))]
-    assert digest(grid_of(parts)) == digest(grid_of(shuffled, rows))
+    assert same(grid_of(parts), grid_of(shuffled, rows))
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0, 400.0]))
@@ -74,7 +69,7 @@ def test_reading_meanwhile_does_not_matter(seed: int, days: float) -> None:
     for machine, rows in parts:
         read.fold(rows, machine)
         read.state()
-    assert digest(read) == digest(grid_of(parts))
+    assert same(read, grid_of(parts))
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0, 400.0]), st.integers(1, 4))
@@ -87,7 +82,7 @@ def test_a_merge_of_folds_is_the_fold_of_all(seed: int, days: float, more: int) 
         one, other = (grids.pop(int(rng.integers(len(grids)))) for _ in range(2))
         one.merge(other)
         grids.append(one)
-    assert digest(grids[0]) == digest(grid_of(parts))
+    assert same(grids[0], grid_of(parts))
 
 
 def test_counts_saturate_in_a_merge_and_become_wide() -> None:
@@ -99,7 +94,7 @@ def test_counts_saturate_in_a_merge_and_become_wide() -> None:
         for grid in (one, other, both, both):
             grid.fold(rows, "loader-1")
     one.merge(other)
-    assert digest(one) == digest(both)
+    assert same(one, both)
     assert max(int(at.page.votes["count"].max()) for at in both.state().pages) == 2**32 - 1
 
 

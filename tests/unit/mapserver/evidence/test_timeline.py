@@ -65,17 +65,6 @@ bucket = st.one_of(st.integers(0, 12 * PER_DAY), st.integers(0, 30)).map(lambda 
 keep = st.integers(1, 4)
 
 
-@settings(max_examples=150)
-@given(st.lists(bucket, min_size=1, max_size=40), keep, keep, keep, st.randoms(use_true_random=False))
-def test_any_order_of_buckets_gives_the_same_timeline(buckets, a, b, c, random):
-    keeps = {"keep_buckets": a, "keep_hours": b, "keep_days": c}
-    shuffled = buckets.copy()
-    random.shuffle(shuffled)
-    line = timeline(buckets, **keeps)
-    assert same(line, timeline(shuffled, **keeps))
-    assert set(places(line)) == by_definition(buckets, (a, b, c))
-
-
 @settings(max_examples=100)
 @given(
     st.lists(st.tuples(bucket, st.sets(st.integers(0, 3), min_size=1).map(tuple)), min_size=1, max_size=30),
@@ -95,18 +84,6 @@ def test_what_stays_apart_is_decided_cell_by_cell(driven, keeps, random):
     for bucket_, cells in driven:
         again.add(page(bucket_, cells=cells))
     assert same(line, again)
-
-
-@settings(max_examples=60)
-@given(st.lists(st.tuples(bucket, st.booleans(), st.sets(st.integers(0, 3), min_size=1).map(tuple)), max_size=40))
-def test_reading_in_between_changes_nothing(driven):
-    read, unread = timeline([]), timeline([])
-    for bucket_, is_read, cells in driven:
-        for one in (read, unread):
-            one.add(page(bucket_, cells=cells))
-        if is_read:
-            read.timed()
-    assert same(read, unread)
 
 
 def test_a_timeline_that_nobody_reads_does_not_grow():
@@ -131,23 +108,6 @@ def test_no_evidence_is_lost_or_doubled(buckets):
         timed.page.add_to(counts, bitmaps, newest_ns)
     assert counts.sum() == len(buckets)
     assert newest_ns.max() == max(buckets) * BUCKET_S * S + 7
-
-
-def test_late_samples_go_where_their_bucket_was_summed():
-    early = [START, START + 1, START + 2]
-    later = [START + 5 * PER_DAY + i * PER_HOUR for i in range(6)]
-    line = timeline([*early, *later, *early, START + 1])
-    assert same(line, timeline(sorted([*early, *later, *early, START + 1])))
-    assert places(line)[-2:] == [(2, START // PER_DAY), (2, START // PER_DAY + 5)]
-
-
-def test_a_late_bucket_does_not_replace_a_newer_one():
-    line = timeline([START + 10, START + 11, START])
-    assert places(line) == [(0, START + 10), (0, START + 11), (1, START // PER_HOUR)]
-
-
-def test_evidence_of_one_bucket_is_one_page():
-    assert places(timeline([START] * 5)) == [(0, START)]
 
 
 def test_a_timeline_goes_on_from_its_pages():
@@ -186,25 +146,9 @@ def test_spans_are_whole_buckets_hours_and_days(offset):
     assert timed[-1].first_ns == buckets[-1] * BUCKET_S * S
 
 
-def test_the_first_and_the_last_bucket_of_an_hour_are_of_that_hour():
-    hour = START // PER_HOUR
-    newer = [START + 100, START + 101]
-    for bucket, index in ((START, hour), (START + PER_HOUR - 1, hour), (START + PER_HOUR, hour + 1)):
-        assert places(timeline([bucket, *newer]))[-1] == (1, index)
-
-
 def test_buckets_of_an_hour_are_not_cut_by_it():
     config = FoldConfig(bucket_s=3600.0, keep_buckets=1, keep_hours=1, keep_days=1)
     line = empty_timeline(config)
     for bucket in range(500_000, 500_005):
         line.add(page(bucket))
     assert places(line) == [(0, 500_004), (1, 500_003), (2, 500_002 // 24)]
-
-
-def test_a_sum_in_a_timeline_saturates():
-    line = empty_timeline(FoldConfig(keep_buckets=1))
-    for _ in range(3):
-        line.add(page(START, ev.COUNT_MAX - 1))
-    (_, _, only), *more = line.items()
-    assert not more
-    assert only.votes["count"].tolist() == [ev.COUNT_MAX]

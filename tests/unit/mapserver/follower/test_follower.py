@@ -3,6 +3,7 @@
 import shutil
 import threading
 from contextlib import closing, contextmanager
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +13,22 @@ import pytest
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
 from mapserver.follower import follower
-from mapserver.follower.archiving import Archiving
-from mapserver.follower.audit import Audit
 from mapserver.follower.follower import Follower
+from mapserver.follower.jobs import Archiving, Audit
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.reader import JournalReader
-from mapserver.trust.auditor import Auditor
 from protocol.errors import QueryError, StoreError
+from protocol.queries.answers import GroundChange
 from protocol.site.ground_classes import ZONES
 from tests.unit.mapserver.data import (
     NOW_NS,
     SITE,
     folded,
     incoming,
-    now_ns,
     open_store,
+    open_writer,
     random_samples,
     same,
     samples,
@@ -44,10 +44,10 @@ class Site:
     """A writer with its follower over a folder, and what was published."""
 
     def __init__(self, folder: Path, judge_s: float = 60.0, *, exclude: bool = True) -> None:
-        self.published: list[dict[str, Any]] = []
+        self.published: list[GroundChange] = []
         self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0), trust=TrustConfig(judge_s, exclude))
-        self.writer = Writer(folder, SITE, self.config, now_ns)
-        self.follower = Follower(self.writer, folder, SITE, self.config, self.published.append, now_ns)
+        self.writer = open_writer(folder, self.config)
+        self.follower = Follower(self.writer, self.published.append)
 
     @property
     def grid(self) -> Grid:
@@ -77,10 +77,7 @@ def opened(tmp_path, monkeypatch):
 def store(tmp_path):
     """A writer without a follower, and a reader of its journal."""
     folder = tmp_path / "store"
-    with (
-        closing(Writer(folder, SITE, ServerConfig(), now_ns)) as writer,
-        JournalReader(folder / JOURNAL_FILE) as reader,
-    ):
+    with closing(open_writer(folder)) as writer, JournalReader(folder / JOURNAL_FILE) as reader:
         yield writer, reader
 
 
@@ -217,23 +214,25 @@ def test_a_change_is_published_listed_and_kept(opened):
     with opened() as site:
         repaved(site)
         wait_for(lambda: site.published)
-        wait_for(lambda: site.follower.changes() and site.follower.changes()[0]["cells"] > 1000)
+        wait_for(lambda: site.follower.changes() and site.follower.changes()[0].cells > 1000)
         (change,) = site.follower.changes()
         assert site.published[-1] == change
-        assert change["resistance_after"] == pytest.approx(0.02, rel=0.05)
+        assert change.resistance_after == pytest.approx(0.02, rel=0.05)
     with opened() as site:
         assert site.follower.changes() == [change]
         wait_for(lambda: not site.writer.run(lambda store: store.grid.take_touched(1)))
         assert site.published == []
-        assert site.follower.changes(after=change["id"]) == []
+        assert site.follower.changes(after=change.id) == []
 
 
 # --- archiving -------------------------------------------------------------------------------------------------------
 
 
 def archiving(writer: Writer, reader: JournalReader, after_h: float, hours_later: float = 3.0) -> Archiving:
-    now = NOW_NS + round(hours_later * HOUR_NS)
-    return Archiving(writer, reader, SITE, after_h, lambda: now, threading.Event())
+    writer = copy(writer)
+    writer.now_ns = lambda: NOW_NS + round(hours_later * HOUR_NS)
+    writer.config = ServerConfig(store=StoreConfig(archive_after_h=after_h))
+    return Archiving(writer, reader, threading.Event())
 
 
 @pytest.mark.parametrize("after_h", [0.0, 1.0, 4.0])
@@ -278,18 +277,20 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
 # --- the audit -------------------------------------------------------------------------------------------------------
 
 
+def audit_of(writer: Writer, reader: JournalReader, report: Any, judge_s: float = 1e-9, busy: bool = False) -> Audit:
+    writer.config = ServerConfig(trust=TrustConfig(judge_s))
+    return Audit(writer, reader, report, lambda: busy)
+
+
 def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(store, monkeypatch):
     writer, reader = store
     send(writer, [incoming(samples(5))])
     reports: list[Any] = []
 
-    def report(*verdicts: Any) -> None:
-        reports.append(verdicts)
-
     def damaged(*_: Any, **__: Any) -> Any:
         raise StoreError("journal.db", "is damaged")
 
-    audit = Audit(writer, reader, Auditor(SITE.cell_m), 1e-9, report, lambda: False)
+    audit = audit_of(writer, reader, lambda *report: reports.append(report))
     audit.run()
     monkeypatch.setattr(reader, "read", damaged)
     with pytest.raises(StoreError):
@@ -301,7 +302,7 @@ def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(
 def test_machines_are_judged_so_often(store, judge_s, times):
     writer, reader = store
     reports: list[Any] = []
-    audit = Audit(writer, reader, Auditor(SITE.cell_m), judge_s, lambda *report: reports.append(report), lambda: False)
+    audit = audit_of(writer, reader, lambda *report: reports.append(report), judge_s)
     for _ in range(3):
         audit.run()
     assert len(reports) == times
@@ -310,7 +311,7 @@ def test_machines_are_judged_so_often(store, judge_s, times):
 def test_other_work_interrupts_the_audit_which_goes_on_where_it_was(store):
     writer, reader = store
     send(writer, [incoming(samples(5), machine=name) for name in "abc"])
-    audit = Audit(writer, reader, Auditor(SITE.cell_m), 1e-9, lambda *_: None, lambda: True)
+    audit = audit_of(writer, reader, lambda *_: None, busy=True)
     for followed in ("a", "ab", "abc", "abc"):
         audit.run()
         assert sorted(audit.verdicts) == list(followed)

@@ -10,7 +10,7 @@ import pytest
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
 from mapserver.ingest import writer as writer_module
-from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.store import Store
 from mapserver.ingest.writer import GROUP_BATCHES, QUEUE_BATCHES, Writer
 from mapserver.journal.journal import Journal
 from mapserver.query.answers import Answers
@@ -28,7 +28,7 @@ from tests.unit.mapserver.data import (
     folded,
     held,
     incoming,
-    now_ns,
+    open_writer,
     random_samples,
     same,
     samples,
@@ -42,12 +42,12 @@ from tests.unit.mapserver.query.fake_follower import FakeFollower
 def start(tmp_path, monkeypatch):
     writers = []
 
-    def open_writer(site=SITE, snapshot_rows: int = 2000, **options: Any) -> Writer:
+    def start_writer(site=SITE, snapshot_rows: int = 2000, **options: Any) -> Writer:
         monkeypatch.setattr(writer_module, "SNAPSHOT_ROWS", snapshot_rows)
-        writers.append(Writer(tmp_path, site, ServerConfig(store=StoreConfig(**options)), now_ns))
+        writers.append(open_writer(tmp_path, ServerConfig(store=StoreConfig(**options)), site))
         return writers[-1]
 
-    yield open_writer
+    yield start_writer
     for writer in writers:
         writer.close()
 
@@ -404,9 +404,9 @@ QUERIES = [
 
 
 @pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
-def test_a_refused_query_says_why(start, tmp_path, reason, name, parameters):
+def test_a_refused_query_says_why(start, reason, name, parameters):
     with pytest.raises(QueryError) as caught:
-        Answers(start(), FakeFollower(), SITE, CONFIG, tmp_path / JOURNAL_FILE).answer(name, parameters)
+        Answers(start(), FakeFollower()).answer(name, parameters)
     assert caught.value.reason == reason
 
 

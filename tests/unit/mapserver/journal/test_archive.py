@@ -16,10 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.journal import archive as ar
-from mapserver.journal import archive_file, archive_writer
-from mapserver.journal.archive import Archive, archive, next_file
+from mapserver.journal import archive_file
+from mapserver.journal.archive import HOUR_NS, Archive, archive, next_file
 from mapserver.journal.archive_file import ArchiveFile
-from mapserver.journal.archive_writer import HOUR_NS
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import ALL, Admission, JournalRow, Selection, checksum
@@ -123,7 +122,7 @@ def test_files_are_contiguous_where_the_clock_steps_back(tmp_path):
 
 def test_a_full_hour_is_cut_and_row_groups_never_cut_a_batch(tmp_path, monkeypatch):
     monkeypatch.setattr(ar, "FILE_SAMPLES", 12)
-    monkeypatch.setattr(archive_writer, "GROUP_SAMPLES", 6)
+    monkeypatch.setattr(ar, "GROUP_SAMPLES", 6)
     with opened(tmp_path) as machines:
         for _ in range(7):
             machines.send(4, NOW_NS)
@@ -222,7 +221,7 @@ def test_any_span_of_rows_is_read(day, after, until):
 
 
 def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
-    monkeypatch.setattr(archive_writer, "GROUP_SAMPLES", 1)
+    monkeypatch.setattr(ar, "GROUP_SAMPLES", 1)
     with opened(tmp_path) as machines:
         for i in range(4):
             rows = samples(3, x_m=10.0 * i, stamp_ns=NOW_NS + i)
@@ -256,7 +255,7 @@ def test_rows_come_back_whatever_the_cuts(data):
     sized = pytest.MonkeyPatch.context()
     with tempfile.TemporaryDirectory() as folder, opened(Path(folder)) as machines, sized as patch:
         patch.setattr(ar, "FILE_SAMPLES", data.draw(st.integers(1, 30)))
-        patch.setattr(archive_writer, "GROUP_SAMPLES", data.draw(st.integers(1, 30)))
+        patch.setattr(ar, "GROUP_SAMPLES", data.draw(st.integers(1, 30)))
         now_ns, before = NOW_NS, []
         for i, step in enumerate(data.draw(st.lists(st.integers(0, 6), min_size=1, max_size=8))):
             now_ns += step * HOUR_NS // 4
@@ -327,8 +326,8 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 
 
 def test_a_file_of_another_schema_is_refused(day, monkeypatch):
-    monkeypatch.setattr(archive_writer, "asdict", lambda header: asdict(header) | {"schema": 2})
-    path = archive_writer.write_file(day.folder, SITE, day.reader.read())
+    monkeypatch.setattr(ar, "asdict", lambda header: asdict(header) | {"schema": 2})
+    path = ar.write_file(day.folder, SITE, day.reader.read())
     with pytest.raises(StoreError, match="has schema 2, this version knows 1"):
         ArchiveFile(path)
 
@@ -354,9 +353,7 @@ def test_a_missing_file_is_an_error(day):
 
 def test_two_files_with_the_same_row_are_an_error(day):
     names = day.archive()
-    archive_writer.write_file(
-        day.folder, SITE, iter([row for row in ArchiveFile(day.folder / names[0]).read() if row.row == 3])
-    )
+    ar.write_file(day.folder, SITE, iter([row for row in ArchiveFile(day.folder / names[0]).read() if row.row == 3]))
     with pytest.raises(StoreError, match="row 3 is also in another file"):
         list(Archive(day.folder).read(0, 7))
 
@@ -368,13 +365,7 @@ class Crash(BaseException):
     """Whatever ends a process at once."""
 
 
-STEPS = {
-    "write_parquet": archive_writer,
-    "seal": archive_writer,
-    "sync_folder": archive_writer,
-    "sync_folder of the temporary file": files,
-    "_compare": ar,
-}
+STEPS = {"write_parquet": ar, "seal": ar, "sync_folder": ar, "sync_folder of the temporary file": files, "_compare": ar}
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -437,7 +428,7 @@ def test_nothing_is_forgotten_before_file_and_name_are_on_disk(day, monkeypatch)
 
 def test_what_a_kill_left_half_written_is_removed(day):
     day.folder.mkdir()
-    for name in (archive_writer.TEMPORARY, f".{archive_writer.TEMPORARY}.{os.getpid()}.0.part"):
+    for name in (ar.TEMPORARY, f".{ar.TEMPORARY}.{os.getpid()}.0.part"):
         (day.folder / name).write_bytes(b"half")
     day.archive()
     assert len(list(day.folder.iterdir())) == 3
@@ -485,8 +476,8 @@ for _ in archive(folder / "archive", JournalReader(folder / "journal.db"), site,
 @pytest.mark.parametrize(
     ("step", "calls"),
     [
-        ("archive_writer._table", 0),
-        ("archive_writer.seal", 1),
+        ("archive._table", 0),
+        ("archive.seal", 1),
         ("replace", 0),
         ("rename", 0),
         ("archive._compare", 0),

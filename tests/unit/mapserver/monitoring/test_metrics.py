@@ -19,8 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 
 from mapserver.monitoring.exporter import Exporter
-from mapserver.monitoring.health import MOST_AGENTS, HealthListener, ReceivedHealth
-from mapserver.monitoring.metrics import ServerCollector, size_of
+from mapserver.monitoring.metrics import MOST_AGENTS, HealthListener, ReceivedHealth, ServerCollector, size_of
 from mapserver.server import Server
 from protocol.errors import LinkError
 from protocol.wire import keys

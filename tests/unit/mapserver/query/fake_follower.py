@@ -18,9 +18,9 @@ class FakeFollower:
     def machines(self) -> list[dict[str, Any]]:
         return [asdict(machine_state("a")), asdict(machine_state("b", trusted=False))]
 
-    def changes(self, after: int) -> list[dict[str, Any]]:
+    def changes(self, after: int) -> list[GroundChange]:
         self.asked.append(after)
-        return [asdict(GroundChange(after + 1, 1, 1, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, None))]
+        return [GroundChange(after + 1, 1, 1, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, None)]
 
     def trust(self, machine: str, trusted: bool | None, reason: str, wait_s: float) -> dict[str, Any]:
         self.asked.append((machine, trusted, reason, wait_s))

@@ -1,34 +1,18 @@
 """Maps as of any time, their differences, the history of a point; machines, changes and commands."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 
-from mapserver.ingest.store import JOURNAL_FILE
-from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answers import Answers, reads_past
 from protocol.errors import QueryError, Refusal
-from protocol.queries.answer_codec import (
-    decode_changes,
-    decode_history,
-    decode_machine,
-    decode_machines,
-    decode_point,
-    decode_region,
-)
+from protocol.queries import answer_codec as codec
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.requests import MAX_SPANS, HistoryQuery, PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    incoming,
-    now_ns,
-    random_samples,
-    samples,
-    send,
-)
+from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, samples, send
 from tests.unit.mapserver.query.fake_follower import FakeFollower
 
 S, HOUR_NS = 10**9, 3600 * 10**9
@@ -45,14 +29,13 @@ def served(tmp_path_factory):
     opened = []
 
     def start(rows=None, follower=None) -> Answers:
-        folder = tmp_path_factory.mktemp("store")
-        writer = Writer(folder, SITE, CONFIG, now_ns)
+        writer = open_writer(tmp_path_factory.mktemp("store"))
         opened.append(writer)
         for machine, table in (ROWS if rows is None else rows).items():
             half = len(table) // 2
             send(writer, [incoming(part, machine=machine) for part in (table[:half],) if len(part)])
             send(writer, [incoming(table[half:], 1 + half, machine)])
-        return Answers(writer, follower or FakeFollower(), SITE, CONFIG, folder / JOURNAL_FILE)
+        return Answers(writer, follower or FakeFollower())
 
     yield start
     for writer in opened:
@@ -253,11 +236,11 @@ def test_a_site_without_samples_has_no_history(served):
 
 @pytest.mark.parametrize("query", [PointQuery(0, 0, when=When(1)), HistoryQuery(0, 0)])
 def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
-    writer = Writer(tmp_path, SITE, CONFIG, now_ns)
-    with pytest.raises(QueryError, match="no usable journal") as caught:
-        getattr(Answers(writer, FakeFollower(), SITE, CONFIG, tmp_path / "none.db"), query.name)(query)
+    with closing(open_writer(tmp_path)) as writer:
+        writer.folder = tmp_path / "elsewhere"
+        with pytest.raises(QueryError, match="no usable journal") as caught:
+            getattr(Answers(writer, FakeFollower()), query.name)(query)
     assert caught.value.reason == Refusal.STORE
-    writer.close()
 
 
 def test_questions_about_the_past_are_recognised():
@@ -270,17 +253,17 @@ def test_questions_about_the_past_are_recognised():
 def test_answers_about_the_past_travel_as_bytes(answers):
     stamp = str(NOW_NS + 900 * S)
     region = {"bounds": "-2,-2,2,2", "layers": "visits"}
-    then = decode_region(answers.answer("region", {**region, "as_of": stamp}))
-    difference = decode_region(answers.answer("region", {**region, "minus": stamp}))
-    now = decode_region(answers.answer("region", region))
+    then = codec.decode_region(answers.answer("region", {**region, "as_of": stamp}))
+    difference = codec.decode_region(answers.answer("region", {**region, "minus": stamp}))
+    now = codec.decode_region(answers.answer("region", region))
     assert np.array_equal(difference["visits"], now["visits"] - then["visits"], equal_nan=True)
     assert then.stamp_ns == int(stamp)
     place = {"x": "0.5", "y": "0.5", "layers": "visits"}
-    assert decode_point(answers.answer("point", {**place, "as_of": stamp})).stamp_ns == int(stamp)
+    assert codec.decode_point(answers.answer("point", {**place, "as_of": stamp})).stamp_ns == int(stamp)
     one = ROWS["a"][ROWS["a"]["distance_m"].argmax()]
     there = {"x": str(one["x_m"]), "y": str(one["y_m"]), "layers": "visits"}
     times = {"from": str(one["stamp_ns"]), "to": str(one["stamp_ns"]), "span": "600"}
-    [span] = decode_history(answers.answer("history", {**there, **times})).spans
+    [span] = codec.decode_history(answers.answer("history", {**there, **times})).spans
     assert span.last_ns - span.first_ns == 600 * S - 1
     with pytest.raises(QueryError, match="row 9 is not merged"):
         answers.answer("history", {**place, "after": "9", "wait": "0.01"})
@@ -293,13 +276,10 @@ def test_the_follower_is_asked(served):
     follower = FakeFollower()
     answers = served(follower=follower)
     assert [
-        (machine.name, machine.trusted) for machine in decode_machines(answers.answer("machines", {"after": "1"}))
-    ] == [
-        ("a", True),
-        ("b", False),
-    ]
-    assert [change.id for change in decode_changes(answers.answer("changes", {"after": "41"}))] == [42]
-    row = decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
+        (machine.name, machine.trusted) for machine in codec.decode_machines(answers.answer("machines", {"after": "1"}))
+    ] == [("a", True), ("b", False)]
+    assert [change.id for change in codec.decode_changes(answers.answer("changes", {"after": "41"}))] == [42]
+    row = codec.decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
     assert (row.name, row.trusted, row.merged) == ("b", False, 4)
     answers.obey("trust", {"machine": "b", "trusted": "auto"})
     assert follower.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]

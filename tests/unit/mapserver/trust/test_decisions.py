@@ -1,3 +1,5 @@
+from dataclasses import asdict
+
 import pytest
 
 from mapserver.journal.rows import Event
@@ -72,7 +74,7 @@ def test_decisions_come_back_from_events_the_newest_of_each_machine():
         TrustDecision("b", False, PERSON, "broken", 2),
         TrustDecision("c", True, PERSON, "repaired", 3),
     ]
-    decisions = TrustDecisions(Event(i, "trust", d.stamp_ns, d.body) for i, d in enumerate(made, 1))
+    decisions = TrustDecisions(Event(i, "trust", d.stamp_ns, asdict(d)) for i, d in enumerate(made, 1))
     assert decisions.distrusted == {"b"}
     assert decisions.newest("c") == made[2]
     assert decisions.newest("b") == made[1]

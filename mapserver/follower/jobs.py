@@ -1,0 +1,133 @@
+"""Jobs of the follower that look again and again: audit of machines, search for changes, archiving of old rows.
+
+Each has a name for the log, and a `run` that does what is due and returns soon.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+
+from mapserver.change import change_log
+from mapserver.change.change_log import ChangeLog
+from mapserver.change.detection import reach_blocks
+from mapserver.change.validity import around
+from mapserver.evidence.timeline import Block, TimedPage
+from mapserver.ingest.store import Store
+from mapserver.ingest.writer import Writer
+from mapserver.journal.archive import FOLDER, archive
+from mapserver.journal.reader import JournalReader
+from mapserver.trust.auditor import Auditor, Verdict
+from protocol.queries.answers import GroundChange
+
+LOOK_BLOCKS = 256  # for changes, at a time: the writer copies their pages, and batches wait meanwhile
+LOOK_S = 60.0  # between two looks for rows that are old enough: files are of whole hours
+Report = Callable[[Mapping[str, Verdict], int], None]
+Publish = Callable[[GroundChange], None]
+log = logging.getLogger("mapserver.follower.jobs")
+
+
+class Audit:
+    """Hands what is journalled to an auditor, and judges all machines from time to time.
+
+    report: is given all verdicts, and the site's now [ns]. interrupted: whether other work waits for the thread.
+    """
+
+    name = "audit"
+
+    def __init__(self, writer: Writer, reader: JournalReader, report: Report, interrupted: Callable[[], bool]) -> None:
+        self.verdicts: Mapping[str, Verdict] = {}
+        self._writer, self._reader, self._report, self._interrupted = writer, reader, report, interrupted
+        self._auditor = Auditor(writer.site.cell_m, writer.config.fold)
+        self._followed = reader.archived_row
+        self._due_s = 0.0
+
+    def run(self) -> None:
+        """Follow the journal, then judge where it is time."""
+        try:
+            self._follow()
+        finally:  # a row that cannot be read must not keep the machines from being judged by the others
+            if time.monotonic() >= self._due_s:
+                self._due_s = time.monotonic() + self._writer.config.trust.judge_s
+                self.verdicts = self._auditor.verdicts()
+                self._report(self.verdicts, self._writer.run(lambda store: store.newest_ns))
+
+    def _follow(self) -> None:
+        until = self._reader.last_row  # what comes in meanwhile waits for the next turn: a busy site has no end
+        for row in self._reader.read(after=max(self._followed, self._reader.archived_row), until=until):
+            self._auditor.add(row.machine, row.rows)
+            self._followed = row.row
+            if self._interrupted():
+                return
+
+
+class ChangeSearch:
+    """Looks at what was folded since the last look. publish: is given each change when it is new or grows."""
+
+    name = "changes"
+
+    def __init__(self, writer: Writer, reader: JournalReader, publish: Publish, ending: threading.Event) -> None:
+        self._writer, self._publish, self._ending = writer, publish, ending
+        cell_m, config = writer.site.cell_m, writer.config
+        self._reach = reach_blocks(cell_m, config.change)
+        kept = [event.body for event in reader.events(change_log.KIND)]
+        self._log = ChangeLog(cell_m, config.change, config.read, kept)
+        self._lock = threading.Lock()
+        writer.run(lambda store: store.grid.touch_all())  # the log knows the changes, but not yet their cells
+
+    def changes(self, after: int) -> list[GroundChange]:
+        """Changes with a number beyond `after`; for any thread."""
+        with self._lock:
+            return self._log.changes(after)
+
+    def run(self) -> None:
+        """Look at all blocks that were folded into; keep and publish each change."""
+        while not self._ending.is_set():
+            blocks, pages = self._writer.run(self._touched)
+            if not blocks:
+                return
+            with self._lock:
+                changes = self._log.look(blocks, pages)
+            for change in changes:
+                self._keep(change)
+                self._publish(change)
+
+    def _keep(self, change: GroundChange) -> None:
+        self._writer.run(lambda store: store.journal.append_event(change_log.KIND, change.last_ns, asdict(change)))
+
+    def _touched(self, store: Store) -> tuple[list[Block], dict[Block, Sequence[TimedPage]]]:
+        """Some of the blocks in which something was folded since they were looked at, and pages of them and around."""
+        blocks = store.grid.take_touched(LOOK_BLOCKS)
+        wide = sorted({near for block in blocks for near in around(block, self._reach)})
+        return blocks, {block: pages for block, pages in zip(wide, store.grid.pages(wide), strict=True) if pages}
+
+
+class Archiving:
+    """Moves journal rows that are old enough into hourly Parquet files."""
+
+    name = "archiving"
+
+    def __init__(self, writer: Writer, reader: JournalReader, ending: threading.Event) -> None:
+        self._writer, self._reader, self._ending = writer, reader, ending
+        self._due_s = 0.0
+
+    def run(self) -> None:
+        """Move the next hour of old rows, where it is time: an hour a turn, so that the end need not wait."""
+        after_h = self._writer.config.store.archive_after_h
+        if not after_h or time.monotonic() < self._due_s:
+            return
+        self._due_s = time.monotonic() + LOOK_S
+        before_ns = self._writer.now_ns() - round(after_h * 3600e9)
+        hours = archive(self._writer.folder / FOLDER, self._reader, self._writer.site, before_ns, self._forget)
+        if path := next(hours, None):
+            self._writer.run(lambda store: store.journal.shrink())
+            log.info("archived file=%s", path.name)
+            self._due_s = 0.0  # there may be more hours
+
+    def _forget(self, until: int) -> int:
+        if self._ending.is_set():  # what is in both meanwhile counts once, and the next start goes on with it
+            return until
+        return self._writer.run(lambda store: store.journal.forget(until))
