@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sitegrid.options.groups import Subparsers, add_action
+from sitegrid.options.groups import add_action
 from sitegrid.options.values import count, positive, seed, withhold
 from sitegrid.process.lifetime import note, plain, say
 from sitegrid.process.progress import Display
@@ -26,69 +25,44 @@ SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command: those of each experiment."""
-    experiments = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
-    physics = add_action(
-        experiments, "physics", "compare the simulator with mechanics, and its two worlds with each other"
-    )
-    _add_seeds(physics, 3)
-    parity = add_action(experiments, "parity", "compare final poses with those that robot_localization's tests expect")
+    what = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
+    physics = add_action(what, "physics", "compare the simulator with mechanics, and its two worlds with each other")
+    parity = add_action(what, "parity", "compare final poses with those that robot_localization's tests expect")
     parity.add_argument(
         "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
     )
-    table = add_action(experiments, "localisation", "repeat the paper's table on simulated recordings")
-    _add_recorded(table, 1200.0)
+    table = add_action(what, "localisation", "repeat the paper's table on simulated recordings")
+    ground = add_action(what, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work")
+    merge = add_action(what, "merge", "compare this map merge with other methods")
+    for action, seeds in ((physics, 3), (table, 12), (ground, 12), (merge, 12)):
+        action.add_argument("--seeds", type=count, default=seeds, help="number of seeds (default %(default)s)")
+        action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
+    out = "folder for recordings and results (default %(default)s)"
+    for action, drawn in (
+        (table, "errors over time, tracks and the table"),
+        (ground, "estimates along the track, errors by place"),
+        (merge, "the maps of the first seed and the table"),
+    ):
+        action.add_argument("--out", type=Path, default=Path("eval-output"), help=out)
+        action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
+        action.add_argument("--plots", type=Path, help=f"folder to draw {drawn} into")
+    for action, seconds in ((table, 1200.0), (ground, 600.0)):
+        length = "length of each recording in seconds (default %(default)g)"
+        action.add_argument("--seconds", type=positive, default=seconds, help=length)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
-    table.add_argument("--plots", type=Path, help="folder to draw errors over time, tracks and the table into")
-    ground = add_action(
-        experiments, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work"
-    )
-    _add_recorded(ground, 600.0)
-    ground.add_argument("--plots", type=Path, help="folder to draw estimates along the track, errors by place into")
-    merge = add_action(experiments, "merge", "compare this map merge with other methods")
-    _add_kept(merge)
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
-    merge.add_argument("--plots", type=Path, help="folder to draw the maps of the first seed and the table into")
-    _add_log(experiments)
+    _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
 
-def _add_log(experiments: Subparsers) -> None:
-    log = add_action(experiments, "log", "replay a real log and compare with withheld fixes or with its ground truth")
+def _add_log(log: ArgumentParser) -> None:
     log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
     log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
-    log.add_argument(
-        "--withhold",
-        action="append",
-        type=withhold,
-        metavar="OFF/PERIOD",
-        help="OFF seconds without GPS in every PERIOD seconds; may be repeated (default none, 1/10, 10/30, 30/60)",
-    )
+    off = "OFF seconds without GPS in every PERIOD seconds; may be repeated (default none, 1/10, 10/30, 30/60)"
+    log.add_argument("--withhold", action="append", type=withhold, metavar="OFF/PERIOD", help=off)
     log.add_argument("--gps", type=count, help="number of GPS receivers to use")
     log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="filter (default %(default)s)")
-    log.add_argument(
-        "--profile", choices=("default", "paper"), default="default", help="filter profile (default %(default)s)"
-    )
-
-
-def _add_recorded(parser: ArgumentParser, seconds: float) -> None:
-    """Options of what runs on recordings that are kept."""
-    _add_kept(parser)
-    parser.add_argument(
-        "--seconds", type=positive, default=seconds, help="length of each recording in seconds (default %(default)g)"
-    )
-
-
-def _add_kept(parser: ArgumentParser) -> None:
-    """Options of what keeps its results by seed."""
-    _add_seeds(parser, 12)
-    parser.add_argument(
-        "--out", type=Path, default=Path("eval-output"), help="folder for recordings and results (default %(default)s)"
-    )
-    parser.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
-
-
-def _add_seeds(parser: ArgumentParser, usual: int) -> None:
-    parser.add_argument("--seeds", type=count, default=usual, help="number of seeds (default %(default)s)")
-    parser.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
+    profile = "filter profile (default %(default)s)"
+    log.add_argument("--profile", choices=("default", "paper"), default="default", help=profile)
 
 
 def run(arguments: Namespace) -> int:
@@ -140,7 +114,7 @@ def _merge(arguments: Namespace) -> Report:
     return _experiment(arguments, "machines drive, their samples are merged", work, "evaluation.maps.plots")
 
 
-def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Any, Any]], plots: str) -> Report:
+def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str) -> Report:
     """Run an experiment with its progress shown, and draw its pictures where they are asked for."""
     from evaluation.campaign.experiment import Runner
     from evaluation.campaign.workers import cores
@@ -148,27 +122,26 @@ def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple
     with Display(title, headless=arguments.json) as display:
         runner = Runner(arguments.out, arguments.processes or cores(), display.show)
         report, outcomes = work(runner)
-    plain_report = asdict(report)
     if arguments.plots:
         pictures = import_module(plots)  # imported here: only pictures need matplotlib
-        plain_report["plots"] = list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))
-    return plain_report
+        report = {**report, "plots": list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))}
+    return report
 
 
 def _log(arguments: Namespace) -> Report:
     from evaluation.positions import real_logs
     from evaluation.positions.configurations import Configuration, select
 
-    with real_logs.opened(arguments.manifest, arguments.data) as log:
-        machine = select(log.machine, gps=arguments.gps)
-        row = Configuration(arguments.filter, real_logs.receivers(machine), 1, arguments.profile)
-        return asdict(real_logs.run(log, machine, row, arguments.withhold or real_logs.WITHHOLD, on_progress=note))
+    with real_logs.opened(arguments.manifest, arguments.data) as (log, truth):
+        log = real_logs.refitted(log, select(log.machine, gps=arguments.gps))
+        row = Configuration(arguments.filter, real_logs.receivers(log.machine), 1, arguments.profile)
+        return real_logs.run(log, truth, row, arguments.withhold or real_logs.WITHHOLD, on_progress=note)
 
 
 def _parity(arguments: Namespace) -> Report:
     from evaluation.positions import parity
 
-    return {"rows": [asdict(row) for row in parity.run(arguments.data, on_progress=note)]}
+    return {"rows": parity.run(arguments.data, on_progress=note)}
 
 
 def _seeds(arguments: Namespace) -> range:

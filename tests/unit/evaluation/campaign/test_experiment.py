@@ -10,8 +10,7 @@ import pytest
 
 from evaluation.campaign import experiment as module
 from evaluation.campaign.experiment import Experiment, Runner, Task, read_result, replay_task, write_result
-from evaluation.campaign.recordings import PlannedDrive
-from evaluation.campaign.versions import code_version
+from evaluation.campaign.recordings import PlannedDrive, code_version
 from evaluation.ground import experiment as ground
 from evaluation.maps import experiment as maps
 from evaluation.positions import table

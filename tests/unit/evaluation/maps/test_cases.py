@@ -5,23 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from evaluation.maps import samples
 from evaluation.maps.cases import CASES, CELL_M, CaseMachine, MapCase, build_site, parking_place, select
-from evaluation.maps.samples import (
-    BATCH_ROWS,
-    BUCKET_NS,
-    C_RR_STD,
-    GRADE_BIAS_STD,
-    GRADE_STD,
-    LATENCY_NS,
-    PERIOD_NS,
-    START_NS,
-    START_WITHIN_NS,
-    STEP_M,
-    cell_of,
-    gauss_markov,
-    simulate,
-    sweep_lanes,
-)
+from evaluation.maps.samples import BUCKET_NS, PERIOD_NS, STEP_M, cell_of, gauss_markov, simulate, sweep_lanes
 from protocol.machine.samples import SAMPLE_DTYPE, check_samples
 
 
@@ -88,18 +74,16 @@ def test_one_pass_drives_every_cell_and_cells_between_samples_count():
 def test_machines_send_valid_samples_of_one_work_day_at_5_hz():
     scene = simulate(case("4x4"), 1)
     starts = []
-    for name in ("machine1", "machine2", "machine3", "machine4"):
-        rows = rows_of(scene, name)
+    for rows in [rows_of(scene, f"machine{i}") for i in (1, 2, 3, 4)]:
         assert rows.dtype == SAMPLE_DTYPE
         check_samples(rows, extent_m=1000.0)
         assert set(np.diff(rows["stamp_ns"])) == {PERIOD_NS}
         assert rows["distance_m"].min() == rows["distance_m"].max() == np.float32(STEP_M)
         assert rows["speed_mps"][0] == 3.0
-        assert (rows["cov_xx_m2"] == np.float32(1.69)).all()
-        assert (rows["cov_yy_m2"] == np.float32(1.69)).all()
-        assert (rows["c_rr_var"] == np.float32(C_RR_STD**2)).all()
+        for column, value in (("cov_xx_m2", 1.69), ("cov_yy_m2", 1.69), ("c_rr_var", samples.C_RR_STD**2)):
+            assert (rows[column] == np.float32(value)).all()
         starts.append(int(rows["stamp_ns"][0]))
-    assert START_NS <= min(starts) <= max(starts) < START_NS + START_WITHIN_NS + PERIOD_NS
+    assert samples.START_NS <= min(starts) <= max(starts) < samples.START_NS + samples.START_WITHIN_NS + PERIOD_NS
     assert max(starts) - min(starts) < PERIOD_NS
     assert len(set(starts)) == 4
     assert scene.samples == sum(len(rows_of(scene, f"machine{i}")) for i in (1, 2, 3, 4))
@@ -110,9 +94,9 @@ def test_batches_of_100_arrive_machine_by_machine_in_turn():
     received = [delivery.received_ns for delivery in scene.deliveries]
     assert received == sorted(received)
     assert {delivery.machine for delivery in scene.deliveries[:4]} == {"machine1", "machine2", "machine3", "machine4"}
-    assert max(len(delivery.rows) for delivery in scene.deliveries) == BATCH_ROWS
+    assert max(len(delivery.rows) for delivery in scene.deliveries) == samples.BATCH_ROWS
     for delivery in scene.deliveries:
-        assert delivery.received_ns == delivery.rows["stamp_ns"][-1] + LATENCY_NS
+        assert delivery.received_ns == delivery.rows["stamp_ns"][-1] + samples.LATENCY_NS
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_other_ones():
@@ -211,11 +195,10 @@ def test_gradients_are_measured_along_and_across_with_a_bias_that_turns():
         true = scene.site.gradient[cell_of(sweep.x_m, sweep.y_m, scene.site)]
         error = np.stack([rows["grade_e"], rows["grade_n"]], axis=-1) - true
         inside = np.abs(error).max(axis=1) < 0.05  # its lanes are not quite this sweep's
-        along = error[inside, 0] * np.cos(sweep.heading_rad[inside]) + error[inside, 1] * np.sin(
-            sweep.heading_rad[inside]
-        )
+        heading_rad = sweep.heading_rad[inside]
+        along = error[inside, 0] * np.cos(heading_rad) + error[inside, 1] * np.sin(heading_rad)
         biases.append(along.mean())
         deviations.append(along.std())
-        assert rows["grade_var"][0] == pytest.approx(GRADE_STD**2 + GRADE_BIAS_STD**2)
-    assert np.median(deviations) == pytest.approx(GRADE_STD, rel=0.1)
-    assert 0.4 * GRADE_BIAS_STD < np.std(biases) < 2 * GRADE_BIAS_STD
+        assert rows["grade_var"][0] == pytest.approx(samples.GRADE_STD**2 + samples.GRADE_BIAS_STD**2)
+    assert np.median(deviations) == pytest.approx(samples.GRADE_STD, rel=0.1)
+    assert 0.4 * samples.GRADE_BIAS_STD < np.std(biases) < 2 * samples.GRADE_BIAS_STD

@@ -36,7 +36,7 @@ def test_options_of_an_experiment_reach_it(monkeypatch: pytest.MonkeyPatch, caps
     from evaluation.positions import table
 
     asked = []
-    report = table.TableReport("paper_site", {}, [1], math.nan, [], [], [])
+    report = {"scenario": "paper_site", "seconds": math.nan, "rows": []}
     monkeypatch.setattr(table, "run", lambda runner, **options: (asked.append((runner, options)), (report, []))[1])
     words = ["eval", "localisation", "--seeds", "2", "--first-seed", "1000", "--rows", "headline", "--seconds", "60"]
     assert cli.main([*words, "--out", "x", "--processes", "3", "--json"]) == 0
