@@ -1,15 +1,13 @@
 """The comparison of merges: figures of maps that are right or wrong where they are meant to be, rows, the command."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evaluation.campaign.experiment import Runner, Task
+from evaluation.campaign.experiment import Runner
 from evaluation.maps import experiment
 from evaluation.maps.cases import CASES, CaseMachine, MapCase, build_site, select
 from evaluation.maps.experiment import NEAR_M, CaseResult, figures, near_parked
@@ -24,18 +22,6 @@ FIGURES = {**NONE, "wrong_pct": 1.0, "known_pct": 50.0, "seconds": 1.0}
 
 def small(kind: str) -> MapCase:
     return next(case for case in SMALL if case.kind == kind)
-
-
-class Here(Runner):
-    """Does tasks in this process, each once in all tests, and keeps nothing."""
-
-    def run(self, asked: experiment.Experiment, tasks: Sequence[Task]) -> list:
-        return [result_of(asked, task) for task in tasks]
-
-
-@cache
-def result_of(asked: experiment.Experiment, task: Task) -> CaseResult:
-    return asked.solve(task, Path())
 
 
 def scene_of(case: MapCase, driven=None) -> MapScene:
@@ -111,8 +97,8 @@ def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
 
 
 @pytest.mark.slow
-def test_every_case_and_method_has_a_row_with_the_figures_that_apply():
-    report, _ = experiment.run(Here(Path()), (3,), SMALL)
+def test_every_case_and_method_has_a_row_with_the_figures_that_apply(tmp_path: Path):
+    report, _ = experiment.run(Runner(tmp_path), (3,), SMALL)
     assert [(row["case"], row["method"]) for row in report["rows"]] == [(c.kind, m) for c in CASES for m in METHODS]
     assert report["seeds"] == [3]
     assert len(report["goals"]) == len(experiment.GOALS)
