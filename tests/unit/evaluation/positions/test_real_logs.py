@@ -132,9 +132,8 @@ def test_planar_fixes_come_back_as_the_metres_that_they_were(circle: Path):
         places = np.array([to_map(f.lat_deg, f.lon_deg, 0.0)[:2] for f in fixes])
     expected = np.array([at((f.stamp_ns - log.start_ns) * 1e-9, 2.0) for f in fixes])
     assert places == pytest.approx(expected, abs=1e-5)
-    assert sorted(p.name for p in circle.iterdir()) == [
-        "evaluation.toml", "gps1.csv", "gps2.csv", "log.toml", "odom.csv", "truth.csv",
-    ]  # fmt: skip
+    names = "evaluation.toml gps1.csv gps2.csv log.toml odom.csv truth.csv"
+    assert sorted(p.name for p in circle.iterdir()) == names.split()
 
 
 def test_receivers_in_use_are_counted_and_chosen(circle: Path):
@@ -159,6 +158,13 @@ def test_a_wrong_side_file_is_refused_in_one_line(circle: Path, old: str, new: s
         pass
 
 
+def beside(folder: str) -> Path:
+    """The data of a real log, where it is at hand."""
+    if not (DATA / folder).is_dir():
+        pytest.skip(f"the log is not beside the project (../shared/data/{folder})")
+    return DATA / folder
+
+
 @pytest.mark.parametrize("folder", sorted(p.name for p in LOGS.iterdir()))
 def test_every_manifest_is_valid(folder: str):
     log = open_log(LOGS / folder)
@@ -169,10 +175,7 @@ def test_every_manifest_is_valid(folder: str):
 
 @pytest.mark.parametrize("folder", sorted(p.name for p in LOGS.iterdir()))
 def test_every_row_of_a_real_log_is_read(folder: str):
-    data = DATA / folder
-    if not data.is_dir():
-        pytest.skip(f"the log is not beside the project (../shared/data/{folder})")
-    with real_logs.opened(LOGS / folder, data) as (log, _):
+    with real_logs.opened(LOGS / folder, beside(folder)) as (log, _):
         sensors = {r.sensor for r in log.readings()}
         assert sensors == {s.name for s in log.machine.sensors if s.use}
         assert not log.refused
@@ -180,8 +183,5 @@ def test_every_row_of_a_real_log_is_read(folder: str):
 
 @pytest.mark.slow
 def test_mower_against_its_truth():
-    data = DATA / "plaza2_mower"
-    if not data.is_dir():
-        pytest.skip("the log is not beside the project (../shared/data/plaza2_mower)")
-    (row,) = run(LOGS / "plaza2_mower", (0.0, 1.0), data=data)["rows"]
+    (row,) = run(LOGS / "plaza2_mower", (0.0, 1.0), data=beside("plaza2_mower"))["rows"]
     assert row["truth_net_m"] < 3.0  # one fix of the first receiver alone is off by 3.3 m

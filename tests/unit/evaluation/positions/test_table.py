@@ -17,7 +17,7 @@ from evaluation.positions.table import paired_ratio, ratios, summarise
 from protocol.machine.machine_config import MachineConfig
 
 FAST = replace(PAPER, world="fast")
-ONE, TWO = (Configuration("ukf", gps, 1, "default") for gps in (1, 2))
+ONE, TWO, NONE = (Configuration("ukf", gps, 1, "default") for gps in (1, 2, 0))
 NEVER = Configuration("ukf", 9, 1, "default")
 SECONDS = 14.0
 
@@ -72,21 +72,22 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
 
 @pytest.fixture(scope="module")
 def result(runner: Runner) -> tuple[Report, list[table.Outcome]]:
-    return table.run(runner, (3,), SECONDS, (ONE, TWO, NEVER), FAST)
+    return table.run(runner, (3,), SECONDS, (ONE, TWO, NONE, NEVER), FAST)
 
 
 @pytest.mark.slow
 def test_rows_are_scored_on_one_recording_and_what_cannot_run_is_named(result, runner: Runner):
     report, outcomes = result
     rows = report["rows"]
-    assert [(row["gps"], row["paper_net_m"]) for row in rows] == [(1, 2.3234), (2, 1.7217)]
-    assert all(0.05 < row["net_m"] < 8 and 0.3 < row["covered"] < 1 for row in rows)
+    assert [(row["gps"], row["paper_net_m"]) for row in rows] == [(1, 2.3234), (2, 1.7217), (0, 65.4774)]
+    assert all(0.05 < row["net_m"] < 8 and 0.3 < row["covered"] < 1 for row in rows[:2])
+    assert rows[2]["covered"] == 1  # without GPS its start is given
     assert all(row["us_per_second"] > 100 for row in rows)
     assert [row["gps"] for row in report["missing"]] == [9]
     assert "9" in report["missing"][0]["why"]
     assert len(list(runner.cache.glob("paper-seed3-*"))) == 1
     assert len(outcomes[0].run.time_s) > 4
-    assert [outcome.row for outcome in outcomes] == [ONE, TWO]
+    assert [outcome.row for outcome in outcomes] == [ONE, TWO, NONE]
     assert list(rows[0])[:5] == ["filter", "gps", "imu", "profile", "rmse_x_m"]
 
 
