@@ -56,11 +56,9 @@ def test_headings_point_ahead():
     assert on_a_lane.mean() > 0.95
 
 
-def test_one_pass_drives_every_cell_and_cells_between_samples_count():
-    scene = simulate(case("1x1", columns=9), 0)
-    assert scene.driven.all()
-    narrow = simulate(replace(case("1x1"), columns=60, rows=1), 0)
-    assert narrow.driven.tolist() == [[True] * 60]
+@pytest.mark.parametrize(("columns", "rows"), [(9, 40), (60, 1)])
+def test_one_pass_drives_every_cell_and_cells_between_samples_count(columns: int, rows: int):
+    assert simulate(case("1x1", columns, rows), 0).driven.all()
 
 
 def test_machines_send_valid_samples_of_one_work_day_at_5_hz():
@@ -93,8 +91,7 @@ def test_batches_of_100_arrive_machine_by_machine_in_turn():
 
 def test_the_same_seed_gives_the_same_bytes_and_another_other_ones():
     first, again, other = (rows_of(simulate(case("1x1"), seed), "machine1").tobytes() for seed in (5, 5, 6))
-    assert first == again
-    assert first != other
+    assert first == again != other
 
 
 def test_the_bad_machine_measures_too_much_and_is_off_to_the_east_and_knows_neither():
@@ -102,8 +99,7 @@ def test_the_bad_machine_measures_too_much_and_is_off_to_the_east_and_knows_neit
     scene = simulate(plan, 2)
     good, bad = rows_of(scene, "machine2"), rows_of(scene, "machine4")
     assert bad["c_rr"].mean() == pytest.approx(1.6 * good["c_rr"].mean(), rel=0.02)
-    assert bad["x_m"].mean() - good["x_m"].mean() == pytest.approx(3.0, abs=0.8)
-    assert bad["y_m"].mean() - good["y_m"].mean() == pytest.approx(0.0, abs=0.8)
+    assert [bad[axis].mean() - good[axis].mean() for axis in ("x_m", "y_m")] == pytest.approx([3.0, 0.0], abs=0.8)
     assert (bad["cov_xx_m2"] == good["cov_xx_m2"][0]).all()
     assert [machine.gain for machine in plan.machines] == [1, 1, 1, 1.6]
 
@@ -125,8 +121,7 @@ def test_the_parked_machine_stands_sends_all_the_time_and_drives_nothing():
     assert parked["distance_m"].max() == parked["speed_mps"].max() == 0.0
     assert len(parked) >= len(busy)
     x_m, y_m = parking_place(parked_case)
-    assert parked["x_m"].mean() == pytest.approx(x_m + 3, abs=1.5)
-    assert parked["y_m"].mean() == pytest.approx(y_m, abs=1.5)
+    assert (parked["x_m"].mean(), parked["y_m"].mean()) == pytest.approx((x_m + 3, y_m), abs=1.5)
     assert parked["c_rr"].mean() == pytest.approx(1.6 * 0.04, abs=0.001)
     alone = replace(parked_case, machines=(CaseMachine(passes=1), CaseMachine(parked=True)))
     assert simulate(alone, 4).driven.sum() == simulate(case("1x1"), 4).driven.sum()
@@ -139,22 +134,19 @@ def test_the_zone_is_repaved_inside_a_bucket_while_the_fourth_pass_is_in_it(seed
     assert 0.15 * BUCKET_NS < scene.repaved_ns % BUCKET_NS < 0.85 * BUCKET_NS
     rows = rows_of(scene, "machine1")
     sweep = sweep_lanes(case("repaved", columns=150, rows=100), CaseMachine(passes=5), np.random.default_rng(0))
-    number = sweep.number[np.searchsorted(rows["stamp_ns"], scene.repaved_ns)]
-    assert number == 3
+    assert sweep.number[np.searchsorted(rows["stamp_ns"], scene.repaved_ns)] == 3
     there = scene.site.repaved[cell_of(sweep.x_m, sweep.y_m, scene.site)]
     late = rows["stamp_ns"] >= scene.repaved_ns
-    assert np.median(rows["c_rr"][there & ~late]) == pytest.approx(0.06, abs=0.001)
-    assert np.median(rows["c_rr"][there & late]) == pytest.approx(0.02, abs=0.001)
-    assert (late & there & (sweep.number == 3)).any()
-    assert (~late & there & (sweep.number == 3)).any()
+    for when, c_rr in ((~late, 0.06), (late, 0.02)):
+        assert np.median(rows["c_rr"][there & when]) == pytest.approx(c_rr, abs=0.001)
+        assert (when & there & (sweep.number == 3)).any()
 
 
 def test_how_many_passes_follow_is_the_cases_own():
     one, two = (simulate(case("repaved", index=index), 0) for index in (0, 1))
     assert 0 < two.samples - one.samples < 60 * 40 / 0.6 + 60
     site = one.site
-    assert set(site.c_rr[site.repaved]) == {0.06}
-    assert set(site.c_rr_later[site.repaved]) == {0.02}
+    assert (set(site.c_rr[site.repaved]), set(site.c_rr_later[site.repaved])) == ({0.06}, {0.02})
     assert (site.c_rr == site.c_rr_later)[~site.repaved].all()
     assert simulate(case("1x1"), 0).repaved_ns is None
 
@@ -163,8 +155,7 @@ def test_how_many_passes_follow_is_the_cases_own():
 def test_a_narrow_road_lies_across_wet_dirt_and_alone_is_judged(index: int, width: int):
     site = build_site(case("narrow_road", index=index))
     assert site.judged.sum() * CELL_M**2 == width * 60
-    assert set(site.c_rr[site.judged]) == {0.008}
-    assert set(site.c_rr[~site.judged]) == {0.06}
+    assert (set(site.c_rr[site.judged]), set(site.c_rr[~site.judged])) == ({0.008}, {0.06})
 
 
 def test_the_site_has_the_five_zones():

@@ -24,16 +24,15 @@ def small(kind: str) -> MapCase:
     return next(case for case in SMALL if case.kind == kind)
 
 
-def scene_of(case: MapCase, driven=None) -> MapScene:
-    site = build_site(case)
-    return MapScene((), site, None, np.ones(site.c_rr.shape, bool) if driven is None else driven)
+def scene_of(kind: str) -> tuple[MapCase, MapScene]:
+    """A small case whose every cell was driven."""
+    site = build_site(small(kind))
+    return small(kind), MapScene((), site, None, np.ones(site.c_rr.shape, bool))
 
 
 def test_a_map_of_the_truth_is_right_and_only_driven_cells_count():
-    case = small("1x1")
-    driven = np.zeros((30, 45), bool)
-    driven[:2] = True
-    scene = scene_of(case, driven)
+    case, scene = scene_of("1x1")
+    scene.driven[2:] = False
     estimated = scene.site.c_rr_later.copy()
     estimated[10:] = 0.25
     assert figures(case, scene, {"resistance": estimated}) == {**NONE, "wrong_pct": 0.0, "known_pct": 100.0}
@@ -43,8 +42,7 @@ def test_a_map_of_the_truth_is_right_and_only_driven_cells_count():
 
 
 def test_changed_and_unchanged_cells_are_judged_apart_by_how_the_site_was_left():
-    case = small("repaved")
-    scene = scene_of(case)
+    case, scene = scene_of("repaved")
     judged = figures(case, scene, {"resistance": scene.site.c_rr})
     assert (judged["changed_wrong_pct"], judged["unchanged_wrong_pct"]) == (100.0, 0.0)
     assert judged["wrong_pct"] == pytest.approx(100 * scene.site.repaved.mean())
@@ -53,27 +51,24 @@ def test_changed_and_unchanged_cells_are_judged_apart_by_how_the_site_was_left()
 
 
 def test_of_a_narrow_road_only_the_road_is_judged():
-    case = small("narrow_road")
-    scene = scene_of(case)
+    case, scene = scene_of("narrow_road")
     assert figures(case, scene, {"resistance": np.full((30, 45), 0.008)})["wrong_pct"] == 0.0
     assert figures(case, scene, {"resistance": np.full((30, 45), 0.06)})["wrong_pct"] == 100.0
 
 
 def test_cells_beside_a_parked_machine_are_judged_apart():
-    case = replace(small("parked_bad_machine"), columns=90, rows=60)
+    case, scene = scene_of("parked_bad_machine")
     near = near_parked(case)
     assert near.sum() == pytest.approx(np.pi * NEAR_M**2, rel=0.1)
-    assert near[15, 70]  # three metres east of where it truly stands
-    assert not near[15, 65]
-    scene = scene_of(case)
+    assert near[7, 36]  # three metres east of where it truly stands, at (33.75, 7.5)
+    assert not near[7, 32]
     estimated = np.where(near, 0.06, scene.site.c_rr)
     assert figures(case, scene, {"resistance": estimated})["near_wrong_pct"] == 100.0
     assert not near_parked(replace(case, machines=(CaseMachine(),))).any()
 
 
 def test_sure_cells_are_judged_apart():
-    case = small("1x1")
-    scene = scene_of(case)
+    case, scene = scene_of("1x1")
     estimated, confidence = scene.site.c_rr.copy(), np.full((30, 45), 0.9)
     estimated[0], confidence[0] = 0.25, 0.59
     judged = figures(case, scene, {"resistance": estimated, "confidence": confidence})
@@ -84,8 +79,7 @@ def test_sure_cells_are_judged_apart():
 
 
 def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
-    case = small("slope_15")
-    scene = scene_of(case)
+    case, scene = scene_of("slope_15")
     east, north = np.moveaxis(scene.site.gradient, -1, 0)
     assert figures(case, scene, {"grade_east": east + 0.007, "grade_north": north + 0.007})["wrong_pct"] == 0.0
     assert figures(case, scene, {"grade_east": east + 0.008, "grade_north": north - 0.008})["wrong_pct"] == 100.0

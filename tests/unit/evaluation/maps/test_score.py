@@ -45,7 +45,9 @@ def test_a_perfect_map_scores_zero_and_an_unknown_one_has_no_score():
 
 @pytest.mark.parametrize(("share", "wrong"), [(0.99, 100.0), (1.01, 0.0)])
 def test_slope_begins_at_the_papers_limit(share, wrong):
-    assert score(region([[0.02]], SLOPE_LIMIT * share), region([[0.02]], 0.27)).wrong_grade_pct == wrong
+    estimated, truth = region([[0.02]], SLOPE_LIMIT * share), region([[0.02]], 0.27)
+    assert score(estimated, truth).wrong_grade_pct == wrong
+    assert score_driven(estimated, truth, ROW_0).wrong_grade_pct == wrong
 
 
 def test_a_track_passes_cells_between_its_points():
@@ -72,10 +74,6 @@ def test_only_cells_that_were_truly_driven_count():
     assert result.by_border[1]["known_pct"] == 50.0
     assert far["to_m"] is None
     assert np.isnan(far["wrong_pct"])
-
-
-def test_a_slope_that_is_none_is_wrong():
-    assert score_driven(region([[0.04] * 6] * 2, east=0.3), TRUE, ROW_0).wrong_grade_pct == 100.0
 
 
 def test_a_site_that_nobody_drove_has_no_score():

@@ -19,15 +19,9 @@ from tests.paths import SHARED_DATA as DATA
 LOGS = ROOT / "evaluation" / "logs"
 ROW = Configuration("ukf", 1, 1, "default")
 MANIFEST = """
-[log]
-name = "circle"
-start_ns = 1700000000000000000
-[site]
-name = "yard"
-origin_lat_deg = 50.0
-origin_lon_deg = 8.0
-[machine]
-name = "mower"
+log = { name = "circle", start_ns = 1700000000000000000 }
+site = { name = "yard", origin_lat_deg = 50.0, origin_lon_deg = 8.0 }
+machine = { name = "mower" }
 [[sensor]]
 name = "wheels"
 kind = "odometry"
@@ -62,11 +56,7 @@ var_n_m2 = {{ value = 1.0 }}
 var_u_m2 = {{ value = 1.0 }}
 """
 SIDE = """
-[truth]
-file = "truth.csv"
-stamp = "t"
-x_m = "east"
-y_m = "north"
+truth = { file = "truth.csv", stamp = "t", x_m = "east", y_m = "north" }
 [[planar]]
 file = "gps1.csv"
 x_m = "x"
@@ -149,7 +139,7 @@ def test_receivers_in_use_are_counted_and_chosen(circle: Path):
         ('x_m = "east"', 'x_m = "west"', "no truth as described: 'west'"),
         ('x_m = "x"', 'x_m = "z"', "no planar fixes as described: 'z'"),
         ('file = "truth.csv"', 'file = "lost.csv"', "cannot be read"),
-        ("[truth]", "[truht]", "unknown key `truht`"),
+        ("truth =", "truht =", "unknown key `truht`"),
     ],
 )
 def test_a_wrong_side_file_is_refused_in_one_line(circle: Path, old: str, new: str, problem: str):

@@ -11,15 +11,9 @@ from sitegrid import cli
 from sitegrid.commands import eval as command
 
 MANIFEST = """
-[log]
-name = "empty"
-start_ns = 1
-[site]
-name = "yard"
-origin_lat_deg = 50.0
-origin_lon_deg = 8.0
-[machine]
-name = "mower"
+log = { name = "empty", start_ns = 1 }
+site = { name = "yard", origin_lat_deg = 50.0, origin_lon_deg = 8.0 }
+machine = { name = "mower" }
 [[sensor]]
 name = "wheels"
 kind = "encoder"
