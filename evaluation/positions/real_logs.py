@@ -105,8 +105,8 @@ def run(
     for off_s, period_s in patterns:
         on_progress(f"{log.name}: {withheld_name(off_s, period_s)}")
         rows.append(_row(log, truth, row, readings, (off_s, period_s)))
-    of = {"log": log.name, "filter": row.filter, "profile": row.profile, "gps": row.gps}
-    return {**of, "readings": len(readings), "refused": dict(log.refused), "rows": rows}
+    described = {"log": log.name, "filter": row.filter, "profile": row.profile, "gps": row.gps}
+    return {**described, "readings": len(readings), "refused": dict(log.refused), "rows": rows}
 
 
 def refitted(log: LogFolder, machine: MachineConfig) -> LogFolder:

@@ -68,8 +68,7 @@ def test_time_without_a_pose_is_stated_and_not_counted_as_error():
     assert result.net_m == pytest.approx(1.0)
 
 
-def test_no_pose_is_no_error_but_nan():
-    """And a replay of nothing is empty."""
+def test_a_replay_of_nothing_has_no_pose_and_no_error_but_nan():
     core: Any = Scripted()
     trace, truth = trace_of([(0.0, 0.0)])
     result = score(replace(replay(core, []), first_ns=trace.first_ns, last_ns=trace.last_ns), truth)
