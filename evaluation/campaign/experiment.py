@@ -14,8 +14,7 @@ from typing import Any, BinaryIO, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from evaluation.campaign.recordings import PlannedDrive, RecordedDrive, load, make
-from evaluation.campaign.versions import code_version, digest
+from evaluation.campaign.recordings import PlannedDrive, RecordedDrive, code_version, digest, load, make
 from evaluation.campaign.workers import each
 from protocol.errors import SitegridError
 from protocol.files import whole_file

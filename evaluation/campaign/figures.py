@@ -1,10 +1,14 @@
-"""Figures of reports: what many of them need, and their rounding."""
+"""Figures of reports: rows of plain values, what many of them need, their rounding, and goals.
+
+A report is a table of rows beside what was run; JSON prints both as they are. docs/evaluation.md explains each figure.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from scipy import stats
@@ -13,6 +17,8 @@ from protocol.arrays import Floats
 
 CONFIDENCE = 0.95
 Value = TypeVar("Value")
+Row = dict[str, Any]  # plain values by name
+Report = dict[str, Any]  # the same, and lists of rows
 
 
 def half_width(sample: Floats) -> float | None:
@@ -30,14 +36,52 @@ def root_mean_square(values: Floats) -> float:
 
 
 def rounded(value: Value, digits: int, **other_digits: int) -> Value:
-    """Round every float in a value, in lists and dataclasses too; other_digits: of a dataclass's fields by name."""
+    """Round every float in a value, in lists and rows too; other_digits: of a row's figures by name."""
     out: Any = value
     if isinstance(value, float):
         out = round(value, digits)
     elif isinstance(value, list):
         out = [rounded(inner, digits) for inner in value]
-    elif is_dataclass(value) and not isinstance(value, type):
-        changes = {f.name: rounded(getattr(value, f.name), other_digits.get(f.name, digits)) for f in fields(value)}
-        out = replace(value, **changes)
+    elif isinstance(value, dict):
+        out = {name: rounded(inner, other_digits.get(name, digits)) for name, inner in value.items()}
     result: Value = out
     return result
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A limit for one figure of the rows that have these values.
+
+    A figure that must not exceed its limit counts by its size, so that a bias may be negative.
+    """
+
+    row: Mapping[str, Any]
+    figure: str
+    relation: Literal["<=", ">="]
+    limit: float
+
+    def is_met(self, value: float | None) -> bool:
+        """Whether a value keeps the limit; what is not known (None, NaN) does not."""
+        if value is None:
+            return False
+        return bool(abs(value) <= self.limit if self.relation == "<=" else value >= self.limit)
+
+
+def judge(goals: Sequence[Goal], rows: Sequence[Row]) -> list[Row]:
+    """Compare rows with the goals that concern them; `row`: the values that choose it, `name`: of the figure."""
+    return [
+        {
+            "row": " ".join(map(str, goal.row.values())),
+            "name": goal.figure,
+            "goal": f"{goal.relation} {goal.limit:g}",
+            "value": row[goal.figure],
+            "met": goal.is_met(row[goal.figure]),
+        }
+        for goal in goals
+        for row in select(rows, goal.row)
+    ]
+
+
+def select(rows: Iterable[Row], values: Mapping[str, Any]) -> list[Row]:
+    """The rows that have these values."""
+    return [row for row in rows if values.items() <= row.items()]

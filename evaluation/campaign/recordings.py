@@ -1,10 +1,14 @@
-"""Recordings of one machine on one route each, kept so that every configuration sees the same."""
+"""Recordings of one machine on one route each, kept so that every configuration sees the same.
+
+What is kept is named by digests of the code and the options that it was made with.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -13,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from evaluation.campaign.truth import Truth, read_track
-from evaluation.campaign.versions import code_version, digest
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
@@ -24,6 +27,9 @@ from sim.scenario.file import load_scenario
 from sim.scenario.tables import FleetConfig, Scenario
 
 MACHINE = "loader"
+_scenario = cache(load_scenario)
+ROOT = Path(__file__).parents[2]
+SUFFIXES = (".py", ".toml", ".urdf")  # of sources
 
 
 @dataclass(frozen=True)
@@ -133,10 +139,23 @@ def track_file(folder: Path) -> Path:
 
 
 @cache
-def _scenario(name: str) -> Scenario:
-    return load_scenario(name)
+def code_version(*names: str) -> str:
+    """Digest of the sources of packages or modules, as paths from the project's root; raises FileNotFoundError."""
+    files = sorted(path for name in names for path in _sources(ROOT / name))
+    return digest(*(f"{path.relative_to(ROOT)}\n{path.read_text(encoding='utf-8')}" for path in files))
+
+
+def digest(*texts: str) -> str:
+    """Ten hex digits that tell texts apart."""
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:10]
 
 
 def _toml(values: Mapping[str, Any]) -> str:
     """Plain values as TOML keys; None is none."""
     return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items() if value is not None)
+
+
+def _sources(path: Path) -> Iterable[Path]:
+    if path.is_dir():
+        return (inner for inner in path.rglob("*") if inner.suffix in SUFFIXES)
+    return [path]  # reading it raises where it is not there

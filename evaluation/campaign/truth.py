@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evaluation.campaign.figures import root_mean_square
 from protocol.arrays import Floats, Ints
 from protocol.wire.messages import Pose
 
@@ -45,7 +46,7 @@ def position_rmse(poses: Mapping[str, Sequence[Pose]], truth: Path) -> dict[str,
     for name, track in poses.items():
         true = np.genfromtxt(truth / "tracks" / f"{name}.csv", delimiter=",", names=True)
         stamps = np.array([pose.stamp_ns for pose in track], np.float64)
-        dx, dy = (np.interp(stamps, true["stamp_ns"], true[axis]) for axis in ("x", "y"))
-        dx, dy = dx - [pose.x_m for pose in track], dy - [pose.y_m for pose in track]
-        rmse[name] = math.sqrt(float((dx**2 + dy**2).mean()))
+        x, y = (np.interp(stamps, true["stamp_ns"], true[axis]) for axis in ("x", "y"))
+        off = np.hypot(x - [pose.x_m for pose in track], y - [pose.y_m for pose in track])
+        rmse[name] = root_mean_square(off)
     return rmse

@@ -1,6 +1,7 @@
 """Samples against the truth, at the places where the machine truly was.
 
-Where localisation put a sample does not matter here: its stamp says where the machine was.
+Where localisation put a sample does not matter here: its stamp says where the machine was. The lag is how long the
+estimate takes to notice that the ground has changed.
 """
 
 from __future__ import annotations
@@ -12,13 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.ground.lag import C_RR, crossings, lags
 from evaluation.ground.truth import CELL_M, LoadTrack, TrueGround
 from protocol.arrays import Bools, Floats, Ints, Table
-from protocol.site.ground_classes import resistance_class, slope_class
+from protocol.site.ground_classes import ZONES, resistance_class, slope_class
 
+C_RR = np.array([zone.c_rr for zone in ZONES])
 FLAT_SLOPE = math.tan(math.radians(2.0))
 EDGE_M, EDGE_DEG = 2.0, 0.5  # at the edge of a ramp the gradient changes by more than this, this far around
+LEAST_RUN_M = 4.0  # a zone that is left sooner gives the estimate no time to settle
+LEAST_STEP = 0.01  # of c_rr; below it noise decides
+BEFORE_M = 2.0  # the front wheels cross a border before the load centre does, half a wheelbase of 1.5 m and a sample
+STEP_NS = 10_000_000  # in which the true track is searched for borders
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class CellMeans:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Estimates against the truth, from which figures are made. lags: see `evaluation.ground.lag.lags`."""
+    """Estimates against the truth, from which figures are made. lags: see `lags`."""
 
     placed: PlacedSamples
     cells: CellMeans
@@ -145,10 +150,16 @@ def cell_means(placed: PlacedSamples, ground: TrueGround) -> CellMeans:
 
 def grade_errors(placed: PlacedSamples) -> tuple[Floats, Floats]:
     """Errors (n,) [deg] of the slope along the machine's true heading, and to its left."""
-    true, estimated = placed.track.gradient, placed.gradient
-    c, s = np.cos(placed.track.yaw_rad), np.sin(placed.track.yaw_rad)
-    ahead, left = np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)
-    return _angle_deg(estimated, ahead) - _angle_deg(true, ahead), _angle_deg(estimated, left) - _angle_deg(true, left)
+    true, estimated, ahead_rad = placed.track.gradient, placed.gradient, placed.track.yaw_rad
+    left_rad = ahead_rad + np.pi / 2
+    ahead, left = (slope_deg(estimated, yaw) - slope_deg(true, yaw) for yaw in (ahead_rad, left_rad))
+    return ahead, left
+
+
+def slope_deg(gradient: Floats, yaw_rad: Floats) -> Floats:
+    """Slope (n,) [deg] of gradients (n, 2) along headings (n,)."""
+    along = gradient[:, 0] * np.cos(yaw_rad) + gradient[:, 1] * np.sin(yaw_rad)
+    return np.asarray(np.degrees(np.arctan(along)), np.float64)
 
 
 def _edges(track: LoadTrack, ground: TrueGround, driven_m: Floats) -> Bools:
@@ -160,11 +171,6 @@ def _edges(track: LoadTrack, ground: TrueGround, driven_m: Floats) -> Bools:
     return np.array(changes) > EDGE_DEG
 
 
-def _angle_deg(gradient: Floats, direction: Floats) -> Floats:
-    angle: Floats = np.degrees(np.arctan((gradient * direction).sum(axis=-1)))
-    return angle
-
-
 def _means(values: Floats, weight: Floats, which: Ints, count: int) -> Floats:
     """Weighted means of groups (count,), of the values that are finite; NaN of none."""
     known = np.isfinite(values)
@@ -172,3 +178,63 @@ def _means(values: Floats, weight: Floats, which: Ints, count: int) -> Floats:
     mean: Floats = np.full(count, np.nan)
     np.divide(np.bincount(which[known], (weight * values)[known], count), total, out=mean, where=total > 0)
     return mean
+
+
+# --- lag -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A change of zone: its instant, the distance driven so far, c_rr before and after, and when the next begins."""
+
+    stamp_ns: int
+    driven_m: float
+    old: float
+    new: float
+    end_ns: int
+
+
+def crossings(track: LoadTrack, ground: TrueGround, from_ns: int) -> list[Crossing]:
+    """Changes of zone under the load centre, from one that lasts to another that lasts."""
+    fine = track.at(np.arange(max(from_ns, track.stamp_ns[0]), track.stamp_ns[-1] + 1, STEP_NS))
+    zone = ground.zone(fine.place_m)
+    first = np.concatenate([[0], np.flatnonzero(np.diff(zone)) + 1])
+    last = np.concatenate([first[1:] - 1, [len(zone) - 1]])
+    run_m = fine.driven_m[last] - fine.driven_m[first]
+    changes = []
+    for i in range(1, len(first)):
+        old, new = (float(C_RR[zone[first[k]]]) for k in (i - 1, i))
+        if min(run_m[i - 1], run_m[i]) >= LEAST_RUN_M and abs(new - old) >= LEAST_STEP:
+            at = first[i]
+            end_ns = int(fine.stamp_ns[last[i]])
+            changes.append(Crossing(int(fine.stamp_ns[at]), float(fine.driven_m[at]), old, new, end_ns))
+    return changes
+
+
+def lags(samples: Table, track: LoadTrack, changes: list[Crossing], lag_s: float) -> Floats:
+    """Lag of each change of zone (k, 3): time [s] and distance [m] until the estimate knew it, and its place error [m].
+
+    A machine dates its samples back by lag_s, the time that a change of the ground takes to show; it knew them then.
+    The estimate knows the change once it is nearer to the new zone's value than to the old one's; infinite where it is
+    not before the next change. The place error is what remains after samples are dated back, positive beyond the
+    border. Changes before which the estimate was not near to the old value are excluded.
+    """
+    samples = samples[np.isfinite(samples["c_rr"])]
+    known = track.at(samples["stamp_ns"] + round(lag_s * 1e9))
+    dated_m = track.at(samples["stamp_ns"]).driven_m
+    rows = [_lag(samples["c_rr"].astype(float), known, dated_m, crossing) for crossing in changes]
+    return np.array([row for row in rows if row], float).reshape(-1, 3)
+
+
+def _lag(c_rr: Floats, known: LoadTrack, dated_m: Floats, crossing: Crossing) -> tuple[float, float, float] | None:
+    nearer = np.abs(c_rr - crossing.new) < np.abs(c_rr - crossing.old)
+    early = np.flatnonzero(known.driven_m < crossing.driven_m - BEFORE_M)
+    if not len(early) or nearer[early[-1]]:
+        return None
+    after = early[-1] + 1
+    knows = after + np.flatnonzero(nearer[after:] & (known.stamp_ns[after:] <= crossing.end_ns))
+    if not len(knows):
+        return np.inf, np.inf, np.inf
+    i = knows[0]
+    lag_s = (known.stamp_ns[i] - crossing.stamp_ns) * 1e-9
+    return float(lag_s), float(known.driven_m[i] - crossing.driven_m), float(dated_m[i] - crossing.driven_m)

@@ -20,13 +20,11 @@ from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from agents.sampling import LAG_S
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
-from evaluation.campaign.figures import half_width, rounded
-from evaluation.campaign.goals import Goal, GoalResult, Relation, judge
-from evaluation.campaign.recordings import PlannedDrive, RecordedDrive, Setup, track_file
+from evaluation.campaign.figures import Goal, Report, Row, half_width, judge, rounded
+from evaluation.campaign.recordings import PlannedDrive, Setup, track_file
 from evaluation.ground.comparison import Comparison, compare, pool
-from evaluation.ground.figures import GroundFigures, SoilRow, by_border, c_rr_bias, figures, soils
+from evaluation.ground.figures import by_border, c_rr_bias, figures, soils
 from evaluation.ground.truth import LoadTrack, TrueGround, read_load_track, true_ground
-from evaluation.maps.borders import BorderBin
 from protocol.arrays import Table
 
 LOADING = Setup("loading", ("west", "east", "middle", "yard"), gps=(1, 2), imu=(3,))
@@ -62,16 +60,15 @@ class GroundConfiguration:
 
 ROWS = tuple(GroundConfiguration(estimator, preset) for estimator in ESTIMATORS for preset in PRESETS)
 GOAL_ROW = GroundConfiguration("kalman", "calibrated")
-LIMITS: tuple[tuple[str, Relation, float], ...] = (
-    ("right_class_pct", ">=", 96.0),
-    ("wrong_cells_pct", "<=", 3.5),
-    ("wrong_cells_interior_pct", "<=", 1.0),
-    ("dirt_flat_right_pct", ">=", 97.0),
-    ("grade_bias_deg", "<=", 0.1),
-    ("grade_std_deg", "<=", 0.35),
-    ("wrong_slope_cells_pct", "<=", 0.2),
+GOALS = (  # what was reached: docs/results/ground-estimation.md
+    Goal(vars(GOAL_ROW), "right_class_pct", ">=", 96.0),
+    Goal(vars(GOAL_ROW), "wrong_cells_pct", "<=", 3.5),
+    Goal(vars(GOAL_ROW), "wrong_cells_interior_pct", "<=", 1.0),
+    Goal(vars(GOAL_ROW), "dirt_flat_right_pct", ">=", 97.0),
+    Goal(vars(GOAL_ROW), "grade_bias_deg", "<=", 0.1),
+    Goal(vars(GOAL_ROW), "grade_std_deg", "<=", 0.35),
+    Goal(vars(GOAL_ROW), "wrong_slope_cells_pct", "<=", 0.2),
 )
-GOALS = tuple(Goal(vars(GOAL_ROW), *limit) for limit in LIMITS)  # what was reached: docs/results/ground-estimation.md
 
 
 @dataclass(frozen=True)
@@ -96,49 +93,22 @@ class GroundOutcome:
     comparison: Comparison
 
 
-@dataclass(frozen=True)
-class GroundRow(GroundFigures, GroundConfiguration):
-    """One row of the table: figures of all samples and cells together. docs/evaluation.md explains each."""
-
-    right_class_ci95: float | None
-    wrong_cells_ci95: float | None
-    samples: int
-    us_per_second: int
-    soils: list[SoilRow]
-    by_border: list[BorderBin]
-    c_rr_bias_by_seed: list[float]
-    wrong_cells_by_seed_pct: list[float]
-    withheld: dict[str, int]
-
-
-@dataclass(frozen=True)
-class GroundReport:
-    """One row per estimator and preset, and what the goals say of them."""
-
-    scenario: str
-    routes: list[str]
-    seeds: list[int]
-    seconds: float
-    judged_from_s: float
-    rows: list[GroundRow]
-    goals: list[GoalResult]
-
-
 def run(
     runner: Runner,
     seeds: Sequence[int],
     seconds: float,
     rows: Sequence[GroundConfiguration] = ROWS,
     setup: Setup = LOADING,
-) -> tuple[GroundReport, list[GroundOutcome]]:
-    """Record, estimate and judge all rows with all seeds."""
+) -> tuple[Report, list[GroundOutcome]]:
+    """Record, estimate and judge all rows with all seeds; a row per estimator and preset, and what the goals say."""
     pairs = [(PlannedDrive(seed, seconds, PRESETS[row.preset][0], setup), row) for seed in seeds for row in rows]
     pairs.sort(key=lambda pair: (pair[0].seed, pair[0].preset))  # a worker loads each recording once
     outputs = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
     outcomes = [judged(*pair, output, runner.cache) for pair, output in zip(pairs, outputs, strict=True)]
     table = [summarise(row, [outcome for outcome in outcomes if outcome.row == row]) for row in rows]
-    drives = (setup.scenario, list(setup.routes), list(seeds), seconds)
-    return GroundReport(*drives, settle_s(seconds), table, judge(GOALS, table)), outcomes
+    drives = {"scenario": setup.scenario, "routes": list(setup.routes), "seeds": list(seeds), "seconds": seconds}
+    judged_from_s = settle_s(seconds)
+    return {**drives, "judged_from_s": judged_from_s, "rows": table, "goals": judge(GOALS, table)}, outcomes
 
 
 def settle_s(seconds: float) -> float:
@@ -160,28 +130,28 @@ def _truth(drive: PlannedDrive, cache: Path) -> tuple[LoadTrack, TrueGround]:
     return track, true_ground(drive.scenario.ground, drive.seed)
 
 
-def summarise(row: GroundConfiguration, outcomes: Sequence[GroundOutcome]) -> GroundRow:
-    """One row of the table, with intervals over the seeds."""
+def summarise(row: GroundConfiguration, outcomes: Sequence[GroundOutcome]) -> Row:
+    """One row of the table: figures of all samples and cells together, with intervals over the seeds."""
     by_seed = [figures(outcome.comparison) for outcome in outcomes]
-    wrong_by_seed = [seed.wrong_cells_pct for seed in by_seed]
+    wrong_by_seed = [seed["wrong_cells_pct"] for seed in by_seed]
     pooled: Comparison = pool([outcome.comparison for outcome in outcomes])
     outputs = [outcome.output for outcome in outcomes]
     withheld: Counter[str] = Counter()
     for output in outputs:
         withheld.update(output.withheld)
-    summary = GroundRow(
+    summary = {
         **vars(row),
-        **vars(figures(pooled)),
-        right_class_ci95=_interval([seed.right_class_pct for seed in by_seed]),
-        wrong_cells_ci95=_interval(wrong_by_seed),
-        samples=sum(len(output.samples) for output in outputs),
-        us_per_second=round(sum(output.us_per_second for output in outputs) / len(outputs)),
-        soils=soils(pooled.cells),
-        by_border=by_border(pooled.cells),
-        c_rr_bias_by_seed=[c_rr_bias(outcome.comparison.placed) for outcome in outcomes],
-        wrong_cells_by_seed_pct=wrong_by_seed,
-        withheld=dict(sorted(withheld.items())),
-    )
+        **figures(pooled),
+        "right_class_ci95": _interval([seed["right_class_pct"] for seed in by_seed]),
+        "wrong_cells_ci95": _interval(wrong_by_seed),
+        "samples": sum(len(output.samples) for output in outputs),
+        "us_per_second": round(sum(output.us_per_second for output in outputs) / len(outputs)),
+        "soils": soils(pooled.cells),
+        "by_border": by_border(pooled.cells),
+        "c_rr_bias_by_seed": [c_rr_bias(outcome.comparison.placed) for outcome in outcomes],
+        "wrong_cells_by_seed_pct": wrong_by_seed,
+        "withheld": dict(sorted(withheld.items())),
+    }
     return rounded(summary, DIGITS, c_rr_bias_by_seed=5)
 
 
@@ -196,18 +166,12 @@ def _interval(numbers: Sequence[float]) -> float | None:
 def _estimate(task: Task[GroundConfiguration], cache: Path) -> PipelineOutput:
     """Run one row on one recording."""
     recording = task.recording(cache)
-    pipeline = Pipeline(recording.site, recording.machine, task.variant.options)
-    samples, cpu_s = sample(pipeline, recording)
-    seconds = (recording.readings[-1].stamp_ns - recording.readings[0].stamp_ns) * 1e-9
-    return PipelineOutput(samples, pipeline.health()["withheld"], cpu_s * 1e6 / seconds if seconds else math.nan)
-
-
-def sample(pipeline: Pipeline, recording: RecordedDrive) -> tuple[Table, float]:
-    """All samples that a pipeline makes of a recording, and the processor time [s] that it took."""
+    pipeline, readings = Pipeline(recording.site, recording.machine, task.variant.options), recording.readings
     began_s = time.process_time()
-    readings = recording.readings
-    made = [pipeline.step(readings[i : i + CHUNK]) for i in range(0, len(readings), CHUNK)]
-    return np.concatenate(made), time.process_time() - began_s
+    samples = np.concatenate([pipeline.step(readings[i : i + CHUNK]) for i in range(0, len(readings), CHUNK)])
+    cpu_s = time.process_time() - began_s
+    seconds = (readings[-1].stamp_ns - readings[0].stamp_ns) * 1e-9
+    return PipelineOutput(samples, pipeline.health()["withheld"], cpu_s * 1e6 / seconds if seconds else math.nan)
 
 
 EXPERIMENT = Experiment("ground", PipelineOutput, SOURCES, _estimate)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.campaign.truth import interpolate
-from evaluation.maps.borders import border_distance
+from evaluation.maps.score import border_distance
 from protocol.arrays import Floats, Ints
 from sim.scenario.ground import GroundConfig, build_terrain
 from sim.terrain.terrain import Terrain

@@ -33,16 +33,11 @@ GATE_SIGMA = 2.5  # of the Kalman filter
 OUTLIER_VARIANCES = 10.0
 
 
-@dataclass(frozen=True)
-class ServerMap:
-    """The map server's layers, and the machines that it excluded because they contradict all others."""
+def soft_votes(deliveries: Sequence[Delivery], window: CellWindow) -> tuple[Layers, tuple[str, ...]]:
+    """The map server's map: its own trust, fold, change test and read, with the options that it has by default.
 
-    layers: Layers
-    distrusted: tuple[str, ...]
-
-
-def soft_votes(deliveries: Sequence[Delivery], window: CellWindow) -> ServerMap:
-    """The map server's map: its own trust, fold, change test and read, with the options that it has by default."""
+    Returns its layers, and the machines that it excluded because they contradict all others.
+    """
     bad = contradicting(deliveries)
     grid = Grid(CELL_M, FoldConfig())
     for delivery in deliveries:
@@ -50,7 +45,7 @@ def soft_votes(deliveries: Sequence[Delivery], window: CellWindow) -> ServerMap:
             grid.fold(delivery.rows, delivery.machine)
     config = ServerConfig()
     values = read_cells(view_of(grid, window, config), window, SERVER_LAYERS, CELL_M, config)
-    return ServerMap({name: layer.astype(np.float64) for name, layer in values.items()}, bad)
+    return {name: layer.astype(np.float64) for name, layer in values.items()}, bad
 
 
 def contradicting(deliveries: Sequence[Delivery]) -> tuple[str, ...]:

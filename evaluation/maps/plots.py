@@ -16,24 +16,23 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
+from evaluation.campaign import pictures
 from evaluation.campaign.experiment import Runner
-from evaluation.campaign.goals import select
-from evaluation.campaign.pictures import WIDTH_IN, draw_all
+from evaluation.campaign.figures import Report, Row, select
+from evaluation.campaign.pictures import EAST, NORTH, ZONE_RGB, head
 from evaluation.campaign.workers import each
 from evaluation.maps.cases import CELL_M, MapCase, parking_place
-from evaluation.maps.experiment import GOALS, SERVER, Maps, MergeReport, MergeRow, solve
-from evaluation.maps.figures import GRADE_TOLERANCE, NEAR_M, MapFigures, classes, figures
+from evaluation.maps.experiment import GOALS, GRADE_TOLERANCE, NEAR_M, SERVER, Maps, classes, figures, solve
 from evaluation.maps.methods import METHODS, Layers
-from protocol.arrays import Bools, Floats, Ints
+from protocol.arrays import Floats
 from protocol.site.ground_classes import UNKNOWN, ZONES, resistance_class
 
 SHOWN = (SERVER, "last_write")
-ZONE_RGB: Floats = np.array([zone.bgr[::-1] for zone in ZONES]) / 255
 UNKNOWN_RGB = (0.88, 0.88, 0.88)
 WRONG_RGB = (1.0, 0.0, 1.0)
 PALENESS = 0.2  # of the true ground behind wrong cells
-# Okabe and Ito's colours, as in the other pictures.
-COLOUR = {SERVER: "#0072B2", "last_write": "#D55E00", "mean": "#E69F00", "median": "#009E73", "kalman": "#CC79A7"}
+COLOURS = (pictures.BLUE, pictures.VERMILION, pictures.ORANGE, pictures.GREEN, pictures.PINK)
+COLOUR = dict(zip((SERVER, *METHODS), COLOURS, strict=True))
 BESIDE_ROAD_M = 15.0  # of a narrow road that is shown; the rest of the site is all the same
 LOWEST_PCT = 0.005  # bottom of the bars' scale: three cells of the site
 LABEL_ROOM = 1.6  # a goal that is less than so many times higher would cross the value above a bar
@@ -57,16 +56,16 @@ BARS: tuple[tuple[dict[str, Any], str, str], ...] = (
 )
 
 
-def draw(report: MergeReport, cases: Sequence[MapCase], runner: Runner, folder: Path) -> list[Path]:
+def draw(report: Report, cases: Sequence[MapCase], runner: Runner, folder: Path) -> list[Path]:
     """Draw the table, and the maps of each case with the first seed, into a folder; returns the paths."""
-    jobs = [(case, report.seeds[0], folder) for case in cases]
+    jobs = [(case, report["seeds"][0], folder) for case in cases]
     paths = {case: path for (case, _, _), path in each(_draw_case, jobs, runner.processes)}
-    return [*draw_all({"table": partial(draw_table, report)}, folder), *(paths[case] for case in cases)]
+    return [*pictures.draw_all({"table": partial(draw_table, report)}, folder), *(paths[case] for case in cases)]
 
 
 def _draw_case(job: tuple[MapCase, int, Path]) -> Path:
     case, seed, folder = job
-    (path,) = draw_all({case.name: partial(draw_maps, case, seed, solve(case, seed))}, folder)
+    (path,) = pictures.draw_all({case.name: partial(draw_maps, case, seed, solve(case, seed))}, folder)
     return path
 
 
@@ -75,33 +74,28 @@ def _draw_case(job: tuple[MapCase, int, Path]) -> Path:
 
 def draw_maps(case: MapCase, seed: int, maps: Maps) -> Figure:
     """Truth and two merges in the upper row; below, how sure the server is (or a key), and their wrong cells."""
-    figure, panels = plt.subplots(2, 3, figsize=(WIDTH_IN + 3, 8.6), constrained_layout=True)
-    true = _true_layers(maps)
-    for axes, (name, layers) in zip(panels[0], [("truth", true), *_shown(maps)], strict=True):
+    figure, panels = plt.subplots(2, 3, figsize=(pictures.WIDTH_IN + 3, 8.6))
+    shown = [(name, maps.layers[name]) for name in SHOWN]
+    for axes, (name, layers) in zip(panels[0], [("truth", _true_layers(maps)), *shown], strict=True):
         _image(axes, case, _picture(case, layers))
-        axes.set_title(name, loc="left", weight="bold", fontsize=10)
-    for axes, (name, layers) in zip(panels[1, 1:], _shown(maps), strict=True):
+        head(axes, name)
+    for axes, (name, layers) in zip(panels[1, 1:], shown, strict=True):
         _draw_wrong(axes, case, maps, layers)
         judged = figures(case, maps.scene, layers)
-        wrong = math.nan if judged.wrong_pct is None else judged.wrong_pct
-        title = f"{name}: {wrong:.2f} % wrong{_parts(judged)}"
-        axes.set_title(title, loc="left", weight="bold", fontsize=10)
-        axes.set_xlabel("east [m]")
+        wrong = math.nan if judged["wrong_pct"] is None else judged["wrong_pct"]
+        head(axes, f"{name}: {wrong:.2f} % wrong{_parts(judged)}")
+        axes.set_xlabel(EAST)
     if case.judges_grade:
         _draw_wheel(panels[1, 0], case)
     else:
         _draw_confidence(figure, panels[1, 0], case, maps.layers[SERVER]["confidence"])
     for axes in panels.flat[[0, 1, 2, 4, 5]]:
         _draw_marks(axes, case, maps)
-    panels[0, 0].set_ylabel("north [m]")
+    panels[0, 0].set_ylabel(NORTH)
     figure.legend(handles=_handles(case), loc="outside lower center", ncols=8)
-    title = f"{case.title}, seed {seed}: {maps.scene.samples:,} samples of {_count(len(case.machines), 'machine')}"
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
+    machines = _count(len(case.machines), "machine")
+    head(figure, f"{case.title}, seed {seed}: {maps.scene.samples:,} samples of {machines}", 11)
     return figure
-
-
-def _shown(maps: Maps) -> list[tuple[str, Layers]]:
-    return [(name, maps.layers[name]) for name in SHOWN]
 
 
 def _true_layers(maps: Maps) -> Layers:
@@ -110,11 +104,10 @@ def _true_layers(maps: Maps) -> Layers:
     return {"resistance": site.c_rr_later, "grade_east": east, "grade_north": north}
 
 
-def _parts(judged: MapFigures) -> str:
+def _parts(judged: Row) -> str:
     """Figures of a case's own, for a title."""
     words = {"changed_wrong_pct": "changed", "unchanged_wrong_pct": "unchanged", "near_wrong_pct": "beside the machine"}
-    values = {word: getattr(judged, name) for name, word in words.items()}
-    parts = [f"{word} {value:.2f}" for word, value in values.items() if value is not None]
+    parts = [f"{word} {judged[name]:.2f}" for name, word in words.items() if judged[name] is not None]
     return f"\n{', '.join(parts)}" if parts else ""
 
 
@@ -133,10 +126,7 @@ def _picture(case: MapCase, layers: Layers) -> Floats:
     """Colours (rows, columns, 3) of a map."""
     if case.judges_grade:
         return _gradient_rgb(layers["grade_east"], layers["grade_north"], _steepest(case))
-    return _zone_rgb(resistance_class(layers["resistance"]))
-
-
-def _zone_rgb(zone: Ints) -> Floats:
+    zone = resistance_class(layers["resistance"])
     return np.where((zone == UNKNOWN)[..., None], UNKNOWN_RGB, ZONE_RGB[np.maximum(zone, 0)])
 
 
@@ -167,9 +157,8 @@ def _draw_wrong(axes: Axes, case: MapCase, maps: Maps, layers: Layers) -> None:
 
 def _draw_confidence(figure: Figure, axes: Axes, case: MapCase, confidence: Floats) -> None:
     image = _image(axes, case, confidence, cmap="viridis", vmin=0.3, vmax=1.0)
-    axes.set_title(f"{SERVER}: confidence", loc="left", weight="bold", fontsize=10)
-    axes.set_xlabel("east [m]")
-    axes.set_ylabel("north [m]")
+    head(axes, f"{SERVER}: confidence")
+    axes.set(xlabel=EAST, ylabel=NORTH)
     bar = axes.inset_axes((0.0, -0.3, 1.0, 0.05))  # a colour bar beside the panel would make it smaller than the others
     label = "share of the votes that the leading class has [-]"
     figure.colorbar(image, cax=bar, orientation="horizontal", label=label)
@@ -184,24 +173,19 @@ def _draw_wheel(axes: Axes, case: MapCase) -> None:
     axes.imshow(rgb, origin="lower", extent=(-steepest, steepest, -steepest, steepest))
     for each_east, each_north in case.gradients:
         axes.plot(100 * each_east, 100 * each_north, "o", color="black", ms=5, mfc="none", clip_on=False)
-    axes.set_title("key; circles: the zones", loc="left", weight="bold", fontsize=10)
-    axes.set_xlabel("grade to the east [%]")
-    axes.set_ylabel("grade to the north [%]")
+    head(axes, "key; circles: the zones")
+    axes.set(xlabel="grade to the east [%]", ylabel="grade to the north [%]")
 
 
 def _draw_marks(axes: Axes, case: MapCase, maps: Maps) -> None:
     """Outline of what was repaved, and the ring that a parked machine reaches."""
     if maps.scene.site.repaved.any():
-        _outline(axes, case, maps.scene.site.repaved)
+        x, y = ((np.arange(count) + 0.5) * CELL_M for count in (case.columns, case.rows))
+        axes.contour(x, y, maps.scene.site.repaved, levels=[0.5], colors="black", linewidths=1.2, linestyles="--")
     for machine in (m for m in case.machines if m.parked):
         x_m, y_m = parking_place(case)
-        axes.add_patch(Circle((x_m + machine.offset_m, y_m), 3 * NEAR_M, fill=False, color="white", lw=3))
-        axes.add_patch(Circle((x_m + machine.offset_m, y_m), 3 * NEAR_M, fill=False, color="black", lw=1.2))
-
-
-def _outline(axes: Axes, case: MapCase, cells: Bools) -> None:
-    x, y = ((np.arange(count) + 0.5) * CELL_M for count in (case.columns, case.rows))
-    axes.contour(x, y, cells, levels=[0.5], colors="black", linewidths=1.2, linestyles="--")
+        for colour, width in (("white", 3.0), ("black", 1.2)):
+            axes.add_patch(Circle((x_m + machine.offset_m, y_m), 3 * NEAR_M, fill=False, color=colour, lw=width))
 
 
 def _handles(case: MapCase) -> list[Any]:
@@ -220,52 +204,48 @@ def _handles(case: MapCase) -> list[Any]:
 # --- all cases -------------------------------------------------------------------------------------------------------
 
 
-def draw_table(report: MergeReport) -> Figure:
+def draw_table(report: Report) -> Figure:
     """Wrong cells of all cases by method, on a logarithmic scale: medians, ranges over the seeds, and goals."""
-    groups = [group for group in BARS if select(report.rows, group[0])]
-    figure, axes = plt.subplots(figsize=(max(6.0, 1.05 * len(groups) + 1.5), 5.0), constrained_layout=True)
+    groups = [group for group in BARS if select(report["rows"], group[0])]
+    figure, axes = plt.subplots(figsize=(max(6.0, 1.05 * len(groups) + 1.5), 5.0))
     wide = 0.84 / len(COLOUR)
     for x, (values, name, _) in enumerate(groups):
         for i, method in enumerate((SERVER, *METHODS)):
-            (row,) = select(report.rows, {**values, "method": method})
-            if getattr(row, name) is not None:
+            (row,) = select(report["rows"], {**values, "method": method})
+            if row[name] is not None:
                 _draw_bar(axes, x + (i - (len(COLOUR) - 1) / 2) * wide, wide, row, name)
-    axes.set_yscale("log")
-    axes.set_ylim(LOWEST_PCT, 250.0)
+    axes.set(yscale="log", ylim=(LOWEST_PCT, 250.0), xlim=(-0.6, len(groups) - 0.4))
     axes.set_yticks([0.01, 0.1, 1, 10, 100], ["0.01", "0.1", "1", "10", "100"])
-    axes.set_xlim(-0.6, len(groups) - 0.4)
     axes.set_xticks(range(len(groups)), [words for _, _, words in groups])
     axes.grid(visible=False, axis="x")
     axes.set_ylabel("driven cells that are wrong [%]")
     handles: list[Any] = [Patch(color=colour, label=name) for name, colour in COLOUR.items()]
     handles.append(Line2D([], [], color="black", lw=2, label=f"goal of {SERVER}"))
     axes.legend(handles=handles, ncols=6, loc="upper left")
-    title = f"Medians of {_count(len(report.seeds), 'seed')}, whiskers from the best to the worst"
-    axes.set_title(title, loc="left", weight="bold", fontsize=10)
+    head(axes, f"Medians of {_count(len(report['seeds']), 'seed')}, whiskers from the best to the worst")
     return figure
 
 
-def _draw_bar(axes: Axes, x: float, wide: float, row: MergeRow, name: str) -> None:
+def _draw_bar(axes: Axes, x: float, wide: float, row: Row, name: str) -> None:
     """One bar; above that of the server its value, free of whisker and goal."""
-    value = getattr(row, name)
-    top = max(value, LOWEST_PCT)
-    axes.bar(x, top, wide * 0.92, color=COLOUR[row.method])
+    top = max(row[name], LOWEST_PCT)
+    axes.bar(x, top, wide * 0.92, color=COLOUR[row["method"]])
     if name == "wrong_pct":
-        low, high = (max(end or 0.0, LOWEST_PCT) for end in (row.wrong_min_pct, row.wrong_max_pct))
+        low, high = (max(row[end] or 0.0, LOWEST_PCT) for end in ("wrong_min_pct", "wrong_max_pct"))
         axes.plot([x, x], [low, high], color="black", lw=1)
         top = max(top, high)
     for limit in _limits(row, name):
         axes.plot([x - 0.7 * wide, x + 0.7 * wide], [limit, limit], color="black", lw=2, zorder=4)
         top = limit if top < limit < LABEL_ROOM * top else top
-    if row.method == SERVER:
-        axes.text(x, top * 1.12, f"{value:.2g}", ha="center", va="bottom", fontsize=7, weight="bold")
+    if row["method"] == SERVER:
+        axes.text(x, top * 1.12, f"{row[name]:.2g}", ha="center", va="bottom", fontsize=7, weight="bold")
 
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _limits(row: MergeRow, name: str) -> list[float]:
+def _limits(row: Row, name: str) -> list[float]:
     """The goals of the server's bar."""
-    goals = [goal for goal in GOALS if (goal.figure, goal.relation) == (name, "<=") and row.method == SERVER]
+    goals = [goal for goal in GOALS if (goal.figure, goal.relation) == (name, "<=") and row["method"] == SERVER]
     return [goal.limit for goal in goals if select([row], goal.row)]

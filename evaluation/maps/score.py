@@ -1,4 +1,7 @@
-"""How right a map is: the paper's J, the share of known cells whose class differs from the truth."""
+"""How right a map is: the paper's J, the share of known cells whose class differs from the truth.
+
+Wrong cells are counted by their distance from the nearest border between two kinds of ground, too.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
-from evaluation.maps.borders import BorderBin, border_distance, by_border_distance
+from evaluation.campaign.figures import Row
 from mapserver.pictures.plotter import NamedLayers
-from protocol.arrays import Bools, Floats
+from protocol.arrays import Bools, Floats, Ints
 from protocol.queries.answers import Region
 from protocol.site.ground_classes import UNKNOWN, resistance_class, slope_class, wrong_percent
 
+EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # of the bins of distances; the last bin is open
 TRACK_STEP_M = 0.1  # between two points of a track that is compared with cells
 
 
@@ -29,25 +34,21 @@ class MapScore:
 class DrivenScore:
     """Cells that a load centre truly passed, which of them the map knows [%], and which of those are wrong [%].
 
-    by_border: the same by distance from the nearest other kind of ground.
+    by_border: see `by_border_distance`.
     """
 
     cells: int
     known_pct: float
     wrong_resistance_pct: float
     wrong_grade_pct: float
-    by_border: list[BorderBin]
+    by_border: list[Row]
 
 
 def score(region: Region, truth: NamedLayers) -> MapScore:
     """Compare a map with true layers of the same cells (resistance, grade_east, grade_north)."""
-    resistance = resistance_class(region["resistance"])
-    slope = slope_class(region["grade_east"], region["grade_north"])
-    return MapScore(
-        cells=int(np.isfinite(region["resistance"]).sum()),
-        wrong_resistance_pct=wrong_percent(resistance, resistance_class(truth["resistance"])),
-        wrong_grade_pct=wrong_percent(slope, slope_class(truth["grade_east"], truth["grade_north"])),
-    )
+    (resistance, slope), (true, true_slope) = _classes(region), _classes(truth)
+    cells = int((resistance != UNKNOWN).sum())
+    return MapScore(cells, wrong_percent(resistance, true), wrong_percent(slope, true_slope))
 
 
 def score_driven(region: Region, truth: NamedLayers, tracks_m: Iterable[Floats]) -> DrivenScore:
@@ -56,14 +57,12 @@ def score_driven(region: Region, truth: NamedLayers, tracks_m: Iterable[Floats])
     Cells that are known but were never passed, because a position was wrong, do not count. tracks_m: true places
     (n, 2) of each machine's load centre, as `evaluation.ground.truth.read_load_track` has them.
     """
-    true = resistance_class(truth["resistance"])
+    (resistance, slope), (true, true_slope) = _classes(region), _classes(truth)
     driven = driven_cells(region, tracks_m) & (true != UNKNOWN)
-    estimated, true_there = resistance_class(region["resistance"])[driven], true[driven]
-    slope = slope_class(region["grade_east"], region["grade_north"])
-    true_slope = slope_class(truth["grade_east"], truth["grade_north"])
+    estimated, true_there = resistance[driven], true[driven]
     return DrivenScore(
         cells=int(driven.sum()),
-        known_pct=100.0 * float((estimated != UNKNOWN).mean()) if driven.any() else np.nan,
+        known_pct=_known_percent(estimated),
         wrong_resistance_pct=wrong_percent(estimated, true_there),
         wrong_grade_pct=wrong_percent(slope[driven], true_slope[driven]),
         by_border=by_border_distance(estimated, true_there, border_distance(true, region.cell_m)[driven]),
@@ -79,6 +78,45 @@ def driven_cells(region: Region, tracks_m: Iterable[Floats]) -> Bools:
         inside = (row >= 0) & (row < passed.shape[0]) & (column >= 0) & (column < passed.shape[1])
         passed[row[inside], column[inside]] = True
     return passed
+
+
+def by_border_distance(estimated: Ints, true: Ints, border_m: Floats) -> list[Row]:
+    """Count known and wrong cells (k,) by their distance from the nearest border, in bins from_m to to_m (None: open).
+
+    cells: with a truth. known_pct: share of them that is known. wrong_pct: share of the known ones that is wrong.
+    """
+    estimated, true, border_m = (values[true != UNKNOWN] for values in (estimated, true, border_m))
+    which = np.digitize(border_m, EDGES_M) - 1
+    bins = []
+    for i, (low, high) in enumerate(zip(EDGES_M, (*EDGES_M[1:], None), strict=True)):
+        here = which == i
+        wrong = wrong_percent(estimated[here], true[here])
+        counts = {"cells": int(here.sum()), "known_pct": _known_percent(estimated[here]), "wrong_pct": wrong}
+        bins.append({"from_m": low, "to_m": high, **counts})
+    return bins
+
+
+def border_distance(classes: Ints, cell_m: float) -> Floats:
+    """Distance [m] of the cells' centres (rows, columns) from the nearest cell of another class.
+
+    Cells of class UNKNOWN border on nothing; infinite where there is no other class.
+    """
+    distance = np.full(classes.shape, np.inf)
+    for kind in np.unique(classes[classes != UNKNOWN]).tolist():
+        others = (classes != kind) & (classes != UNKNOWN)
+        if others.any():
+            here = classes == kind
+            distance[here] = (distance_transform_edt(~others)[here] - 0.5) * cell_m  # to its edge, not to its centre
+    return distance
+
+
+def _classes(layers: Region | NamedLayers) -> tuple[Ints, Ints]:
+    """Classes of resistance and of slope."""
+    return resistance_class(layers["resistance"]), slope_class(layers["grade_east"], layers["grade_north"])
+
+
+def _known_percent(classes: Ints) -> float:
+    return 100.0 * float((classes != UNKNOWN).mean()) if classes.size else np.nan
 
 
 def _dense(track_m: Floats) -> Floats:

@@ -49,6 +49,11 @@ class Configuration:
         return self.gps, self.imu
 
     @property
+    def options(self) -> PipelineConfig:
+        """The pipeline's."""
+        return PipelineConfig(localisation=LocalisationConfig(filter=self.filter, profile=self.profile))
+
+    @property
     def published_net_m(self) -> float | None:
         """Net RMSE [m] that the paper reports, with either profile; None where it has no such row."""
         return PAPER_NET_M.get((self.filter, self.gps, self.imu))
@@ -59,23 +64,11 @@ def configurations(sensors: Sequence[tuple[int, int]] = SENSORS) -> list[Configu
     return [Configuration(f, gps, imu, p) for gps, imu in sensors for p in PROFILES for f in FILTERS]
 
 
-def configure(machine: MachineConfig, row: Configuration) -> tuple[MachineConfig, PipelineConfig]:
-    """The machine with the sensors of a row in use, and the pipeline's options; raises UnsupportedError."""
-    return select(machine, row.gps, row.imu), pipeline_options(row)
-
-
-def pipeline_options(row: Configuration) -> PipelineConfig:
-    """Options of the pipeline for a row."""
-    return PipelineConfig(localisation=LocalisationConfig(filter=row.filter, profile=row.profile))
-
-
-def started_at(options: PipelineConfig, pose: tuple[float, float, float]) -> PipelineConfig:
-    """The options of a machine without GPS, with its start: x, y [m] and heading [rad] in `map`."""
-    return replace(options, localisation=replace(options.localisation, start=pose))
-
-
 def select(machine: MachineConfig, gps: int | None = None, imu: int | None = None) -> MachineConfig:
-    """Use the first receivers, and the first IMUs with an orientation of each; None leaves them as they are."""
+    """Use the first receivers, and the first IMUs with an orientation of each; None leaves them as they are.
+
+    Raises UnsupportedError.
+    """
     limits = {"gps": gps, "imu": imu, "attitude": imu}
     counts = dict.fromkeys(limits, 0)
     sensors = []

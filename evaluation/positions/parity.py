@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from evaluation.campaign.figures import rounded
+from evaluation.campaign.figures import Row, rounded
 from evaluation.positions.real_logs import refitted
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.readings import Reading
@@ -21,56 +21,32 @@ from protocol.site.site_config import Projection
 
 LOGS = Path(__file__).parents[1] / "logs"
 STEP_S = 0.02
+# What its tests assert, by log and filter: the final position [m], and how far off it may be [m].
+ASSERTED = {
+    "rl_test1_husky": {
+        "ekf": ((-40.0454, -76.9988, -2.6974), 1.0452),
+        "ukf": ((-39.7333, -76.9820, -2.4427), 1.2910),
+    },
+    "rl_test2_jackal": {"ekf": ((1.0206, 3.4292, 0.7419), 0.1383), "ukf": ((1.0438, 3.4940, 0.7260), 0.2351)},
+}
 
 
-@dataclass(frozen=True)
-class Asserted:
-    """What a test of robot_localization asserts: final position [m] and how far off it may be [m], by filter."""
+def run(data: Path, on_progress: Callable[[str], None] = lambda _: None) -> list[Row]:
+    """Run both filters on both logs: the final position of each [m], and how far it is from the asserted one.
 
-    log: str
-    position_m: dict[str, tuple[float, float, float]]
-    tolerance_m: dict[str, float]
-
-
-@dataclass(frozen=True)
-class ParityRow:
-    """Final position of one filter on one log [m], and its distance from the asserted one."""
-
-    log: str
-    filter: str
-    x_m: float
-    y_m: float
-    z_m: float
-    off_m: float
-    tolerance_m: float
-    within: bool
-
-
-ASSERTED = (
-    Asserted(
-        "rl_test1_husky",
-        {"ekf": (-40.0454, -76.9988, -2.6974), "ukf": (-39.7333, -76.9820, -2.4427)},
-        {"ekf": 1.0452, "ukf": 1.2910},
-    ),
-    Asserted(
-        "rl_test2_jackal",
-        {"ekf": (1.0206, 3.4292, 0.7419), "ukf": (1.0438, 3.4940, 0.7260)},
-        {"ekf": 0.1383, "ukf": 0.2351},
-    ),
-)
-
-
-def run(data: Path, on_progress: Callable[[str], None] = lambda _: None) -> list[ParityRow]:
-    """Run both filters on both logs; data: the folder that holds a folder of each log's name."""
+    data: the folder that holds a folder of each log's name.
+    """
     rows = []
-    for asserted in ASSERTED:
-        log = _without_gps(open_log(LOGS / asserted.log, data / asserted.log))
+    for folder, asserted in ASSERTED.items():
+        log = _without_gps(open_log(LOGS / folder, data / folder))
         readings = list(log.readings())
-        for name, expected in asserted.position_m.items():
-            on_progress(f"{asserted.log}: {name}")
-            position, tolerance = _final_position(log, readings, name), asserted.tolerance_m[name]
-            off = math.dist(position, expected)
-            rows.append(rounded(ParityRow(asserted.log, name, *position, off, tolerance, off <= tolerance), 4))
+        for name, (expected, tolerance_m) in asserted.items():
+            on_progress(f"{folder}: {name}")
+            position = _final_position(log, readings, name)
+            place = dict(zip(("x_m", "y_m", "z_m"), position, strict=True))
+            off_m = math.dist(position, expected)
+            judged = {"off_m": off_m, "tolerance_m": tolerance_m, "within": off_m <= tolerance_m}
+            rows.append(rounded({"log": folder, "filter": name, **place, **judged}, 4))
     return rows
 
 

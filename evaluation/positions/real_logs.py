@@ -22,15 +22,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
 from agents.holdout import Holdout, HoldoutConfig
 from agents.pipeline import Pipeline
-from evaluation.campaign.figures import root_mean_square
+from evaluation.campaign.figures import Report, Row, root_mean_square, rounded
 from evaluation.campaign.truth import Truth
-from evaluation.positions.configurations import Configuration, pipeline_options
+from evaluation.positions.configurations import Configuration
 from evaluation.positions.replay import Trace, errors, replay, score
 from protocol.config import from_table
 from protocol.errors import ConfigError, LogFolderError
@@ -75,63 +74,12 @@ class Side:
     planar: tuple[PlanarFile, ...] = ()
 
 
-@dataclass(frozen=True)
-class RealLog:
-    """A real log as it is evaluated."""
-
-    log: LogFolder
-    truth: Truth | None
-
-    @property
-    def machine(self) -> MachineConfig:
-        """What the agent may know of the machine."""
-        return self.log.machine
-
-
-@dataclass(frozen=True)
-class LogRow:
-    """One pattern of withheld GPS: errors against the withheld fixes, from `HoldoutConfig.settle_s` on."""
-
-    withhold: str
-    fixes: int
-    rms_m: float | None
-    median_m: float | None
-    max_m: float | None
-    us_per_second: int | None
-    counters: dict[str, int]
-    consistency: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class LogRowWithTruth(LogRow):
-    """The same with errors against the truth from the first pose on; truth_withheld_m: of the times without GPS."""
-
-    truth_rmse_x_m: float
-    truth_rmse_y_m: float
-    truth_net_m: float
-    truth_max_m: float
-    truth_nees: float
-    truth_coverage95: float
-    truth_covered: float
-    truth_withheld_m: float
-
-
-@dataclass(frozen=True)
-class LogReport:
-    """A log with one row per pattern of withheld GPS. refused: readings by reason."""
-
-    log: str
-    filter: str
-    profile: str
-    gps: int
-    readings: int
-    refused: dict[str, int]
-    rows: list[LogRow]
-
-
 @contextmanager
-def opened(manifest: Path, data: Path | None = None) -> Iterator[RealLog]:
-    """Open a log with its side file; planar fixes are converted into a folder that lasts as long as the context."""
+def opened(manifest: Path, data: Path | None = None) -> Iterator[tuple[LogFolder, Truth | None]]:
+    """Open a log, and the truth that its side file names; None without.
+
+    Planar fixes are converted into a folder that lasts as long as the context.
+    """
     log = open_log(manifest, data)
     side_file = (manifest if manifest.is_dir() else manifest.parent) / SIDE_FILE
     side = from_table(Side, load_toml(side_file), str(side_file)) if side_file.is_file() else Side()
@@ -141,24 +89,24 @@ def opened(manifest: Path, data: Path | None = None) -> Iterator[RealLog]:
     with TemporaryDirectory(prefix="sitegrid-") as folder:
         made = {planar.file: str(convert(log, planar, Path(folder))) for planar in side.planar}
         log.sources = tuple(replace(source, file=made.get(source.file, source.file)) for source in log.sources)
-        yield RealLog(log, truth)
+        yield log, truth
 
 
 def run(
-    real: RealLog,
-    machine: MachineConfig,
+    log: LogFolder,
+    truth: Truth | None,
     row: Configuration,
     patterns: Sequence[tuple[float, float]] = WITHHOLD,
     on_progress: Callable[[str], None] = lambda _: None,
-) -> LogReport:
-    """Replay a log once per pattern of withheld GPS: (seconds off, period)."""
-    log = refitted(real.log, machine)
+) -> Report:
+    """Replay a log once per pattern of withheld GPS: (seconds off, period). refused: readings by reason."""
     readings = list(log.readings())
     rows = []
     for off_s, period_s in patterns:
         on_progress(f"{log.name}: {withheld_name(off_s, period_s)}")
-        rows.append(_row(real, Pipeline(log.site, machine, pipeline_options(row)), readings, (off_s, period_s)))
-    return LogReport(log.name, row.filter, row.profile, row.gps, len(readings), dict(log.refused), rows)
+        rows.append(_row(log, truth, row, readings, (off_s, period_s)))
+    described = {"log": log.name, "filter": row.filter, "profile": row.profile, "gps": row.gps}
+    return {**described, "readings": len(readings), "refused": dict(log.refused), "rows": rows}
 
 
 def refitted(log: LogFolder, machine: MachineConfig) -> LogFolder:
@@ -207,29 +155,33 @@ def convert(log: LogFolder, planar: PlanarFile, folder: Path) -> Path:
     return path
 
 
-def _row(real: RealLog, pipeline: Pipeline, readings: Sequence[Reading], pattern: tuple[float, float]) -> LogRow:
+def _row(
+    log: LogFolder, truth: Truth | None, row: Configuration, readings: Sequence[Reading], pattern: tuple[float, float]
+) -> Row:
+    """Errors [m] against the withheld fixes, from `HoldoutConfig.settle_s` on, and against the truth if known."""
     off_s, period_s = pattern
     config = HoldoutConfig(period_s=period_s, off_s=off_s) if off_s else None
-    holdout = Holdout(real.log.site, real.machine, config) if config else None
+    holdout = Holdout(log.site, log.machine, config) if config else None
+    pipeline = Pipeline(log.site, log.machine, row.options)
     trace = replay(pipeline, readings, holdout)
-    against_fixes: dict[str, Any] = holdout.report() if holdout else NOTHING_WITHHELD
     health = pipeline.health()
-    row = LogRow(
-        withhold=withheld_name(off_s, period_s),
-        **against_fixes,
-        us_per_second=round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None,
-        counters=health["counters"],
-        consistency=health["consistency"],
-    )
-    return LogRowWithTruth(**vars(row), **_against_truth(trace, real.truth, pattern)) if real.truth else row
+    return {
+        "withhold": withheld_name(*pattern),
+        **(holdout.report() if holdout else NOTHING_WITHHELD),
+        "us_per_second": round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None,
+        "counters": health["counters"],
+        "consistency": health["consistency"],
+        **(_against_truth(trace, truth, pattern) if truth else {}),
+    }
 
 
-def _against_truth(trace: Trace, truth: Truth, pattern: tuple[float, float]) -> dict[str, Any]:
+def _against_truth(trace: Trace, truth: Truth, pattern: tuple[float, float]) -> Row:
+    """Errors from the first pose on; truth_withheld_m: of the times without GPS."""
     overall = vars(score(trace, truth))
     off = np.hypot(*errors(trace, truth).T)
     dark = np.isfinite(off) & (trace.since_start_s % pattern[1] < pattern[0])
     values = {name: overall[name] for name in TRUTH_FIGURES} | {"withheld_m": root_mean_square(off[dark])}
-    return {f"truth_{name}": round(value, 4) for name, value in values.items()}
+    return rounded({f"truth_{name}": value for name, value in values.items()}, 4)
 
 
 def _read(path: Path) -> list[dict[str, str]]:

@@ -6,20 +6,20 @@ Poses are all it compares, so only the localising half of the pipeline runs, wit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from agents.pipeline import Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
+from evaluation.campaign.figures import Report, Row, half_width, rounded
 from evaluation.campaign.recordings import PAPER, PlannedDrive, Setup
-from evaluation.positions.configurations import Configuration, UnsupportedError, configure, started_at
+from evaluation.positions.configurations import Configuration, UnsupportedError, select
 from evaluation.positions.replay import Score, errors, replay, score
-from evaluation.positions.summary import RatioRow, TableRow, ratios, summarise
 from protocol.arrays import Floats
+from protocol.machine.machine_config import MachineConfig
 from sim.sensors.presets import load_preset
 
 TRACE_S = 1.0  # between two points of the curves that plots draw
@@ -52,42 +52,31 @@ class Outcome:
     run: ScoredRun
 
 
-@dataclass(frozen=True)
-class MissingRow(Configuration):
-    """A configuration that the pipeline cannot run, and why."""
-
-    why: str
-
-
-@dataclass(frozen=True)
-class TableReport:
-    """The table. rows: one per configuration; ratios: paired on the same recordings."""
-
-    scenario: str
-    gps_error: dict[str, Any]
-    seeds: list[int]
-    seconds: float
-    rows: list[TableRow]
-    ratios: list[RatioRow]
-    missing: list[MissingRow]
-
-
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, rows: Sequence[Configuration], setup: Setup = PAPER
-) -> tuple[TableReport, list[Outcome]]:
-    """Record, replay and score all configurations with all seeds."""
+) -> tuple[Report, list[Outcome]]:
+    """Record, replay and score all configurations with all seeds; `missing`: those that the pipeline cannot run."""
     drives = [PlannedDrive(seed, seconds, setup=setup) for seed in seeds]
-    runnable, missing = _sort_out(drives[0], rows)
+    machine = drives[0].machine
+    refusals = {row: _why_not(machine, row) for row in rows}
+    runnable = [row for row, why in refusals.items() if not why]
     pairs = [(drive, row) for drive in drives for row in runnable]
     runs = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
     outcomes = [Outcome(*pair, run) for pair, run in zip(pairs, runs, strict=True)]
     scores = {row: [o.run for o in outcomes if o.row == row] for row in runnable}
-    table = [summarise(row, several) for row, several in scores.items()]
-    error = gps_error(drives[0].preset)
-    return TableReport(setup.scenario, error, list(seeds), seconds, table, ratios(scores), missing), outcomes
+    report: Report = {
+        "scenario": setup.scenario,
+        "gps_error": gps_error(drives[0].preset),
+        "seeds": list(seeds),
+        "seconds": seconds,
+        "rows": [summarise(row, several) for row, several in scores.items()],
+        "ratios": ratios(scores),
+        "missing": [{**vars(row), "why": why} for row, why in refusals.items() if why],
+    }
+    return report, outcomes
 
 
-def gps_error(preset: str) -> dict[str, Any]:
+def gps_error(preset: str) -> Row:
     """How slow the GPS errors of a preset are: on white noise every filter looks wonderful."""
     gps = load_preset(preset).gps
     slow, white = gps.drift_std_m**2, gps.white_std_m**2
@@ -100,16 +89,73 @@ def gps_error(preset: str) -> dict[str, Any]:
     }
 
 
-def _sort_out(drive: PlannedDrive, rows: Sequence[Configuration]) -> tuple[list[Configuration], list[MissingRow]]:
-    """Rows that the pipeline can run, and those that it cannot with the reason."""
-    runnable, missing = [], []
-    for row in rows:
-        try:
-            configure(drive.machine, row)
-            runnable.append(row)
-        except UnsupportedError as error:
-            missing.append(MissingRow(**vars(row), why=str(error)))
-    return runnable, missing
+def _why_not(machine: MachineConfig, row: Configuration) -> str:
+    """Why the pipeline cannot run a row; nothing if it can."""
+    try:
+        select(machine, row.gps, row.imu)
+    except UnsupportedError as error:
+        return str(error)
+    return ""
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+def summarise(row: Configuration, scores: Sequence[Score]) -> Row:
+    """One row of the table: means over the seeds; beside their net error, the paper's."""
+    net, paper = values(scores, "net_m"), row.published_net_m
+
+    def mean(name: str) -> float:
+        return float(values(scores, name).mean())
+
+    summary = {
+        **vars(row),
+        "rmse_x_m": mean("rmse_x_m"),
+        "rmse_y_m": mean("rmse_y_m"),
+        "net_m": mean("net_m"),
+        "ci95_m": half_width(net),
+        "max_m": float(values(scores, "max_m").max()),
+        "nees": mean("nees"),
+        "nees_95": nees_interval(scores),
+        "coverage95": mean("coverage95"),
+        "covered": mean("covered"),
+        "us_per_second": round(mean("us_per_second")),
+        "paper_net_m": paper,
+        "difference_m": None if paper is None else mean("net_m") - paper,
+        "net_by_seed_m": net.tolist(),
+    }
+    return rounded(summary, 4, max_m=3, nees=3, nees_95=3)
+
+
+def ratios(scores: Mapping[Configuration, Sequence[Score]]) -> list[Row]:
+    """Net errors of `default` over `paper`, and of EKF over UKF, where both were run on the same recordings."""
+    rows = []
+    for row in scores:
+        others = {"default/paper": replace(row, profile="paper"), "ekf/ukf": replace(row, filter="ukf")}
+        for name, other in others.items():
+            if other != row and other in scores:
+                ratio, half = paired_ratio(values(scores[row], "net_m"), values(scores[other], "net_m"))
+                rows.append(rounded({**vars(row), "ratio": name, "net": ratio, "ci95": half}, 4))
+    return rows
+
+
+def paired_ratio(a: Floats, b: Floats) -> tuple[float, float | None]:
+    """Ratio of the means of paired values (n,), and the half-width of its 95 % interval (None of one pair)."""
+    ratio = float(a.mean() / b.mean())
+    return ratio, half_width((a - ratio * b) / b.mean())
+
+
+def nees_interval(scores: Sequence[Score]) -> list[float]:
+    """Interval of the mean NEES over independent runs: the half-widths of their intervals add as squares."""
+    low, high = values(scores, "nees_low"), values(scores, "nees_high")
+    middle, half = (low + high) / 2, (high - low) / 2
+    width = float(np.sqrt((half**2).sum())) / len(scores)
+    return [float(middle.mean()) - width, float(middle.mean()) + width]
+
+
+def values(scores: Sequence[Score], name: str) -> Floats:
+    """One field of scores (n,)."""
+    return np.array([getattr(score, name) for score in scores], float)
 
 
 # --- in the worker processes -----------------------------------------------------------------------------------------
@@ -118,9 +164,9 @@ def _sort_out(drive: PlannedDrive, rows: Sequence[Configuration]) -> tuple[list[
 def _replay(task: Task[Configuration], cache: Path) -> ScoredRun:
     """Run one configuration on one recording."""
     recording = task.recording(cache)
-    machine, options = configure(recording.machine, task.variant)
+    machine, options = select(recording.machine, task.variant.gps, task.variant.imu), task.variant.options
     if not task.variant.gps:
-        options = started_at(options, recording.start)
+        options = replace(options, localisation=replace(options.localisation, start=recording.start))
     in_use = {sensor.name for sensor in machine.sensors if sensor.use}
     readings = [reading for reading in recording.readings if reading.sensor in in_use]
     trace = replay(Positioning(recording.site, machine, options), readings)

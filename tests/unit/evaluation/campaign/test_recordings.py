@@ -48,3 +48,24 @@ def test_a_recording_that_was_cut_off_is_made_anew(monkeypatch: pytest.MonkeyPat
     assert [p.name for p in tmp_path.iterdir()] == [DRIVE.folder(tmp_path).name]
     monkeypatch.setattr(recordings, "record", lambda *_: pytest.fail("recorded again"))
     recordings.make(DRIVE, tmp_path)
+
+
+def test_the_version_of_code_changes_with_each_source_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recordings, "ROOT", tmp_path)
+    (tmp_path / "package").mkdir()
+    seen = set()
+    for i, name in enumerate(("a.py", "a.py", "package/b.toml", "package/c.urdf")):
+        (tmp_path / name).write_text(f"x = {i}")
+        seen.add(recordings.code_version.__wrapped__("a.py", "package"))
+    (tmp_path / "package" / "notes.md").write_text("not a source")
+    assert len(seen | {recordings.code_version.__wrapped__("a.py", "package")}) == 4
+
+
+def test_a_source_that_is_not_there_is_an_error():
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        recordings.code_version("protocol/units.py", "nowhere.py")
+
+
+def test_a_digest_tells_where_one_text_ends():
+    assert recordings.digest("ab", "c") != recordings.digest("a", "bc")
+    assert len(recordings.digest("a")) == 10

@@ -24,8 +24,8 @@ def truth(tmp_path: Path) -> Path:
 
 
 def test_true_positions_have_no_error_also_between_the_truths_stamps(truth):
-    rmse = position_rmse({"a": [pose("a", t, 2.0 * t, 0.0) for t in (0.0, 0.25, 3.7, 10.0)]}, truth)
-    assert rmse["a"] == pytest.approx(0.0, abs=1e-5)  # stamps as doubles are good to 256 ns
+    poses = [pose("a", t, 2.0 * t, 0.0) for t in (0.0, 0.25, 3.7, 10.0)]
+    assert position_rmse({"a": poses}, truth)["a"] == pytest.approx(0.0, abs=1e-5)  # doubles are good to 256 ns
 
 
 def test_error_is_the_root_mean_square_in_the_plane(truth):
@@ -33,9 +33,7 @@ def test_error_is_the_root_mean_square_in_the_plane(truth):
         "a": [pose("a", 1.0, 2.0 + 3.0, 4.0), pose("a", 2.0, 4.0, 0.0)],  # 5 m and 0 m off
         "b": [pose("b", t, 5.0, -7.0) for t in range(10)],
     }
-    rmse = position_rmse(poses, truth)
-    assert rmse["a"] == pytest.approx((25 / 2) ** 0.5, abs=1e-5)
-    assert rmse["b"] == pytest.approx(2.0)
+    assert position_rmse(poses, truth) == pytest.approx({"a": (25 / 2) ** 0.5, "b": 2.0}, abs=1e-5)
 
 
 def test_a_machine_without_a_track_is_an_error(truth):

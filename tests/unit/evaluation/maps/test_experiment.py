@@ -1,59 +1,112 @@
-"""The comparison of merges: a row per case and method, through the command line, and its pictures."""
+"""The comparison of merges: figures of maps that are right or wrong where they are meant to be, rows, the command."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
-from functools import cache
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from evaluation.campaign.experiment import Runner, Task
+from evaluation.campaign.experiment import Runner
 from evaluation.maps import experiment
-from evaluation.maps.cases import CASES, MapCase, select
-from evaluation.maps.experiment import CaseResult, MergeRow
-from evaluation.maps.figures import MapFigures
+from evaluation.maps.cases import CASES, CaseMachine, MapCase, build_site, select
+from evaluation.maps.experiment import NEAR_M, CaseResult, figures, near_parked
+from evaluation.maps.samples import MapScene
 from sitegrid import cli
 
 METHODS = ["soft_votes", "last_write", "mean", "median", "kalman"]
 SMALL = tuple(replace(case, columns=45, rows=30) for case in CASES)
-FIGURES = asdict(MapFigures(wrong_pct=1.0, known_pct=50.0, seconds=1.0))
+NONE = dict.fromkeys(experiment.FIGURES)
+FIGURES = {**NONE, "wrong_pct": 1.0, "known_pct": 50.0, "seconds": 1.0}
 
 
 def small(kind: str) -> MapCase:
     return next(case for case in SMALL if case.kind == kind)
 
 
-class Here(Runner):
-    """Does tasks in this process, each once in all tests, and keeps nothing."""
+def scene_of(kind: str) -> tuple[MapCase, MapScene]:
+    """A small case whose every cell was driven."""
+    site = build_site(small(kind))
+    return small(kind), MapScene((), site, None, np.ones(site.c_rr.shape, bool))
 
-    def run(self, asked: experiment.Experiment, tasks: Sequence[Task]) -> list:
-        return [result_of(asked, task) for task in tasks]
+
+def test_a_map_of_the_truth_is_right_and_only_driven_cells_count():
+    case, scene = scene_of("1x1")
+    scene.driven[2:] = False
+    estimated = scene.site.c_rr_later.copy()
+    estimated[10:] = 0.25
+    assert figures(case, scene, {"resistance": estimated}) == {**NONE, "wrong_pct": 0.0, "known_pct": 100.0}
+    estimated[0, :9], estimated[1] = 0.25, np.nan
+    judged = figures(case, scene, {"resistance": estimated})
+    assert (judged["wrong_pct"], judged["known_pct"]) == (pytest.approx(100 * 9 / 45), 50.0)
 
 
-@cache
-def result_of(asked: experiment.Experiment, task: Task) -> CaseResult:
-    return asked.solve(task, Path())
+def test_changed_and_unchanged_cells_are_judged_apart_by_how_the_site_was_left():
+    case, scene = scene_of("repaved")
+    judged = figures(case, scene, {"resistance": scene.site.c_rr})
+    assert (judged["changed_wrong_pct"], judged["unchanged_wrong_pct"]) == (100.0, 0.0)
+    assert judged["wrong_pct"] == pytest.approx(100 * scene.site.repaved.mean())
+    left = figures(case, scene, {"resistance": scene.site.c_rr_later})
+    assert left["changed_wrong_pct"] == 0.0
+
+
+def test_of_a_narrow_road_only_the_road_is_judged():
+    case, scene = scene_of("narrow_road")
+    assert figures(case, scene, {"resistance": np.full((30, 45), 0.008)})["wrong_pct"] == 0.0
+    assert figures(case, scene, {"resistance": np.full((30, 45), 0.06)})["wrong_pct"] == 100.0
+
+
+def test_cells_beside_a_parked_machine_are_judged_apart():
+    case, scene = scene_of("parked_bad_machine")
+    near = near_parked(case)
+    assert near.sum() == pytest.approx(np.pi * NEAR_M**2, rel=0.1)
+    assert near[7, 36]  # three metres east of where it truly stands, at (33.75, 7.5)
+    assert not near[7, 32]
+    estimated = np.where(near, 0.06, scene.site.c_rr)
+    assert figures(case, scene, {"resistance": estimated})["near_wrong_pct"] == 100.0
+    assert not near_parked(replace(case, machines=(CaseMachine(),))).any()
+
+
+def test_sure_cells_are_judged_apart():
+    case, scene = scene_of("1x1")
+    estimated, confidence = scene.site.c_rr.copy(), np.full((30, 45), 0.9)
+    estimated[0], confidence[0] = 0.25, 0.59
+    judged = figures(case, scene, {"resistance": estimated, "confidence": confidence})
+    assert judged["share60_wrong_pct"] == 0.0
+    assert judged["share60_cells_pct"] == pytest.approx(100 * 29 / 30)
+    confidence[0] = 0.6
+    assert figures(case, scene, {"resistance": estimated, "confidence": confidence})["share60_wrong_pct"] > 0
+
+
+def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
+    case, scene = scene_of("slope_15")
+    east, north = np.moveaxis(scene.site.gradient, -1, 0)
+    assert figures(case, scene, {"grade_east": east + 0.007, "grade_north": north + 0.007})["wrong_pct"] == 0.0
+    assert figures(case, scene, {"grade_east": east + 0.008, "grade_north": north - 0.008})["wrong_pct"] == 100.0
+    unknown = np.where(np.arange(45) < 9, np.nan, east)
+    assert figures(case, scene, {"grade_east": unknown, "grade_north": north})["known_pct"] == pytest.approx(80)
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_every_case_and_method_has_a_row_with_the_figures_that_apply():
-    report, _ = experiment.run(Here(Path()), (3,), SMALL)
-    assert [(row.case, row.method) for row in report.rows] == [(c.kind, m) for c in CASES for m in METHODS]
-    assert report.seeds == [3]
-    assert len(report.goals) == len(experiment.GOALS)
-    for row in report.rows:
-        server = row.method == "soft_votes"
-        assert (row.changed_wrong_pct is None) == (row.passes_after is None) == (row.case != "repaved")
-        assert (row.unchanged_wrong_pct is None) == (row.case != "repaved")
-        assert (row.near_wrong_pct is None) == (row.case != "parked_bad_machine")
-        assert (row.width_m is None) == (row.case != "narrow_road")
-        assert (row.share60_cells_pct is None) == (not server or row.case in ("grade_both_ways", "slope_15"))
-        assert 0 <= row.wrong_min_pct <= row.wrong_pct <= row.wrong_max_pct
-        assert row.known_pct > 50
-        assert row.samples > row.cells > 0
-    plain = asdict(report)
-    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+def test_every_case_and_method_has_a_row_with_the_figures_that_apply(tmp_path: Path):
+    report, _ = experiment.run(Runner(tmp_path), (3,), SMALL)
+    assert [(row["case"], row["method"]) for row in report["rows"]] == [(c.kind, m) for c in CASES for m in METHODS]
+    assert report["seeds"] == [3]
+    assert len(report["goals"]) == len(experiment.GOALS)
+    for row in report["rows"]:
+        server = row["method"] == "soft_votes"
+        assert (row["changed_wrong_pct"] is None) == (row["passes_after"] is None) == (row["case"] != "repaved")
+        assert (row["unchanged_wrong_pct"] is None) == (row["case"] != "repaved")
+        assert (row["near_wrong_pct"] is None) == (row["case"] != "parked_bad_machine")
+        assert (row["width_m"] is None) == (row["case"] != "narrow_road")
+        assert (row["share60_cells_pct"] is None) == (not server or row["case"] in ("grade_both_ways", "slope_15"))
+        assert 0 <= row["wrong_min_pct"] <= row["wrong_pct"] <= row["wrong_max_pct"]
+        assert row["known_pct"] > 50
+        assert row["samples"] > row["cells"] > 0
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
 def test_rows_are_medians_over_seeds():
@@ -62,21 +115,20 @@ def test_rows_are_medians_over_seeds():
         for samples, wrong in ((10, 1.0), (30, 4.0), (20, 2.00004))
     ]
     row = experiment.summarise(small("1x1"), "mean", results)
-    assert (row.wrong_pct, row.wrong_min_pct, row.wrong_max_pct) == (2.0, 1.0, 4.0)
-    assert row.wrong_by_seed_pct == [1.0, 4.0, 2.0]
-    assert (row.samples, row.known_pct, row.near_wrong_pct, row.distrusted) == (20, 50.0, None, None)
+    assert (row["wrong_pct"], row["wrong_min_pct"], row["wrong_max_pct"]) == (2.0, 1.0, 4.0)
+    assert row["wrong_by_seed_pct"] == [1.0, 4.0, 2.0]
+    assert (row["samples"], row["known_pct"], row["near_wrong_pct"], row["distrusted"]) == (20, 50.0, None, None)
 
 
 def test_machines_that_the_server_excluded_are_counted_over_seeds():
     results = [CaseResult(1, 8, names, {"soft_votes": FIGURES}) for names in (["b"], [], ["b", "a"])]
-    assert experiment.summarise(small("1x1"), "soft_votes", results).distrusted == {"a": 1, "b": 2}
+    assert experiment.summarise(small("1x1"), "soft_votes", results)["distrusted"] == {"a": 1, "b": 2}
 
 
 def test_each_goal_names_a_figure_and_at_least_one_row():
-    names = {field.name for field in fields(MergeRow)}
     keys = [(case.kind, case.passes_after) for case in CASES]
     for goal in experiment.GOALS:
-        assert goal.figure in names
+        assert goal.figure in experiment.FIGURES
         case, passes_after, method = (goal.row.get(name) for name in ("case", "passes_after", "method"))
         assert method in METHODS
         assert (case, passes_after) in keys
@@ -94,7 +146,7 @@ def test_an_unknown_case_is_one_line(capsys: pytest.CaptureFixture[str]):
 
 def test_options_choose_seeds_and_cases(monkeypatch: pytest.MonkeyPatch):
     asked = []
-    report = experiment.MergeReport([], [], [])
+    report = {"seeds": [], "rows": [], "goals": []}
     monkeypatch.setattr(experiment, "run", lambda *_, **options: (asked.append(options), (report, ()))[1])
     assert cli.main(["eval", "merge", "--seeds", "2", "--first-seed", "7", "--cases", "repaved,1x1"]) == 0
     assert cli.main(["eval", "merge"]) == 0

@@ -4,15 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from evaluation.positions.consistency import (
-    ConsistencySummary,
-    ellipse_limit,
-    independent_values,
-    mean_interval,
-    normalised_square,
-    summarise,
-)
+from evaluation.positions import consistency
+from evaluation.positions.consistency import ConsistencySummary, independent_values, normalised_square, summarise
 
 COVARIANCE = np.array([[4.0, 1.2], [1.2, 1.0]])
 
@@ -25,11 +20,8 @@ def drawn(n: int, scale: float = 1.0, seed: int = 1) -> tuple[np.ndarray, np.nda
 
 def slow(n: int, correlation: float, seed: int = 2) -> np.ndarray:
     draws = np.random.default_rng(seed).standard_normal(n)
-    out = np.empty(n)
-    out[0] = draws[0]
-    for i in range(1, n):
-        out[i] = correlation * out[i - 1] + math.sqrt(1 - correlation**2) * draws[i]
-    return out
+    draws[1:] *= math.sqrt(1 - correlation**2)
+    return lfilter([1.0], [1.0, -correlation], draws)
 
 
 def is_consistent(summary: ConsistencySummary) -> bool:
@@ -60,9 +52,9 @@ def test_a_wrong_sigma_shows(scale: float, mean: float, coverage: float):
 
 
 def test_limits_are_those_of_the_tables():
-    assert ellipse_limit(2) == pytest.approx(5.991, abs=1e-3)
-    assert ellipse_limit(3) == pytest.approx(7.815, abs=1e-3)
-    low, high = mean_interval(2, 50)  # chi-square with 100 degrees of freedom: 74.222 to 129.561
+    assert consistency.ellipse_limit(2) == pytest.approx(5.991, abs=1e-3)
+    assert consistency.ellipse_limit(3) == pytest.approx(7.815, abs=1e-3)
+    low, high = consistency.mean_interval(2, 50)  # chi-square with 100 degrees of freedom: 74.222 to 129.561
     assert (low, high) == (pytest.approx(74.222 / 50, abs=1e-3), pytest.approx(129.561 / 50, abs=1e-3))
 
 
@@ -74,16 +66,15 @@ def test_interval_holds_the_mean_of_consistent_errors_19_times_in_20():
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9, 0.98])
 def test_slow_errors_are_worth_fewer_values(correlation: float):
     n = 40_000
-    assert independent_values(slow(n, correlation)) == pytest.approx(
-        n * (1 - correlation) / (1 + correlation), rel=0.25
-    )
+    expected = n * (1 - correlation) / (1 + correlation)
+    assert independent_values(slow(n, correlation)) == pytest.approx(expected, rel=0.25)
 
 
 def test_slow_errors_of_the_right_size_are_consistent_although_their_mean_wanders():
     errors = np.stack([slow(3000, 0.995, seed) for seed in (3, 4)], axis=1)
-    summary = summarise(normalised_square(errors, np.broadcast_to(np.eye(2), (3000, 2, 2))), dof=2)
+    squares = normalised_square(errors, np.broadcast_to(np.eye(2), (3000, 2, 2)))
+    summary, narrow = summarise(squares, dof=2), summarise(squares, dof=2, independent=3000)
     assert is_consistent(summary)
-    narrow = summarise(normalised_square(errors, np.broadcast_to(np.eye(2), (3000, 2, 2))), dof=2, independent=3000)
     assert summary.high - summary.low > 3 * (narrow.high - narrow.low)
 
 

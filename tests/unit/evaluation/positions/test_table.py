@@ -1,23 +1,68 @@
-"""The table on short recordings, and its pictures."""
+"""The table: its rows on made-up scores, and on short recordings, with pictures."""
 
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from agents.pipeline import PipelineConfig
 from evaluation.campaign.experiment import Runner
+from evaluation.campaign.figures import Report
 from evaluation.campaign.recordings import PAPER
 from evaluation.positions import table
 from evaluation.positions.configurations import Configuration
+from evaluation.positions.replay import Score
+from evaluation.positions.table import paired_ratio, ratios, summarise
 from protocol.machine.machine_config import MachineConfig
 
 FAST = replace(PAPER, world="fast")
-ONE, TWO = (Configuration("ukf", gps, 1, "default") for gps in (1, 2))
-pytestmark = pytest.mark.slow  # a recording, and two filters that follow it
+ONE, TWO, NONE = (Configuration("ukf", gps, 1, "default") for gps in (1, 2, 0))
 NEVER = Configuration("ukf", 9, 1, "default")
 SECONDS = 14.0
+
+
+def score(net_m: float, max_m: float = 3.0, us: float = 100.0) -> Score:
+    return Score(0.6 * net_m, 0.8 * net_m, net_m, max_m, 2.0, 1.0, 3.0, 0.95, 0.98, us)
+
+
+def test_row_has_means_over_seeds_and_stands_beside_the_paper():
+    row = summarise(ONE, [score(1.0, 4.0), score(2.0, 7.0, 300.0)])
+    assert (row["filter"], row["gps"], row["imu"], row["profile"]) == ("ukf", 1, 1, "default")
+    assert (row["rmse_x_m"], row["rmse_y_m"], row["net_m"]) == (0.9, 1.2, 1.5)
+    assert (row["max_m"], row["us_per_second"]) == (7.0, 200)
+    assert row["paper_net_m"] == 2.3234
+    assert row["difference_m"] == pytest.approx(1.5 - 2.3234)
+    assert row["net_by_seed_m"] == [1.0, 2.0]
+    assert row["nees_95"] == pytest.approx([2 - 0.707, 2 + 0.707])
+    assert row["ci95_m"] == pytest.approx(12.7062 * math.sqrt(0.5) / math.sqrt(2), abs=1e-3)
+
+
+def test_a_single_seed_has_no_interval_and_a_row_of_ours_no_figure_of_the_paper():
+    row = summarise(Configuration("ukf", 3, 1, "default"), [score(1.0)])
+    assert row["ci95_m"] is None
+    assert row["paper_net_m"] is row["difference_m"] is None
+
+
+def test_pairing_takes_out_what_recordings_have_in_common():
+    hard = np.random.default_rng(6).uniform(1, 4, 12)
+    ratio, half = paired_ratio(0.7 * hard, hard)
+    assert ratio == pytest.approx(0.7)
+    assert half == pytest.approx(0.0, abs=1e-12)
+
+
+def test_ratios_are_of_profiles_and_of_filters_that_were_both_run():
+    rows = {(f, p): Configuration(f, 1, 1, p) for f, p in (("ukf", "paper"), ("ukf", "default"), ("ekf", "default"))}
+    net = {("ukf", "paper"): 2.0, ("ukf", "default"): 1.0, ("ekf", "default"): 1.1}
+    pairs = ratios({row: [score(net[key]), score(2 * net[key])] for key, row in rows.items()})
+    assert [(r["ratio"], r["filter"], r["profile"], r["net"]) for r in pairs] == [
+        ("default/paper", "ukf", "default", 0.5),
+        ("ekf/ukf", "ekf", "default", 1.1),
+    ]
+    assert ratios({ONE: [score(1.0)]}) == []
+
+
+# --- on recordings ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -26,21 +71,24 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
 
 
 @pytest.fixture(scope="module")
-def result(runner: Runner) -> tuple[table.TableReport, list[table.Outcome]]:
-    return table.run(runner, (3,), SECONDS, (ONE, TWO, NEVER), FAST)
+def result(runner: Runner) -> tuple[Report, list[table.Outcome]]:
+    return table.run(runner, (3,), SECONDS, (ONE, TWO, NONE, NEVER), FAST)
 
 
+@pytest.mark.slow
 def test_rows_are_scored_on_one_recording_and_what_cannot_run_is_named(result, runner: Runner):
     report, outcomes = result
-    assert [(row.gps, row.paper_net_m) for row in report.rows] == [(1, 2.3234), (2, 1.7217)]
-    assert all(0.05 < row.net_m < 8 and 0.3 < row.covered < 1 for row in report.rows)
-    assert all(row.us_per_second > 100 for row in report.rows)
-    assert [row.gps for row in report.missing] == [9]
-    assert "9" in report.missing[0].why
+    rows = report["rows"]
+    assert [(row["gps"], row["paper_net_m"]) for row in rows] == [(1, 2.3234), (2, 1.7217), (0, 65.4774)]
+    assert all(0.05 < row["net_m"] < 8 and 0.3 < row["covered"] < 1 for row in rows[:2])
+    assert rows[2]["covered"] == 1  # without GPS its start is given
+    assert all(row["us_per_second"] > 100 for row in rows)
+    assert [row["gps"] for row in report["missing"]] == [9]
+    assert "9" in report["missing"][0]["why"]
     assert len(list(runner.cache.glob("paper-seed3-*"))) == 1
     assert len(outcomes[0].run.time_s) > 4
-    assert [outcome.row for outcome in outcomes] == [ONE, TWO]
-    assert list(asdict(report.rows[0]))[:5] == ["filter", "gps", "imu", "profile", "rmse_x_m"]
+    assert [outcome.row for outcome in outcomes] == [ONE, TWO, NONE]
+    assert list(rows[0])[:5] == ["filter", "gps", "imu", "profile", "rmse_x_m"]
 
 
 def test_the_report_says_how_slow_gps_errors_are():
@@ -48,6 +96,7 @@ def test_the_report_says_how_slow_gps_errors_are():
     assert (error["slow_variance_share"], error["correlation_time_s"]) == (0.9, 45.0)
 
 
+@pytest.mark.slow
 def test_localisation_alone_runs(runner: Runner, result, monkeypatch: pytest.MonkeyPatch):
     """So what a row costs is what localisation costs; and the same code on the same recording has the same score."""
     monkeypatch.setattr("agents.pipeline.GroundEstimator", lambda *_: pytest.fail("estimates the ground"))
@@ -57,6 +106,7 @@ def test_localisation_alone_runs(runner: Runner, result, monkeypatch: pytest.Mon
     np.testing.assert_equal(asdict(replace(again, **changes)), asdict(replace(outcome.run, **changes)))
 
 
+@pytest.mark.slow
 def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):
     cv2 = pytest.importorskip("cv2")
     plots = pytest.importorskip("evaluation.positions.plots", reason="needs the extra `eval`")
@@ -68,19 +118,19 @@ def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):
         assert picture.std() > 10
 
 
+@pytest.mark.slow
 def test_a_configuration_that_never_had_a_pose_still_has_a_row(
     runner: Runner, result, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     """Without a single GPS fix the machine cannot know where it is."""
-    monkeypatch.setattr(table, "configure", _deaf)
+    monkeypatch.setattr(table, "select", _deaf)
     run = table._replay(table.replay_task(ONE, result[1][0].drive), runner.cache)
     row = table.summarise(ONE, [run])
-    assert row.covered == 0.0
-    assert row.net_m != row.net_m  # NaN; the command prints null
+    assert row["covered"] == 0.0
+    assert math.isnan(row["net_m"])  # the command prints null
     plots = pytest.importorskip("evaluation.positions.plots")
     assert plots.draw(result[0], [replace(result[1][0], run=run)], runner, tmp_path) == []
 
 
-def _deaf(machine: MachineConfig, _: Configuration) -> tuple[MachineConfig, PipelineConfig]:
-    sensors = tuple(replace(s, use=s.use and s.kind != "gps") for s in machine.sensors)
-    return replace(machine, sensors=sensors), PipelineConfig()
+def _deaf(machine: MachineConfig, *_: int) -> MachineConfig:
+    return replace(machine, sensors=tuple(replace(s, use=s.use and s.kind != "gps") for s in machine.sensors))

@@ -11,15 +11,9 @@ from sitegrid import cli
 from sitegrid.commands import eval as command
 
 MANIFEST = """
-[log]
-name = "empty"
-start_ns = 1
-[site]
-name = "yard"
-origin_lat_deg = 50.0
-origin_lon_deg = 8.0
-[machine]
-name = "mower"
+log = { name = "empty", start_ns = 1 }
+site = { name = "yard", origin_lat_deg = 50.0, origin_lon_deg = 8.0 }
+machine = { name = "mower" }
 [[sensor]]
 name = "wheels"
 kind = "encoder"
@@ -36,7 +30,7 @@ def test_options_of_an_experiment_reach_it(monkeypatch, capsys):
     from evaluation.positions import table
 
     asked = []
-    report = table.TableReport("paper_site", {}, [1], math.nan, [], [], [])
+    report = {"scenario": "paper_site", "seconds": math.nan, "rows": []}
     monkeypatch.setattr(table, "run", lambda runner, **options: (asked.append((runner, options)), (report, []))[1])
     words = ["eval", "localisation", "--seeds", "2", "--first-seed", "1000", "--rows", "headline", "--seconds", "60"]
     assert cli.main([*words, "--out", "x", "--processes", "3", "--json"]) == 0
