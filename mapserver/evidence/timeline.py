@@ -91,7 +91,8 @@ def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
     """Votes of pages as PackedPages has them, in the order of time, and where those of each page end."""
     if isinstance(pages, TimedPages):
         return pages.packed_votes()
-    parts = [PackedPages.from_page(0, 0, timed.page).votes for timed in pages]
+    columns = ((timed.page.votes["place"], timed.page.votes["count"].astype(np.uint64)) for timed in pages)
+    parts = [count << np.uint64(16) | place for place, count in columns]
     return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum([len(part) for part in parts], dtype=np.int64)
 
 
