@@ -72,7 +72,6 @@ class ModelServer:
         self._backup = _Disk()
 
     def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
-        """As Store.commit."""
         fault = plan.fault
         plan.disarm()
         new = self.disk.copy()
@@ -91,22 +90,18 @@ class ModelServer:
         return answers
 
     def back_up(self) -> None:
-        """Keep a copy."""
         self._backup = self.disk.copy()
 
     def restore(self) -> None:
-        """Go back to the copy."""
         self.disk = self._backup.copy()
 
     def samples(self) -> Iterator[JournalledSample]:
-        """Everything in the journal."""
         for admission in self.disk.rows:
             batch = admission.batch
             for i, row in enumerate(batch.rows):
                 yield JournalledSample(batch.machine, batch.spool_id, batch.first_seq + i, row.tobytes())
 
     def marks(self) -> dict[RunKey, tuple[int, int]]:
-        """Watermark and lost, by run."""
         return self.disk.marks
 
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
@@ -143,37 +138,29 @@ class RealServer:
         try:
             return self._store.commit(group)
         except Killed:
-            self._close()
+            self.close()
             self._open()
             raise
         finally:
             self._plan.disarm()
 
     def back_up(self) -> None:
-        """Copy the folder between two commits."""
         shutil.rmtree(self._backup, ignore_errors=True)
         shutil.copytree(self._folder, self._backup)
 
     def restore(self) -> None:
-        """Put the copy in the folder's place."""
-        self._close()
+        self.close()
         shutil.rmtree(self._folder)
         shutil.copytree(self._backup, self._folder)
         self._open()
 
     def samples(self) -> Iterator[JournalledSample]:
-        """Everything in the journal."""
         for row in self._journal.read():
             for i, sample in enumerate(row.rows):
                 yield JournalledSample(row.machine, row.spool_id, row.first_seq + i, sample.tobytes())
 
     def marks(self) -> dict[RunKey, tuple[int, int]]:
-        """Watermark and lost, by run."""
         return {run: (mark.seq, mark.lost) for run, mark in self._journal.watermarks().items()}
-
-    def close(self) -> None:
-        """End the server."""
-        self._close()
 
     @property
     def _journal(self) -> Journal:
@@ -189,7 +176,7 @@ class RealServer:
         db.plan = self._plan
         self._journal._db = db
 
-    def _close(self) -> None:
+    def close(self) -> None:
         """Let go of the files without a word to SQLite: what was not committed is gone."""
         self._plan.killed = False
         self._plan.disarm()

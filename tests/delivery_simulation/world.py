@@ -28,8 +28,7 @@ from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_reply, encode_reply
 from protocol.wire.messages import Ack, Refused
-from tests.delivery_simulation.faults import Fault, FaultPlan, FaultySpool, Killed
-from tests.delivery_simulation.rates import draw_rates
+from tests.delivery_simulation.faults import Fault, FaultPlan, FaultySpool, Killed, draw_rates
 from tests.delivery_simulation.servers import MapServer, ModelServer, RealServer
 
 START_NS = 1_767_225_600_000_000_000
@@ -37,17 +36,6 @@ HOUR_NS = 3_600_000_000_000
 TIMEOUT_S = UplinkConfig().timeout_s
 PACING = Pacing(first_batch=4, max_batch=16)
 MOST_ROUNDS = 3000  # to settle everything, without faults
-_WEIGHTS = {
-    "record": 30,
-    "exchange": 45,
-    "late": 5,
-    "end": 4,
-    "start": 6,
-    "finalise": 3,
-    "clock": 1,
-    "server": 4,
-    "copy": 2,
-}
 
 
 class SimulatedAgent:
@@ -140,22 +128,18 @@ class World:
 
     def _step(self) -> None:
         agent = self.rng.choice(self._agents)
-        what = self.rng.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0]
-        if what == "exchange":
-            self._exchange(agent)
-        elif what == "late":
-            self._deliver_late()
-        elif what == "server":
-            self._change_server()
-        else:
-            {
-                "record": self._record,
-                "finalise": self._finalise,
-                "start": self._start,
-                "end": self._end,
-                "clock": self._step_clock,
-                "copy": self._copy_or_restore,
-            }[what](agent)
+        weights: dict[Callable[..., object], int] = {
+            self._record: 30,
+            self._exchange: 45,
+            self._deliver_late: 5,
+            self._end: 4,
+            self._start: 6,
+            self._finalise: 3,
+            self._step_clock: 1,
+            self._change_server: 4,
+            self._copy_or_restore: 2,
+        }
+        self.rng.choices(list(weights), list(weights.values()))[0](agent)
 
     def _record(self, agent: SimulatedAgent) -> None:
         if not agent.spool:
@@ -242,7 +226,7 @@ class World:
             return None
         return next(answer for one, answer in zip(group, answers, strict=True) if one is incoming)
 
-    def _deliver_late(self) -> None:
+    def _deliver_late(self, *_: object) -> None:
         if self._late and self._server_up:
             incoming = self._late.pop(self.rng.randrange(len(self._late)))
             answer = self._take(incoming)
@@ -315,7 +299,7 @@ class World:
         agent.clock_ns = self.rng.choice((-HOUR_NS, 0, HOUR_NS))
         self.note(f"{agent.name} clock off by {agent.clock_ns / HOUR_NS:+.0f} h")
 
-    def _change_server(self) -> None:
+    def _change_server(self, *_: object) -> None:
         """Switch it on or off, back it up, or restore it."""
         draw = self.rng.random()
         if draw < 0.6 or not self.rates.server_backups:
