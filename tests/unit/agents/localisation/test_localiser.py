@@ -154,6 +154,7 @@ def test_receiver_that_comes_late_or_never_is_no_trouble(from_s: float) -> None:
     assert max(position_errors(beliefs, made)) < 0.3
 
 
+@pytest.mark.slow
 def test_late_receiver_brings_its_own_unknown_error() -> None:
     """A second receiver that is 3 m off must not pull the position with the weight of its white noise alone."""
     vehicle = machine(receivers=2)
@@ -187,6 +188,7 @@ def test_standstill_shows_the_gyro_bias() -> None:
     assert state(located)[GYRO_BIAS] == pytest.approx(0.004, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_turning_on_the_spot_is_no_gyro_bias() -> None:
     """An articulated loader that steers at rest turns its rear frame."""
     vehicle = machine()
@@ -211,6 +213,7 @@ def test_wheels_that_fall_silent_do_not_hold_the_machine() -> None:
     assert position_errors(beliefs, made)[-1] < 3.0
 
 
+@pytest.mark.slow
 def test_dead_reckoning_grows_unsure_and_a_fix_makes_it_sure_again() -> None:
     vehicle = machine()
     made = drive([*S_BEND, Leg(20), Leg(2)], vehicle)
@@ -286,6 +289,7 @@ def arriving(readings: list[Reading], late: dict[str, float]) -> list[Reading]:
     return sorted(readings, key=lambda r: r.stamp_ns + round(late.get(r.sensor, 0.0) * 1e9))
 
 
+@pytest.mark.slow
 @FILTERS
 def test_fixes_that_come_late_give_the_pose_of_those_in_time(engine: str) -> None:
     vehicle = machine(receivers=2)
@@ -301,6 +305,7 @@ def test_fixes_that_come_late_give_the_pose_of_those_in_time(engine: str) -> Non
     assert (newest[last].x_m, newest[last].y_m) == pytest.approx((before.x_m, before.y_m), abs=0.05)
 
 
+@pytest.mark.slow
 def test_first_fix_of_a_receiver_that_comes_late_brings_its_unknown_error_all_the_same() -> None:
     """What is set at the first fix stays set when older fixes of the other receiver arrive after it."""
     vehicle = machine(receivers=2)
@@ -316,6 +321,7 @@ def test_first_fix_of_a_receiver_that_comes_late_brings_its_unknown_error_all_th
     assert max(late_errors) < max(errors) + 0.2
 
 
+@pytest.mark.slow
 def test_first_fix_that_is_refused_does_not_count_as_heard() -> None:
     vehicle = machine(receivers=2)
     made = drive(S_BEND, vehicle)
@@ -370,6 +376,7 @@ def with_ahrs(made: Drive, off_rad: float) -> list[Reading]:
     return sorted([*made.readings, *more], key=lambda r: r.stamp_ns)
 
 
+@pytest.mark.slow
 def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores() -> None:
     vehicle = machine()
     vehicle = replace(vehicle, sensors=(*vehicle.sensors, SensorConfig("ahrs", "attitude")))
@@ -388,6 +395,7 @@ def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores(
     assert abs(off["default"]) < 0.03
 
 
+@pytest.mark.slow
 def test_each_of_two_imus_has_its_own_bias() -> None:
     vehicle = machine()
     vehicle = replace(

@@ -50,6 +50,7 @@ def steps_at(border_m: float):
     return lambda x: np.where(x < border_m, 0.04, 0.06)
 
 
+@pytest.mark.slow
 def test_a_right_estimate_has_right_figures():
     track, here = drive_east(), ground(WET)
     row = figures(compare(samples_of(track, steps_at(BORDER_M)), track, here, LAG_S, START_NS))
