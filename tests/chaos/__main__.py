@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.chaos import bit_flips, power_cuts, site_faults, write_faults
+from tests.chaos import bit_flips, disk_faults, site_faults
 from tests.chaos.outcome import Console, FaultOutcome, InterruptError, table
 from tests.chaos.recordings import make
 from tests.chaos.scenario import FaultRun
@@ -40,8 +40,8 @@ class ChaosFault:
 # The longest first, so that lanes end together.
 FAULTS = (
     ChaosFault("kills", site_faults.kills, 0.45),
-    ChaosFault("power", power_cuts.power),
-    ChaosFault("writes", write_faults.writes),
+    ChaosFault("power", disk_faults.power),
+    ChaosFault("writes", disk_faults.writes),
     ChaosFault("proxy", site_faults.proxy, 0.08),
     ChaosFault("cable", site_faults.cable, 0.08),
     ChaosFault("freezes", site_faults.freezes, 0.08),

@@ -12,6 +12,7 @@ from typing import Any
 TimeSpan = tuple[float, float]  # [s] of one clock
 
 COLUMNS = ("fault", "count", "recorded", "merged", "lost", "double", "longest pause", "")
+LINE = "{:<8}{:>8}{:>10}{:>10}{:>6}{:>8}{:>15}  {}"
 
 
 class InterruptError(Exception):
@@ -94,11 +95,7 @@ def _covered(gap: TimeSpan, spans: Iterable[TimeSpan]) -> float:
 
 def table(outcomes: Iterable[FaultOutcome]) -> str:
     """Lay results out for people."""
-    rows = [COLUMNS, *(_row(outcome) for outcome in outcomes)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
-    lines = [[row[0].ljust(widths[0]), *(v.rjust(w) for v, w in zip(row[1:-1], widths[1:-1], strict=True)), row[-1]]
-             for row in rows]  # fmt: skip
-    return "\n".join("  ".join(line).rstrip() for line in lines)
+    return "\n".join(LINE.format(*row).rstrip() for row in (COLUMNS, *map(_row, outcomes)))
 
 
 def _row(outcome: FaultOutcome) -> tuple[str, ...]:

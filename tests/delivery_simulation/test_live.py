@@ -25,7 +25,6 @@ from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol.errors import LinkError
 from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_pose
@@ -33,10 +32,10 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.commands.agent import _claim_name, _open
 from sitegrid.process.children import wait_until
 from tests.chaos.tcp_proxy import Proxy, Weather
+from tests.unit.agents.drives import made_up_samples
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 MACHINE = MachineConfig("loader-1", sensors=(SensorConfig("imu", "imu"), SensorConfig("wheels", "encoder")))
-START_NS = 1_767_225_600_000_000_000
 WAIT_S = 20.0
 
 Opened = Callable[..., zenoh.Session]
@@ -68,15 +67,6 @@ def opened(endpoint: str) -> Iterator[Opened]:
             return opened
 
         yield session
-
-
-def made_up(n: int) -> np.ndarray:
-    rows = np.zeros(n, SAMPLE_DTYPE)
-    rows["stamp_ns"] = START_NS + np.arange(n) * 100_000_000
-    rows["x_m"] = np.arange(n) % 200
-    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0
-    rows["c_rr"], rows["c_rr_var"], rows["distance_m"] = 0.05, 1e-4, 0.5
-    return rows
 
 
 # --- one machine's name ----------------------------------------------------------------------------------------------
@@ -154,7 +144,7 @@ class Silent:
 def test_agent_holds_its_samples_while_another_has_its_name(opened: Opened, tmp_path: Path) -> None:
     first = Presence(opened(), SITE.name, "loader-1")
     agent = Agent(opened(), SITE, MACHINE, AgentConfig(), Places(tmp_path / "spool.db"))
-    agent._spool.record(made_up(3))
+    agent._spool.record(made_up_samples(3))
     wait_until(lambda: agent._yield_name() or bool(agent._uplink.held), WAIT_S, "it yields")
     problem = agent.report(Silent(1))["uplink"]["problem"]
     assert f"runs as {first.owner}: it sends, this one waits" in problem
@@ -204,7 +194,7 @@ def test_agent_goes_on_while_its_disk_takes_nothing(opened: Opened, tmp_path: Pa
     agent = Agent(opened(), SITE, MACHINE, AgentConfig(linger_s=0), Places(tmp_path / "spool.db"))
     agent._spool._db.execute("PRAGMA query_only = ON")
     for _ in range(5):
-        agent._deliver(made_up(2))
+        agent._deliver(made_up_samples(2))
     report = agent.report(Silent(1))
     assert (report["samples"], report["spool"]["unsaved"], report["spool"]["given_up"]) == (0, 8, 2)
     assert "look at the machine's disk" in report["spool_problem"]
@@ -222,7 +212,7 @@ def test_samples_that_the_disk_takes_only_after_the_end_are_delivered(
     with server_at(endpoint, tmp_path / "store"):
         agent = Agent(opened(), SITE, MACHINE, AgentConfig(linger_s=WAIT_S), Places(tmp_path / "spool.db"))
         agent._spool._db.execute("PRAGMA query_only = ON")
-        agent._deliver(made_up(5))
+        agent._deliver(made_up_samples(5))
 
         def mend(seconds: float) -> None:
             agent._spool._db.execute("PRAGMA query_only = OFF")
@@ -241,7 +231,7 @@ def test_samples_that_the_disk_takes_only_after_the_end_are_delivered(
 def uplink_of(session: zenoh.Session, path: Path, n: int) -> Iterator[Spool]:
     spool = Spool(path, SpoolConfig())
     for first in range(0, n, 50_000):
-        spool.record(made_up(n)[first : first + 50_000])
+        spool.record(made_up_samples(n)[first : first + 50_000])
     link = UplinkThread(session, SITE.name, Uplink("loader-1", SITE.frame, UplinkConfig().timeout_s), spool)
     yield spool
     link.close()

@@ -29,7 +29,7 @@ from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_reply, encode_reply
 from protocol.wire.messages import Ack, Refused
 from tests.delivery_simulation.faults import Fault, FaultPlan, FaultySpool, Killed, draw_rates
-from tests.delivery_simulation.servers import MapServer, ModelServer, RealServer
+from tests.delivery_simulation.servers import ModelServer, RealServer
 
 START_NS = 1_767_225_600_000_000_000
 HOUR_NS = 3_600_000_000_000
@@ -86,8 +86,7 @@ class World:
         self._now_ns = START_NS
         site = SiteConfig("lot", 49.01, 8.4, 120.0, clock="wall" if self.rates.wall_clock else "data")
         self._frame = site.frame
-        kind = RealServer if real else ModelServer
-        self._server: MapServer = RealServer(folder, site, self._now) if real else ModelServer(site, self._now)
+        self._server = RealServer(folder, site, self._now) if real else ModelServer(site, self._now)
         self._server_up = True
         self._late: list[Incoming] = []
         self._agents = [
@@ -98,7 +97,7 @@ class World:
         self._explained: set[int] = set()
         self._faults = True
         self._numbers = iter(range(10**9))
-        self.note(f"{kind.__name__} {self.rates}")
+        self.note(f"{type(self._server).__name__} {self.rates}")
         for agent in self._agents:
             self._start(agent)
 
@@ -358,7 +357,7 @@ class World:
         outcome = self.outcome
         samples = list(self._server.samples())
         by_stamp = Counter(_stamp(one.row) for one in samples)
-        by_identity = Counter((one.machine, one.spool_id, one.seq) for one in samples)
+        by_identity = Counter(one[:3] for one in samples)
         outcome.double = max(sum(n - 1 for n in counts.values()) for counts in (by_stamp, by_identity))
         for agent in self._agents:
             self._explained |= self._quarantined(agent.path)

@@ -18,7 +18,7 @@ from agents.delivery.spool import Spool, SpoolConfig
 from protocol.machine.samples import empty
 from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
-from tests.chaos import bit_flips, power_cuts, site_faults, stepped_clock, write_faults
+from tests.chaos import bit_flips, disk_faults, site_faults, stepped_clock
 from tests.chaos.__main__ import FAULTS, ChaosFault, run_suite, totals
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
@@ -55,7 +55,7 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
 @pytest.mark.processes
 @pytest.mark.skipif(sys.platform != "linux", reason="LD_PRELOAD")
 def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
-    outcome = power_cuts.power(scenario(tmp_path / "run", strikes=40))
+    outcome = disk_faults.power(scenario(tmp_path / "run", strikes=40))
     assert (outcome.count, outcome.lost, outcome.double, outcome.problems) == (40, 0, 0, [])
     assert outcome.recorded == outcome.merged > 1000
 
@@ -63,13 +63,13 @@ def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
 @pytest.mark.processes
 @pytest.mark.parametrize("what", ["spool", "store"])
 def test_power_cuts_find_a_file_that_is_not_synced_at_every_commit(tmp_path, library, what):
-    operations = power_cuts.trace(library, tmp_path / "run", what, 3, "careless")
-    assert power_cuts.cut(operations, what, 20, random.Random(1)).lost > 0
+    operations = disk_faults.trace(library, tmp_path / "run", what, 3, "careless")
+    assert disk_faults.cut(operations, what, 20, random.Random(1)).lost > 0
 
 
 @pytest.mark.processes
 def test_writes_that_fail_one_after_the_other_lose_nothing(tmp_path, library):
-    outcome = write_faults.writes(scenario(tmp_path / "run", scale=0.05))
+    outcome = disk_faults.writes(scenario(tmp_path / "run", scale=0.05))
     assert (outcome.lost, outcome.double, outcome.problems) == (0, 0, [])
     assert outcome.count > 10
 

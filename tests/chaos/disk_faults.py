@@ -1,7 +1,13 @@
-"""Power cuts: the real spool and the real store, on a disk that loses or tears what was not synced."""
+"""The real spool and the real store on a disk that loses or tears what was not synced, or whose writes fail.
+
+`python -m tests.chaos.disk_faults WHAT CONTROL FOLDER SEED STRIDE`: the same work is done again and again, each time
+with another write, sync or new file that fails (and, by turns, one or two after it): full disk and I/O error at every
+write of the spool and of the store. The last line is the outcome as JSON.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import shutil
@@ -23,12 +29,14 @@ from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from tests.chaos import power_worker as work
 from tests.chaos.disk_model import Disk, Kind, Operation, read_trace
-from tests.chaos.disk_shim import FailingDisk, build
+from tests.chaos.disk_shim import DiskError, FailingDisk, build
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
 
 CUTS = 2000  # of the whole suite, half of them of the spool
 STEPS = {"spool": 400, "store": 200}
+SWEEP_STEPS = 12
+MOST = 5000  # writes of a sweep; the work ends long before
 IN_MEMORY = Path("/dev/shm")
 SampleNumber = tuple[int, int]  # spool_id, seq
 
@@ -161,3 +169,52 @@ def add(total: FaultOutcome, part: FaultOutcome) -> None:
     for name in ("count", "recorded", "merged", "lost", "double"):
         setattr(total, name, getattr(total, name) + getattr(part, name))
     total.problems += part.problems
+
+
+def writes(scenario: FaultRun) -> FaultOutcome:
+    """Run the sweeps, each in a process under the shim."""
+    scenario.folder.mkdir(parents=True)
+    if not (library := build(scenario.folder)):
+        return FaultOutcome(scenario.fault, skipped="no C compiler for the shim")
+    total, stride = FaultOutcome(scenario.fault), max(1, round(1 / max(scenario.scale, 0.05)))
+    for what in ("spool", "store"):
+        folder, control = scenario.folder / what, scenario.folder / f"{what}.bin"
+        folder.mkdir()
+        env = {**os.environ, **FailingDisk(library, folder, control).env}
+        words = ("-m", "tests.chaos.disk_faults", what, control, folder, scenario.seed, stride)
+        child = subprocess.Popen([sys.executable, *map(str, words)], env=env, stdout=subprocess.PIPE, text=True)
+        total.pids.append(child.pid)
+        try:
+            while child.poll() is None:
+                scenario.console.wait(0.1)
+            text = child.communicate()[0]
+        finally:
+            child.kill()
+        add(total, FaultOutcome(**json.loads(text.splitlines()[-1])))
+    return total
+
+
+def sweep(what: str, disk: FailingDisk, folder: Path, seed: int, stride: int) -> FaultOutcome:
+    """Have the n-th write fail, for every n or each stride-th."""
+    outcome = FaultOutcome(what)
+    for n in range(0, MOST, stride):
+        used, promised = folder / str(n), folder.with_name(f"{what}-{n}.promises")
+        used.mkdir()
+        promises = work.Promises(promised)
+        times = 1 + n % 3
+        disk.set(list(DiskError)[n // stride % 2], after=n, times=times)
+        work.USE[what](used, promises, seed, SWEEP_STEPS)
+        untouched = disk.left == times
+        disk.set(0)
+        promises.close()
+        judge(outcome, promised.read_text(encoding="ascii"), LOOK[what](used))
+        outcome.count += 1
+        if untouched:
+            return outcome
+    return outcome
+
+
+if __name__ == "__main__":
+    WHAT, CONTROL, FOLDER, SEED, STRIDE = sys.argv[1:]
+    DISK = FailingDisk(Path(), Path(FOLDER), Path(CONTROL))
+    print(json.dumps(sweep(WHAT, DISK, Path(FOLDER), int(SEED), int(STRIDE)).plain()))
