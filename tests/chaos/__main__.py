@@ -52,7 +52,6 @@ FAULTS = (
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run the suite."""
     arguments = _parse(words)
     console, began_s = Console(), time.monotonic()
     console.stop_on_signals()

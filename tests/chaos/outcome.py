@@ -46,7 +46,6 @@ class FaultOutcome:
         return self.lost == self.double == 0 and not self.problems
 
     def plain(self) -> dict[str, Any]:
-        """Values for JSON."""
         return asdict(self)
 
 
@@ -58,7 +57,6 @@ class Console:
     stop: threading.Event = field(default_factory=threading.Event)
 
     def say(self, text: str) -> None:
-        """Print a line at once."""
         self.line(text, flush=True)
 
     def wait(self, seconds: float) -> None:
@@ -94,7 +92,6 @@ def _covered(gap: TimeSpan, spans: Iterable[TimeSpan]) -> float:
 
 
 def table(outcomes: Iterable[FaultOutcome]) -> str:
-    """Lay results out for people."""
     return "\n".join(LINE.format(*row).rstrip() for row in (COLUMNS, *map(_row, outcomes)))
 
 

@@ -13,14 +13,6 @@ from tests.chaos.chaos_site import ChaosSite
 from tests.chaos.outcome import Console, FaultOutcome
 from tests.chaos.recordings import Recordings
 
-# Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
-SERVER_TOML = """
-[store]
-snapshot_s = 2.0
-[trust]
-exclude = false
-"""
-
 
 @dataclass(frozen=True)
 class Spell:
@@ -54,11 +46,9 @@ class FaultRun:
         return random.Random(f"{self.seed} {self.fault}")
 
     def site(self, **options: Any) -> ChaosSite:
-        """Return a site, not yet started."""
-        return ChaosSite(self.folder, self.recordings, self.console, server_toml=SERVER_TOML, **options)
+        return ChaosSite(self.folder, self.recordings, self.console, **options)
 
     def say(self, text: str) -> None:
-        """Print a line."""
         self.console.say(f"{self.fault}: {text}")
 
     def strike(

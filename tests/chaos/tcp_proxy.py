@@ -55,7 +55,6 @@ class Proxy:
         return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
 
     def set(self, weather: Weather) -> None:
-        """Change the weather."""
         self.weather = weather
         if weather.cut:
             self._drop_links()

@@ -24,7 +24,6 @@ IN_MEMORY = Path("/dev/shm")
 
 
 def main() -> int:
-    """Run."""
     parser = argparse.ArgumentParser(prog="python -m tests.delivery_simulation", description=__doc__)
     parser.add_argument("--seeds", type=int, default=1000, help="how many")
     parser.add_argument("--first", type=int, default=0, help="the first one")

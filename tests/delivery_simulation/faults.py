@@ -43,15 +43,12 @@ class FaultPlan:
     killed: bool = False
 
     def arm(self, fault: Fault, left: int) -> None:
-        """Choose the next fault."""
         self.fault, self.left = fault, left
 
     def disarm(self) -> None:
-        """Have no fault."""
         self.fault = None
 
     def due(self, statement: str) -> Fault | None:
-        """Return the fault of this statement."""
         if self.killed:
             raise Killed
         if self.fault is None or statement.lstrip().startswith(("SELECT", "PRAGMA")):
@@ -70,12 +67,10 @@ class FaultyConnection(sqlite3.Connection):
     plan: FaultPlan | None = None
 
     def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        """As sqlite3, or the fault."""
         with self._fault_of(statement):
             return super().execute(statement, *values)
 
     def executemany(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        """As sqlite3, or the fault."""
         with self._fault_of(statement):
             return super().executemany(statement, *values)
 

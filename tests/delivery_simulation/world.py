@@ -68,7 +68,6 @@ class Outcome:
 
     @property
     def is_good(self) -> bool:
-        """Whether everything held."""
         return not (self.lost or self.double or self.problems)
 
 
@@ -114,12 +113,10 @@ class World:
         return self.outcome
 
     def note(self, text: str) -> None:
-        """Trace what happens."""
         if self._say:
             self._say(text.replace(str(self._folder), "."))
 
     def close(self) -> None:
-        """Let go of the server's files."""
         if isinstance(self._server, RealServer):
             self._server.close()
 
@@ -236,18 +233,15 @@ class World:
         if agent.spool:
             return
         agent.plan = FaultPlan()
-        config = SpoolConfig(self.rates.max_samples)
+        options = {"config": SpoolConfig(self.rates.max_samples), "draw_id": lambda: self.rng.getrandbits(63)}
         try:
             with self._spool_faults(agent):
-                agent.spool = FaultySpool(
-                    agent.path, agent.plan, config=config, draw_id=lambda: self.rng.getrandbits(63)
-                )
+                agent.spool = FaultySpool(agent.path, agent.plan, **options)
         except StoreError as error:
             self.note(f"{agent.name} cannot start: {error}")
         if not agent.spool:
             return
-        rng = np.random.default_rng(0)
-        agent.uplink = Uplink(agent.machine, self._frame, TIMEOUT_S, PACING, rng)
+        agent.uplink = Uplink(agent.machine, self._frame, TIMEOUT_S, PACING, np.random.default_rng(0))
         present = self._present(agent)
         self._end_doubt(agent, present)
         agent.pending = (0, [])
@@ -285,10 +279,8 @@ class World:
             self.outcome.events["spool_restores"] += 1
             self.note(f"{agent.name} restored from a copy")
         elif len(self._agents) < 4:
-            number = next(self._numbers)
-            clone = SimulatedAgent(
-                f"clone-{number}", agent.machine, self._copy(copy, self._folder / f"clone-{number}.db")
-            )
+            name = f"clone-{next(self._numbers)}"
+            clone = SimulatedAgent(name, agent.machine, self._copy(copy, self._folder / f"{name}.db"))
             self._agents.append(clone)
             self.outcome.events["clones"] += 1
             self.note(f"{clone.name} is a clone of a copy of {agent.machine}")
@@ -385,12 +377,8 @@ class World:
         events = self.outcome.events
         if events["spool_restores"] or events["clones"] or events["server_restores"]:
             return
-        counted = sum(
-            counters[name]
-            for a in self._agents
-            if a.spool and (counters := a.spool.counters())
-            for name in ("dropped", "put_aside")
-        )
+        counters = [agent.spool.counters() for agent in self._agents if agent.spool]
+        counted = sum(each["dropped"] + each["put_aside"] for each in counters)
         never = self.outcome.explained
         if counted < never:
             self.outcome.problems.append(f"{never} never arrived, {counted} are counted")

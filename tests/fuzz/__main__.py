@@ -121,7 +121,6 @@ def save(result: DecoderResult) -> list[Path]:
 
 
 def main() -> int:
-    """Run."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="for all decoders together")
     parser.add_argument("--decoder", help="only this one")

@@ -68,7 +68,6 @@ _KEPT: list[tempfile.TemporaryDirectory[str]] = []
 
 @cache
 def decoders() -> tuple[Decoder, ...]:
-    """All of them."""
     return (*_messages(), *_selectors(), *_configs(), *_logs(), *_kept())
 
 
