@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +134,7 @@ def totals(outcomes: Sequence[FaultOutcome], seed: int) -> dict[str, Any]:
     for name in ("recorded", "merged", "lost", "double"):
         table[name] = sum(getattr(outcome, name) for outcome in outcomes)
     table["ok"] = all(outcome.is_good for outcome in outcomes)
-    return {**table, "seed": seed, "faults": [outcome.plain() for outcome in outcomes]}
+    return {**table, "seed": seed, "faults": [asdict(outcome) for outcome in outcomes]}
 
 
 if __name__ == "__main__":

@@ -219,7 +219,9 @@ class ChaosSite:
         out.notes |= {"declared": declared, "unrecorded": result.unrecorded, "rows": len(rows)}
         if result.unrecorded:
             self.problem(f"{result.unrecorded} samples in the journal that nobody recorded")
-        commits = {m: [_true_s(s, ended_s) for name, s in rows if name == m] for m in self.machines}
+        # Undo the server's clock having been an hour off: no scenario lasts that long.
+        true = [(name, s - round((s - ended_s) / HOUR_S) * HOUR_S) for name, s in rows]
+        commits = {machine: [s for name, s in true if name == machine] for machine in self.machines}
         out.longest_pause_s = max(
             longest_pause([s for s in stamps if s < resumed_s], self.faults, resumed_s) for stamps in commits.values()
         )
@@ -245,8 +247,3 @@ class ChaosSite:
         files = ("--spool", self.folder / "spool" / f"{role}.db", "--audit", self.folder / "audit" / role)
         config = ("--config", self._recordings.folder / "agent.toml")
         return [str(word) for word in ("agent", *where, *site, *config, *replay, *files, "--json")]
-
-
-def _true_s(received_s: float, now_s: float) -> float:
-    """Undo the server's clock having been an hour off: no scenario lasts that long."""
-    return received_s - round((received_s - now_s) / HOUR_S) * HOUR_S

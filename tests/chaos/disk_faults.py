@@ -217,4 +217,4 @@ def sweep(what: str, disk: FailingDisk, folder: Path, seed: int, stride: int) ->
 if __name__ == "__main__":
     WHAT, CONTROL, FOLDER, SEED, STRIDE = sys.argv[1:]
     DISK = FailingDisk(Path(), Path(FOLDER), Path(CONTROL))
-    print(json.dumps(sweep(WHAT, DISK, Path(FOLDER), int(SEED), int(STRIDE)).plain()))
+    print(json.dumps(vars(sweep(WHAT, DISK, Path(FOLDER), int(SEED), int(STRIDE)))))

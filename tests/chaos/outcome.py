@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -44,9 +44,6 @@ class FaultOutcome:
     def is_good(self) -> bool:
         """Nothing lost, nothing double, and nothing else that should not be."""
         return self.lost == self.double == 0 and not self.problems
-
-    def plain(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -424,26 +424,19 @@ class World:
             self._contents[_stamp(row)] = {row}
 
     def _present(self, agent: SimulatedAgent) -> set[int]:
-        assert agent.spool
         with agent.spool._lock:
             return _stamp_set(row for (row,) in agent.spool._db.execute("SELECT row FROM sample"))
 
-    def _held(self, path: Path) -> set[int]:
-        return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM sample"))
+    def _held(self, path: Path, table: str = "sample") -> set[int]:
+        """Read a file, whoever has it open: a copy of it."""
+        with contextlib.closing(sqlite3.connect(self._copy(path, self._folder / "look.db"))) as db:
+            try:
+                return _stamp_set(row for (row,) in db.execute(f"SELECT row FROM {table}"))
+            except sqlite3.OperationalError:  # the process was killed while it made the file
+                return set()
 
     def _quarantined(self, path: Path) -> set[int]:
-        return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM quarantine"))
-
-    def _query(self, path: Path, statement: str) -> list[tuple[bytes]]:
-        """Read a file, whoever has it open: a copy of it."""
-        look = self._copy(path, self._folder / "look.db")
-        db = sqlite3.connect(look)
-        try:
-            return db.execute(statement).fetchall()
-        except sqlite3.OperationalError:  # the process was killed while it made the file
-            return []
-        finally:
-            db.close()
+        return self._held(path, "quarantine")
 
     def _copy(self, source: Path, target: Path) -> Path:
         """Copy a database between two transactions, with its log."""
