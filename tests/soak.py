@@ -119,10 +119,9 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def report(result: Soak, growth_pct: float) -> None:
-    """Print the table."""
     print(" minute   samples   server MiB   router MiB")
     step = max(1, len(result.looks) // 12)
-    for look in [*result.looks[step - 1 :: step]]:
+    for look in result.looks[step - 1 :: step]:
         print(f"{look.minute:7.0f} {look.samples:9d} {look.server_mib:12.1f} {look.router_mib:12.1f}")
     print(f"second half: {growth_pct:+.1f} % of resident memory; sent {result.sent}, late {result.late_s:.0f} s")
 
@@ -195,13 +194,8 @@ def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
 
 
 def _look(client: Client, watched: tuple[Child, Child], minute: float) -> Look:
-    server_mib, router_mib = (_resident_mib(child.pid) for child in watched)
-    return Look(minute, client.info().samples_merged, server_mib, router_mib)
-
-
-def _resident_mib(pid: int) -> float:
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    pages = (int(Path(f"/proc/{child.pid}/statm").read_text().split()[1]) for child in watched)
+    return Look(minute, client.info().samples_merged, *(n * os.sysconf("SC_PAGE_SIZE") / 2**20 for n in pages))
 
 
 if __name__ == "__main__":

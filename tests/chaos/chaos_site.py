@@ -29,6 +29,8 @@ RESUME_S = 60.0
 ROUTER, SERVER = "router", "server"
 COMMAND = ("-m", "sitegrid.cli")
 HOUR_S = 3600
+# Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
+SERVER_TOML = "[store]\nsnapshot_s = 2.0\n[trust]\nexclude = false\n"
 ALL_STOPPED = (signal.SIGCONT, signal.SIGTERM)
 
 
@@ -39,7 +41,7 @@ class StartError(Exception):
 class ChaosSite:
     """Router, map server and agents. Leaving the block ends them all.
 
-    clock: the site's clock. server_toml: options of the map server. first_ns: when the first drives begin.
+    clock: the site's clock. first_ns: when the first drives begin.
     """
 
     def __init__(
@@ -49,7 +51,6 @@ class ChaosSite:
         console: Console,
         *,
         clock: str = "data",
-        server_toml: str = "",
         first_ns: int = START_NS,
     ) -> None:
         for name in ("log", "spool", "audit", "store"):
@@ -69,7 +70,7 @@ class ChaosSite:
         self._starts = 0
         site = replace(open_log(recordings.data(self.machines[0])).site, clock=clock)
         (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
-        (folder / "server.toml").write_text(server_toml, encoding="utf-8")
+        (folder / "server.toml").write_text(SERVER_TOML, encoding="utf-8")
 
     def __enter__(self) -> ChaosSite:
         return self
@@ -105,11 +106,9 @@ class ChaosSite:
         return self._running[role]
 
     def send(self, role: str, number: signal.Signals) -> None:
-        """Send a signal."""
         self._running[role].send(number)
 
     def kill(self, role: str) -> None:
-        """Kill a process, and start it again."""
         with self.fault():
             self._running[role].end(signal.SIGKILL)
             self.start(role)
@@ -131,7 +130,6 @@ class ChaosSite:
         return self._running.pop(role).code, process.last_words()
 
     def wait_ready(self, role: str) -> None:
-        """Wait until a process says that it is ready."""
         self._wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
 
     def tend(self) -> None:
@@ -160,7 +158,6 @@ class ChaosSite:
             self.tend()
 
     def problem(self, text: str) -> None:
-        """Note what should not be."""
         self.outcome.problems.append(text)
 
     # --- the end -----------------------------------------------------------------------------------------------------
@@ -222,7 +219,9 @@ class ChaosSite:
         out.notes |= {"declared": declared, "unrecorded": result.unrecorded, "rows": len(rows)}
         if result.unrecorded:
             self.problem(f"{result.unrecorded} samples in the journal that nobody recorded")
-        commits = {m: [_true_s(s, ended_s) for name, s in rows if name == m] for m in self.machines}
+        # Undo the server's clock having been an hour off: no scenario lasts that long.
+        true = [(name, s - round((s - ended_s) / HOUR_S) * HOUR_S) for name, s in rows]
+        commits = {machine: [s for name, s in true if name == machine] for machine in self.machines}
         out.longest_pause_s = max(
             longest_pause([s for s in stamps if s < resumed_s], self.faults, resumed_s) for stamps in commits.values()
         )
@@ -246,10 +245,5 @@ class ChaosSite:
         manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, first_ns, idle=idle)
         replay = ("--driver", "replay", "--log", manifest, "--data", self._recordings.data(role), "--speed", SPEED)
         files = ("--spool", self.folder / "spool" / f"{role}.db", "--audit", self.folder / "audit" / role)
-        config = ("--config", self._recordings.agent_file)
+        config = ("--config", self._recordings.folder / "agent.toml")
         return [str(word) for word in ("agent", *where, *site, *config, *replay, *files, "--json")]
-
-
-def _true_s(received_s: float, now_s: float) -> float:
-    """Undo the server's clock having been an hour off: no scenario lasts that long."""
-    return received_s - round((received_s - now_s) / HOUR_S) * HOUR_S

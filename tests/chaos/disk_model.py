@@ -72,7 +72,6 @@ class Disk:
         self._was: list[dict[str, _File]] = [{}]  # names since the last sync, the durable ones first
 
     def do(self, operation: Operation) -> None:
-        """Take in the next operation."""
         name = operation.name
         if operation.kind == Kind.SYNC:
             if name in self._names:

@@ -36,7 +36,6 @@ class Process:
         return self._process.poll()
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal, if it still runs."""
         if self.code is None:
             self._process.send_signal(number)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 
 OFFICE_IP, MACHINES_IP = "10.197.61.1", "10.197.61.2"
 
@@ -44,19 +45,23 @@ class Cable:
         """What to put before a command to run it in a namespace."""
         return ("ip", "netns", "exec", name)
 
-    def set_link(self, *, up: bool) -> None:
-        """Pull the cable at the machines' end, or plug it in."""
-        _run("ip", "-n", self.machines, "link", "set", "veth0", "up" if up else "down")
+    @contextmanager
+    def down(self) -> Iterator[None]:
+        """Pull the cable at the machines' end, and plug it in again."""
+        link = ("ip", "-n", self.machines, "link", "set", "veth0")
+        _run(*link, "down")
+        yield
+        _run(*link, "up")
 
-    def limit(self, kbit_s: int) -> None:
-        """Make both directions slow; 0 for no limit."""
+    @contextmanager
+    def slow(self, kbit_s: int) -> Iterator[None]:
+        """Make both directions slow."""
+        where, rate = ("dev", "veth0", "root"), ("rate", f"{kbit_s}kbit", "burst", "4kb", "latency", "400ms")
         for name in (self.office, self.machines):
-            where = ("dev", "veth0", "root")
-            if kbit_s:
-                rate = ("rate", f"{kbit_s}kbit", "burst", "4kb", "latency", "400ms")
-                _run("tc", "-n", name, "qdisc", "replace", *where, "tbf", *rate)
-            else:
-                _run("tc", "-n", name, "qdisc", "del", *where)
+            _run("tc", "-n", name, "qdisc", "replace", *where, "tbf", *rate)
+        yield
+        for name in (self.office, self.machines):
+            _run("tc", "-n", name, "qdisc", "del", *where)
 
 
 def _run(*words: str) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 TimeSpan = tuple[float, float]  # [s] of one clock
 
 COLUMNS = ("fault", "count", "recorded", "merged", "lost", "double", "longest pause", "")
+LINE = "{:<8}{:>8}{:>10}{:>10}{:>6}{:>8}{:>15}  {}"
 
 
 class InterruptError(Exception):
@@ -44,10 +45,6 @@ class FaultOutcome:
         """Nothing lost, nothing double, and nothing else that should not be."""
         return self.lost == self.double == 0 and not self.problems
 
-    def plain(self) -> dict[str, Any]:
-        """Values for JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Console:
@@ -57,7 +54,6 @@ class Console:
     stop: threading.Event = field(default_factory=threading.Event)
 
     def say(self, text: str) -> None:
-        """Print a line at once."""
         self.line(text, flush=True)
 
     def wait(self, seconds: float) -> None:
@@ -93,12 +89,7 @@ def _covered(gap: TimeSpan, spans: Iterable[TimeSpan]) -> float:
 
 
 def table(outcomes: Iterable[FaultOutcome]) -> str:
-    """Lay results out for people."""
-    rows = [COLUMNS, *(_row(outcome) for outcome in outcomes)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
-    lines = [[row[0].ljust(widths[0]), *(v.rjust(w) for v, w in zip(row[1:-1], widths[1:-1], strict=True)), row[-1]]
-             for row in rows]  # fmt: skip
-    return "\n".join("  ".join(line).rstrip() for line in lines)
+    return "\n".join(LINE.format(*row).rstrip() for row in (COLUMNS, *map(_row, outcomes)))
 
 
 def _row(outcome: FaultOutcome) -> tuple[str, ...]:

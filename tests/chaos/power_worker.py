@@ -9,7 +9,6 @@ from __future__ import annotations
 import random
 import sqlite3
 import sys
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -37,19 +36,16 @@ class Promises:
         self._file = path.open("ab", buffering=0)
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def kept(self, spool_id: int, first_seq: int, rows: Table) -> None:
         """Say that samples are on disk."""
-        self._write(f"+ {spool_id:x} {first_seq + i} {content_hash(row)}\n" for i, row in enumerate(rows))
+        lines = [f"+ {spool_id:x} {first_seq + i} {content_hash(row)}\n" for i, row in enumerate(rows)]
+        self._file.write("".join(lines).encode())
 
     def given_up(self, spool_id: int, upto: int) -> None:
         """Say that samples are going to be deleted."""
-        self._write([f"- {spool_id:x} {upto}\n"])
-
-    def _write(self, lines: Iterator[str] | list[str]) -> None:
-        self._file.write("".join(lines).encode())
+        self._file.write(f"- {spool_id:x} {upto}\n".encode())
 
 
 def drive(rng: np.random.Generator, n: int, first_ns: int) -> Table:
@@ -67,7 +63,8 @@ def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, carele
     rng, chance, spool = np.random.default_rng(seed), random.Random(seed), None
     for step in range(steps):
         with suppress(StoreError, sqlite3.Error):  # a disk that fails: nothing was promised
-            spool = spool or _open_spool(folder, careless=careless)
+            spool = spool or Spool(folder / SPOOL_FILE, SpoolConfig())
+            _sync(spool._db, careless)
             rows = drive(rng, chance.randint(1, 12), step * 1000)
             promises.kept(spool.spool_id, spool.record(rows), rows)
             if chance.random() < 0.3 and (head := spool.head(chance.randint(1, 30))):
@@ -88,7 +85,8 @@ def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, carele
         if chance.random() > 0.2:
             waiting = np.concatenate([waiting, drive(rng, chance.randint(1, 40), 1 + step * 1000)])
         with suppress(StoreError, sqlite3.Error, OSError):
-            store = store or _open_store(folder, careless=careless)
+            store = store or Store(folder / STORE_FOLDER, SITE, ServerConfig(), lambda: 10**18)
+            _sync(store.journal._db, careless)
             payload = encode_batch(SampleBatch(MACHINE, SPOOL_ID, done + 1, waiting, SITE.frame, 0))
             answers = store.commit([Incoming(MACHINE, payload)] * chance.randint(1, 2))
             if isinstance(answers[0], Ack) and len(waiting):
@@ -100,18 +98,9 @@ def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, carele
         store.journal._db.close()
 
 
-def _open_spool(folder: Path, *, careless: bool) -> Spool:
-    spool = Spool(folder / SPOOL_FILE, SpoolConfig())
+def _sync(db: sqlite3.Connection, careless: bool) -> None:
     if careless:
-        spool._db.execute("PRAGMA synchronous=NORMAL")
-    return spool
-
-
-def _open_store(folder: Path, *, careless: bool) -> Store:
-    store = Store(folder / STORE_FOLDER, SITE, ServerConfig(), lambda: 10**18)
-    if careless:
-        store.journal._db.execute("PRAGMA synchronous=NORMAL")
-    return store
+        db.execute("PRAGMA synchronous=NORMAL")
 
 
 USE = {"spool": use_spool, "store": use_store}

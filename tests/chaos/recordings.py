@@ -32,11 +32,6 @@ class Recordings:
     folder: Path
     machines: tuple[str, ...]
 
-    @property
-    def agent_file(self) -> Path:
-        """Options of all agents."""
-        return self.folder / "agent.toml"
-
     def data(self, machine: str) -> Path:
         """Folder of a machine's CSV files."""
         return self.folder / machine

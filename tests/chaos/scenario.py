@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tests.chaos.chaos_site import ChaosSite
-from tests.chaos.outcome import Console
+from tests.chaos.outcome import Console, FaultOutcome
 from tests.chaos.recordings import Recordings
 
-# Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
-SERVER_TOML = """
-[store]
-snapshot_s = 2.0
-[trust]
-exclude = false
-"""
+
+@dataclass(frozen=True)
+class Spell:
+    """A fault that lasts for a while: inside of the block."""
+
+    words: str
+    lasts_s: float
+    block: AbstractContextManager[None]
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,24 @@ class FaultRun:
         return random.Random(f"{self.seed} {self.fault}")
 
     def site(self, **options: Any) -> ChaosSite:
-        """Return a site, not yet started."""
-        return ChaosSite(self.folder, self.recordings, self.console, server_toml=SERVER_TOML, **options)
+        return ChaosSite(self.folder, self.recordings, self.console, **options)
 
     def say(self, text: str) -> None:
-        """Print a line."""
         self.console.say(f"{self.fault}: {text}")
+
+    def strike(
+        self, site: ChaosSite, draw: Callable[[random.Random, int], Spell], counts: Sequence[int] | None = None
+    ) -> FaultOutcome:
+        """Start a site and have one spell follow the other, each after a pause. counts: of each spell, where not 1."""
+        rng, left_s, n = self.rng, self.seconds, 0
+        site.start_all()
+        while left_s > 0:
+            spell, pause_s = draw(rng, n), rng.uniform(0.5, 1.5)
+            lasts_s = min(spell.lasts_s, max(1.0, left_s))
+            self.say(f"{spell.words} for {lasts_s:.1f} s")
+            site.linger(pause_s)
+            with site.fault(), spell.block:
+                site.linger(lasts_s)
+            left_s, n = left_s - pause_s - lasts_s, n + 1
+        site.outcome.notes["spells"] = n
+        return site.finish(self.fault, n if counts is None else sum(counts))

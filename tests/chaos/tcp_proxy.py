@@ -32,12 +32,17 @@ FAIR = Weather()
 
 
 class Proxy:
-    """Forwards connections to a port on loopback. Leaving the block ends its threads and links."""
+    """Forwards connections to a port on loopback. Leaving the block ends its threads and links.
 
-    def __init__(self, port: int) -> None:
-        self.weather = FAIR
+    buffer_bytes: what the kernel may hold back for it, so that a slow link is felt at the sender; 0 for its own choice.
+    """
+
+    def __init__(self, port: int, weather: Weather = FAIR, buffer_bytes: int = 0) -> None:
+        self.weather = weather
         self._port = port
         self._listener = socket.create_server(("127.0.0.1", 0))
+        if buffer_bytes:  # taken over by the connections that it accepts
+            self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
         self._links: list[socket.socket] = []
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
@@ -50,7 +55,6 @@ class Proxy:
         return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
 
     def set(self, weather: Weather) -> None:
-        """Change the weather."""
         self.weather = weather
         if weather.cut:
             self._drop_links()

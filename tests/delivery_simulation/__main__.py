@@ -9,14 +9,21 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import shutil
 import sys
+import tempfile
 import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from tests.delivery_simulation.campaign import run_one, run_seeds
+from tests.delivery_simulation.world import Outcome, World
+
+IN_MEMORY = Path("/dev/shm")
 
 
 def main() -> int:
-    """Run."""
     parser = argparse.ArgumentParser(prog="python -m tests.delivery_simulation", description=__doc__)
     parser.add_argument("--seeds", type=int, default=1000, help="how many")
     parser.add_argument("--first", type=int, default=0, help="the first one")
@@ -37,6 +44,48 @@ def main() -> int:
     table = {**sums, "seconds": round(time.monotonic() - start_s, 1)}
     print(json.dumps(table) if arguments.json else "  ".join(f"{name} {value}" for name, value in table.items()))
     return 1 if sums["failed"] else 0
+
+
+def run_one(seed: int, *, real: bool = False, say: Callable[[str], None] | None = None) -> Outcome:
+    """Run one world; an error in it is a failure of this seed."""
+    folder = Path(tempfile.mkdtemp(prefix="sitegrid-", dir=IN_MEMORY if IN_MEMORY.is_dir() else None))
+    try:
+        world = World(seed, folder, real=real, say=say)
+        try:
+            return world.run()
+        finally:
+            world.close()
+    except Exception as error:
+        if say:
+            raise
+        return Outcome(seed, problems=[f"{type(error).__name__}: {error}"])
+    finally:
+        shutil.rmtree(folder)
+
+
+def run_seeds(
+    first: int, n: int, *, real: bool = False, say: Callable[[str], None], stop_at_failure: bool = False
+) -> dict[str, Any]:
+    """Run `n` worlds; the sums over them, and what happened in them.
+
+    Each that fails is reported with the command that replays it.
+    """
+    sums: Counter[str] = Counter()
+    events: Counter[str] = Counter()
+    failed: list[int] = []
+    for seed in range(first, first + n):
+        outcome = run_one(seed, real=real)
+        for name in ("recorded", "journalled", "explained", "lost", "double"):
+            sums[name] += getattr(outcome, name)
+        events.update(outcome.events)
+        if not outcome.is_good:
+            failed.append(seed)
+            problem = "; ".join(outcome.problems)
+            replay = f"python -m tests.delivery_simulation --seed {seed} --trace{' --real' if real else ''}"
+            say(f"seed {seed}: lost {outcome.lost}, double {outcome.double} {problem}  replay: {replay}")
+            if stop_at_failure:
+                break
+    return {"seeds": n, "failed": len(failed), "failed_seeds": failed[:20], **sums, "events": dict(events)}
 
 
 if __name__ == "__main__":

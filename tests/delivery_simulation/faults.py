@@ -1,8 +1,14 @@
-"""SQLite connections that fail at a chosen statement, as the disk or the process under them would."""
+"""The faults of a world: how likely each is, and SQLite connections that fail at a chosen statement.
+
+They fail as the disk or the process under them would.
+"""
 
 from __future__ import annotations
 
+import random
 import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -37,15 +43,12 @@ class FaultPlan:
     killed: bool = False
 
     def arm(self, fault: Fault, left: int) -> None:
-        """Choose the next fault."""
         self.fault, self.left = fault, left
 
     def disarm(self) -> None:
-        """Have no fault."""
         self.fault = None
 
     def due(self, statement: str) -> Fault | None:
-        """Return the fault of this statement."""
         if self.killed:
             raise Killed
         if self.fault is None or statement.lstrip().startswith(("SELECT", "PRAGMA")):
@@ -64,31 +67,23 @@ class FaultyConnection(sqlite3.Connection):
     plan: FaultPlan | None = None
 
     def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        """As sqlite3, or the fault."""
-        self._before(fault := self._due(statement))
-        cursor = super().execute(statement, *values)
-        self._after(fault)
-        return cursor
+        with self._fault_of(statement):
+            return super().execute(statement, *values)
 
     def executemany(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        """As sqlite3, or the fault."""
-        self._before(fault := self._due(statement))
-        cursor = super().executemany(statement, *values)
-        self._after(fault)
-        return cursor
+        with self._fault_of(statement):
+            return super().executemany(statement, *values)
 
-    def _due(self, statement: str) -> Fault | None:
-        return self.plan.due(statement) if self.plan else None
-
-    def _before(self, fault: Fault | None) -> None:
+    @contextmanager
+    def _fault_of(self, statement: str) -> Iterator[None]:
+        fault = self.plan.due(statement) if self.plan else None
         if fault == Fault.KILLED_BEFORE:
             raise Killed
         if fault == Fault.FULL_ROLLED_BACK and self.in_transaction:
             super().execute("ROLLBACK")
         if fault in (Fault.FULL, Fault.FULL_ROLLED_BACK):
             raise sqlite3.OperationalError("database or disk is full")
-
-    def _after(self, fault: Fault | None) -> None:
+        yield
         if fault == Fault.KILLED_AFTER:
             raise Killed
 
@@ -113,3 +108,47 @@ class FaultySpool(Spool):
         db.execute("PRAGMA wal_autocheckpoint=0")  # files that are copied and thrown away: no need for it
         db.plan = self.plan
         return db
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How likely each fault is, and what kind of site this is; drawn from the seed."""
+
+    lost: float
+    late: float
+    twice: float
+    reply_lost: float
+    server_fault: float
+    spool_fault: float
+    bad_sample: float
+    pending: bool
+    copies: bool
+    server_backups: bool
+    max_samples: int
+    wall_clock: bool
+    machines: int
+    steps: int
+
+
+def draw_rates(rng: random.Random) -> Rates:
+    """Every kind of fault is absent in some worlds, so that those that remain are met alone."""
+
+    def some(most: float) -> float:
+        return rng.choice((0.0, rng.uniform(0, most)))
+
+    return Rates(
+        lost=some(0.5),
+        late=some(0.5),
+        twice=some(0.4),
+        reply_lost=some(0.5),
+        server_fault=some(0.4),
+        spool_fault=some(0.3),
+        bad_sample=some(0.15),
+        pending=rng.random() < 0.3,
+        copies=rng.random() < 0.5,
+        server_backups=rng.random() < 0.3,
+        max_samples=rng.choice((10_000, 10_000, 20, 6)),
+        wall_clock=rng.random() < 0.2,
+        machines=rng.choice((1, 1, 2)),
+        steps=rng.randint(20, 80),
+    )

@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 from mapserver.config import ServerConfig
 from mapserver.ingest.admission import GapError, admit, parse
@@ -22,33 +22,13 @@ from tests.delivery_simulation.faults import Fault, FaultPlan, FaultyConnection,
 RunKey = tuple[str, int]  # machine, spool_id
 
 
-@dataclass(frozen=True)
-class JournalledSample:
+class JournalledSample(NamedTuple):
     """One sample in the journal."""
 
     machine: str
     spool_id: int
     seq: int
     row: bytes
-
-
-class MapServer(Protocol):
-    """What the simulation needs of a server. Each method leaves it usable, also after a kill."""
-
-    def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
-        """Answer a group of batches in one commit; Killed if the plan says so."""
-
-    def back_up(self) -> None:
-        """Keep a copy of all that is committed."""
-
-    def restore(self) -> None:
-        """Go back to the copy."""
-
-    def samples(self) -> Iterator[JournalledSample]:
-        """Everything in the journal."""
-
-    def marks(self) -> dict[RunKey, tuple[int, int]]:
-        """Watermark and samples declared lost, by run."""
 
 
 @dataclass
@@ -72,7 +52,7 @@ class ModelServer:
         self._backup = _Disk()
 
     def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
-        """As Store.commit."""
+        """Answer a group of batches in one commit; Killed if the plan says so: usable then, too."""
         fault = plan.fault
         plan.disarm()
         new = self.disk.copy()
@@ -91,7 +71,7 @@ class ModelServer:
         return answers
 
     def back_up(self) -> None:
-        """Keep a copy."""
+        """Keep a copy of all that is committed."""
         self._backup = self.disk.copy()
 
     def restore(self) -> None:
@@ -106,7 +86,7 @@ class ModelServer:
                 yield JournalledSample(batch.machine, batch.spool_id, batch.first_seq + i, row.tobytes())
 
     def marks(self) -> dict[RunKey, tuple[int, int]]:
-        """Watermark and lost, by run."""
+        """Watermark and samples declared lost, by run."""
         return self.disk.marks
 
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
@@ -125,7 +105,7 @@ class ModelServer:
 
 
 class RealServer:
-    """The map server's own store, in a folder."""
+    """The map server's own store, in a folder; its methods are those of the model."""
 
     def __init__(self, folder: Path, site: SiteConfig, now_ns: Callable[[], int]) -> None:
         self._folder, self._backup = folder / "store", folder / "store-backup"
@@ -143,37 +123,29 @@ class RealServer:
         try:
             return self._store.commit(group)
         except Killed:
-            self._close()
+            self.close()
             self._open()
             raise
         finally:
             self._plan.disarm()
 
     def back_up(self) -> None:
-        """Copy the folder between two commits."""
         shutil.rmtree(self._backup, ignore_errors=True)
         shutil.copytree(self._folder, self._backup)
 
     def restore(self) -> None:
-        """Put the copy in the folder's place."""
-        self._close()
+        self.close()
         shutil.rmtree(self._folder)
         shutil.copytree(self._backup, self._folder)
         self._open()
 
     def samples(self) -> Iterator[JournalledSample]:
-        """Everything in the journal."""
         for row in self._journal.read():
             for i, sample in enumerate(row.rows):
                 yield JournalledSample(row.machine, row.spool_id, row.first_seq + i, sample.tobytes())
 
     def marks(self) -> dict[RunKey, tuple[int, int]]:
-        """Watermark and lost, by run."""
         return {run: (mark.seq, mark.lost) for run, mark in self._journal.watermarks().items()}
-
-    def close(self) -> None:
-        """End the server."""
-        self._close()
 
     @property
     def _journal(self) -> Journal:
@@ -189,7 +161,7 @@ class RealServer:
         db.plan = self._plan
         self._journal._db = db
 
-    def _close(self) -> None:
+    def close(self) -> None:
         """Let go of the files without a word to SQLite: what was not committed is gone."""
         self._plan.killed = False
         self._plan.disarm()

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.delivery_simulation.__main__ import run_one, run_seeds
 from tests.delivery_simulation.bugs import BUGS
-from tests.delivery_simulation.campaign import run_one, run_seeds
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,17 +25,17 @@ from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol.errors import LinkError
 from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_pose
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.commands.agent import _claim_name, _open
 from sitegrid.process.children import wait_until
+from tests.chaos.tcp_proxy import Proxy, Weather
+from tests.unit.agents.drives import made_up_samples
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 MACHINE = MachineConfig("loader-1", sensors=(SensorConfig("imu", "imu"), SensorConfig("wheels", "encoder")))
-START_NS = 1_767_225_600_000_000_000
 WAIT_S = 20.0
 
 Opened = Callable[..., zenoh.Session]
@@ -51,6 +50,13 @@ def endpoint() -> Iterator[str]:
 
 
 @pytest.fixture
+def slow_link(endpoint: str) -> Iterator[str]:
+    """The router's endpoint, over 300 kbit/s."""
+    with Proxy(int(endpoint.rpartition(":")[2]), Weather(bytes_per_s=300e3 / 8), 4096) as link:
+        yield link.endpoint
+
+
+@pytest.fixture
 def opened(endpoint: str) -> Iterator[Opened]:
     """Sessions as agents have them, closed with the test."""
     with contextlib.ExitStack() as stack:
@@ -61,15 +67,6 @@ def opened(endpoint: str) -> Iterator[Opened]:
             return opened
 
         yield session
-
-
-def made_up(n: int) -> np.ndarray:
-    rows = np.zeros(n, SAMPLE_DTYPE)
-    rows["stamp_ns"] = START_NS + np.arange(n) * 100_000_000
-    rows["x_m"] = np.arange(n) % 200
-    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0
-    rows["c_rr"], rows["c_rr_var"], rows["distance_m"] = 0.05, 1e-4, 0.5
-    return rows
 
 
 # --- one machine's name ----------------------------------------------------------------------------------------------
@@ -147,7 +144,7 @@ class Silent:
 def test_agent_holds_its_samples_while_another_has_its_name(opened: Opened, tmp_path: Path) -> None:
     first = Presence(opened(), SITE.name, "loader-1")
     agent = Agent(opened(), SITE, MACHINE, AgentConfig(), Places(tmp_path / "spool.db"))
-    agent._spool.record(made_up(3))
+    agent._spool.record(made_up_samples(3))
     wait_until(lambda: agent._yield_name() or bool(agent._uplink.held), WAIT_S, "it yields")
     problem = agent.report(Silent(1))["uplink"]["problem"]
     assert f"runs as {first.owner}: it sends, this one waits" in problem
@@ -197,7 +194,7 @@ def test_agent_goes_on_while_its_disk_takes_nothing(opened: Opened, tmp_path: Pa
     agent = Agent(opened(), SITE, MACHINE, AgentConfig(linger_s=0), Places(tmp_path / "spool.db"))
     agent._spool._db.execute("PRAGMA query_only = ON")
     for _ in range(5):
-        agent._deliver(made_up(2))
+        agent._deliver(made_up_samples(2))
     report = agent.report(Silent(1))
     assert (report["samples"], report["spool"]["unsaved"], report["spool"]["given_up"]) == (0, 8, 2)
     assert "look at the machine's disk" in report["spool_problem"]
@@ -215,7 +212,7 @@ def test_samples_that_the_disk_takes_only_after_the_end_are_delivered(
     with server_at(endpoint, tmp_path / "store"):
         agent = Agent(opened(), SITE, MACHINE, AgentConfig(linger_s=WAIT_S), Places(tmp_path / "spool.db"))
         agent._spool._db.execute("PRAGMA query_only = ON")
-        agent._deliver(made_up(5))
+        agent._deliver(made_up_samples(5))
 
         def mend(seconds: float) -> None:
             agent._spool._db.execute("PRAGMA query_only = OFF")
@@ -234,7 +231,7 @@ def test_samples_that_the_disk_takes_only_after_the_end_are_delivered(
 def uplink_of(session: zenoh.Session, path: Path, n: int) -> Iterator[Spool]:
     spool = Spool(path, SpoolConfig())
     for first in range(0, n, 50_000):
-        spool.record(made_up(n)[first : first + 50_000])
+        spool.record(made_up_samples(n)[first : first + 50_000])
     link = UplinkThread(session, SITE.name, Uplink("loader-1", SITE.frame, UplinkConfig().timeout_s), spool)
     yield spool
     link.close()
@@ -261,54 +258,10 @@ def test_machine_catches_up_at_the_speed_of_the_server(endpoint: str, opened: Op
     assert rate > 5000  # a week of work is half a million
 
 
-class SlowLink:
-    """A TCP proxy that passes so many bytes per second to the router, with as small a buffer as the kernel allows."""
-
-    def __init__(self, router: str, bytes_per_s: float) -> None:
-        self._host, port = router.removeprefix("tcp/").split(":")
-        self._port = int(port)
-        self._bytes_per_s = bytes_per_s
-        self._listener = socket.socket()
-        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        self._listener.bind(("127.0.0.1", 0))
-        self._listener.listen()
-        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
-        self._sockets = [self._listener]
-        self._threads = [threading.Thread(target=self._accept, daemon=True)]
-        self._threads[0].start()
-
-    def close(self) -> None:
-        """Cut it."""
-        for one in self._sockets:
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-            one.close()
-        for thread in list(self._threads):
-            thread.join()
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                near, _ = self._listener.accept()
-                far = socket.create_connection((self._host, self._port))
-                self._sockets += [near, far]
-                for ends in ((near, far, self._bytes_per_s), (far, near, 1e9)):
-                    self._threads.append(threading.Thread(target=self._pass, args=ends, daemon=True))
-                    self._threads[-1].start()
-
-    def _pass(self, source: socket.socket, target: socket.socket, bytes_per_s: float) -> None:
-        with contextlib.suppress(OSError):
-            while data := source.recv(1024):
-                target.sendall(data)
-                time.sleep(len(data) / bytes_per_s)
-        for end in (source, target):
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-
-def test_pose_and_health_stay_live_while_a_machine_catches_up(endpoint: str, opened: Opened, tmp_path: Path) -> None:
+def test_pose_and_health_stay_live_while_a_machine_catches_up(
+    endpoint: str, slow_link: str, opened: Opened, tmp_path: Path
+) -> None:
     """Over 300 kbit/s, with more in the spool than the link can pass during the test."""
-    link = SlowLink(endpoint, 300e3 / 8)
     delays: dict[str, list[float]] = {"pose": [], "health": []}
 
     def received(kind: str, stamp_ns: int) -> None:
@@ -319,7 +272,7 @@ def test_pose_and_health_stay_live_while_a_machine_catches_up(endpoint: str, ope
     for kind, decode in decoders.items():
         key = f"sitegrid/{SITE.name}/machine/*/{kind}"
         listener.declare_subscriber(key, lambda s, k=kind, d=decode: received(k, d(s.payload.to_bytes()).stamp_ns))
-    session = opened(link.endpoint)
+    session = opened(slow_link)
     presence = Presence(session, SITE.name, "loader-1")
     with server_at(endpoint, tmp_path / "store"), uplink_of(session, tmp_path / "spool.db", 20_000) as spool:
         wait_until(lambda: spool.acknowledged > 400, WAIT_S, "it catches up")
@@ -339,4 +292,3 @@ def test_pose_and_health_stay_live_while_a_machine_catches_up(endpoint: str, ope
     assert np.median(delays["pose"]) < one_batch_s
     assert np.median(delays["health"]) < one_batch_s
     assert rate > 200  # of 550 that the link can carry
-    link.close()

@@ -28,26 +28,14 @@ from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_reply, encode_reply
 from protocol.wire.messages import Ack, Refused
-from tests.delivery_simulation.faults import Fault, FaultPlan, FaultySpool, Killed
-from tests.delivery_simulation.rates import draw_rates
-from tests.delivery_simulation.servers import MapServer, ModelServer, RealServer
+from tests.delivery_simulation.faults import Fault, FaultPlan, FaultySpool, Killed, draw_rates
+from tests.delivery_simulation.servers import ModelServer, RealServer
 
 START_NS = 1_767_225_600_000_000_000
 HOUR_NS = 3_600_000_000_000
 TIMEOUT_S = UplinkConfig().timeout_s
 PACING = Pacing(first_batch=4, max_batch=16)
 MOST_ROUNDS = 3000  # to settle everything, without faults
-_WEIGHTS = {
-    "record": 30,
-    "exchange": 45,
-    "late": 5,
-    "end": 4,
-    "start": 6,
-    "finalise": 3,
-    "clock": 1,
-    "server": 4,
-    "copy": 2,
-}
 
 
 class SimulatedAgent:
@@ -80,7 +68,6 @@ class Outcome:
 
     @property
     def is_good(self) -> bool:
-        """Whether everything held."""
         return not (self.lost or self.double or self.problems)
 
 
@@ -98,8 +85,7 @@ class World:
         self._now_ns = START_NS
         site = SiteConfig("lot", 49.01, 8.4, 120.0, clock="wall" if self.rates.wall_clock else "data")
         self._frame = site.frame
-        kind = RealServer if real else ModelServer
-        self._server: MapServer = RealServer(folder, site, self._now) if real else ModelServer(site, self._now)
+        self._server = RealServer(folder, site, self._now) if real else ModelServer(site, self._now)
         self._server_up = True
         self._late: list[Incoming] = []
         self._agents = [
@@ -110,7 +96,7 @@ class World:
         self._explained: set[int] = set()
         self._faults = True
         self._numbers = iter(range(10**9))
-        self.note(f"{kind.__name__} {self.rates}")
+        self.note(f"{type(self._server).__name__} {self.rates}")
         for agent in self._agents:
             self._start(agent)
 
@@ -127,12 +113,10 @@ class World:
         return self.outcome
 
     def note(self, text: str) -> None:
-        """Trace what happens."""
         if self._say:
             self._say(text.replace(str(self._folder), "."))
 
     def close(self) -> None:
-        """Let go of the server's files."""
         if isinstance(self._server, RealServer):
             self._server.close()
 
@@ -140,22 +124,18 @@ class World:
 
     def _step(self) -> None:
         agent = self.rng.choice(self._agents)
-        what = self.rng.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0]
-        if what == "exchange":
-            self._exchange(agent)
-        elif what == "late":
-            self._deliver_late()
-        elif what == "server":
-            self._change_server()
-        else:
-            {
-                "record": self._record,
-                "finalise": self._finalise,
-                "start": self._start,
-                "end": self._end,
-                "clock": self._step_clock,
-                "copy": self._copy_or_restore,
-            }[what](agent)
+        weights: dict[Callable[..., object], int] = {
+            self._record: 30,
+            self._exchange: 45,
+            self._deliver_late: 5,
+            self._end: 4,
+            self._start: 6,
+            self._finalise: 3,
+            self._step_clock: 1,
+            self._change_server: 4,
+            self._copy_or_restore: 2,
+        }
+        self.rng.choices(list(weights), list(weights.values()))[0](agent)
 
     def _record(self, agent: SimulatedAgent) -> None:
         if not agent.spool:
@@ -242,7 +222,7 @@ class World:
             return None
         return next(answer for one, answer in zip(group, answers, strict=True) if one is incoming)
 
-    def _deliver_late(self) -> None:
+    def _deliver_late(self, *_: object) -> None:
         if self._late and self._server_up:
             incoming = self._late.pop(self.rng.randrange(len(self._late)))
             answer = self._take(incoming)
@@ -253,18 +233,15 @@ class World:
         if agent.spool:
             return
         agent.plan = FaultPlan()
-        config = SpoolConfig(self.rates.max_samples)
+        options = {"config": SpoolConfig(self.rates.max_samples), "draw_id": lambda: self.rng.getrandbits(63)}
         try:
             with self._spool_faults(agent):
-                agent.spool = FaultySpool(
-                    agent.path, agent.plan, config=config, draw_id=lambda: self.rng.getrandbits(63)
-                )
+                agent.spool = FaultySpool(agent.path, agent.plan, **options)
         except StoreError as error:
             self.note(f"{agent.name} cannot start: {error}")
         if not agent.spool:
             return
-        rng = np.random.default_rng(0)
-        agent.uplink = Uplink(agent.machine, self._frame, TIMEOUT_S, PACING, rng)
+        agent.uplink = Uplink(agent.machine, self._frame, TIMEOUT_S, PACING, np.random.default_rng(0))
         present = self._present(agent)
         self._end_doubt(agent, present)
         agent.pending = (0, [])
@@ -302,10 +279,8 @@ class World:
             self.outcome.events["spool_restores"] += 1
             self.note(f"{agent.name} restored from a copy")
         elif len(self._agents) < 4:
-            number = next(self._numbers)
-            clone = SimulatedAgent(
-                f"clone-{number}", agent.machine, self._copy(copy, self._folder / f"clone-{number}.db")
-            )
+            name = f"clone-{next(self._numbers)}"
+            clone = SimulatedAgent(name, agent.machine, self._copy(copy, self._folder / f"{name}.db"))
             self._agents.append(clone)
             self.outcome.events["clones"] += 1
             self.note(f"{clone.name} is a clone of a copy of {agent.machine}")
@@ -315,7 +290,7 @@ class World:
         agent.clock_ns = self.rng.choice((-HOUR_NS, 0, HOUR_NS))
         self.note(f"{agent.name} clock off by {agent.clock_ns / HOUR_NS:+.0f} h")
 
-    def _change_server(self) -> None:
+    def _change_server(self, *_: object) -> None:
         """Switch it on or off, back it up, or restore it."""
         draw = self.rng.random()
         if draw < 0.6 or not self.rates.server_backups:
@@ -374,7 +349,7 @@ class World:
         outcome = self.outcome
         samples = list(self._server.samples())
         by_stamp = Counter(_stamp(one.row) for one in samples)
-        by_identity = Counter((one.machine, one.spool_id, one.seq) for one in samples)
+        by_identity = Counter(one[:3] for one in samples)
         outcome.double = max(sum(n - 1 for n in counts.values()) for counts in (by_stamp, by_identity))
         for agent in self._agents:
             self._explained |= self._quarantined(agent.path)
@@ -402,12 +377,8 @@ class World:
         events = self.outcome.events
         if events["spool_restores"] or events["clones"] or events["server_restores"]:
             return
-        counted = sum(
-            counters[name]
-            for a in self._agents
-            if a.spool and (counters := a.spool.counters())
-            for name in ("dropped", "put_aside")
-        )
+        counters = [agent.spool.counters() for agent in self._agents if agent.spool]
+        counted = sum(each["dropped"] + each["put_aside"] for each in counters)
         never = self.outcome.explained
         if counted < never:
             self.outcome.problems.append(f"{never} never arrived, {counted} are counted")
@@ -453,26 +424,19 @@ class World:
             self._contents[_stamp(row)] = {row}
 
     def _present(self, agent: SimulatedAgent) -> set[int]:
-        assert agent.spool
         with agent.spool._lock:
             return _stamp_set(row for (row,) in agent.spool._db.execute("SELECT row FROM sample"))
 
-    def _held(self, path: Path) -> set[int]:
-        return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM sample"))
+    def _held(self, path: Path, table: str = "sample") -> set[int]:
+        """Read a file, whoever has it open: a copy of it."""
+        with contextlib.closing(sqlite3.connect(self._copy(path, self._folder / "look.db"))) as db:
+            try:
+                return _stamp_set(row for (row,) in db.execute(f"SELECT row FROM {table}"))
+            except sqlite3.OperationalError:  # the process was killed while it made the file
+                return set()
 
     def _quarantined(self, path: Path) -> set[int]:
-        return _stamp_set(row for (row,) in self._query(path, "SELECT row FROM quarantine"))
-
-    def _query(self, path: Path, statement: str) -> list[tuple[bytes]]:
-        """Read a file, whoever has it open: a copy of it."""
-        look = self._copy(path, self._folder / "look.db")
-        db = sqlite3.connect(look)
-        try:
-            return db.execute(statement).fetchall()
-        except sqlite3.OperationalError:  # the process was killed while it made the file
-            return []
-        finally:
-            db.close()
+        return self._held(path, "quarantine")
 
     def _copy(self, source: Path, target: Path) -> Path:
         """Copy a database between two transactions, with its log."""

@@ -2,23 +2,125 @@
 
 --decoder NAME: only this one. --seed N: other inputs. Failing inputs are saved beside the tests, in corpus/. Exit
 code 1 if there are any.
+
+Inputs that once failed are replayed, then new ones are made until the time is up. corpus/<decoder>/<hash>: one small
+file for each fault that was found.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import logging
 import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from tests.fuzz.campaign import DecoderResult, fuzz_for, save
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis.errors import HypothesisException
+
 from tests.fuzz.decoders import decoders
-from tests.fuzz.verdict import watched
+from tests.fuzz.verdict import Decoder, FaultError, judge, watched
 
+CORPUS = Path(__file__).parent / "corpus"
+MAX_FILE_BYTES = 16 * 2**10
+ROUND = 200  # inputs between two looks at the clock
+SHRINK = 400  # inputs that are tried to make a failing one shorter
 LINE = "{:<14} {:>9} {:>9} {:>9} {:>7}"
 
 
+@dataclass
+class DecoderResult:
+    """What became of the inputs of one decoder. faults: by signature, what happened and the shortest such input."""
+
+    decoder: str
+    accepted: int = 0
+    refused: int = 0
+    faults: dict[str, tuple[str, bytes]] = field(default_factory=dict)
+
+    def take(self, decoder: Decoder, data: bytes) -> str | None:
+        """Judge one input; the signature of its fault, if it has one."""
+        try:
+            if judge(decoder, data):
+                self.accepted += 1
+            else:
+                self.refused += 1
+        except FaultError as fault:
+            shortest = self.faults.get(fault.signature)
+            if shortest is None or len(data) < len(shortest[1]):
+                self.faults[fault.signature] = (str(fault), data)
+            return fault.signature
+        return None
+
+
+def replay(decoder: Decoder) -> DecoderResult:
+    """Seeds, which have to be accepted, and the corpus, which has to be free of faults by now."""
+    result = DecoderResult(decoder.name)
+    for data in decoder.seeds:
+        result.take(decoder, data)
+        if result.refused:
+            raise AssertionError(f"{decoder.name}: a valid input is refused: {data[:80]!r}")
+    for path in sorted((CORPUS / decoder.name).glob("*")):
+        result.take(decoder, path.read_bytes())
+    return result
+
+
+def fuzz(decoder: Decoder, result: DecoderResult, n: int, number: int) -> None:
+    """Judge about `n` new inputs, drawn from the seed `number`; stops at the first fault that is not in `result` yet.
+
+    The input is made shorter then.
+    """
+    known, first, tries = set(result.faults), "", 0
+
+    @seed(number)
+    @settings(
+        max_examples=n,
+        deadline=None,
+        database=None,
+        derandomize=False,
+        print_blob=False,
+        report_multiple_bugs=False,
+        phases=(Phase.generate, Phase.shrink),
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(data=decoder.inputs(decoder.seeds))
+    def one(data: bytes) -> None:
+        nonlocal first, tries
+        signature = result.take(decoder, data)
+        tries += bool(first)
+        if signature and signature not in known and signature == (first or signature) and tries < SHRINK:
+            first = signature
+            raise FaultError(signature, "again")
+
+    try:
+        one()
+    except (FaultError, HypothesisException):  # also where shrinking was cut short, which Hypothesis calls flaky
+        assert first, "Hypothesis failed by itself"
+
+
+def fuzz_for(decoder: Decoder, seconds: float, number: int) -> DecoderResult:
+    """Replay, then round after round until the time is up."""
+    result, end_s, rounds = replay(decoder), time.monotonic() + seconds, 0
+    while time.monotonic() < end_s:
+        fuzz(decoder, result, ROUND, 1_000_003 * number + rounds)
+        rounds += 1
+    return result
+
+
+def save(result: DecoderResult) -> list[Path]:
+    """Add what failed to the corpus; returns the new files."""
+    saved = []
+    for _, data in result.faults.values():
+        path = CORPUS / result.decoder / hashlib.sha256(data).hexdigest()[:12]
+        if len(data) <= MAX_FILE_BYTES and not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            saved.append(path)
+    return saved
+
+
 def main() -> int:
-    """Run."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="for all decoders together")
     parser.add_argument("--decoder", help="only this one")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import sqlite3
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -15,10 +16,18 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from agents.config import load_agent
 from agents.estimation import calibration_file
 from agents.estimation.calibration import Calibration
 from mapserver.config import ServerConfig
+from mapserver.journal.archive import FOLDER as ARCHIVE
+from mapserver.journal.archive import next_file
+from mapserver.journal.archive_file import ArchiveFile
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Admission, JournalRow
 from protocol.config import from_table
 from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
 from protocol.files import load_toml
@@ -29,19 +38,20 @@ from protocol.queries import requests
 from protocol.queries.commands import TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
 from protocol.site.geometry import Bounds
+from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire.credentials import check_valid, load_credentials
+from protocol.wire.messages import SampleBatch
 from sim.config import load_sim
 from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml
 from tests.fuzz.messages import messages
-from tests.fuzz.mutations import files
-from tests.fuzz.stores import archive_decoder, journal_decoder
-from tests.fuzz.texts import texts
+from tests.fuzz.mutations import files, texts
 from tests.fuzz.verdict import Decoder
-from tests.golden.make import EXTENT_M, FOLDER, GOLDEN, NEWER, T0
+from tests.golden.make import EXTENT_M, FOLDER, GOLDEN, NEWER, T0, rows
 from tests.paths import CONFIG
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
+SITE = SiteConfig("paper", 49.0, 8.0)
 PLAIN = ("health", "info", "machines", "machine", "changes", "change")  # people see these as JSON
 
 
@@ -58,7 +68,6 @@ _KEPT: list[tempfile.TemporaryDirectory[str]] = []
 
 @cache
 def decoders() -> tuple[Decoder, ...]:
-    """All of them."""
     return (*_messages(), *_selectors(), *_configs(), *_logs(), *_kept())
 
 
@@ -189,21 +198,19 @@ READINGS = [
 
 
 def _logs() -> Iterator[Decoder]:
-    folder = workshop() / "log"
     (workshop() / "paper.toml").write_bytes((CONFIG / "site.toml").read_bytes())
-    write_log(folder, "drive", load_site(workshop() / "paper.toml"), MACHINE, READINGS)
-    manifest, csv = (folder / "log.toml").read_bytes(), (folder / "imu-1.csv").read_bytes()
-    converted = manifest.replace(b'gyro_x_radps = "', b'gyro_x_radps = { value = 0.5, unit = "deg/s" }\n#"')
-    errors = (ConfigError, LogFolderError)
-    yield Decoder("manifest", (manifest, converted), partial(_log, folder, "log.toml"), errors, texts, str(folder))
-    other = workshop() / "csv"
-    write_log(other, "drive", load_site(workshop() / "paper.toml"), MACHINE, READINGS)
-    yield Decoder("csv", (csv,), partial(_log, other, "imu-1.csv"), (LogFolderError,), texts, "imu-1.csv")
-    packed = workshop() / "gzip"
-    write_log(packed, "drive", load_site(workshop() / "paper.toml"), MACHINE, READINGS)
+    site = load_site(workshop() / "paper.toml")
+    folders = [workshop() / name for name in ("log", "csv", "gzip")]
+    for folder in folders:
+        write_log(folder, "drive", site, MACHINE, READINGS)
+    log, plain, packed = folders
+    manifest, csv = (log / "log.toml").read_bytes(), (log / "imu-1.csv").read_bytes()
     (packed / "log.toml").write_bytes(manifest.replace(b"imu-1.csv", b"imu-1.csv.gz"))
-    seeds = (gzip.compress(csv, mtime=0),)
-    yield Decoder("csv_gzip", seeds, partial(_log, packed, "imu-1.csv.gz"), (LogFolderError,), files, "imu-1.csv.gz")
+    converted = manifest.replace(b'gyro_x_radps = "', b'gyro_x_radps = { value = 0.5, unit = "deg/s" }\n#"')
+    errors, seeds = (ConfigError, LogFolderError), (gzip.compress(csv, mtime=0),)
+    yield Decoder("manifest", (manifest, converted), partial(_log, log, "log.toml"), errors, texts, str(log))
+    yield Decoder("csv", (csv,), partial(_log, plain, "imu-1.csv"), errors[1:], texts, "imu-1.csv")
+    yield Decoder("csv_gzip", seeds, partial(_log, packed, "imu-1.csv.gz"), errors[1:], files, "imu-1.csv.gz")
 
 
 def _log(folder: Path, file: str, data: bytes) -> None:
@@ -229,5 +236,55 @@ def _kept() -> Iterator[Decoder]:
         assert calibration_file.load(path, "loader-1") == loaded
 
     yield Decoder("calibration", (path.read_bytes(),), decode, (StoreError,), texts, path.name)
-    yield journal_decoder(workshop() / "journal")
-    yield archive_decoder(workshop() / "archive")
+    yield _journal(workshop() / "journal")
+    yield _archive(workshop() / "archive")
+
+
+def _journal(folder: Path) -> Decoder:
+    """A row whose payload is another one, its checksum left as it was."""
+    expected = _write_journal(folder)
+    path = folder / "journal.db"
+    db = sqlite3.connect(path, isolation_level=None)
+    db.execute("PRAGMA synchronous=OFF")
+    payload = db.execute("SELECT payload FROM journal WHERE row = 2").fetchone()[0]
+
+    def decode(data: bytes) -> None:
+        db.execute("UPDATE journal SET payload = ? WHERE row = 2", (data,))
+        with JournalReader(path) as reader:
+            _compare(list(reader.read()), expected)
+
+    return Decoder("journal", (payload,), decode, (StoreError,), messages, "row 2 is damaged")
+
+
+def _archive(folder: Path) -> Decoder:
+    """A file that is damaged anywhere."""
+    expected = _write_journal(folder)
+    with JournalReader(folder / "journal.db") as reader:
+        made = next_file(folder / ARCHIVE, reader, SITE, T0 + 360_000 * 10**9)
+    assert made is not None
+
+    def decode(data: bytes) -> None:
+        made.write_bytes(data)
+        _compare(list(ArchiveFile(made).read()), expected)
+
+    return Decoder("archive", (made.read_bytes(),), decode, (StoreError,), files, made.name)
+
+
+def _write_journal(folder: Path) -> list[JournalRow]:
+    """Make a journal of three rows; returns what has to be read from it."""
+    journal = Journal(folder / "journal.db", SITE.name, SITE.frame)
+    journal.begin()
+    for i in range(3):
+        batch = SampleBatch("loader-1", 7, 1 + 3 * i, rows(), SITE.frame)
+        journal.append(Admission(batch, 0, 0), T0)
+    journal.commit()
+    rows_read = list(journal.read())
+    journal.close()
+    return rows_read
+
+
+def _compare(rows_read: list[JournalRow], expected: list[JournalRow]) -> None:
+    assert [row.row for row in rows_read] == [row.row for row in expected]
+    for one, other in zip(rows_read, expected, strict=True):
+        assert np.array_equal(one.rows.tobytes(), other.rows.tobytes())
+        assert (one.machine, one.spool_id, one.first_seq) == (other.machine, other.spool_id, other.first_seq)

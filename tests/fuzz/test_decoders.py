@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.fuzz.campaign import CORPUS, DecoderResult, fuzz, replay
+from tests.fuzz.__main__ import CORPUS, DecoderResult, fuzz, replay
 from tests.fuzz.decoders import decoders
 from tests.fuzz.mutations import files
 from tests.fuzz.verdict import Decoder, FaultError, judge, watched

@@ -110,11 +110,9 @@ def _check_message(decoder: Decoder, error: Exception) -> None:
         raise FaultError(f"no plain line in {type(error).__name__}", f"{len(text)} characters: {text[:200]!r}")
     if decoder.place and decoder.place not in text:
         raise FaultError(f"no place in {type(error).__name__}", f"{decoder.place!r} is not in {text!r}")
-    if isinstance(error, MessageError) and error.reason not in WHOLE and not _names_field(error):
-        raise FaultError(f"no field in {type(error).__name__}", f"field {error.field!r} of {text!r}")
+    if isinstance(error, MessageError) and error.reason not in WHOLE:
+        is_named = error.field and text.startswith(one_line(str(error.field))[:20])
+        if not is_named:
+            raise FaultError(f"no field in {type(error).__name__}", f"field {error.field!r} of {text!r}")
     if isinstance(error, QueryError) and "`" not in text and "bounds" not in text and "region" not in text:
         raise FaultError("no parameter in QueryError", text)
-
-
-def _names_field(error: MessageError) -> bool:
-    return bool(error.field) and str(error).startswith(one_line(str(error.field))[:20])

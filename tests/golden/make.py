@@ -17,15 +17,7 @@ from protocol.errors import QueryError, Refusal
 from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu, Odometry, Torque
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
-from protocol.queries.answers import (
-    GroundChange,
-    HistoryAnswer,
-    HistorySpan,
-    MachineState,
-    PointAnswer,
-    Region,
-    TrustAnswer,
-)
+from protocol.queries import answers as records
 from protocol.wire import codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -70,10 +62,10 @@ def readings() -> tuple[Any, ...]:
     )
 
 
-def region() -> Region:
+def region() -> records.Region:
     """3 x 2 cells of half a metre, south-west corner (-1, 2)."""
     resistance = np.array([[0.02, NAN, 0.25], [NAN, 0.008, 0.04]], np.float32)
-    return Region(
+    return records.Region(
         x_m=np.array([-0.75, -0.25, 0.25]),
         y_m=np.array([2.25, 2.75]),
         cell_m=0.5,
@@ -90,8 +82,7 @@ def decode_batch(data: bytes) -> SampleBatch:
 
 def decode_info_table(data: bytes) -> dict[str, Any]:
     """Decode any table of plain values; `decode_info` asks for every field of `MapInfo`."""
-    table: dict[str, Any] = codec.take_plain(codec.unpack(data, codec.MAX_SMALL_BYTES), "info")
-    return table
+    return codec.take_plain(codec.unpack(data, codec.MAX_SMALL_BYTES), "info")
 
 
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
@@ -99,18 +90,13 @@ LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
-POINT = PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
-HISTORY = HistoryAnswer(
-    0.5,
-    1.5,
-    (
-        HistorySpan(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
-        HistorySpan(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
-    ),
-    17,
-    T0 + 700_000_000_000,
+POINT = records.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
+SPANS = (
+    records.HistorySpan(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
+    records.HistorySpan(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
 )
-MACHINE = MachineState(
+HISTORY = records.HistoryAnswer(0.5, 1.5, SPANS, 17, T0 + 700_000_000_000)
+MACHINE = records.MachineState(
     name="loader-2",
     trusted=False,
     by="audit",
@@ -124,7 +110,8 @@ MACHINE = MachineState(
     lost=3,
     newest_ns=T0 + 1,
 )
-CHANGE = GroundChange(
+TRUST = records.TrustAnswer(**vars(MACHINE), merged=17)
+CHANGE = records.GroundChange(
     id=4,
     first_ns=T0,
     last_ns=T0 + 60_000_000_000,
@@ -135,6 +122,7 @@ CHANGE = GroundChange(
     grade_before=0.0,
     grade_after=None,
 )
+ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 
 GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
@@ -149,15 +137,11 @@ GOLDEN: dict[str, Golden] = {
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
     "machines.bin": Golden([MACHINE], answers.encode_machines, answers.decode_machines),
-    "machine.bin": Golden(TrustAnswer(**vars(MACHINE), merged=17), answers.encode_machine, answers.decode_machine),
+    "machine.bin": Golden(TRUST, answers.encode_machine, answers.decode_machine),
     "changes.bin": Golden([CHANGE], answers.encode_changes, answers.decode_changes),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
     "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, answers.encode_info, decode_info_table),
-    "error.bin": Golden(
-        QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known"),
-        answers.encode_error,
-        answers.decode_error,
-    ),
+    "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),
 }
 NEWER = "batch_newer.bin"  # of a later version of the software: an unknown field and an unknown column
 
@@ -170,7 +154,6 @@ def newer_batch() -> bytes:
 
 
 def main() -> None:
-    """Write all files."""
     for name, golden in GOLDEN.items():
         (FOLDER / name).write_bytes(golden.encode(golden.record))
     (FOLDER / NEWER).write_bytes(newer_batch())

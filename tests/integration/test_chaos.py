@@ -18,13 +18,13 @@ from agents.delivery.spool import Spool, SpoolConfig
 from protocol.machine.samples import empty
 from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
-from tests.chaos import bit_flips, power_cuts, process_faults, stepped_clock, write_faults
+from tests.chaos import bit_flips, disk_faults, site_faults, stepped_clock
+from tests.chaos.__main__ import FAULTS, ChaosFault, run_suite, totals
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
 from tests.chaos.outcome import Console, FaultOutcome, longest_pause, table
 from tests.chaos.recordings import make
 from tests.chaos.scenario import FaultRun
-from tests.chaos.suite import FAULTS, ChaosFault, run_suite, totals
 from tests.chaos.tcp_proxy import FAIR, Proxy, Weather
 
 
@@ -43,7 +43,7 @@ def scenario(folder: Path, **options) -> FaultRun:
 @pytest.mark.processes
 def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
     recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=40)
-    outcome = process_faults.kills(scenario(tmp_path / "run", recordings=recordings, strikes=4, seconds=2.0))
+    outcome = site_faults.kills(scenario(tmp_path / "run", recordings=recordings, strikes=4, seconds=2.0))
     assert (outcome.lost, outcome.double, outcome.problems) == (0, 0, [])
     assert outcome.count == 4
     assert outcome.recorded == outcome.merged > 30
@@ -55,7 +55,7 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
 @pytest.mark.processes
 @pytest.mark.skipif(sys.platform != "linux", reason="LD_PRELOAD")
 def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
-    outcome = power_cuts.power(scenario(tmp_path / "run", strikes=40))
+    outcome = disk_faults.power(scenario(tmp_path / "run", strikes=40))
     assert (outcome.count, outcome.lost, outcome.double, outcome.problems) == (40, 0, 0, [])
     assert outcome.recorded == outcome.merged > 1000
 
@@ -63,13 +63,13 @@ def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
 @pytest.mark.processes
 @pytest.mark.parametrize("what", ["spool", "store"])
 def test_power_cuts_find_a_file_that_is_not_synced_at_every_commit(tmp_path, library, what):
-    operations = power_cuts.trace(library, tmp_path / "run", what, 3, "careless")
-    assert power_cuts.cut(operations, what, 20, random.Random(1)).lost > 0
+    operations = disk_faults.trace(library, tmp_path / "run", what, 3, "careless")
+    assert disk_faults.cut(operations, what, 20, random.Random(1)).lost > 0
 
 
 @pytest.mark.processes
 def test_writes_that_fail_one_after_the_other_lose_nothing(tmp_path, library):
-    outcome = write_faults.writes(scenario(tmp_path / "run", scale=0.05))
+    outcome = disk_faults.writes(scenario(tmp_path / "run", scale=0.05))
     assert (outcome.lost, outcome.double, outcome.problems) == (0, 0, [])
     assert outcome.count > 10
 
@@ -170,7 +170,7 @@ def test_a_pause_leaves_out_what_the_fault_lasted():
 
 
 def test_the_order_of_kills_comes_from_the_seed(tmp_path):
-    drawn = [process_faults.draw_kills(scenario(tmp_path).rng, ("a", "b"), 200, 60.0) for _ in range(2)]
+    drawn = [site_faults.draw_kills(scenario(tmp_path).rng, ("a", "b"), 200, 60.0) for _ in range(2)]
     assert drawn[0] == drawn[1]
     assert sum(pause for pause, _ in drawn[0]) == pytest.approx(60.0)
     assert {victim for _, victim in drawn[0]} == {"a", "b", "router", "server"}
@@ -188,12 +188,11 @@ def test_a_loss_fails_the_suite_and_an_error_in_one_fault_lets_the_others_run(tm
     monkeypatch.setattr(command, "run_suite", lambda _, *rest: run_suite(faults, *rest))
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     monkeypatch.setattr("logging.disable", lambda: None)
-    monkeypatch.setattr("tests.chaos.suite.make", lambda *_, **__: None)
+    monkeypatch.setattr(command, "make", lambda *_, **__: None)
     assert command.main(["--json", "--seconds", "1"]) == 1
     lines = capsys.readouterr().out.splitlines()
     result = json.loads(lines[-1])
-    expected = {"kills": 7, "recorded": 9, "merged": 8, "lost": 1, "double": 0, "ok": False}
-    assert {key: result[key] for key in expected} == expected
+    assert result | {"kills": 7, "recorded": 9, "merged": 8, "lost": 1, "double": 0, "ok": False} == result
     assert "RuntimeError: broke" in result["faults"][1]["problems"][0]
     assert any("skipped: not permitted" in line for line in lines)
 

@@ -96,6 +96,7 @@ def keys(table: Mapping[str, Any]) -> Iterator[str]:
                 yield from keys(inner)
 
 
+@pytest.mark.slow
 def test_no_identifier_is_a_private_word() -> None:
     wrong = []
     for path in tracked("*.py"):

@@ -38,6 +38,7 @@ def run(
     return pipeline, holdout.report()
 
 
+@pytest.mark.slow
 def test_withheld_fixes_never_reach_the_pipeline(vehicle: MachineConfig, made: Drive) -> None:
     """A withheld fix far off would show in the poses, a seen one in the counters."""
     holdout = Holdout(SITE, vehicle, CONFIG)
@@ -55,6 +56,7 @@ def test_withheld_fixes_never_reach_the_pipeline(vehicle: MachineConfig, made: D
     assert not any("gated" in name for name in pipelines[1].health()["counters"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off_m", [0.0, 3.0])
 def test_errors_are_right_on_a_made_up_case(vehicle: MachineConfig, made: Drive, off_m: float) -> None:
     gps = vehicle.sensors[-1]
@@ -72,12 +74,14 @@ def test_errors_are_right_on_a_made_up_case(vehicle: MachineConfig, made: Drive,
     assert report["rms_m"] <= report["max_m"]
 
 
+@pytest.mark.slow
 def test_report_without_a_judged_fix_says_so(vehicle: MachineConfig, made: Drive) -> None:
     none = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None}
     assert run(vehicle, made.readings[:100])[1] == none
     assert run(vehicle, made.readings, settle_s=1000.0)[1] == none
 
 
+@pytest.mark.slow
 def test_fixes_of_a_stranger_are_left_to_the_pipeline(vehicle: MachineConfig, made: Drive) -> None:
     strangers = [replace(r, sensor="stranger") for r in made.readings if isinstance(r, Gps)]
     readings = sorted([*made.readings, *strangers], key=lambda r: r.stamp_ns)

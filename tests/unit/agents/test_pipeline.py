@@ -108,7 +108,7 @@ def test_every_sample_is_plausible(base: tuple[bytes, Any]) -> None:
     assert (np.diff(rows["stamp_ns"]) > 0).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_any_cutting_of_the_stream_gives_the_same_samples(
     vehicle: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any], seed: int
 ) -> None:
@@ -119,6 +119,7 @@ def test_any_cutting_of_the_stream_gives_the_same_samples(
     assert (np.concatenate(made).tobytes(), pipeline.health()) == base, f"seed={seed}"
 
 
+@pytest.mark.slow
 def test_positioning_alone_makes_the_very_poses_of_the_whole_pipeline(
     vehicle: MachineConfig, recorded: list[Reading]
 ) -> None:
@@ -148,6 +149,7 @@ def same(a: PoseBelief | None, b: PoseBelief | None) -> bool:
     return repr(a) == repr(b) and a.covariance_m2.tobytes() == b.covariance_m2.tobytes()
 
 
+@pytest.mark.slow
 def test_readings_of_unknown_sensors_are_counted_and_change_nothing(
     vehicle: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any]
 ) -> None:
@@ -175,6 +177,7 @@ def test_doubled_readings_are_counted_and_change_nothing(
     assert health["counters"]["reading_duplicate"] + health["counters"]["reading_late"] >= 50
 
 
+@pytest.mark.slow
 def test_long_pause_starts_localisation_anew_and_keeps_the_counts() -> None:
     made = drive([*S_BEND, Leg(8), *S_BEND[2:]], VEHICLE)
     silent = (START_NS + 30 * SECOND, START_NS + 38 * SECOND)
@@ -195,6 +198,7 @@ def test_long_pause_starts_localisation_anew_and_keeps_the_counts() -> None:
     assert counters["gps-1_used"] > used
 
 
+@pytest.mark.slow
 def test_machine_without_imu_or_torque_gives_samples_without_resistance_or_slope() -> None:
     made = drive([Leg(4, 0.5), Leg(20)], VEHICLE, without=("imu", "torque"))
     rows = Pipeline(SITE, VEHICLE, PipelineConfig()).step(made.readings)
@@ -289,6 +293,7 @@ def test_sensor_that_fails_costs_the_resistance_and_nothing_else(name: str) -> N
     assert pipeline.health()["ground"]["fault"] == ""
 
 
+@pytest.mark.slow
 def test_torque_in_a_wrong_unit_costs_the_resistance_and_nothing_else() -> None:
     """In kNm where Nm are meant: known for sure once the machine has driven 20 s."""
     legs = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.6), Leg(3, -0.6)] * 7]
@@ -302,6 +307,7 @@ def test_torque_in_a_wrong_unit_costs_the_resistance_and_nothing_else() -> None:
     assert pipeline.health()["without_resistance"]["torque_implausible"] >= len(late)
 
 
+@pytest.mark.slow
 def test_torque_a_thousand_times_too_large_moves_no_position() -> None:
     made = long_drive()
     rows = Pipeline(SITE, VEHICLE, PipelineConfig()).step(failing(torque_times(1000.0)))
@@ -310,6 +316,7 @@ def test_torque_a_thousand_times_too_large_moves_no_position() -> None:
         assert math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y)) < 3
 
 
+@pytest.mark.slow
 def test_accelerometer_in_g_withholds_samples_and_is_reported() -> None:
     def in_g(r: Reading) -> Reading | None:
         if not isinstance(r, Imu):
@@ -338,6 +345,7 @@ def test_samples_go_on_when_wheels_fall_silent() -> None:
 # --- what is carried on ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_finish_gives_what_still_waits_and_counts_what_has_no_place() -> None:
     pipeline = Pipeline(SITE, VEHICLE, PipelineConfig())
     rows = pipeline.step(drive(S_BEND, VEHICLE).readings)
@@ -351,6 +359,7 @@ def test_finish_gives_what_still_waits_and_counts_what_has_no_place() -> None:
     assert unaligned.health()["withheld"]["no_pose"] > 90
 
 
+@pytest.mark.slow
 def test_calibration_is_handed_over_a_pause_and_to_the_next_pipeline() -> None:
     known = Calibration(0.004, 0.02, ((1e-7, 0.0), (0.0, 1e-5)), START_NS - 10**9, 80)
     vehicle, made = VEHICLE, drive([*S_BEND, Leg(8), *S_BEND[2:]], VEHICLE).readings
@@ -362,6 +371,7 @@ def test_calibration_is_handed_over_a_pause_and_to_the_next_pipeline() -> None:
     assert Pipeline(SITE, vehicle, PipelineConfig(), pipeline.calibration).calibration.zero == pipeline.calibration.zero
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("half_m", "known"), [(60.0, True), (8.0, False)])
 def test_known_ground_counts_well_inside_of_it_only(half_m: float, known: bool) -> None:
     """3 m and twice the position's deviation from its edge; the drive leads 60 m away from its middle."""
@@ -427,12 +437,14 @@ def test_no_reading_carries_truth() -> None:
 # --- options of sensors that the pipeline itself sees to ----------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sensor_that_is_not_used_is_as_if_it_were_not_there(vehicle: MachineConfig, recorded: list[Reading]) -> None:
     unused = run(changed_sensor(vehicle, "gps-2", use=False), recorded)
     without = replace(vehicle, sensors=tuple(s for s in vehicle.sensors if s.name != "gps-2"))
     assert unused[0] == run(without, [r for r in recorded if r.sensor != "gps-2"])[0]
 
 
+@pytest.mark.slow
 def test_sensor_whose_stamps_are_late_by_its_delay_is_as_one_in_time(
     vehicle: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any]
 ) -> None:

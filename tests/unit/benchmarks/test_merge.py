@@ -88,6 +88,7 @@ def test_work_drives_a_tenth_of_a_square_kilometre():
     assert np.hypot(rows["grade_e"], rows["grade_n"]).max() < 0.2
 
 
+@pytest.mark.slow
 def test_work_comes_in_batches_of_ten_machines_in_the_order_of_time_with_nights_off():
     a_day = merge_work.samples_of(10.0) // 100
     taken = list(islice(merge_work.batches(), a_day + 10))

@@ -68,6 +68,7 @@ def published(
     return report, listener.bundles
 
 
+@pytest.mark.slow
 def test_every_reading_arrives_in_counted_bundles(tmp_path: Path) -> None:
     report, bundles = published(CONFIG, truth_dir=tmp_path / "truth")
     assert (report.machines, report.bundles, report.stopped) == (2, 10, False)
@@ -125,6 +126,7 @@ class FakeStop(threading.Event):
         return False
 
 
+@pytest.mark.slow
 def test_run_takes_as_long_as_its_speed_says() -> None:
     stop = FakeStop()
     config = replace(CONFIG, seconds=10.0, speed=4.0)

@@ -44,6 +44,7 @@ def test_same_seed_repeats_every_reading() -> None:
     assert run(changed(world="pybullet")) != BASE
 
 
+@pytest.mark.slow
 def test_readings_do_not_depend_on_other_machines() -> None:
     """Where they need not give way."""
     busy = changed(scenario="busy_site", machines=3)
@@ -87,6 +88,7 @@ def test_truth_is_never_in_the_readings() -> None:
                 assert not set(values) & set(truths.tolist()), reading
 
 
+@pytest.mark.slow
 def test_drive_speed_is_reached() -> None:
     for drive_mps in (2.0, 4.0):
         with closing(Simulator(changed(machines=2, drive_mps=drive_mps))) as simulator:
@@ -94,6 +96,7 @@ def test_drive_speed_is_reached() -> None:
         assert drive_mps - 0.3 < top < drive_mps + 1.0
 
 
+@pytest.mark.slow
 def test_ground_changes_when_the_scenario_says_so(tmp_path: Path) -> None:
     path = tmp_path / "rain.toml"
     path.write_text(

@@ -261,6 +261,7 @@ def test_agent_that_is_stopped_does_not_linger(sessions: tuple[Any, Any], tmp_pa
 OUT_AND_BACK = (Leg(4, 0.5), Leg(14), Leg(4, -0.5), Leg(2), Leg(4, -0.5), Leg(14), Leg(4, 0.5), Leg(3))
 
 
+@pytest.mark.slow
 def test_calibration_is_kept_across_restarts(sessions: tuple[Any, Any], tmp_path: Path) -> None:
     """Whoever drives out and back learns the accelerometer's zero, and the next agent starts with it."""
     zero_mps2, made = 0.05, drive(OUT_AND_BACK, VEHICLE)
@@ -280,6 +281,7 @@ def test_calibration_is_kept_across_restarts(sessions: tuple[Any, Any], tmp_path
     assert reports[0]["calibration_problem"] == ""
 
 
+@pytest.mark.slow
 def test_calibration_file_that_makes_no_sense_is_reported_and_replaced(
     sessions: tuple[Any, Any], tmp_path: Path
 ) -> None:
@@ -296,6 +298,7 @@ def test_calibration_file_that_makes_no_sense_is_reported_and_replaced(
     assert load(tmp_path / "c.json", VEHICLE.name)
 
 
+@pytest.mark.slow
 def test_uplink_waits_timeout_s_for_an_acknowledgement(sessions: tuple[Any, Any], tmp_path: Path) -> None:
     """A server that never answers: the question is given up after timeout_s."""
     router, client = sessions

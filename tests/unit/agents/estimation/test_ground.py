@@ -112,6 +112,7 @@ def test_health_says_what_the_machine_carries(estimator: str) -> None:
     assert run.estimator.health()["payload_kg"] == 5000
 
 
+@pytest.mark.slow
 def test_mass_that_nobody_weighs_is_estimated_from_forces() -> None:
     loaded = replace(VEHICLE, mass_kg=1.2 * VEHICLE.mass_kg)
     legs = [STAND, START, *[Leg(2, 0.7), Leg(2, -0.7)] * 12]
@@ -348,6 +349,7 @@ def test_zero_is_found_by_the_work_cycle() -> None:
     assert run.last.slope_var < without.last.slope_var
 
 
+@pytest.mark.slow
 def test_known_ground_shows_the_zero_without_a_way_back() -> None:
     readings = off(drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(10)], VEHICLE).readings, 0.06)
     run = EstimatorRun(VEHICLE, known_c_rr=0.04).feed(readings)
@@ -357,6 +359,7 @@ def test_known_ground_shows_the_zero_without_a_way_back() -> None:
     assert np.mean([e.c_rr for e in run.between(58, 66) if not e.reason]) == pytest.approx(0.04, abs=0.002)
 
 
+@pytest.mark.slow
 def test_new_calibration_takes_effect_at_a_standstill_only() -> None:
     made = drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(6)], VEHICLE).readings
     run = EstimatorRun(VEHICLE, known_c_rr=0.04).feed(off(made, 0.06))
@@ -378,6 +381,7 @@ def test_calibration_from_before_is_used_at_once() -> None:
     assert health["age_s"] == pytest.approx(10 + 16, abs=0.5)
 
 
+@pytest.mark.slow
 def test_what_is_found_is_handed_on() -> None:
     run = EstimatorRun(VEHICLE).feed(off(cycles(VEHICLE, 2), 0.06))
     calibration = run.estimator.calibration
@@ -410,6 +414,7 @@ def test_scale_is_found_on_slopes() -> None:
     assert health["scale_std"] < 0.02
 
 
+@pytest.mark.slow
 def test_nothing_is_learnt_of_moments_that_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     readings = off(cycles(VEHICLE, 1), 0.06)
     some = EstimatorRun(VEHICLE).feed(readings)

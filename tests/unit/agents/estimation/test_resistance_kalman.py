@@ -202,6 +202,7 @@ def test_borders_pauses_and_turns_back_are_not_mistaken_for_noise(tune: Tune) ->
 # --- borders ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_border_is_dated_to_where_it_began(tune: Tune, sign: float) -> None:
     tune(NOISE=0.002, JUMP_SIGMA=4.0)
@@ -215,6 +216,7 @@ def test_border_is_dated_to_where_it_began(tune: Tune, sign: float) -> None:
     assert sum(is_dated) >= 27
 
 
+@pytest.mark.slow
 def test_border_under_the_noise_of_bad_sensors_is_found_all_the_same() -> None:
     """A step of two standard deviations of a raw value: dated within a metre or so."""
     late = []
@@ -391,6 +393,7 @@ def at_work(scale: float, seconds: float, seed: int, c_rr: float = 0.05, start: 
     return [replace(s, stamp_ns=s.stamp_ns + start * STEP_NS) for s in steps]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.2, -0.2])
 def test_wrong_mass_is_found_where_forces_vary(scale: float) -> None:
     """raw = c_rr + scale error / (1 + ...) * share: what drives in excess of what the motion takes."""
@@ -405,6 +408,7 @@ def test_wrong_mass_is_found_where_forces_vary(scale: float) -> None:
     assert np.mean(blinds) > 1.3 * np.mean(errors)
 
 
+@pytest.mark.slow
 def test_load_that_changes_at_a_stop_is_found_again() -> None:
     kalman = KalmanResistance(estimates_mass=True)
     feed(kalman, at_work(0.0, 120, 1))

@@ -147,6 +147,7 @@ def test_receiver_that_comes_late_or_never_is_no_trouble(from_s: float) -> None:
     assert max(position_errors(beliefs, made)) < 0.3
 
 
+@pytest.mark.slow
 def test_late_receiver_brings_its_own_unknown_error() -> None:
     """A second receiver that is 3 m off must not pull the position with the weight of its white noise alone."""
     vehicle = machine(receivers=2)
@@ -179,6 +180,7 @@ def test_standstill_shows_the_gyro_bias() -> None:
     assert state(located)[GYRO_BIAS] == pytest.approx(0.004, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_turning_on_the_spot_is_no_gyro_bias() -> None:
     """An articulated loader that steers at rest turns its rear frame."""
     located = localiser(VEHICLE)
@@ -201,6 +203,7 @@ def test_wheels_that_fall_silent_do_not_hold_the_machine() -> None:
     assert position_errors(beliefs, made)[-1] < 3.0
 
 
+@pytest.mark.slow
 def test_dead_reckoning_grows_unsure_and_a_fix_makes_it_sure_again() -> None:
     made = drive([*S_BEND, Leg(20), Leg(2)], VEHICLE)
     readings = [r for r in made.readings if not isinstance(r, Gps) or not after(r, 30) or after(r, 50)]
@@ -273,6 +276,7 @@ def arriving(readings: list[Reading], late: dict[str, float]) -> list[Reading]:
     return sorted(readings, key=lambda r: r.stamp_ns + round(late.get(r.sensor, 0.0) * 1e9))
 
 
+@pytest.mark.slow
 @FILTERS
 def test_fixes_that_come_late_give_the_pose_of_those_in_time(engine: str) -> None:
     vehicle = machine(receivers=2)
@@ -288,6 +292,7 @@ def test_fixes_that_come_late_give_the_pose_of_those_in_time(engine: str) -> Non
     assert (newest[last].x_m, newest[last].y_m) == pytest.approx((before.x_m, before.y_m), abs=0.05)
 
 
+@pytest.mark.slow
 def test_first_fix_of_a_receiver_that_comes_late_brings_its_unknown_error_all_the_same() -> None:
     """What is set at the first fix stays set when older fixes of the other receiver arrive after it."""
     vehicle = machine(receivers=2)
@@ -303,6 +308,7 @@ def test_first_fix_of_a_receiver_that_comes_late_brings_its_unknown_error_all_th
     assert max(late_errors) < max(errors) + 0.2
 
 
+@pytest.mark.slow
 def test_first_fix_that_is_refused_does_not_count_as_heard() -> None:
     vehicle = machine(receivers=2)
     made = drive(S_BEND, vehicle)
@@ -346,6 +352,7 @@ def test_a_given_start_may_lie_anywhere() -> None:
     assert abs(math.remainder(last.heading_rad - heading - math.pi, math.tau)) < 0.02
 
 
+@pytest.mark.slow
 def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores() -> None:
     vehicle = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("ahrs", "attitude")))
     made = drive(S_BEND, vehicle)
@@ -363,6 +370,7 @@ def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores(
     assert abs(off["default"]) < 0.03
 
 
+@pytest.mark.slow
 def test_each_of_two_imus_has_its_own_bias() -> None:
     vehicle = replace(
         VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("imu-2", "imu", Mount((0.5, 0.0, 1.0), (0.0, 0.0, 90.0))))

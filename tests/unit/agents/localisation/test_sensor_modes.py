@@ -128,6 +128,7 @@ def test_a_machine_with_such_a_receiver_alone_never_aligns_but_runs_from_a_start
     assert located.counters["gps-1_gated"] == 0
 
 
+@pytest.mark.slow
 @MODES
 def test_the_start_heading_comes_from_absolute_receivers_alone(mode: str) -> None:
     vehicle = of_gps(mode, receivers=2)
@@ -138,6 +139,7 @@ def test_the_start_heading_comes_from_absolute_receivers_alone(mode: str) -> Non
     assert off.counters["gps-2_used"] > 100
 
 
+@pytest.mark.slow
 def test_differential_receiver_shows_speed_and_heading_where_wheels_are_wrong() -> None:
     """Wheels that turn a fifth too much, and no state for it in the paper's profile: fixes 200 m off hold the speed."""
     drifts = {}
@@ -221,6 +223,7 @@ def test_relative_receivers_are_shifted_each_by_its_own_first_fix() -> None:
     assert located.counters["gps-2_gated"] == located.counters["gps-3_gated"] == 0
 
 
+@pytest.mark.slow
 def test_a_relative_receiver_that_comes_late_counts_from_the_belief_at_its_first_stamp() -> None:
     """The machine drives 0.8 m while its fixes are on their way."""
     vehicle = of_gps("relative")
@@ -253,6 +256,7 @@ def test_a_relative_receiver_does_not_make_a_wrong_start_sure() -> None:
     assert stds[-1] > 0.7 * stds[0]
 
 
+@pytest.mark.slow
 def test_a_restart_takes_a_new_reference() -> None:
     vehicle = of_gps("relative")
     first, second = drive(S_BEND, vehicle), drive(S_BEND, vehicle)
@@ -306,6 +310,7 @@ def yaw_error(made: Drive, belief: Belief) -> float:
     return abs(math.remainder(belief.x[YAW] - made.at(belief.stamp_ns)[2], math.tau))
 
 
+@pytest.mark.slow
 @EACH_PAIR
 def test_an_attitude_that_is_far_off_is_used_in_its_mode_in_both_profiles(mode: str, profile: str, engine: str) -> None:
     vehicle = of_ahrs(mode=mode)
@@ -318,6 +323,7 @@ def test_an_attitude_that_is_far_off_is_used_in_its_mode_in_both_profiles(mode: 
     assert max(errors(made, beliefs)) < 0.6
 
 
+@pytest.mark.slow
 @MODES
 def test_an_attitude_in_its_mode_holds_the_heading_where_the_gyro_is_wrong(mode: str) -> None:
     """A gyro that is off by 0.02 rad/s, with no fixes: over 25 s that is half a radian."""
@@ -334,6 +340,7 @@ def test_an_attitude_in_its_mode_holds_the_heading_where_the_gyro_is_wrong(mode:
     assert wrong[mode] < 0.3 * wrong["absolute"], wrong
 
 
+@pytest.mark.slow
 @PROFILES
 def test_a_relative_heading_that_comes_late_counts_from_the_belief_then(profile: str) -> None:
     vehicle = of_ahrs(mode="relative", measures=("heading",))
@@ -358,6 +365,7 @@ def test_tilt_of_a_relative_attitude_stays_absolute() -> None:
     assert localiser(vehicle, start=START).beliefs(tilted)[-1].x[3] == pytest.approx(0.1, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_relative_heading_leaves_a_wrong_start_to_be_corrected_by_fixes() -> None:
     """The start is 0.1 rad off: the reference is as wrong, and known to be unsure; GPS turns both."""
     vehicle = of_ahrs(mode="relative")
@@ -402,6 +410,7 @@ def test_each_standard_deviation_counts(sensor: str, name: str, std: float) -> N
     assert np.abs(changed - final(vehicle, made)).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_a_configured_position_replaces_what_fixes_state() -> None:
     """Stated 1.41 m (2 m2): the same number configured is the same belief, whatever is stated."""
     made = drive(S_BEND, VEHICLE)
@@ -413,6 +422,7 @@ def test_a_configured_position_replaces_what_fixes_state() -> None:
     assert np.abs(located.P - expected.P).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_a_configured_position_may_be_better_than_receivers_are_believed_to_be() -> None:
     vehicle, stds = machine(), []
     for std in (0.02, 0.3):  # min_fix_std_m is 0.3
@@ -421,6 +431,7 @@ def test_a_configured_position_may_be_better_than_receivers_are_believed_to_be()
     assert stds[0] < 0.6 * stds[1]
 
 
+@pytest.mark.slow
 def test_a_configured_heading_replaces_what_an_attitude_states() -> None:
     vehicle = of_ahrs(mode="relative", std={"heading": 0.01, "tilt": 0.01})
     plain = of_ahrs(mode="relative")

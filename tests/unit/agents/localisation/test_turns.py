@@ -113,6 +113,7 @@ def test_dead_reckoning_turns_without_an_imu(sensors: tuple[SensorConfig, ...]) 
     assert (reckoning.pose.x_m, reckoning.pose.y_m) == pytest.approx((moved.real, moved.imag), abs=0.3)
 
 
+@pytest.mark.slow
 def test_turn_of_odometry_beside_an_imu_changes_nothing() -> None:
     vehicle = truck(SensorConfig("gyro", "imu"), ODOMETRY)
     made = driven(vehicle, Wrong(rate_radps=1.0), BEND)
@@ -199,6 +200,7 @@ def test_a_machine_without_imu_is_located_and_holds_through_ten_seconds_without_
     assert located.counters["gps-1_gated"] == 0, shown
 
 
+@pytest.mark.slow
 def test_the_offset_of_steering_is_learnt_and_standing_still_does_not_unlearn_it() -> None:
     vehicle = truck(ENCODER, STEERING)
     made = driven(vehicle, Wrong(math.radians(1), fixes=False), [*EIGHT, Leg(3, -1.0), Leg(20)])

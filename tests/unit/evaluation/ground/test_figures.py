@@ -56,6 +56,7 @@ def compared(c_rr=0.04, here: TrueGround = HERE, track: LoadTrack = EAST, **colu
     return compare(samples_of(track, c_rr, **columns), track, here, LAG_S, START_NS)
 
 
+@pytest.mark.slow
 def test_a_right_estimate_has_right_figures():
     row = figures(compared(steps_at(BORDER_M)))
     assert row["right_class_pct"] == row["dirt_flat_right_pct"] == 100.0

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.evidence.grid import LIVE_ROWS, Grid
@@ -55,6 +55,7 @@ def test_every_page_is_as_the_definition_says(seed: int, days: float, cell_m: fl
     assert grid.skipped > 0
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0]), st.sampled_from([1, 7, 100, 8192]))
 def test_how_many_samples_wait_and_in_which_order_they_come_does_not_matter(seed: int, days: float, rows: int) -> None:
     parts = batches(seed, days=days)
@@ -62,6 +63,7 @@ def test_how_many_samples_wait_and_in_which_order_they_come_does_not_matter(seed
     assert same(grid_of(parts), grid_of(shuffled, rows))
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0, 400.0]))
 def test_reading_meanwhile_does_not_matter(seed: int, days: float) -> None:
     parts = batches(seed, days=days)
@@ -72,6 +74,7 @@ def test_reading_meanwhile_does_not_matter(seed: int, days: float) -> None:
     assert same(read, grid_of(parts))
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0, 400.0]), st.integers(1, 4))
 def test_a_merge_of_folds_is_the_fold_of_all(seed: int, days: float, more: int) -> None:
     parts = batches(seed, days=days)

@@ -249,7 +249,7 @@ def taking(folder, stuck: int, saved: int) -> Iterator[subprocess.Popen]:
         child.stdout.close()
 
 
-@pytest.mark.parametrize(("stuck", "saved"), [(1, 9), (7, 9), (7, 4)])
+@pytest.mark.parametrize(("stuck", "saved"), [(1, 9), pytest.param(7, 9, marks=pytest.mark.slow), (7, 4)])
 def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, saved):
     rows = random_samples(200, 12)
     np.save(tmp_path / "rows.npy", rows)

@@ -209,7 +209,13 @@ def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, chan
 
 @pytest.mark.parametrize(
     ("cell_m", "c_rr", "edge_m"),
-    [(1.0, 0.2, 6.0), (1.0, 0.04, 11.0), (0.5, 0.2, 6.0), (0.5, 0.04, 11.0), (0.2, 0.2, 6.0)],
+    [
+        (1.0, 0.2, 6.0),
+        (1.0, 0.04, 11.0),
+        (0.5, 0.2, 6.0),
+        pytest.param(0.5, 0.04, 11.0, marks=pytest.mark.slow),
+        pytest.param(0.2, 0.2, 6.0, marks=pytest.mark.slow),
+    ],
 )
 def test_a_change_is_seen_with_all_its_surroundings_in_cells_of_any_size(tmp_path, cell_m, c_rr, edge_m):
     cells = round(edge_m / cell_m)  # a metre more than the least

@@ -3,7 +3,7 @@ from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol.errors import MessageError, QueryError, Refusal
@@ -181,6 +181,7 @@ def test_bad_query_is_refused_by_name(name, parameters, reason, words):
 NAMES = ["x", "y", "bounds", "layers", "as_of", "minus", "from", "to", "span", "after", "wait"]
 
 
+@settings(max_examples=40)
 @given(
     st.sampled_from(["point", "region", "history", "machines", "changes", "info", "x"]),
     st.dictionaries(st.sampled_from(NAMES) | st.text(max_size=3), st.text() | st.integers().map(str)),

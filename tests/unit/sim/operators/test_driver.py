@@ -189,6 +189,7 @@ def test_machines_give_way(machines: int) -> None:
     assert (abs(driven.states.speed_mps).sum(axis=0) * 0.1 > 550).all()
 
 
+@pytest.mark.slow
 def test_without_give_way_machines_drive_on() -> None:
     driven = drive(SimConfig(scenario="busy_site", seed=2), 20.0)
     assert len(driven.scenario.machine_names) == 100

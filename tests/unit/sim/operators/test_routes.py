@@ -65,6 +65,7 @@ def test_course_follows_laps_and_goes_straight_on_beyond_open_ends() -> None:
     assert np.isfinite(far).all()
 
 
+@pytest.mark.slow
 def test_machines_line_up_by_share_and_apart() -> None:
     routes = [tour(SQUARE)] * 4
     length = routes[0].length_m

@@ -33,6 +33,7 @@ def plan(monkeypatch: pytest.MonkeyPatch, scenario: str, **options: object) -> t
         simulator.close()
 
 
+@pytest.mark.slow
 def test_the_plan_names_routes_machines_and_slope(monkeypatch) -> None:
     image, written = plan(monkeypatch, "paper_site")
     machines, routes = ["loader-1", "loader-2", "loader-3"], ["west", "east", "middle"]
@@ -41,6 +42,7 @@ def test_the_plan_names_routes_machines_and_slope(monkeypatch) -> None:
     assert all((image == colour).all(axis=-1).any() for colour in pale)
 
 
+@pytest.mark.slow
 def test_many_machines_are_dots_without_names(monkeypatch) -> None:
     _, written = plan(monkeypatch, "busy_site")
     assert sorted(written) == sorted(["west", "east", "middle", "15 deg uphill"])
@@ -50,6 +52,7 @@ HAUL = {"loads 22 t in 30 s", "dumps 22 t in 15 s", "loads 4.5 t in 6 s", "dumps
 CHANGES = {"after 150 s: dry concrete", "after 200 s: wet dirt"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "labels"),
     [

@@ -27,6 +27,7 @@ def test_head_on_collision_stays_finite_and_nobody_passes_through() -> None:
     assert abs(run.roll_rad).max() < 0.2
 
 
+@pytest.mark.slow
 def test_wheels_carry_what_the_machine_carries() -> None:
     grade, models = 0.1, (LOADER, TRUCK)
     with lanes(BulletWorld, [Lane(model, 2) for model in models], grade) as world:

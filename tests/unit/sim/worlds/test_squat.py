@@ -13,6 +13,7 @@ from sim.worlds.bullet import BulletWorld
 from tests.unit.sim.planes import LOADER, TRUCK, Lane, cruise, idle, lanes, of_each
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope_deg", [0, 15])
 def test_squat_at_steady_speed_is_that_of_the_axles_loads(slope_deg: int) -> None:
     cases = [Lane(model, 1, yaw) for model in (LOADER, TRUCK) for yaw in (0.0, 0.0, math.pi, math.pi)]

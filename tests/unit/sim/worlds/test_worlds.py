@@ -279,6 +279,7 @@ def test_true_bodies_differ_from_the_model(kind: type) -> None:
     world.close()
 
 
+@pytest.mark.slow
 def test_both_worlds_take_the_same_track_under_the_same_commands() -> None:
     cases = [Lane(model, 2, 0.4) for model in MODELS]
     weight_n, runs = load_of(cases), []

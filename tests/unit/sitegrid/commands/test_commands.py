@@ -48,6 +48,7 @@ def test_sim_options_go_over_the_config(tmp_path: Path):
     assert resolve(over).machine_names == ("loader-1",)
 
 
+@pytest.mark.slow
 def test_sim_records_log_folders_and_truth(tmp_path: Path, capsys):
     logs, truth = tmp_path / "logs", tmp_path / "truth"
     words = ["--record", str(logs), "--truth", str(truth), "--seconds", "2", "--machines", "2"]

@@ -26,6 +26,7 @@ def parse(*words: str) -> argparse.Namespace:
     return cli.build_parser().parse_args(["eval", *words])
 
 
+@pytest.mark.slow
 def test_options_of_an_experiment_reach_it(monkeypatch, capsys):
     from evaluation.positions import table
 

@@ -59,6 +59,7 @@ def test_an_earlier_run_is_cleared_away(tmp_path: Path):
     assert not old.exists()
 
 
+@pytest.mark.slow
 def test_the_default_log_is_used_only_where_its_data_lies(tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert plan_of(tmp_path).log is None

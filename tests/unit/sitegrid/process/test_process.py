@@ -118,6 +118,7 @@ def test_what_is_no_address_is_a_usage_error(text: str):
     assert end.value.code == 2
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("glibc" not in platform.libc_ver()[0], reason="other C libraries keep no such blocks")
 def test_large_blocks_go_back_to_the_system():
     def grown_mib(how: str) -> float:

@@ -167,6 +167,7 @@ def test_the_order_of_measurements_of_a_moment_does_not_matter_to_first_order(ki
         assert np.abs(other.P - beliefs[0].P).max() < 5 * scale * np.abs(beliefs[0].P).max()
 
 
+@pytest.mark.slow
 def test_ukf_is_nearer_to_the_truth_than_ekf_where_the_heading_is_uncertain() -> None:
     """Ten metres driven with a heading known to 0.5 rad: moments of 200 000 drawn states."""
     x = np.zeros(15)
@@ -325,7 +326,9 @@ def test_wrapping_touches_angles_alone() -> None:
 
 
 @pytest.mark.parametrize("kind", ALL, ids=name)
-@pytest.mark.parametrize("turned", [math.pi, 1.0, math.pi - 0.01, -2.0])
+@pytest.mark.parametrize(
+    "turned", [math.pi, 1.0, *(pytest.param(t, marks=pytest.mark.slow) for t in (math.pi - 0.01, -2.0))]
+)
 def test_where_east_lies_does_not_matter(kind: Filter, turned: float) -> None:
     """A drive of four turns in a map that is turned by any angle is the drive turned: across +-pi nothing jumps.
 
