@@ -67,10 +67,8 @@ def _own(kind: Filter) -> dict[str, FilterStep]:
     As in a drive a step finds the factor of its belief's covariance, and computes that of the belief it makes.
     """
     belief = _start()
-    steps: dict[str, FilterStep] = {"predict": lambda: kind.predict(belief, motion(MODEL, belief, DT_S), 10_000_000)}
-    for name, states in MEASURED.items():
-        steps[name] = _conditioned(kind, belief, states)
-    return steps
+    updates = {name: _conditioned(kind, belief, states) for name, states in MEASURED.items()}
+    return {"predict": lambda: kind.predict(belief, motion(MODEL, belief, DT_S), 10_000_000), **updates}
 
 
 def _conditioned(kind: Filter, belief: Belief, states: slice) -> FilterStep:

@@ -82,8 +82,7 @@ def memory_mb(name: str = "VmRSS") -> float:
 
 def in_child(module: str, *words: str) -> Report:
     """What a module prints as one JSON object when it runs in a process of its own."""
-    command = [sys.executable, "-m", module, *words]
-    root = Path(__file__).parent.parent
+    command, root = [sys.executable, "-m", module, *words], Path(__file__).parent.parent
     result: Report = json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603
     return result
 

@@ -108,13 +108,9 @@ def _share(samples: int, share: int) -> int:
 
 
 def _timer(fold: Fold, rows: Table, piece: int) -> Callable[[], float]:
-    def run_once() -> float:
-        fresh = rows.copy()  # in the caches as after decoding: the first in turn does not load it for the others
-        return timed(lambda: _fold(fold, fresh, piece))
+    def fold_pieces(fresh: Table) -> None:
+        for first in range(0, len(fresh), piece):
+            fold(fresh[first : first + piece])
 
-    return run_once
-
-
-def _fold(fold: Fold, rows: Table, piece: int) -> None:
-    for first in range(0, len(rows), piece):
-        fold(rows[first : first + piece])
+    # a copy is in the caches as after decoding: the first in turn does not load it for the others
+    return lambda: timed(partial(fold_pieces, rows.copy()))

@@ -50,10 +50,9 @@ class Exclusion:
 
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
         """Have decided what the audit may decide, which may be nothing: `machines` names its verdicts in any case."""
-        if not self._writer.config.trust.exclude:
-            return
         with self._changed:
-            self._requested += self._decisions.judge(verdicts, stamp_ns)
+            if self._writer.config.trust.exclude:
+                self._requested += self._decisions.judge(verdicts, stamp_ns)
 
     def request(self, decision: TrustDecision) -> None:
         """Have a decision made."""

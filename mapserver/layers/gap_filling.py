@@ -149,8 +149,7 @@ def resistance_filled_std(area: Area) -> Floats:
     """Standard deviation of `resistance_filled` [-]; `resistance_std` in known cells."""
     log, std, weights = _log_resistance(area)
     filled = area["resistance_filled"]
-    prior = RESISTANCE_PRIOR_STD
-    return filled * filled_std(log, std, weights, np.log(filled), prior, area.kernel)
+    return filled * filled_std(log, std, weights, np.log(filled), RESISTANCE_PRIOR_STD, area.kernel)
 
 
 def resistance_class_filled(area: Area) -> Floats:

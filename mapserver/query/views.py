@@ -59,11 +59,8 @@ class PastMaps:
     @contextmanager
     def _history(self) -> Iterator[tuple[History, int]]:
         try:
-            reader = JournalReader(self.journal)
-            try:
+            with JournalReader(self.journal) as reader:
                 yield History.beside(reader), reader.last_row
-            finally:
-                reader.close()
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None
 
