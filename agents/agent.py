@@ -11,9 +11,9 @@ import zenoh
 
 from agents.config import AgentConfig
 from agents.delivery.audit import AuditLog
-from agents.delivery.link import Sign, UplinkThread, linger
 from agents.delivery.spool import Spool
 from agents.delivery.uplink import Uplink
+from agents.delivery.uplink_thread import Sign, UplinkThread, linger
 from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
-from agents.drivers.stream_order import Decision, StreamOrder
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
+from agents.stream_order import Decision, StreamOrder
 from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Reading

@@ -12,8 +12,8 @@ from functools import partial
 
 from benchmarks.measure import SIDE_M, Report, machine, medians, scattered, timed, track
 from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, Polars
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Table
 
 PATTERNS = {"track": track, "random": scattered}

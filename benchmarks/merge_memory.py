@@ -16,9 +16,9 @@ import numpy as np
 from benchmarks.measure import Report, in_child, machine, memory_mb, timed
 from benchmarks.merge_work import BATCH, batches, samples_of
 from mapserver.evidence import snapshot
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.pages import CompactPages
-from mapserver.evidence.votes import FoldConfig
 
 GOALS = {"bytes_per_cell_and_bucket": 500, "resident_mb": 400}
 MB = 1e6

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from mapserver.change.detection import ChangeConfig
-from mapserver.evidence.votes import FoldConfig
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.layers.cell_layers import ReadConfig
 from protocol.config import require_positive
 

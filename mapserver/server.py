@@ -16,7 +16,7 @@ from mapserver.config import ServerConfig
 from mapserver.follower.follower import Follower
 from mapserver.ingest.store import Incoming, Store, Verify
 from mapserver.ingest.writer import Writer
-from mapserver.query.answers import Answers, reads_past
+from mapserver.query.answering import Answers, reads_past
 from protocol.errors import ConfigError, QueryError
 from protocol.queries.answer_codec import encode_change, encode_error
 from protocol.queries.answers import GroundChange

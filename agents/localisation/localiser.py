@@ -9,7 +9,7 @@ from agents.localisation.alignment import Alignment, align_fixes, align_start, s
 from agents.localisation.consistency import Consistency
 from agents.localisation.filters.belief import Belief, Filter, PoseBelief
 from agents.localisation.filters.ekf import Ekf
-from agents.localisation.filters.history import Fusion
+from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf

@@ -13,8 +13,8 @@ import numpy as np
 from evaluation.maps.cases import CELL_M
 from evaluation.maps.samples import Delivery
 from mapserver.config import ServerConfig
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.votes import FoldConfig
 from mapserver.query.views import read_cells, view_of
 from mapserver.trust.auditor import Auditor
 from protocol.arrays import Bools, Floats, Ints, Table

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from evaluation.maps.cases import CELL_M, PASSES_BEFORE, CaseMachine, MapCase, Site, build_site, parking_place
-from mapserver.evidence.votes import FoldConfig
+from mapserver.evidence.fold_config import FoldConfig
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.machine.samples import empty
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.fold_kernels import fold_sorted
 from mapserver.evidence.pages import CELL, PackedPages, frozen
 from mapserver.evidence.sample_kernels import locate, split, weigh
-from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
 from protocol.arrays import AnyArray, Bools, Ints, Table
 
 MOST_SHARES = 1 << 24  # of stencils that are weighed at once, 64 MB

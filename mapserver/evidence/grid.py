@@ -9,9 +9,9 @@ import numpy as np
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import fold, scratch_block
+from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.pages import CompactPages, Page
 from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
-from mapserver.evidence.votes import FoldConfig, is_foldable, name_hash
 from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.geometry import BLOCK_CELLS, CellWindow

@@ -8,8 +8,7 @@ import numba
 import numpy as np
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold_kernels import BLOCK_BITS, BUCKET_BITS, HALF
-from mapserver.evidence.votes import (
+from mapserver.evidence.fold_config import (
     GRADE_LOW,
     GRADE_STEPS,
     HASH,
@@ -20,6 +19,7 @@ from mapserver.evidence.votes import (
     VISIT_NS,
     WEIGHT_SHIFT,
 )
+from mapserver.evidence.fold_kernels import BLOCK_BITS, BUCKET_BITS, HALF
 
 _R_LAST, _G_LAST = ev.RESISTANCE_BINS - 2, ev.GRADE_BINS - 2
 _R_PER_LOG = len(RESISTANCE_STEPS) / np.log(ev.RESISTANCE_CENTRES[-1] / ev.RESISTANCE_CENTRES[0])

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.grid import Grid, GridState
 from mapserver.evidence.pages import EMPTY, CompactPages
-from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
 from protocol.arrays import AnyArray
 from protocol.files import whole_file
 

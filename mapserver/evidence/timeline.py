@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.pages import CELL, EMPTY, RAW_CELL, CompactPages, PackedPages, Page, pick
 from mapserver.evidence.timeline_kernel import settle
-from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import AnyArray, Bools, Ints
 
 HOUR_S, DAY_S = 3600, 86_400

@@ -12,8 +12,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.grid import REFOLD_ROWS, Grid
-from mapserver.evidence.votes import STD_FLOOR_M, FoldConfig
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.reader import LAST, ArchivedError, JournalQueries
 from mapserver.journal.rows import ALL, JournalRow, Selection

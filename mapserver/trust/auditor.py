@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mapserver.evidence.votes import FoldConfig, is_foldable
+from mapserver.evidence.fold_config import FoldConfig, is_foldable
 from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
 from mapserver.trust.comparison import ComparedMap, Difference, compare, reverse
 from mapserver.trust.judgement import AGREE, DISAGREE, GROUND, UNKNOWN, ClockLeads, Judgement, Reason, judge, outvoted

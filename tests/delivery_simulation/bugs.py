@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from agents.delivery import link
-from agents.delivery.link import Ask
+from agents.delivery import uplink_thread
 from agents.delivery.spool import Spool, SpoolRun
 from agents.delivery.uplink import Action, Send, Uplink
+from agents.delivery.uplink_thread import Ask
 from mapserver.journal.rows import Admission
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from tests.delivery_simulation import servers
@@ -45,7 +45,7 @@ def watermark_one_too_high(patch: pytest.MonkeyPatch) -> None:
 
 def delete_before_ack(patch: pytest.MonkeyPatch) -> None:
     """The agent deletes what it has sent, not what has arrived."""
-    perform = link.perform
+    perform = uplink_thread.perform
 
     def sent_is_done(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
         head = uplink._head
@@ -53,7 +53,7 @@ def delete_before_ack(patch: pytest.MonkeyPatch) -> None:
             spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
         return perform(action, uplink, spool, ask)
 
-    patch.setattr(link, "perform", sent_is_done)
+    patch.setattr(uplink_thread, "perform", sent_is_done)
 
 
 def _plant_admit(patch: pytest.MonkeyPatch, wrong: Callable[[SampleBatch, int], SampleBatch]) -> None:

@@ -16,9 +16,9 @@ import zenoh
 
 from agents.agent import Agent, Places
 from agents.config import AgentConfig
-from agents.delivery.link import UplinkThread
 from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import Uplink, UplinkConfig, Wait
+from agents.delivery.uplink_thread import UplinkThread
 from agents.localisation.filters.belief import PoseBelief
 from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
 from mapserver.config import ServerConfig

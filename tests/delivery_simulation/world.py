@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.delivery import link
+from agents.delivery import uplink_thread
 from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import Action, Pacing, Uplink, UplinkConfig, Wait
 from mapserver.ingest.store import Incoming
@@ -183,7 +183,7 @@ class World:
             errors = agent.uplink.counters["disk_errors"]
             action: Action = agent.uplink.start_exchange()
             while not isinstance(action, Wait):
-                action = link.perform(action, agent.uplink, agent.spool, ask)
+                action = uplink_thread.perform(action, agent.uplink, agent.spool, ask)
             if agent.uplink.counters["disk_errors"] > errors:
                 self.outcome.events["disk_full"] += 1
                 self.note(f"{agent.name}: {agent.uplink.problem}")

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import TABLE, TABLE_LAST, TABLE_PER_UNIT, WEIGHT_SHIFT, FoldConfig, is_foldable
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import Tiers
-from mapserver.evidence.votes import TABLE, TABLE_LAST, TABLE_PER_UNIT, WEIGHT_SHIFT, FoldConfig, is_foldable
 from protocol.arrays import Table
 from tests.reference.votes import prepare
 

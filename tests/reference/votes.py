@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.votes import (
+from mapserver.evidence.fold_config import (
     GRADE_LOW,
     GRADE_STEPS,
     HASH,

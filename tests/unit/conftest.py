@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from mapserver.change.detection import ChangeConfig, cuts
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import warm_up
-from mapserver.evidence.votes import FoldConfig
 from sim.worlds.fast import FastWorld
 from tests.unit.mapserver.data import NOW_NS, folded, samples
 from tests.unit.sim.planes import LOADER, idle, placed, plane

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.delivery.link import linger, perform
 from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import (
     BLOCKING,
@@ -27,6 +26,7 @@ from agents.delivery.uplink import (
     UplinkConfig,
     Wait,
 )
+from agents.delivery.uplink_thread import linger, perform
 from mapserver.ingest.admission import GapError, admit, parse
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.machine.samples import content_hash

@@ -7,8 +7,8 @@ import pytest
 from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import ChangeConfig
 from mapserver.change.validity import around
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.votes import FoldConfig
 from mapserver.layers.cell_layers import ReadConfig
 from protocol.queries.answers import GroundChange
 from tests.unit.mapserver.data import NOW_NS, samples

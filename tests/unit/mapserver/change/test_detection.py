@@ -5,9 +5,9 @@ import pytest
 
 from mapserver.change.detection import BINS, VARIATION, WEIGHT_M, ChangeConfig, credible, cuts, kinds
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import TimedPage
-from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Bools, Floats, Ints
 from tests.unit.mapserver.data import NOW_NS, samples
 

@@ -7,9 +7,9 @@ from mapserver.change import validity
 from mapserver.change.detection import ChangeConfig, cuts
 from mapserver.change.validity import around, clusters, valid_pages
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import evidence
-from mapserver.evidence.votes import FoldConfig
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import ReadConfig
 from protocol.site.geometry import CellWindow

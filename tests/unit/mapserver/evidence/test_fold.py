@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import TABLE, TABLE_LAST, FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.votes import TABLE, TABLE_LAST, FoldConfig
 from protocol.errors import MessageError
 from protocol.machine.samples import check_samples
 from protocol.site.ground_classes import ZONES

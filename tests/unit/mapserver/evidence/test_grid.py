@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks
-from mapserver.evidence.votes import FoldConfig
 from protocol.site.geometry import CellWindow
 from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
 

@@ -11,9 +11,9 @@ import pytest
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.pages import CompactPages
-from mapserver.evidence.votes import FoldConfig
 from protocol.wire.messages import Ack
 from tests.unit.mapserver.data import CONFIG, folded, incoming, merged, open_store, random_samples, same, samples
 
@@ -221,7 +221,7 @@ from pathlib import Path
 import numpy as np
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.votes import FoldConfig
+from mapserver.evidence.fold_config import FoldConfig
 
 folder, part, waiting_rows = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 config = FoldConfig()

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import LIVE_ROWS, Grid
-from mapserver.evidence.votes import FoldConfig
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from tests.reference.grid import by_definition, of_grid, plain

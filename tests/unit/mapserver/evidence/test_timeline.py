@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.pages import CELL, PackedPages
 from mapserver.evidence.timeline import DAY_S, HOUR_S, PATIENCE, Space, Tiers, Timeline
-from mapserver.evidence.votes import FoldConfig
 from tests.unit.mapserver.data import same_page
 
 S = 10**9

@@ -13,7 +13,7 @@ from mapserver.ingest import writer as writer_module
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import GROUP_BATCHES, QUEUE_BATCHES, Writer
 from mapserver.journal.journal import Journal
-from mapserver.query.answers import Answers
+from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
 from protocol.wire.messages import Ack

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.votes import FoldConfig
 from mapserver.journal.archive import FOLDER, HOUR_NS, Archive, archive
 from mapserver.journal.history import History, grid_as_of, history_rows, point_history, samples_of
 from mapserver.journal.journal import Journal

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.votes import FoldConfig
 from mapserver.layers.cell_layers import LAYERS, ReadConfig, derive_area, margin_cells, read, required, select
 from mapserver.layers.gap_filling import AREA_LAYERS
 from protocol.config import from_table

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from mapserver.evidence.votes import FoldConfig
+from mapserver.evidence.fold_config import FoldConfig
 from mapserver.trust import coarse_map
 from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.judgement import Reason

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapserver.layers.cell_layers import LAYERS
-from mapserver.query.answers import Answers, reads_past
+from mapserver.query.answering import Answers, reads_past
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.commands import TrustCommand, encode_command

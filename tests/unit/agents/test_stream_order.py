@@ -1,6 +1,6 @@
 import pytest
 
-from agents.drivers.stream_order import LATE_LIMIT, Decision, StreamOrder
+from agents.stream_order import LATE_LIMIT, Decision, StreamOrder
 from protocol.machine.readings import Articulation, Reading
 
 MS = 1_000_000

@@ -14,7 +14,7 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_reply
 from protocol.wire.messages import Ack, Refused
 
-log = logging.getLogger("agents.delivery.link")
+log = logging.getLogger("agents.delivery.uplink_thread")
 
 Sign = Callable[[str, bytes], bytes]  # key expression and payload to signature
 Ask = Callable[[bytes], tuple[Ack | Refused | None, float]]  # payload to reply (None: none), and how long it took [s]

@@ -9,7 +9,7 @@ from mapserver.ingest.writer import Writer
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import LAYERS, ReadConfig
 from mapserver.layers.gap_filling import AREA_LAYERS
-from mapserver.query.answers import Answers
+from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
 from protocol.queries.requests import PointQuery, RegionQuery

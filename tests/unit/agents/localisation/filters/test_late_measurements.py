@@ -9,7 +9,7 @@ import pytest
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Filter, Measurement
 from agents.localisation.filters.ekf import Ekf
-from agents.localisation.filters.history import Fusion
+from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel, motion
 from agents.localisation.filters.state import POSITION, SPEED, VELOCITY, YAW, Layout
 from agents.localisation.filters.ukf import Ukf
