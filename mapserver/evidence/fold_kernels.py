@@ -62,14 +62,7 @@ def fold_sorted(
             x, end_x = max(first_x, left), min(first_x + n, left + 16)
             y, end_y = max(first_y, bottom), min(first_y + n, bottom + 16)
             part = lane[: (end_y - y) * 16]
-            part[:] = 0
-            source = np.uint64(starts[k] + (y - first_y) * n + x - first_x)
-            target = np.uint64(x - left)
-            for _ in range(end_y - y):
-                for i in range(np.uint64(end_x - x)):
-                    lane[target + i] = shares[source + i]
-                source += np.uint64(n)
-                target += np.uint64(16)
+            _lay_out(shares, starts[k] + (y - first_y) * n + x - first_x, n, end_x - x, x - left, part)
             top, end = y - bottom, end_y - bottom
             low, high = min(low, top), max(high, end)
             _vote_all(counts, lines, top, end, part, bins, bin_shares, k)
@@ -90,6 +83,18 @@ def fold_sorted(
             pages += 1
         votes, cells = end_votes, end_cells
     return at, pages, votes, cells
+
+
+@numba.njit(cache=True, nogil=True)
+def _lay_out(shares: Any, first: int, edge: int, width: int, column: int, lane: Any) -> None:
+    """Copy the lines of a stencil that lie in a block into rows of 16 cells, from a column on."""
+    lane[:] = 0
+    source, target = np.uint64(first), np.uint64(column)
+    for _ in range(len(lane) // 16):
+        for i in range(np.uint64(width)):
+            lane[target + i] = shares[source + i]
+        source += np.uint64(edge)
+        target += np.uint64(16)
 
 
 @numba.njit(cache=True, nogil=True)
