@@ -158,6 +158,11 @@ def merged(parts: Iterable[Grid]) -> Grid:
     return first
 
 
+def grid_copy(store: Store) -> Grid:
+    """The map as it is, for another thread than the one that owns the store."""
+    return Grid.from_state(store.grid.cell_m, store.grid.config, store.grid.state())
+
+
 def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Store:
     return Store(folder, site, config, now_ns)
 

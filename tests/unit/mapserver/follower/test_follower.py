@@ -26,6 +26,7 @@ from tests.unit.mapserver.data import (
     NOW_NS,
     SITE,
     folded,
+    grid_copy,
     incoming,
     open_store,
     open_writer,
@@ -51,7 +52,7 @@ class Site:
 
     @property
     def grid(self) -> Grid:
-        return self.writer.run(lambda store: store.grid)
+        return self.writer.run(grid_copy)
 
     def machine(self, name: str) -> dict[str, Any]:
         return next(row for row in self.follower.machines() if row["name"] == name)
@@ -247,7 +248,7 @@ def test_rows_that_are_old_enough_move_to_the_archive_and_the_map_stays(store, t
     shutil.copytree(tmp_path / "store", tmp_path / "copy")  # as a kill leaves it: without a snapshot
     with closing(open_store(tmp_path / "copy")) as again:  # folded from archive and journal
         assert same(again.grid, folded(rows))
-    assert same(writer.run(lambda store: store.grid), folded(rows))
+    assert same(writer.run(grid_copy), folded(rows))
 
 
 def test_where_nothing_was_old_enough_it_looks_again_only_later(store):
