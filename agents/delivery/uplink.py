@@ -1,6 +1,6 @@
 """The rules of delivery, first in first out and at least once: a state machine without I/O, clock or threads.
 
-Each event returns the next action; whoever carries it out (link.py, or a test) reports the result as the next event:
+Each event returns the next action; whoever carries it out (uplink_thread.py, or a test) reports the result as an event:
 
     start_exchange -> ReadHead -> on_head -> Send -> on_reply -> Delete ... -> on_stored -> Wait -> start_exchange
 

@@ -1,4 +1,4 @@
-"""Samples into votes, in numpy: it shares with the kernels of the map server only the tables of votes.py."""
+"""Samples into votes, in numpy: it shares with the kernels of the map server only the tables of fold_config.py."""
 
 from __future__ import annotations
 
