@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from protocol.wire.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.listener import Listener
 from sitegrid.security.join import join
 
+# A server that has just connected to the router may not be seen for a moment: nobody answers then, at once.
+APPEARS_S = 1.0
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
 TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 
@@ -149,11 +152,16 @@ class Client:
 
     def _get(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
         selector = zenoh.Selector(key, selector_of(parameters)) if parameters else zenoh.Selector(key)
-        for reply in self.session.get(selector, timeout=self._timeout_s + wait_s):
-            if reply.ok is not None:
-                return reply.ok.payload.to_bytes()
-            if reply.err is not None and (text := reply.err.payload.to_bytes()) != TIMED_OUT:
-                raise answer_codec.decode_error(text)
+        end_s = time.monotonic() + APPEARS_S
+        while True:
+            for reply in self.session.get(selector, timeout=self._timeout_s + wait_s):
+                if reply.ok is not None:
+                    return reply.ok.payload.to_bytes()
+                if reply.err is not None and (text := reply.err.payload.to_bytes()) != TIMED_OUT:
+                    raise answer_codec.decode_error(text)
+            if time.monotonic() > end_s:
+                break
+            time.sleep(APPEARS_S / 10)
         problem = f"no map server answers for site {self.site!r}: start one with `sitegrid server`, or check the name"
         if self._endpoint.startswith("tls/"):
             problem += "; or these keys may not ask this (see docs/security.md)"

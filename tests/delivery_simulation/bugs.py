@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -121,10 +123,17 @@ def commit_is_assumed(patch: pytest.MonkeyPatch) -> None:
 def failed_commit_stays_open(patch: pytest.MonkeyPatch) -> None:
     """A transaction whose commit fails is not rolled back."""
 
-    def leave(self: Any, kind: object, *_: object) -> None:
-        self._db.execute("ROLLBACK" if kind else "COMMIT")
+    @contextmanager
+    def careless(db: sqlite3.Connection) -> Iterator[None]:
+        db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            db.execute("ROLLBACK")
+            raise
+        db.execute("COMMIT")
 
-    patch.setattr("agents.delivery.spool_file.transaction.__exit__", leave)
+    patch.setattr("agents.delivery.spool.transaction", careless)
 
 
 def drops_are_silent(patch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,8 @@
 import math
 
 import pytest
-from agents.estimation.squat import squat_rad
 
+from agents.estimation.balance import squat_rad
 from protocol.units import GRAVITY_MPS2
 from sim.sensors.presets import load_preset
 from sim.sensors.rigs import machine_config
