@@ -163,10 +163,14 @@ def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
 
 def _settled(settled: CompactPages, fresh: list[PackedPages], tiers: Tiers, space: Space) -> CompactPages:
     votes, cells = len(settled.cells), len(settled.marks)
+    if not cells and len(fresh) == 1 and len(fresh[0].table) <= tiers.keeps[0] and not fresh[0].table[:, 0].any():
+        (only,) = fresh  # few buckets, in order and each once, as the fold or another timeline gives them: all are kept
+        return CompactPages.from_packed(only.table.copy(), only.votes.astype(np.uint64), only.cells)
     table = np.concatenate([settled.table.astype(np.int64), *(pages.table for pages in fresh)])
     space.grow(votes + sum(len(pages.votes) for pages in fresh), cells + sum(len(pages.cells) for pages in fresh))
     row = len(settled.table)
-    settled.expand_into(PackedPages(table[:row], space.votes[:votes], space.cells[:cells].view(CELL)))
+    if cells:
+        settled.expand_into(PackedPages(table[:row], space.votes[:votes], space.cells[:cells].view(CELL)))
     for pages in fresh:
         table[row : row + len(pages.table), 2:4] += votes
         table[row : row + len(pages.table), 4:6] += cells

@@ -25,8 +25,17 @@ from functools import lru_cache
 
 import numpy as np
 
-from agents.localisation.filters import square_root
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
+from agents.localisation.filters.square_root import (
+    bounded,
+    conclude,
+    definite,
+    noise_root,
+    refused,
+    root,
+    wrapped,
+    wrapped_state,
+)
 from protocol.arrays import Floats
 
 
@@ -54,21 +63,19 @@ class Ukf:
         points = self._points(len(belief.x), 0)
         _, d, mean = points.deviations(belief, motion.f, ())
         P = points.W * d.dot(d.T) + motion.Q
-        return square_root.definite(
-            stamp_ns, square_root.wrapped_state(mean, motion.angles), square_root.bounded(P, motion.angles)
-        )
+        return definite(stamp_ns, wrapped_state(mean, motion.angles), bounded(P, motion.angles))
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
-        noise = square_root.noise_root(measurement)
+        noise = noise_root(measurement)
         if noise is None:
-            return square_root.refused(belief, measurement)
+            return refused(belief, measurement)
         k = len(noise)
         points = self._points(len(belief.x), k)
         of_x, d, mean = points.deviations(belief, measurement.h, measurement.angles)
         together = points.root_W * np.concatenate([d, of_x])
         together[:k, -k:] = noise
-        return square_root.conclude(belief, measurement, mean, together)
+        return conclude(belief, measurement, mean, together)
 
     def _points(self, n: int, k: int) -> "SigmaPoints":
         return _sigma_points(n, k, self.alpha, self.beta, 3.0 - n if self.kappa is None else self.kappa)
@@ -92,10 +99,10 @@ class SigmaPoints:
         self, belief: Belief, g: Callable[[Floats], Floats], angles: tuple[int, ...]
     ) -> tuple[Floats, Floats, Floats]:
         """Those of x (n, 2 n + 1 + k) and d of g (j, 2 n + 1 + k) at the points, and the mean (j,) of g."""
-        of_x = square_root.root(belief).dot(self.directions)
+        of_x = root(belief).dot(self.directions)
         values = g((of_x + belief.x[:, None]).T)
         centre = values[0]
-        d = square_root.wrapped(values - centre, angles).T
+        d = wrapped(values - centre, angles).T
         m = d.dot(self.weights)
         if self.surplus:
             d[:, 0] = math.sqrt(self.surplus / self.W) * m
