@@ -11,8 +11,8 @@ import pytest
 from protocol.errors import SitegridError
 from sitegrid import Client, connect
 from sitegrid.process.children import Children, wait_until
+from tests.integration import compose_run
 
-compose_run = pytest.importorskip("compose_run", reason="needs ruamel.yaml, which comes with check-jsonschema")
 pytestmark = pytest.mark.processes
 SERVED_S = 100.0
 
