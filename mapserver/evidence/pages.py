@@ -54,12 +54,6 @@ class PackedPages:
     votes: NDArray[np.unsignedinteger[Any]]
     cells: Table
 
-    @classmethod
-    def from_page(cls, tier: int, index: int, page: Page) -> PackedPages:
-        """One page alone."""
-        votes = page.votes["count"].astype(np.uint64) << np.uint64(16) | page.votes["place"]
-        return cls(np.array([(tier, index, 0, len(votes), 0, len(page.cells))]), votes, page.cells)
-
     def items(self) -> Iterator[tuple[int, int, Page]]:
         """Tier, index on it, and page."""
         votes: Table = np.empty(len(self.votes), NARROW if int(self.votes.max(initial=0)) < 2**32 else WIDE)

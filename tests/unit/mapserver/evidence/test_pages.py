@@ -83,14 +83,6 @@ def test_a_page_shows_its_votes_as_records(count, dtype):
     assert one.votes["count"].tolist() == [count, 1]
 
 
-@given(drawn)
-def test_a_page_alone_is_packed_again_as_it_was(drawn_page):
-    before = packed([drawn_page])
-    again = PackedPages.from_page(0, 0, page(*drawn_page))
-    assert np.array_equal(again.votes, before.votes)
-    assert np.array_equal(again.table, before.table)
-
-
 @given(drawn, st.sets(st.integers(0, 255)))
 def test_a_part_of_the_cells_and_the_rest_are_the_page(drawn_page, chosen):
     one, inside = page(*drawn_page), np.zeros(ev.CELLS, np.bool_)
