@@ -37,7 +37,7 @@ from sitegrid.process.children import Child, Children
 START_NS = 1_767_225_600_000_000_000
 SITE_TOML = 'name = "soak"\norigin_lat_deg = 49.01\norigin_lon_deg = 8.4\n'
 BATCH_S, RATE_HZ = 4.0, 2.5  # of a machine: one batch so often, so many samples a second (5 m/s, one each 2 m)
-ASK_S, PAST_S, LOOK_S = 10.0, 300.0, 60.0  # site time between two questions, two about the past, two looks
+ASK_S, PAST_S, LOOK_S = 10.0, 100.0, 60.0  # site time between two questions, two about the past, two looks
 MOST_GROWTH_PCT = 5.0
 READY_S = 60.0
 
@@ -60,12 +60,15 @@ class Soak:
     sent: int
     late_s: float
 
-    def growth_pct(self, first: float = 0.5) -> float:
-        """Growth of the server from a share of the run to its end; medians of the tenths before them."""
+    def growth_pct(self) -> float:
+        """Growth of the server from the middle third of the run to its last: medians, as each look is up to a tenth off.
+
+        In the first third everything is used for the first time. Between two looks memory goes up and down with what is
+        being answered and folded.
+        """
         memory = [look.server_mib for look in self.looks]
-        span = max(1, len(memory) // 10)
-        middle = max(span, round(first * len(memory)))
-        return 100 * (float(np.median(memory[-span:]) / np.median(memory[middle - span : middle])) - 1)
+        third = max(1, len(memory) // 3)
+        return 100 * (float(np.median(memory[-third:]) / np.median(memory[-2 * third : -third])) - 1)
 
 
 class SoakMachine:
@@ -123,7 +126,7 @@ def report(result: Soak, growth_pct: float) -> None:
     step = max(1, len(result.looks) // 12)
     for look in result.looks[step - 1 :: step]:
         print(f"{look.minute:7.0f} {look.samples:9d} {look.server_mib:12.1f} {look.router_mib:12.1f}")
-    print(f"second half: {growth_pct:+.1f} % of resident memory; sent {result.sent}, late {result.late_s:.0f} s")
+    print(f"last third: {growth_pct:+.1f} % of resident memory; sent {result.sent}, late {result.late_s:.0f} s")
 
 
 def soak(folder: Path, minutes: float, speed: float, machines: int) -> Soak:
