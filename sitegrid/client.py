@@ -92,6 +92,14 @@ class Client:
         query = requests.HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, fresh)
         return answer_codec.decode_history(self._ask(query)).spans
 
+    def tiles(self, since: MapVersion | None = None, *, as_of_ns: int | None = None) -> TilesAnswer:
+        """The map in tiles of 8-bit layers, for pages that draw it: those that differ since a version, or all."""
+        return decode_tiles(self._ask(requests.TilesQuery(since, as_of_ns)))
+
+    def why(self, x_m: float, y_m: float, *, as_of_ns: int | None = None) -> CellReasons:
+        """Everything that is known of the cell at a position in `map`: votes, passes, machines, changes."""
+        return answer_codec.decode_why(self._ask(requests.WhyQuery(float(x_m), float(y_m), as_of_ns)))
+
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
         return answer_codec.decode_info(self._ask(requests.InfoQuery(requests.Freshness(after, wait_s))))

@@ -10,7 +10,7 @@ import numpy as np
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import fold, scratch_block
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
-from mapserver.evidence.pages import CompactPages, Page
+from mapserver.evidence.pages import CompactPages, PackedPages, Page
 from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
 from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -69,6 +69,7 @@ class Grid:
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
+        self._turn, self._turns = 0, dict[Block, int]()  # how often anything was folded; the last turn of each block
         self._scratch, self._space = scratch_block(), Space()
         self._rows: AnyArray = np.empty(waiting_rows, _RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
@@ -105,9 +106,9 @@ class Grid:
             raise ValueError(f"folded otherwise: {other.cell_m} m, {other.config}; {self.cell_m} m, {self.config}")
         self._drain()
         other._drain()
+        self._turn += 1
         for block, timeline in other._timelines.items():
-            self._timeline(block).add(timeline.settled().expanded())
-            self._touched.add(block)
+            self._add(block, timeline.settled().expanded())
         self._folded += other._folded
         self._skipped += other._skipped
         self.newest_ns = max(self.newest_ns, other.newest_ns)
@@ -142,6 +143,11 @@ class Grid:
         self._drain()
         return [self._touched.pop() for _ in range(min(most, len(self._touched)))]
 
+    def folded_since(self, turn: int) -> tuple[list[Block], int]:
+        """Blocks that were folded into after a turn of this grid, all after turn -1; and the turn that it is now."""
+        self._drain()
+        return [block for block, last in self._turns.items() if last > turn], self._turn
+
     def evidence(self, blocks: Iterable[Block]) -> ev.Evidence:
         """Everything that was ever seen of these blocks, whether it still holds or not."""
         return evidence(self.pages(blocks))
@@ -171,7 +177,7 @@ class Grid:
         """Undo `state`."""
         grid = cls(cell_m, config)
         for x, y, pages in state.blocks:
-            grid._timelines[x, y] = Timeline(grid._tiers, grid._space, pages)
+            grid._timelines[x, y], grid._turns[x, y] = Timeline(grid._tiers, grid._space, pages), 0
         grid._folded, grid._skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
         return grid
 
@@ -195,19 +201,21 @@ class Grid:
         if not self._waiting:
             return
         rows, names = self._rows[: self._waiting].view(SAMPLE_DTYPE), self._names[: self._waiting]
+        self._turn += 1
         for x, y, pages in fold(rows, names, self.cell_m, self.config, self._scratch):
-            self._timeline((x, y)).add(pages)
-            self._touched.add((x, y))
+            self._add((x, y), pages)
         voting = int(is_foldable(rows, self.config).sum())
         self._folded += voting
         self._skipped += len(rows) - voting
         self._waiting, self._weight = 0, 0
 
-    def _timeline(self, block: Block) -> Timeline:
+    def _add(self, block: Block, pages: PackedPages) -> None:
         timeline = self._timelines.get(block)
         if timeline is None:
             timeline = self._timelines[block] = Timeline(self._tiers, self._space)
-        return timeline
+        timeline.add(pages)
+        self._touched.add(block)
+        self._turns[block] = self._turn
 
 
 def warm_up(config: FoldConfig) -> None:

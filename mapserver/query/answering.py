@@ -51,6 +51,10 @@ class Answers:
                 return codec.encode_point(self.point(query))
             case RegionQuery():
                 return codec.encode_region(self.region(query))
+            case requests.TilesQuery():
+                return encode_tiles(self.tiles(query))
+            case requests.WhyQuery():
+                return codec.encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
             case requests.MachinesQuery():

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries import parameters as ps
+from protocol.queries.answers import MapVersion
 from protocol.site.geometry import MAX_CELLS, Bounds
 
 MAX_WAIT_S = 60.0
@@ -106,7 +107,30 @@ class ChangesQuery:
     name = "changes"
 
 
-MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | MachinesQuery | ChangesQuery
+@dataclass(frozen=True)
+class TilesQuery:
+    """Tiles of the map: all, or those that differ since a version of it; or all as of a time [ns]."""
+
+    since: MapVersion | None = None
+    as_of_ns: int | None = None
+    fresh = Freshness()
+
+    name = "tiles"
+
+
+@dataclass(frozen=True)
+class WhyQuery:
+    """Everything that is known of the cell at a position in `map` [m]."""
+
+    x_m: float
+    y_m: float
+    as_of_ns: int | None = None
+    fresh = Freshness()
+
+    name = "why"
+
+
+MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | MachinesQuery | ChangesQuery | TilesQuery | WhyQuery
 
 
 def check_size(columns: int, rows: int) -> None:
@@ -123,7 +147,11 @@ def encode_query(query: MapQuery) -> dict[str, str]:
     if isinstance(query, ChangesQuery):
         return {"after": str(query.after)} if query.after else {}
     parameters: dict[str, str] = {}
-    if isinstance(query, PointQuery | HistoryQuery):
+    if isinstance(query, TilesQuery) and query.since:
+        parameters |= {"store": query.since.store, "row": str(query.since.row), "fact": str(query.since.fact)}
+    if isinstance(query, TilesQuery | WhyQuery):
+        parameters |= _stamps({"as_of": query.as_of_ns})
+    if isinstance(query, PointQuery | HistoryQuery | WhyQuery):
         parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
     if isinstance(query, RegionQuery):
         b = query.bounds
@@ -176,6 +204,21 @@ def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
     return HistoryQuery(x_m, y_m, _layers(parameters), from_ns, to_ns, span_s, _freshness(parameters))
 
 
+def _parse_tiles(parameters: ps.Parameters) -> TilesQuery:
+    as_of_ns = ps.stamp(parameters, "as_of")
+    if "store" not in parameters and not {"row", "fact"} & set(parameters):
+        return TilesQuery(None, as_of_ns)
+    if as_of_ns is not None:
+        raise QueryError(Refusal.OUT_OF_RANGE, "`as_of` with a version: the tiles of a time do not change, ask for all")
+    store = ps.required(parameters, "store")
+    row, fact = (ps.count({name: ps.required(parameters, name)}, name) for name in ("row", "fact"))
+    return TilesQuery(MapVersion(store, row, fact))
+
+
+def _parse_why(parameters: ps.Parameters) -> WhyQuery:
+    return WhyQuery(*_place(parameters), ps.stamp(parameters, "as_of"))
+
+
 _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
     "point": (("x", "y", "layers", "as_of", "minus", *_FRESH), _parse_point),
@@ -183,6 +226,8 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
+    "tiles": (("store", "row", "fact", "as_of"), _parse_tiles),
+    "why": (("x", "y", "as_of"), _parse_why),
     "info": (_FRESH, lambda parameters: InfoQuery(_freshness(parameters))),
 }
 
