@@ -17,7 +17,7 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import LIVE_ROWS, REFOLD_ROWS, Grid
 from mapserver.ingest.admission import GapError, admit, parse
 from mapserver.journal.archive import FOLDER, Archive
-from mapserver.journal.history import History, history_rows
+from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Admission, Selection
 from mapserver.trust.decisions import KIND as TRUST
@@ -204,8 +204,8 @@ class Store:
     def _fold_tail(self, grid: Grid, merged: int, excluded: frozenset[str]) -> None:
         """Fold what a grid does not hold yet."""
         history = History(self.journal, Archive(self.folder / FOLDER))
-        for row in history_rows(history, after=merged, selection=Selection(without=excluded)):
-            grid.fold(row.rows, row.machine)
+        for rows in read_history(history, after=merged, selection=Selection(without=excluded)):
+            grid.fold_all(rows.samples, rows.names())
 
 
 @contextmanager
