@@ -1,4 +1,5 @@
 import json
+import shutil
 import sys
 from itertools import islice
 
@@ -8,16 +9,18 @@ import pytest
 from benchmarks import merge, merge_memory, merge_restart, merge_work
 from benchmarks.__main__ import main
 from benchmarks.measure import START_NS, scattered, track
-from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, Polars
+from benchmarks.merge_sums import AddAt, BoostHistogram, DuckDb, HardVotes, PlainC, Polars
 
 SIDE = 1024
 LIBRARIES = {HardVotes: "numba", AddAt: "numpy", BoostHistogram: "boost_histogram", Polars: "polars", DuckDb: "duckdb"}
 
 
-@pytest.mark.parametrize("kind", LIBRARIES)
+@pytest.mark.parametrize("kind", [*LIBRARIES, PlainC])
 @pytest.mark.parametrize("draw", [track, scattered])
 def test_every_library_finds_the_same_sums(kind, draw):
-    pytest.importorskip(LIBRARIES[kind])
+    if kind is PlainC and not shutil.which("cc"):
+        pytest.skip("no compiler")
+    pytest.importorskip(LIBRARIES.get(kind, "numpy"))
     rows, sums = draw(3000), kind(SIDE)
     rows["x_m"][1::2], rows["y_m"][1::2] = rows["x_m"][::2], rows["y_m"][::2]  # cells that are hit again
     for part in (rows[:1000], rows[1000:]):
@@ -43,9 +46,10 @@ def test_merge_measures_every_variant_on_every_pattern(capsys):
         assert [r["variant"] for r in rows if r["pattern"] == pattern] == [
             v for v in merge.VARIANTS if v not in missing
         ]
-    columns = {"variant", "pattern", "samples", "msamples_per_s", "ratio_to_add_at", "us_per_batch_of_100"}
-    assert all(set(row) == columns for row in rows)
-    assert all(value > 0 for row in rows for value in row.values() if not isinstance(value, str))
+    figures = {"msamples_per_s", "cpu_msamples_per_s", "ratio_to_add_at", "batch_us_median", "batch_us_amortised"}
+    assert all(set(row) == {"variant", "buffer", "pattern", "samples"} | figures for row in rows)
+    assert all(row[name] > 0 for row in rows for name in figures)
+    assert [row["buffer"] for row in rows if row["buffer"]] == 2 * ["refold", "live", "live_read"]
     assert [row["ratio_to_add_at"] for row in rows if row["variant"] == "np.add.at"] == [1.0, 1.0]
 
 
@@ -58,8 +62,23 @@ def test_shares_and_ratios_are_those_of_the_figures(monkeypatch, capsys):
         assert row["samples"] == max(100, 20_000 // share)
     rows = [row for row in rows if row["variant"] != "soft_votes"]
     for hard, yardstick in (rows[:2], rows[2:]):
-        expected = hard["msamples_per_s"] / yardstick["msamples_per_s"]
+        expected = hard["cpu_msamples_per_s"] / yardstick["cpu_msamples_per_s"]
         assert hard["ratio_to_add_at"] == pytest.approx(expected, rel=0.02)
+
+
+def test_a_second_of_site_time_is_read_at_once():
+    rows = track(250)  # 10 ms apart, the first one at the beginning of a second
+    parts = list(merge._spans(rows, merge.SECOND_NS))
+    assert [len(part) for part in parts] == [100, 100, 50]
+    assert np.concatenate(parts).tobytes() == rows.tobytes()
+    assert [len(part) for part in merge._spans(rows, 0)] == [250]
+
+
+def test_a_variant_without_a_compiler_is_absent(monkeypatch, capsys):
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    result = merged(capsys, "--samples", "100")
+    assert "hard_votes in C" not in {row["variant"] for row in result["rows"]}
+    assert "compiler" in result["missing"]["hard_votes in C"]
 
 
 @pytest.mark.parametrize(
