@@ -33,7 +33,7 @@ Start = Callable[[], tuple[Fold, End]]  # of a run: what folds samples, and what
 class Variant:
     """A way to merge samples.
 
-    make: gives what starts a run, or ImportError or FileNotFoundError where something is missing; install: what that is.
+    make: gives what starts a run; ImportError or FileNotFoundError where something is missing, and install says what.
     buffer: of soft votes. shares: of each pattern one in so many samples is folded, where that is not all: the slow
     ones need not take minutes.
     """
