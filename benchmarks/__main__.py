@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from benchmarks import filter as filters
-from benchmarks import ingest, live, merge, merge_memory, merge_restart, sim
+from benchmarks import ingest, live, merge, merge_memory, merge_restart, query, sim
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 
@@ -30,6 +30,7 @@ OPTIONS = {
     "runs": ("N", _count, "of each variant; the median counts"),
     "samples": ("N", _count, "in a run, or a journal"),
     "steps": ("N", _count, "in a run"),
+    "queries": ("N", _count, "of each kind"),
     "hours": ("H", _positive, "of work"),
     "seconds": ("S", _positive, "simulated, or of the site's time, in a run"),
 }
@@ -47,6 +48,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         "processor time of a server at work, by thread",
         {"hours": 2.0, "seconds": 120.0},
     ),
+    "query": (query.run, "queries of a real server, while samples come in", {"hours": HOURS, "queries": 200}),
     "ingest": (ingest.run, "samples that the server takes, from bytes to the grid", {"runs": 5, "samples": 20_000}),
     "sim": (sim.run, "simulated time of small and large fleets, sensors on", {"runs": 5, "seconds": 20.0}),
     "filter": (filters.run, "steps of the filters, and a whole agent's CPU and memory", {"runs": 5, "steps": 1000}),

@@ -13,15 +13,13 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-
 from benchmarks.measure import START_NS, Report, machine
-from benchmarks.merge_work import BATCH, LEG_SAMPLES, MACHINES, batches, samples_of
+from benchmarks.merge_work import BATCH, Batches, batches, samples_of, seconds_of
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import warm_up
 from mapserver.follower.jobs import Audit, ChangeSearch
@@ -29,16 +27,13 @@ from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.ingest.writer import GROUP_BATCHES, Writer
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Auditor
-from protocol.arrays import Table
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()
 GOALS = {"look": 10.0, "sum": 60.0}
-A_SECOND = 6  # samples of one machine
 ANSWERED_S = 60.0
-Batches = Sequence[tuple[str, Table]]
 
 
 def run(hours: float, seconds: float) -> Report:
@@ -69,7 +64,7 @@ def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:
         search = ChangeSearch(writer, reader, lambda _: None, threading.Event())
         audit.run()
         search.run()
-        ms = _each_second(link, audit, search, islice(_seconds(work), seconds))
+        ms = _each_second(link, audit, search, islice(seconds_of(work), seconds))
         ms["audit"] += _own_ms(_judging(before)) / CONFIG.trust.judge_s
         ms["snapshot"] = link.cpu_ms(lambda: _snapshot(writer), own=True) / CONFIG.store.snapshot_s
         return ms
@@ -118,15 +113,6 @@ def _each_second(link: Link, audit: Audit, search: ChangeSearch, seconds: Iterat
         ms["audit"].append(link.cpu_ms(audit.run, own=True))
     means = {name: statistics.fmean(figures) for name, figures in ms.items()}
     return means | {"audit": statistics.median(ms["audit"])}
-
-
-def _seconds(work: Iterator[tuple[str, Table]]) -> Iterator[Batches]:
-    """What each machine sends in each second, as it drives on."""
-    parts = MACHINES * LEG_SAMPLES // BATCH
-    while leg := list(islice(work, parts)):
-        machines = {name: np.concatenate([rows for other, rows in leg if other == name]) for name, _ in leg}
-        for first in range(0, LEG_SAMPLES, A_SECOND):
-            yield [(name, rows[first : first + A_SECOND]) for name, rows in machines.items()]
 
 
 def _judging(work: Batches) -> Callable[[], object]:
