@@ -11,10 +11,20 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mapserver.journal.rows import ALL, Event, JournalRow, Selection, Watermark, checksum, extent_checksum, unpack
+from mapserver.journal.rows import (
+    ALL,
+    Event,
+    JournalRow,
+    Selection,
+    StoreIdentity,
+    Watermark,
+    checksum,
+    extent_checksum,
+    unpack,
+)
 from protocol.errors import StoreError
 
-SCHEMA = 3  # the only one: a journal of another one is refused
+SCHEMA = 4  # the only one: a journal of another one is refused
 # When and where the samples of a row lie is a table of its own: 50 bytes a row, so that a read by time and place passes
 # over rows without touching the pages of their payloads. Such a read cannot see that it misses a row where a bit of its
 # extent has flipped; so extents have a checksum of their own, which is checked on opening.
@@ -94,6 +104,13 @@ class JournalQueries:
         """The newest stamp of all samples, archived or not: the site's now."""
         return self._number("SELECT COALESCE(MAX(newest_ns), 0) FROM watermark")
 
+    def identity(self) -> StoreIdentity:
+        """Which store this is; StoreError where that is damaged."""
+        words = self._meta().get("store", "").split()
+        if len(words) < 2 or words[-1] != f"{checksum(*words[:-1]):08x}":
+            raise self._damaged("the id of the store")
+        return StoreIdentity(words[0], tuple(words[1:-1]))
+
     @property
     def archived_row(self) -> int:
         """The last row that has moved to the archive."""
@@ -107,12 +124,14 @@ class JournalQueries:
         return [self._event(*values) for values in self._query(query, (after, kind))]
 
     def check(self) -> None:
-        """Check extents, events and watermarks; StoreError where one is damaged. Rows are checked when they are read.
+        """Check identity, extents, events and watermarks; StoreError where one is damaged.
 
-        A damaged extent would hide its row from a read by time and place, without any error.
+        Rows are checked when they are read. A damaged extent would hide its row from a read by time and place, without
+        any error.
         """
         self._db.execute("BEGIN")  # one state for all of it, also while a server writes
         try:
+            self.identity()
             self._require_each(self._extent_rows(), self.archived_row, self._last_row())
             self._require_each((event.id for event in self.events()), 0)
             self._load_watermarks()
