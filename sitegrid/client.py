@@ -10,9 +10,20 @@ import zenoh
 
 from protocol.errors import LinkError
 from protocol.queries import answer_codec, requests
-from protocol.queries.answers import GroundChange, HistorySpan, MachineState, MapInfo, PointAnswer, Region, TrustAnswer
+from protocol.queries.answers import (
+    CellReasons,
+    GroundChange,
+    HistorySpan,
+    MachineState,
+    MapInfo,
+    MapVersion,
+    PointAnswer,
+    Region,
+    TrustAnswer,
+)
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
+from protocol.queries.tiles import TilesAnswer, decode_tiles
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
@@ -106,11 +117,12 @@ class Client:
 
     def machines(self, *, after: int = 0, wait_s: float = 10.0) -> list[MachineState]:
         """What the server knows of each machine: whether it is trusted, why, and what it sent."""
-        return answer_codec.decode_machines(self._ask(requests.MachinesQuery(requests.Freshness(after, wait_s))))
+        asked = requests.MachinesQuery(requests.Freshness(after, wait_s))
+        return list(answer_codec.decode_machines(self._ask(asked)).machines)
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with an id beyond `after`: when, where, how many cells, from what to what."""
-        return answer_codec.decode_changes(self._ask(requests.ChangesQuery(after)))
+        return list(answer_codec.decode_changes(self._ask(requests.ChangesQuery(after))).changes)
 
     def on_change(self, callback: Callable[[GroundChange], object]) -> Listener[GroundChange]:
         """Call `callback`, on a thread of its own, with each change that is found or grows, until the handle is closed.
@@ -150,10 +162,7 @@ class Client:
 
     def _ask(self, query: requests.MapQuery) -> bytes:
         wait_s = query.fresh.wait_s if query.fresh.after else 0.0
-        if isinstance(query, requests.HistoryQuery) or (
-            isinstance(query, requests.PointQuery | requests.RegionQuery) and query.when != requests.NOW
-        ):
-            wait_s += PAST_S
+        wait_s += PAST_S if _of_past(query) else 0.0
         return self._get(keys.map_query(self.site, query.name), requests.encode_query(query), wait_s)
 
     def _command(self, command: TrustCommand) -> TrustAnswer:
@@ -190,3 +199,11 @@ def connect(
     """
     config = join(endpoint, keys, site=site)
     return Client(open_session(config), config.endpoint, site, timeout_s)
+
+
+def _of_past(query: requests.MapQuery) -> bool:
+    if isinstance(query, requests.TilesQuery | requests.WhyQuery):
+        return query.as_of_ns is not None
+    if isinstance(query, requests.PointQuery | requests.RegionQuery):
+        return query.when != requests.NOW
+    return isinstance(query, requests.HistoryQuery)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import fold, scratch_block
@@ -89,12 +90,15 @@ class Grid:
 
     def fold(self, rows: Table, machine: str) -> None:
         """Fold samples of one machine; commutative, not idempotent: exactly-once is decided at the journal."""
+        self.fold_all(rows, np.full(len(rows), name_hash(machine), np.uint64))
+
+    def fold_all(self, rows: Table, names: NDArray[np.uint64]) -> None:
+        """Fold samples of several machines; names (n,): hash of each one's name."""
         if not len(rows):
             return
         self.newest_ns = max(self.newest_ns, int(rows["stamp_ns"].max()))
-        name = name_hash(machine)
         for first in range(0, len(rows), PIECE):
-            self._take(np.ascontiguousarray(rows[first : first + PIECE]), name)
+            self._take(np.ascontiguousarray(rows[first : first + PIECE]), names[first : first + PIECE])
 
     def merge(self, other: Grid) -> None:
         """Add the evidence of another grid: the fold of both sets of samples, bit for bit.
@@ -181,7 +185,7 @@ class Grid:
         grid._folded, grid._skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
         return grid
 
-    def _take(self, rows: Table, name: int) -> None:
+    def _take(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Let rows wait; what waits is folded before its weight could exceed a count."""
         weight = int(rows["distance_m"].sum(dtype=np.float64) * ev.WEIGHT_UNITS_PER_M) + len(rows)
         if self._weight + weight > ev.COUNT_MAX:
@@ -191,8 +195,8 @@ class Grid:
             part = rows[: len(self._rows) - self._waiting]
             end = self._waiting + len(part)
             self._rows[self._waiting : end] = part.view(_RAW_SAMPLE)
-            self._names[self._waiting : end] = name
-            self._waiting, rows = end, rows[len(part) :]
+            self._names[self._waiting : end] = names[: len(part)]
+            self._waiting, rows, names = end, rows[len(part) :], names[len(part) :]
             if end == len(self._rows):
                 self._drain()
 

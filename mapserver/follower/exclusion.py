@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Mapping
-from dataclasses import asdict
 
 from mapserver.evidence.grid import REFOLD_ROWS, Grid
 from mapserver.ingest.writer import Writer
@@ -77,7 +76,7 @@ class Exclusion:
             self._changed.notify_all()
 
     def _keep(self, decision: TrustDecision) -> None:
-        self._writer.run(lambda store: store.journal.append_event(KIND, decision.stamp_ns, asdict(decision)))
+        self._writer.run(lambda store: store.decide(decision))
         values = (decision.machine, decision.trusted, decision.by, decision.reason)
         log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
         with self._changed:

@@ -8,15 +8,17 @@ decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulate
 from __future__ import annotations
 
 import json
+import secrets
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
-from mapserver.journal.rows import Admission, Watermark, checksum, extent_checksum, pack
+from mapserver.journal.records import record
+from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, extent_checksum
 from protocol.errors import StoreError
 
 _WAL_LIMIT = 64 * 2**20
@@ -28,7 +30,8 @@ class Journal(JournalQueries):
 
     last_row: int
 
-    def __init__(self, path: Path, site: str, frame: str) -> None:
+    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
+        """descends: ids of the stores that a new one is made from."""
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as opened:
@@ -39,7 +42,7 @@ class Journal(JournalQueries):
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
-                self._create_or_check(site, frame)
+                self._create_or_check(site, frame, descends)
                 self.check()
                 self._return_to_disk()
             except sqlite3.Error as error:
@@ -61,18 +64,11 @@ class Journal(JournalQueries):
     def append(self, admission: Admission, received_ns: int) -> int:
         """Write one row and its watermark into the open transaction; returns the row's number."""
         batch = admission.batch
-        payload = pack(batch.rows)
         x_m, y_m, stamps = (batch.rows[name] for name in ("x_m", "y_m", "stamp_ns"))
         first_ns, last_ns = int(stamps.min()), int(stamps.max())
-        spool = _spool_bytes(batch.spool_id)
         row = self.last_row + 1
-        crc32 = checksum(row, batch.machine, spool, batch.first_seq, received_ns, payload)
-        values = (row, batch.machine, spool, batch.first_seq, len(batch.rows), received_ns)
-        self._db.execute(
-            "INSERT INTO journal (row, machine, spool_id, first_seq, n, received_ns, first_stamp_ns, last_stamp_ns,"
-            " payload, crc32) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*values, first_ns, last_ns, payload, crc32),
-        )
+        written = JournalRow(row, batch.machine, batch.spool_id, batch.first_seq, batch.rows, received_ns)
+        self._db.execute("INSERT INTO journal VALUES (?, ?)", (row, record(written)))
         box = (float(x_m.min()), float(y_m.min()), float(x_m.max()), float(y_m.max()))
         extent = (row, first_ns, last_ns, *box)
         self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, extent_checksum(*extent)))
@@ -154,11 +150,13 @@ class Journal(JournalQueries):
             self.rollback()
             raise
 
-    def _create_or_check(self, site: str, frame: str) -> None:
+    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
         expected = {"schema": str(SCHEMA), "site": site, "frame": frame}
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
             self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
-            self._db.executemany("INSERT INTO meta VALUES (?, ?)", expected.items())
+            words = (secrets.token_hex(8), *descends)
+            store = " ".join((*words, f"{checksum(*words):08x}"))
+            self._db.executemany("INSERT INTO meta VALUES (?, ?)", {**expected, "store": store}.items())
             self._db.execute("COMMIT")
         meta = self._meta()
         for key, value in expected.items():

@@ -70,7 +70,9 @@ class Tiles:
         with self._lock:
             version, stamp_ns = self._update()
             since = query.since
-            whole = since is None or since.store != version.store or since.row > version.row or since.fact > version.fact
+            whole = (
+                since is None or since.store != version.store or since.row > version.row or since.fact > version.fact
+            )
             tiles = (tile for tile in self._tiles.values() if whole or _is_newer(tile, since))
             return TilesAnswer(version, stamp_ns, self._cell_m, whole, tuple(tiles))
 
@@ -134,5 +136,3 @@ def _put(squares: dict[Place, _Square], block: Block, planes: Plane, newest_ns: 
     square.planes[: len(planes), rows, columns] = planes.reshape(-1, BLOCK_CELLS, BLOCK_CELLS)
     square.newest_ns[rows, columns] = newest_ns.reshape(BLOCK_CELLS, BLOCK_CELLS)
     return place
-
-

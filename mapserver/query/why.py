@@ -19,7 +19,9 @@ from protocol.arrays import AnyArray
 from protocol.queries.answers import CellReasons, MapVersion, Votes
 from protocol.site.geometry import BLOCK_CELLS
 
-LAYERS = tuple(name for name in cell_layers.LAYERS if name not in ("age_s", "changed_s"))  # which follow from the stamps
+LAYERS = tuple(
+    name for name in cell_layers.LAYERS if name not in ("age_s", "changed_s")
+)  # which follow from the stamps
 MACHINE_SHIFT = 58  # the top six bits of a name's hash choose its bit
 
 

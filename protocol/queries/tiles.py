@@ -1,4 +1,4 @@
-"""Tiles: the map in squares of 64 x 64 cells, a few layers in 8 bits each, for pages that draw it (docs/protocol.md)."""
+"""Tiles: the map in squares of 64 x 64 cells, a few layers in 8 bits each, for pages that draw it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ Plane = NDArray[np.uint8]
 class Scale:
     """What 8 bits mean: 0 unknown, 1 to 255 a value.
 
-    kind: "log" and "linear" from low to high, in even steps; "count" the value itself; "since" seconds before the newest
-    sample of the tile, low (2^((q - 1) / steps) - 1).
+    kind: "log" and "linear" from low to high, in even steps; "count" the value itself; "since" seconds before the
+    newest sample of the tile, low (2^((q - 1) / steps) - 1).
     """
 
     kind: Literal["log", "linear", "count", "since"]
@@ -67,12 +67,12 @@ class Scale:
         return out
 
 
-# A step of c_rr is 1.8 %, of a slope 0.2 % of grade; the past is told apart to 4 %, up to a week. Cells in which machines
-# drove and measured nothing have visits alone.
+# A step of c_rr is 1.8 %, one of a slope 0.3 % of grade, one of time 4 %, up to a week. Cells in which machines drove
+# and measured nothing have visits alone.
 PLANES: dict[str, Scale] = {
     "resistance": Scale("log", 0.004, 0.4),
     "confidence": Scale("linear", 0.0, 1.0),
-    "grade": Scale("linear", 0.0, 0.5),
+    "grade": Scale("linear", 0.0, 0.75),
     "grade_std": Scale("linear", 0.0, 0.25),
     "visits": Scale("count"),
     "since": Scale("since", low=10.0, steps=16.0),
@@ -102,7 +102,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class TilesAnswer:
-    """Tiles of one version of the map. whole: all that there are; else those that differ since the version asked with."""
+    """Tiles of one version of the map. whole: all that there are; else those that differ since a version."""
 
     version: MapVersion
     stamp_ns: int
@@ -133,9 +133,9 @@ def decode_tiles(data: bytes) -> TilesAnswer:
 def _tile(row: Any, index: int) -> Tile:
     if type(row) is not list or [type(value) for value in row] != [int] * 5 + [bytes]:
         raise MessageError(Refusal.WRONG_TYPE, "five whole numbers and bytes are expected", field="tiles", row=index)
-    *numbers, planes = row
-    if any(abs(number) > MAX_SEQ for number in numbers):
-        raise MessageError(Refusal.OUT_OF_RANGE, f"{numbers}", field="tiles", row=index)
+    x, y, version_row, fact, newest_ns, planes = row
+    if any(abs(number) > MAX_SEQ for number in row[:-1]):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{row[:-1]}", field="tiles", row=index)
     stream = zlib.decompressobj()
     try:
         length = len(stream.decompress(planes, len(PLANES) * AREA + 1))
@@ -144,4 +144,4 @@ def _tile(row: Any, index: int) -> Tile:
     if length != len(PLANES) * AREA or not stream.eof:
         problem = f"{length} bytes of planes, {len(PLANES)} take {len(PLANES) * AREA}"
         raise MessageError(Refusal.COLUMN_LENGTH, problem, field="tiles", row=index)
-    return Tile(*numbers, planes)
+    return Tile(x, y, version_row, fact, newest_ns, planes)
