@@ -116,7 +116,7 @@ def served_mb(hours: float) -> dict[str, float]:
 
 
 def _are_judged(machines: bytes) -> bool:
-    return all("cells" in machine.evidence for machine in decode_machines(machines))
+    return all("cells" in machine.evidence for machine in decode_machines(machines).machines)
 
 
 def _wait(what: str, condition: Callable[[], bool]) -> None:
