@@ -106,7 +106,11 @@ class Agent:
             "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._given_up},
             "spool_problem": self._spool_problem,
             "calibration_problem": self._calibration_file.problem,
-            "uplink": {"problem": uplink.held or uplink.problem, "counters": dict(uplink.counters)},
+            "uplink": {
+                "problem": uplink.held or uplink.problem,
+                "counters": dict(uplink.counters),
+                "ack_ms_max": round(uplink.ack_s_max * 1e3),
+            },
             "holdout": self._holdout.report() if self._holdout else None,
         }
 

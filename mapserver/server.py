@@ -30,20 +30,24 @@ log = logging.getLogger("mapserver")
 
 
 class Server:
-    """Serves one site over an open session until closed. answers: the map, for callers in this process."""
+    """Serves one site over two open sessions until closed. answers: the map, for callers in this process."""
 
     def __init__(
         self,
-        session: zenoh.Session,
+        ingest: zenoh.Session,
+        readers: zenoh.Session,
         folder: Path,
         site: SiteConfig,
         config: ServerConfig,
         now_ns: Callable[[], int],
         verify: Verify | None = None,
     ) -> None:
-        """verify: of signed batches, see Store; without it signatures are not asked for."""
+        """ingest: for batches alone, since an answer that nobody takes holds up its whole link. readers: for all else.
+
+        verify: of signed batches, see Store; without it signatures are not asked for.
+        """
         self._writer = Writer(Store(folder, site, config, now_ns, verify))
-        self._changed = session.declare_publisher(
+        self._changed = readers.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
         self._follower = Follower(self._writer, self._publish)
@@ -53,9 +57,9 @@ class Server:
         self._past_thread = ThreadPoolExecutor(1, thread_name_prefix="past")
         self._command_thread = ThreadPoolExecutor(1, thread_name_prefix="command")
         self._queryables = [
-            session.declare_queryable(keys.ingest_all(site.name), self._on_batch),
-            session.declare_queryable(keys.map_queries_all(site.name), self._on_query),
-            session.declare_queryable(keys.admin_all(site.name), self._on_command),
+            ingest.declare_queryable(keys.ingest_all(site.name), self._on_batch),
+            readers.declare_queryable(keys.map_queries_all(site.name), self._on_query),
+            readers.declare_queryable(keys.admin_all(site.name), self._on_command),
         ]
 
     @property

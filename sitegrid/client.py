@@ -19,8 +19,8 @@ from protocol.wire.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.listener import Listener
 from sitegrid.security.join import join
 
-# A server that has just connected to the router may not be seen for a moment: nobody answers then, at once.
-APPEARS_S = 1.0
+# Nobody answers, at once: the server starts again, or has just connected (Zenoh issue 2767). It may answer in a moment.
+AGAIN_S = 0.1
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
 TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 
@@ -28,7 +28,9 @@ TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 class Client:
     """Asks the map server of one site.
 
-    Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read).
+    Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read). A
+    question that nobody takes, or whose server ends, is asked again for timeout_s: a restart of router or server shows
+    as an answer that comes later.
     Arguments of several methods: layers: names, none for all. after: answer once this journal row is merged, and wait
     for it at most wait_s [s]. as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
     Times are stamps, UTC in nanoseconds.
@@ -153,17 +155,20 @@ class Client:
 
     def _get(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
         selector = zenoh.Selector(key, selector_of(parameters)) if parameters else zenoh.Selector(key)
-        end_s = time.monotonic() + APPEARS_S
-        while True:
-            for reply in self.session.get(selector, timeout=self._timeout_s + wait_s):
+        held_s, text = time.monotonic(), b""  # until when somebody held the question; the last error reply
+        end_s = held_s + self._timeout_s + wait_s
+        while (asked_s := time.monotonic()) < min(end_s, held_s + self._timeout_s):
+            for reply in self.session.get(selector, timeout=end_s - asked_s):
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
                 if reply.err is not None and (text := reply.err.payload.to_bytes()) != TIMED_OUT:
                     raise answer_codec.decode_error(text)
-            if time.monotonic() > end_s:
-                break
-            time.sleep(APPEARS_S / 10)
+            if time.monotonic() > asked_s + AGAIN_S:
+                held_s = time.monotonic()
+            time.sleep(AGAIN_S)
         problem = f"no map server answers for site {self.site!r}: start one with `sitegrid server`, or check the name"
+        if text == TIMED_OUT:
+            problem = f"the map server of site {self.site!r} did not answer in time: it hangs, or has too much to do"
         if self._endpoint.startswith("tls/"):
             problem += "; or these keys may not ask this (see docs/security.md)"
         raise LinkError(self._endpoint, problem)

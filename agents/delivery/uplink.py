@@ -143,6 +143,7 @@ class Uplink:
     """Delivery of one machine's samples.
 
     held: why nothing is sent although it could be, empty if it is. problem: what keeps samples from the server now.
+    ack_s_max: the longest time from the first sending of a batch until samples of it were acknowledged.
     """
 
     def __init__(
@@ -158,6 +159,7 @@ class Uplink:
         self.counters: Counter[str] = Counter()
         self.problem = ""
         self.held = ""
+        self.ack_s_max = 0.0
         self._frame = frame
         self._pacing = pacing or Pacing()
         self._rng = rng or np.random.default_rng()
@@ -166,6 +168,7 @@ class Uplink:
         self._failures = 0
         self._head: Head | None = None  # of the batch under way
         self._took_s = 0.0  # by its exchange
+        self._unacknowledged_s = 0.0  # since samples were sent that no acknowledgement has answered
 
     def start_exchange(self) -> ReadHead | Wait:
         """Begin: at the start, and after each pause."""
@@ -186,6 +189,7 @@ class Uplink:
     def on_reply(self, reply: Ack | Refused | None, took_s: float) -> SpoolAction | Wait:
         """Act on the reply to the last batch, None for none. took_s: how long the exchange took."""
         self._took_s = took_s
+        self._unacknowledged_s += took_s
         if reply is None:
             return self._on_silence()
         return self._on_refused(reply) if isinstance(reply, Refused) else self._on_ack(reply)
@@ -226,7 +230,7 @@ class Uplink:
         return self._back_off()
 
     def _on_ack(self, ack: Ack) -> SpoolAction | Wait:
-        head = self._head
+        head, waited_s, self._unacknowledged_s = self._head, self._unacknowledged_s, 0.0
         if head is None:
             return self._succeed(0.0)
         if not len(head.rows):  # an earlier run is closed, even if the server is older than the run
@@ -239,6 +243,7 @@ class Uplink:
             self.problem = f"the map server acknowledges {ack.watermark}, which is not what was sent"
             return self._back_off()
         self.counters["batches"] += 1
+        self.ack_s_max = max(self.ack_s_max, waited_s)
         return Delete(head.spool_id, ack.watermark)
 
     def _on_refused(self, refused: Refused) -> SpoolAction | Wait:
@@ -272,4 +277,6 @@ class Uplink:
     def _back_off(self) -> Wait:
         self._failures += 1
         pause_s = min(self._pacing.backoff_s * 2 ** min(self._failures - 1, 10), self._pacing.max_backoff_s)
-        return Wait(float(pause_s * self._rng.uniform(0.5, 1.0)))
+        pause_s = float(pause_s * self._rng.uniform(0.5, 1.0))
+        self._unacknowledged_s += pause_s
+        return Wait(pause_s)

@@ -54,13 +54,15 @@ def run(arguments: Namespace) -> int:
     config = from_table(ServerConfig, table, str(arguments.config))
     with ExitStack() as opened:
         warm_up(config.fold)
-        session = open_session(join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name))
-        opened.callback(session.close)
-        server = Server(session, arguments.store, site, config, time.time_ns, _verifier(arguments.signed))
+        joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
+        ingest, readers = open_session(joined), open_session(joined)
+        for session in (ingest, readers):
+            opened.callback(session.close)
+        server = Server(ingest, readers, arguments.store, site, config, time.time_ns, _verifier(arguments.signed))
         opened.callback(server.close)
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:
-            ready["metrics"] = _export(opened, session, server, site.name, arguments)
+            ready["metrics"] = _export(opened, readers, server, site.name, arguments)
         say(ready)
         while not stop.wait(0.5):
             if server.failed:

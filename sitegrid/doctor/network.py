@@ -212,7 +212,12 @@ def receive_health(session: zenoh.Session, site: str, machine: str) -> Health | 
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | None = None) -> bytes | None:
-    for reply in session.get(key, payload=payload, attachment=attachment, timeout=ANSWER_S):
-        if reply.ok is not None:
-            return reply.ok.payload.to_bytes()
-    return None
+    """The answer, None for none. A server that has just connected may not be seen yet: it is asked for a moment."""
+    end_s = time.monotonic() + KNOWN_S
+    while True:
+        for reply in session.get(key, payload=payload, attachment=attachment, timeout=ANSWER_S):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+        if time.monotonic() > end_s:
+            return None
+        time.sleep(KNOWN_S / 10)

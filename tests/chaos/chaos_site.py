@@ -65,6 +65,8 @@ class ChaosSite:
         self.excuses: tuple[str, ...] = ()  # last words with which a process may end, to be started again
         self.outcome = FaultOutcome("")
         self.faults: list[TimeSpan] = []
+        self.named = 0  # lost samples that were not declared, but that some log, health or metric told of
+        self._ack_ms: list[int] = []
         self._recordings, self._first_ns = recordings, first_ns
         self._running: dict[str, Process] = {}
         self._starts = 0
@@ -122,6 +124,7 @@ class ChaosSite:
         works = process.said("ready") and not process.said("ended")  # before and after, SIGTERM is Python's own
         if code and (code != -signal.SIGTERM or works):
             self.problem(f"{role} ended with {code} on SIGTERM: {process.last_words()}")
+        self._note_report(process)
 
     def expect_end(self, role: str) -> tuple[int | None, str]:
         """Start what cannot run; returns its exit code, None if it does run, and its last words."""
@@ -139,6 +142,7 @@ class ChaosSite:
                 words = process.last_words()
                 if not process.said("ended") and not any(excuse in words for excuse in self.excuses):
                     self.problem(f"{role} ended with {process.code}: {words}")
+                self._note_report(process)
                 self.start(role)
 
     @contextmanager
@@ -178,6 +182,7 @@ class ChaosSite:
         for machine, process in zip(self.machines, drained, strict=True):
             self._running.pop(machine)
             process.end()
+            self._note_report(process)
             if process.code:
                 self.problem(f"{process.log.name} could not deliver: {process.last_words()}")
         self.stop(SERVER)
@@ -195,6 +200,11 @@ class ChaosSite:
         except StoreError:  # being made, or recovered
             return {}
         return counts
+
+    def _note_report(self, process: Process) -> None:
+        """Take what an agent reported when it ended."""
+        if report := process.line("ended"):
+            self._ack_ms.append(report["uplink"]["ack_ms_max"])
 
     def _resume(self) -> None:
         before = self.progress()
@@ -215,8 +225,11 @@ class ChaosSite:
             declared = sum(mark.lost for mark in reader.watermarks().values())
         out = self.outcome
         out.recorded, out.merged, out.double = result.recorded, result.merged, result.double
-        out.lost = result.lost - min(declared, result.lost)
-        out.notes |= {"declared": declared, "unrecorded": result.unrecorded, "rows": len(rows)}
+        out.declared = min(declared, result.lost)
+        out.lost = result.lost - out.declared
+        out.silent = max(0, out.lost - self.named)
+        out.ack_ms_max = max(self._ack_ms, default=0)
+        out.notes |= {"declared in all": declared, "unrecorded": result.unrecorded, "rows": len(rows)}
         if result.unrecorded:
             self.problem(f"{result.unrecorded} samples in the journal that nobody recorded")
         # Undo the server's clock having been an hour off: no scenario lasts that long.

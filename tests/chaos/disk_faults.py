@@ -107,6 +107,7 @@ def judge(outcome: FaultOutcome, promises: str, left: Remains) -> None:
     kept = sum(content in left.contents.get(identity, ()) for identity, content in promised.items())
     outcome.merged += kept
     outcome.lost += len(promised) - kept
+    outcome.silent += len(promised) - kept
     outcome.double += sum(len(contents) - 1 for contents in left.contents.values())
     if left.problem and len(outcome.problems) < 5:
         outcome.problems.append(left.problem)
@@ -166,7 +167,7 @@ LOOK = {"spool": _look_at_spool, "store": _look_at_store}
 
 
 def add(total: FaultOutcome, part: FaultOutcome) -> None:
-    for name in ("count", "recorded", "merged", "lost", "double"):
+    for name in ("count", "recorded", "merged", "lost", "double", "silent"):
         setattr(total, name, getattr(total, name) + getattr(part, name))
     total.problems += part.problems
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 END_S = 10.0  # after SIGTERM; then it is killed
 # The kernel kills the children of a suite that was itself killed.
@@ -42,6 +44,11 @@ class Process:
     def said(self, key: str) -> bool:
         """Whether a line with this key was printed."""
         return f'"{key}":' in self.log.with_suffix(".out").read_text(encoding="utf-8")
+
+    def line(self, key: str) -> Any:
+        """The value of the line that was printed with this key, None where there is none."""
+        lines = self.log.with_suffix(".out").read_text(encoding="utf-8").splitlines()
+        return next((json.loads(line)[key] for line in lines if line.startswith(f'{{"{key}":')), None)
 
     def last_words(self) -> str:
         """The last line on standard error."""

@@ -11,8 +11,11 @@ from typing import Any
 
 TimeSpan = tuple[float, float]  # [s] of one clock
 
-COLUMNS = ("fault", "count", "recorded", "merged", "lost", "double", "longest pause", "")
-LINE = "{:<8}{:>8}{:>10}{:>10}{:>6}{:>8}{:>15}  {}"
+COLUMNS = (
+    *("fault", "count", "recorded", "merged", "declared", "lost", "double", "silent", "longest ack", "longest pause"),
+    "",
+)
+LINE = "{:<16}{:>6}{:>10}{:>9}{:>10}{:>6}{:>8}{:>8}{:>13}{:>15}  {}"
 
 
 class InterruptError(Exception):
@@ -23,17 +26,22 @@ class InterruptError(Exception):
 class FaultOutcome:
     """Result of one fault.
 
-    count: how often it struck; recorded: samples in the audit files; declared: those of the lost that were declared
-    to the server. longest_pause_s: between two commits of one machine, without the time that faults lasted; None where
-    nothing runs meanwhile. skipped: why it did not run.
+    count: how often it struck; recorded: samples in the audit files; declared: those that are in no journal and were
+    declared lost to the server; lost: those that are in no journal and were not; silent: those of the lost that no log,
+    health or metric named either. ack_ms_max: the longest time from the first sending of a batch until it was
+    acknowledged, as agents that ended in order report it; longest_pause_s: between two commits of one machine, without
+    the time that faults lasted; both None where no agents run. skipped: why it did not run.
     """
 
     fault: str
     count: int = 0
     recorded: int = 0
     merged: int = 0
+    declared: int = 0
     lost: int = 0
     double: int = 0
+    silent: int = 0
+    ack_ms_max: int | None = None
     longest_pause_s: float | None = None
     skipped: str = ""
     problems: list[str] = field(default_factory=list)
@@ -43,7 +51,7 @@ class FaultOutcome:
     @property
     def is_good(self) -> bool:
         """Nothing lost, nothing double, and nothing else that should not be."""
-        return self.lost == self.double == 0 and not self.problems
+        return self.lost == self.double == self.silent == 0 and not self.problems
 
 
 @dataclass(frozen=True)
@@ -94,8 +102,10 @@ def table(outcomes: Iterable[FaultOutcome]) -> str:
 
 def _row(outcome: FaultOutcome) -> tuple[str, ...]:
     if outcome.skipped:
-        return (outcome.fault, *("-",) * 6, f"skipped: {outcome.skipped}")
+        return (outcome.fault, *("-",) * 9, f"skipped: {outcome.skipped}")
     pause = "-" if outcome.longest_pause_s is None else f"{outcome.longest_pause_s:.1f} s"
-    counts = (outcome.count, outcome.recorded, outcome.merged, outcome.lost, outcome.double)
+    ack = "-" if outcome.ack_ms_max is None else f"{outcome.ack_ms_max} ms"
+    names = ("count", "recorded", "merged", "declared", "lost", "double", "silent")
+    counts = (getattr(outcome, name) for name in names)
     verdict = "ok" if outcome.is_good else "FAILED: " + "; ".join(outcome.problems or ["lost or double"])
-    return (outcome.fault, *map(str, counts), pause, verdict)
+    return (outcome.fault, *map(str, counts), ack, pause, verdict)

@@ -241,7 +241,7 @@ def uplink_of(session: zenoh.Session, path: Path, n: int) -> Iterator[Spool]:
 @contextlib.contextmanager
 def server_at(endpoint: str, folder: Path) -> Iterator[None]:
     session: Any = open_session(SessionConfig(endpoint))
-    server = Server(session, folder, SITE, ServerConfig(), time.time_ns)
+    server = Server(session, session, folder, SITE, ServerConfig(), time.time_ns)
     yield
     server.close()
     session.close()

@@ -48,6 +48,9 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
     assert outcome.count == 4
     assert outcome.recorded == outcome.merged > 30
     assert outcome.longest_pause_s is not None
+    assert (outcome.declared, outcome.silent) == (0, 0)
+    assert outcome.ack_ms_max is not None
+    assert 0 < outcome.ack_ms_max < 60_000
     assert len(set(outcome.pids)) >= 4 + 4 + 2, "a process of its own for every start"
     assert not any(Path(f"/proc/{pid}").exists() for pid in outcome.pids)
 
@@ -183,7 +186,9 @@ def test_a_loss_fails_the_suite_and_an_error_in_one_fault_lets_the_others_run(tm
         raise RuntimeError("broke")
 
     faults = (
-        ChaosFault("kills", lambda s: FaultOutcome("kills", count=7, recorded=9, merged=8, lost=1)),
+        ChaosFault(
+            "kills", lambda s: FaultOutcome("kills", count=7, recorded=9, merged=8, lost=1, silent=1, ack_ms_max=40)
+        ),
         ChaosFault("power", breaks),
         ChaosFault("cable", lambda s: FaultOutcome("cable", skipped="not permitted")),
     )
@@ -195,6 +200,7 @@ def test_a_loss_fails_the_suite_and_an_error_in_one_fault_lets_the_others_run(tm
     lines = capsys.readouterr().out.splitlines()
     result = json.loads(lines[-1])
     assert result | {"kills": 7, "recorded": 9, "merged": 8, "lost": 1, "double": 0, "ok": False} == result
+    assert result | {"declared": 0, "silent": 1, "ack_ms_max": 40} == result
     assert "RuntimeError: broke" in result["faults"][1]["problems"][0]
     assert any("skipped: not permitted" in line for line in lines)
 
@@ -202,7 +208,16 @@ def test_a_loss_fails_the_suite_and_an_error_in_one_fault_lets_the_others_run(tm
 def test_a_skipped_fault_is_no_failure():
     outcomes = [FaultOutcome("kills", count=1), FaultOutcome("cable", skipped="not permitted")]
     assert totals(outcomes, 1)["ok"]
+    assert totals(outcomes, 1)["ack_ms_max"] == 0
     assert table(outcomes).splitlines()[1].endswith("ok")
+
+
+def test_a_loss_that_was_named_fails_the_suite_and_is_not_silent():
+    outcome = FaultOutcome("restored_store", recorded=9, merged=8, lost=1)
+    assert not outcome.is_good
+    header, row = (line.split()[:8] for line in table([outcome]).splitlines())
+    shown = dict(zip(header, row, strict=True))
+    assert (shown["declared"], shown["lost"], shown["silent"]) == ("0", "1", "0")
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ def sessions():
 @pytest.fixture
 def served(sessions, tmp_path):
     router, client = sessions
-    server = Server(router, tmp_path, SITE, CONFIG, now_ns)
+    server = Server(router, router, tmp_path, SITE, CONFIG, now_ns)
     yield server, client
     server.close()
 
@@ -112,7 +112,7 @@ def test_a_bug_in_a_query_is_answered(served, monkeypatch):
 @pytest.mark.parametrize(("query_threads", "together"), [(1, False), (2, True)])
 def test_so_many_queries_are_answered_at_once(sessions, tmp_path, monkeypatch, query_threads, together):
     router, client = sessions
-    server = Server(router, tmp_path, SITE, replace(CONFIG, query_threads=query_threads), now_ns)
+    server = Server(router, router, tmp_path, SITE, replace(CONFIG, query_threads=query_threads), now_ns)
     both = threading.Barrier(2)
     met = []
 
@@ -137,12 +137,12 @@ def test_so_many_queries_are_answered_at_once(sessions, tmp_path, monkeypatch, q
 
 def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     router, client = sessions
-    server = Server(router, tmp_path, SITE, CONFIG, now_ns)
+    server = Server(router, router, tmp_path, SITE, CONFIG, now_ns)
     deliver(client, batch(samples(5)))
     server.close()
     assert not server.failed
     assert list(client.get(keys.ingest("pit", "a"), payload=b"", timeout=WAIT_S)) == []  # nobody listens
-    server = Server(router, tmp_path, SITE, CONFIG, now_ns)
+    server = Server(router, router, tmp_path, SITE, CONFIG, now_ns)
     ack = deliver(client, batch(samples(0)))
     assert ack == Ack(5, 1, store=ack.store)
     assert server.answers.info()["samples_merged"] == 5

@@ -550,3 +550,21 @@ def test_runs_that_are_left_over_do_not_wait_for_one_another(tmp_path: Path) -> 
 def test_bad_timeout_is_refused_by_name(timeout_s: float) -> None:
     with pytest.raises(ValueError, match="timeout_s"):
         UplinkConfig(timeout_s)
+
+
+def test_the_longest_acknowledgement_counts_from_the_first_sending():
+    uplink = Uplink("loader-1", SITE.frame, TIMEOUT_S)
+    head = Head(7, 1, ROWS[:10], 0, newest=10)
+
+    def exchange(reply: Ack | None, took_s: float) -> SpoolAction | Wait:
+        uplink.on_head(head, 7)
+        return uplink.on_reply(reply, took_s)
+
+    assert isinstance(exchange(Ack(10, 1, 0), 0.2), Delete)
+    assert uplink.ack_s_max == 0.2
+    pause = exchange(None, TIMEOUT_S)
+    assert isinstance(pause, Wait)
+    exchange(Ack(10, 2, 0), 0.1)
+    assert uplink.ack_s_max == pytest.approx(TIMEOUT_S + pause.seconds + 0.1), "with the pause, and both exchanges"
+    exchange(Ack(10, 3, 0), 0.3)
+    assert uplink.ack_s_max > TIMEOUT_S, "it keeps the longest"

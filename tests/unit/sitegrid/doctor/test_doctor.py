@@ -341,7 +341,9 @@ def test_a_healthy_site_passes_and_nothing_is_left_behind(site: Site, capsys):
     filled_store(site.folder / "store")
     with closing(Spool(site.folder / "spool.db", SpoolConfig())):
         pass
-    with closing(Server(site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)) as server:
+    with closing(
+        Server(site.session, site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)
+    ) as server:
         files = ("--site-file", site.site_file, "--store", site.folder / "store", "--spool", site.folder / "spool.db")
         code, findings = site.doctor(capsys, *files)
         info = server.answers.info()
@@ -356,7 +358,7 @@ def test_a_healthy_site_passes_and_nothing_is_left_behind(site: Site, capsys):
 
 def test_the_wrong_site_file_is_found_out(site: Site, capsys):
     site.site_file.write_text(SITE_TOML.replace("48.0", "47.0"))
-    with closing(Server(site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)):
+    with closing(Server(site.session, site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)):
         code, findings = site.doctor(capsys, "--site-file", site.site_file, "--machine", "loader-7")
     assert code == 1
     assert findings["site"].level == Level.FAIL

@@ -1,0 +1,108 @@
+"""What a client sees while router or server come and go (docs/protocol.md, Answers that do not come)."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pytest
+
+from protocol.errors import LinkError
+from protocol.queries.answers import MapInfo
+from protocol.wire import keys
+from protocol.wire.session import free_endpoint
+from sim.config import SimConfig
+from sitegrid import Client, connect
+from sitegrid.process.children import Children, wait_until
+from tests.integration.site_run import SiteRun, kill  # beside this file
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.fixture
+def site(tmp_path, children: Children) -> SiteRun:
+    return SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
+
+
+@pytest.fixture
+def asking() -> Iterator[Callable[[Client], Future[MapInfo]]]:
+    """Asks on a thread of its own; the question is out when this returns."""
+    with ThreadPoolExecutor(1) as pool:
+
+        def ask(client: Client) -> Future[MapInfo]:
+            out, get = threading.Event(), client.session.get
+
+            def noted(*words, **options):
+                out.set()
+                return get(*words, **options)
+
+            client.session = _Noted(client.session, noted)  # type: ignore[assignment]
+            answer = pool.submit(client.info)
+            assert out.wait(10.0)
+            return answer
+
+        yield ask
+
+
+class _Noted:
+    """A session whose questions are noted."""
+
+    def __init__(self, session, get) -> None:
+        self._session, self.get = session, get
+
+    def __getattr__(self, name: str):
+        return getattr(self._session, name)
+
+
+def raw(client: Client, timeout_s: float) -> list[bytes]:
+    """Replies of Zenoh itself: errors alone are expected."""
+    replies = client.session.get(keys.map_query(client.site, "info"), timeout=timeout_s)
+    return [reply.err.payload.to_bytes() for reply in replies]
+
+
+def test_a_server_that_is_restarted_in_between_answers_later(site: SiteRun, asking):
+    site.start_router()
+    kill(site.start_server())
+    with site.connect() as client:
+        wait_until(lambda: raw(client, 5.0) == [], 20.0, "nobody answers, at once")
+        answer = asking(client)
+        site.start_server()
+        assert answer.result(20.0).site.name == site.site
+
+
+def test_a_question_that_dies_with_its_server_is_asked_again(site: SiteRun, asking):
+    site.start_router()
+    server = site.start_server()
+    with site.connect() as client:
+        server.send(signal.SIGSTOP)
+        answer = asking(client)
+        kill(server)
+        site.start_server()
+        assert answer.result(20.0).site.name == site.site
+
+
+def test_a_router_that_is_restarted_in_between_costs_time_alone(site: SiteRun, asking):
+    router = site.start_router()
+    site.start_server()
+    with site.connect() as client:
+        kill(router)
+        answer = asking(client)
+        site.start_router()
+        assert answer.result(20.0).site.name == site.site
+
+
+def test_a_server_that_hangs_is_no_answer_in_time(site: SiteRun):
+    site.start_router()
+    server = site.start_server()
+    with connect(site.endpoint, site.site, timeout_s=1.0) as client:
+        server.send(signal.SIGSTOP)
+        began_s = time.monotonic()
+        with pytest.raises(LinkError, match="did not answer in time"):
+            client.info()
+        assert 1.0 <= time.monotonic() - began_s < 3.0
+        assert raw(client, 0.5) == [b"Timeout"], "of Zenoh itself, no map"
+        server.send(signal.SIGCONT)
+        assert client.info().site.name == site.site
