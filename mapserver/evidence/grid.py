@@ -14,7 +14,7 @@ from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.pages import CompactPages, Page
 from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
 from protocol.arrays import AnyArray, Table
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 # Samples that wait to be folded together: the more, the fewer pages. While machines drive, the map is read every second
@@ -22,7 +22,6 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 LIVE_ROWS, REFOLD_ROWS = 8192, 131_072
 PIECE = 4096  # samples whose weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
-_RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records field by field, and these at once
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Grid:
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
         self._scratch, self._space = scratch_block(), Space()
-        self._rows: AnyArray = np.empty(waiting_rows, _RAW_SAMPLE)
+        self._rows: AnyArray = np.empty(waiting_rows, RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
         self._waiting, self._weight = 0, 0
 
@@ -119,7 +118,7 @@ class Grid:
     def resize_buffer(self, waiting_rows: int) -> None:
         """Let so many samples wait from now on."""
         self._drain()
-        self._rows, self._names = np.empty(waiting_rows, _RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
+        self._rows, self._names = np.empty(waiting_rows, RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
 
     def blocks_in(self, window: CellWindow) -> list[Block]:
         """Block columns and rows with evidence that the window touches."""
@@ -188,7 +187,7 @@ class Grid:
         while len(rows):
             part = rows[: len(self._rows) - self._waiting]
             end = self._waiting + len(part)
-            self._rows[self._waiting : end] = part.view(_RAW_SAMPLE)
+            self._rows[self._waiting : end] = part.view(RAW_SAMPLE)
             self._names[self._waiting : end] = names[: len(part)]
             self._waiting, rows, names = end, rows[len(part) :], names[len(part) :]
             if end == len(self._rows):

@@ -33,6 +33,23 @@ class SampleBatch:
 
 
 @dataclass(frozen=True)
+class PackedBatch:
+    """A batch whose samples nobody has looked at yet. n: how many; columns: as on the wire, in the order of COLUMNS."""
+
+    machine: str
+    spool_id: int
+    first_seq: int
+    frame: str
+    lost_before: int
+    n: int
+    columns: tuple[bytes, ...]
+
+    def with_rows(self, rows: Table) -> SampleBatch:
+        """The batch with its columns as rows."""
+        return SampleBatch(self.machine, self.spool_id, self.first_seq, rows, self.frame, self.lost_before)
+
+
+@dataclass(frozen=True)
 class Ack:
     """Everything up to `watermark` is on the server's disk. row: the journal row; trimmed: samples it had already."""
 
