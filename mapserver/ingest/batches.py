@@ -6,6 +6,7 @@ What is refused, and why, is what `protocol.wire.codec.decode_batch` says of eac
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Floats32, Table
 from protocol.errors import MessageError
-from protocol.machine.samples import COLUMNS, GRADE, LIMITS, RESISTANCE, SAMPLE_DTYPE, check_samples
+from protocol.machine.samples import COLUMNS, GRADE, LIMITS, RESISTANCE, SAMPLE_DTYPE, check_samples, empty
 from protocol.wire.codec import unpack_batch
 from protocol.wire.messages import PackedBatch, SampleBatch
 
@@ -49,7 +50,8 @@ def decode_batches(payloads: Sequence[bytes], extent_m: float) -> list[SampleBat
 
 def warm_up() -> None:
     """Compile the kernels, or read them from their cache, before a batch waits for them."""
-    one = PackedBatch("", 1, 1, "", 0, 1, tuple(bytes(SAMPLE_DTYPE[name].itemsize) for name in COLUMNS))
+    columns = tuple(bytes(SAMPLE_DTYPE[name].itemsize) for name in COLUMNS)
+    one = PackedBatch(SampleBatch("", 1, 1, empty(), ""), 1, columns)
     _decode([one], 1.0)
 
 
@@ -78,7 +80,7 @@ def _batch(batch: PackedBatch, rows: Table, extent_m: float, is_plausible: bool)
             check_samples(rows, extent_m)  # which names field and row
         except MessageError as error:
             return error
-    return batch.with_rows(rows)
+    return replace(batch.batch, rows=rows)
 
 
 @numba.njit(cache=True, nogil=True)

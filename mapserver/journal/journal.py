@@ -8,8 +8,9 @@ decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulate
 from __future__ import annotations
 
 import json
+import secrets
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +30,8 @@ class Journal(JournalQueries):
 
     last_row: int
 
-    def __init__(self, path: Path, site: str, frame: str) -> None:
+    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
+        """descends: ids of the stores that a new one is made from."""
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as opened:
@@ -40,7 +42,7 @@ class Journal(JournalQueries):
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
-                self._create_or_check(site, frame)
+                self._create_or_check(site, frame, descends)
                 self.check()
                 self._return_to_disk()
             except sqlite3.Error as error:
@@ -145,11 +147,13 @@ class Journal(JournalQueries):
             self.rollback()
             raise
 
-    def _create_or_check(self, site: str, frame: str) -> None:
+    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
         expected = {"schema": str(SCHEMA), "site": site, "frame": frame}
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
             self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
-            self._db.executemany("INSERT INTO meta VALUES (?, ?)", expected.items())
+            words = (secrets.token_hex(8), *descends)
+            store = " ".join((*words, f"{checksum(*words):08x}"))
+            self._db.executemany("INSERT INTO meta VALUES (?, ?)", {**expected, "store": store}.items())
             self._db.execute("COMMIT")
         meta = self._meta()
         for key, value in expected.items():

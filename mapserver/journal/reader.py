@@ -15,7 +15,17 @@ from typing import Any
 import numpy as np
 
 from mapserver.journal.records import decoded
-from mapserver.journal.rows import ALL, Event, JournalRow, JournalRows, Selection, Watermark, checksum, extent_checksum
+from mapserver.journal.rows import (
+    ALL,
+    Event,
+    JournalRow,
+    JournalRows,
+    Selection,
+    StoreIdentity,
+    Watermark,
+    checksum,
+    extent_checksum,
+)
 from protocol.errors import StoreError
 
 SCHEMA = 4  # the only one: a journal of another one is refused
@@ -117,6 +127,13 @@ class JournalQueries:
         """The newest stamp of all samples, archived or not: the site's now."""
         return self._number("SELECT COALESCE(MAX(newest_ns), 0) FROM watermark")
 
+    def identity(self) -> StoreIdentity:
+        """Which store this is; StoreError where that is damaged."""
+        words = self._meta().get("store", "").split()
+        if len(words) < 2 or words[-1] != f"{checksum(*words[:-1]):08x}":
+            raise self._damaged("the id of the store")
+        return StoreIdentity(words[0], tuple(words[1:-1]))
+
     @property
     def archived_row(self) -> int:
         """The last row that has moved to the archive."""
@@ -130,12 +147,14 @@ class JournalQueries:
         return [self._event(*values) for values in self._query(query, (after, kind))]
 
     def check(self) -> None:
-        """Check extents, events and watermarks; StoreError where one is damaged. Rows are checked when they are read.
+        """Check identity, extents, events and watermarks; StoreError where one is damaged.
 
-        A damaged extent would hide its row from a read by time and place, without any error.
+        Rows are checked when they are read. A damaged extent would hide its row from a read by time and place, without
+        any error.
         """
         self._db.execute("BEGIN")  # one state for all of it, also while a server writes
         try:
+            self.identity()
             self._require_each(self._extent_rows(), self.archived_row, self._last_row())
             self._require_each((event.id for event in self.events()), 0)
             self._load_watermarks()

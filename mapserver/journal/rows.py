@@ -144,6 +144,14 @@ class Watermark:
 
 
 @dataclass(frozen=True)
+class StoreIdentity:
+    """Which store this is. id: drawn when it is made, and kept by its copies; descends: of what it was folded from."""
+
+    id: str
+    descends: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Event:
     """Something that the server has to remember and that is no sample; body: plain values."""
 

@@ -1,7 +1,9 @@
 """Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong."""
 
 import math
+import re
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -9,7 +11,7 @@ import numpy as np
 
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
-from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples
+from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples, empty
 from protocol.site.site_config import NAME
 from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
 
@@ -22,6 +24,8 @@ MAX_DEPTH = 16  # of plain values
 MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
 _WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
+_NO_ROWS = empty()
+STORE_ID = re.compile(r"[0-9a-f]{16}")
 
 
 def pack(table: dict[str, Any]) -> bytes:
@@ -96,6 +100,14 @@ def _take_name(table: dict[str, Any], field: str = "machine") -> str:
     return name
 
 
+def take_store(table: dict[str, Any], name: str = "store", *, optional: bool = False) -> str:
+    """Take the id of a store; empty where it is optional and missing."""
+    text: str = take(table, name, str, "" if optional else None)
+    if not STORE_ID.fullmatch(text) and (text or not optional):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{text[:40]!r} is no id of a store", field=name)
+    return text
+
+
 def _take_stamp(table: dict[str, Any]) -> int:
     return _take_int(table, "stamp_ns", 1, MAX_STAMP_NS)
 
@@ -115,6 +127,8 @@ def encode_batch(batch: SampleBatch) -> bytes:
     }
     if batch.lost_before:
         table["lost_before"] = batch.lost_before
+    if batch.store:
+        table["store"] = batch.store
     return pack(table)
 
 
@@ -128,7 +142,7 @@ def decode_batch(data: bytes, extent_m: float) -> SampleBatch:
     for name, column in zip(COLUMNS, packed.columns, strict=True):
         rows[name] = np.frombuffer(column, SAMPLE_DTYPE[name])
     check_samples(rows, extent_m)
-    return packed.with_rows(rows)
+    return replace(packed.batch, rows=rows)
 
 
 def unpack_batch(data: bytes) -> PackedBatch:
@@ -137,15 +151,16 @@ def unpack_batch(data: bytes) -> PackedBatch:
     n = _take_int(table, "n", 0, MAX_BATCH_SAMPLES, Refusal.TOO_LARGE)
     first_seq = _take_int(table, "first_seq", 1, MAX_SEQ, Refusal.FIRST_SEQ)
     lost_before = _take_int({"lost_before": 0, **table}, "lost_before", 0, first_seq - 1)
-    return PackedBatch(
+    batch = SampleBatch(
         machine=_take_name(table),
         spool_id=_take_int(table, "spool_id", 1, MAX_U64),
         first_seq=first_seq,
+        rows=_NO_ROWS,
         frame=take(table, "frame", str),
         lost_before=lost_before,
-        n=n,
-        columns=_columns(take(table, "cols", dict), n),
+        store=take_store(table, optional=True),
     )
+    return PackedBatch(batch, n, _columns(take(table, "cols", dict), n))
 
 
 def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
@@ -162,7 +177,8 @@ def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
 def encode_reply(reply: Ack | Refused) -> bytes:
     """The server's answer to a batch."""
     if isinstance(reply, Ack):
-        return pack({"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed})
+        table = {"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed}
+        return pack({**table, "store": reply.store} | ({"replaces": reply.replaces} if reply.replaces else {}))
     return pack({"ack": False, "reason": reply.reason, "problem": reply.problem, "expected": reply.expected})
 
 
@@ -170,8 +186,8 @@ def decode_reply(data: bytes) -> Ack | Refused:
     """Undo `encode_reply`."""
     table = unpack(data, MAX_SMALL_BYTES)
     if take(table, "ack", bool):
-        numbers = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
-        return Ack(*numbers)
+        watermark, row, trimmed = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
+        return Ack(watermark, row, trimmed, take_store(table), take_store(table, "replaces", optional=True))
     return Refused(take(table, "reason", str), take(table, "problem", str), _take_int(table, "expected", 0, MAX_SEQ))
 
 
