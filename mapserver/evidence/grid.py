@@ -41,13 +41,14 @@ class PlacedPage:
 class GridState:
     """Everything that a snapshot keeps; equal grids have equal states.
 
-    blocks: column, row and pages of each block, in the order of places. newest_ns: of all samples, 0 for none.
+    blocks: column, row and pages of each block, in the order of places. newest_ns, oldest_ns: of all samples, or 0.
     """
 
     blocks: tuple[tuple[int, int, CompactPages], ...]
     folded: int
     skipped: int
     newest_ns: int
+    oldest_ns: int
 
     @property
     def pages(self) -> list[PlacedPage]:
@@ -60,13 +61,13 @@ class GridState:
 
 
 class Grid:
-    """Evidence of one site. newest_ns: the newest stamp of all samples."""
+    """Evidence of one site. newest_ns, oldest_ns: the newest and the oldest stamp of all samples, 0 for none."""
 
     def __init__(self, cell_m: float, config: FoldConfig, waiting_rows: int = LIVE_ROWS) -> None:
         """waiting_rows: so many samples are folded together, LIVE_ROWS or REFOLD_ROWS; the grid is the same."""
         self.cell_m = cell_m
         self.config = config
-        self.newest_ns = 0
+        self.newest_ns = self.oldest_ns = 0
         self._folded = self._skipped = 0
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
@@ -97,7 +98,7 @@ class Grid:
         """Fold samples of several machines; names (n,): hash of each one's name."""
         if not len(rows):
             return
-        self.newest_ns = max(self.newest_ns, int(rows["stamp_ns"].max()))
+        self._widen(int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max()))
         for first in range(0, len(rows), PIECE):
             self._take(np.ascontiguousarray(rows[first : first + PIECE]), names[first : first + PIECE])
 
@@ -118,7 +119,7 @@ class Grid:
             self._turns[block] = self._turn
         self._folded += other._folded
         self._skipped += other._skipped
-        self.newest_ns = max(self.newest_ns, other.newest_ns)
+        self._widen(other.oldest_ns, other.newest_ns)
 
     @contextmanager
     def bulk(self, workers: Workers = ALONE) -> Iterator[None]:
@@ -185,7 +186,7 @@ class Grid:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()
         blocks = ((x, y, self._timelines[x, y].settled()) for x, y in sorted(self._timelines))
-        return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns)
+        return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns, self.oldest_ns)
 
     @classmethod
     def from_state(cls, cell_m: float, config: FoldConfig, state: GridState) -> Grid:
@@ -193,8 +194,14 @@ class Grid:
         grid = cls(cell_m, config)
         for x, y, pages in state.blocks:
             grid._timelines[x, y], grid._turns[x, y] = Timeline(grid._tiers, grid._spaces[0], pages), 0
-        grid._folded, grid._skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
+        grid._folded, grid._skipped = state.folded, state.skipped
+        grid.newest_ns, grid.oldest_ns = state.newest_ns, state.oldest_ns
         return grid
+
+    def _widen(self, oldest_ns: int, newest_ns: int) -> None:
+        """Take in the span of stamps of other samples; 0, 0 for none."""
+        self.newest_ns = max(self.newest_ns, newest_ns)
+        self.oldest_ns = min(self.oldest_ns or oldest_ns, oldest_ns or self.oldest_ns)
 
     def _take(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Let rows wait; what waits is folded before its weight could exceed a count."""

@@ -78,7 +78,8 @@ class Answers:
 
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
-        return {**self._writer.info(), "layers": [*cell_layers.LAYERS, *AREA_LAYERS]}
+        names = {"layers": [*cell_layers.LAYERS, *AREA_LAYERS], "boundaries": list(self._config.read.boundaries)}
+        return {**self._writer.info(), **names}
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""

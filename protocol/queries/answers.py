@@ -133,7 +133,8 @@ class MapInfo:
 
     store: its id; descends: ids of the stores that it was folded from; fact: see MapVersion. journalled, merged,
     snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks with evidence; None
-    without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    without any. first_ns, stamp_ns: the map's oldest stamp, and the site's now; 0 without any. wall_ns: the server's
+    clock. distrusted: machines whose samples are excluded. boundaries: of the classes of resistance.
     """
 
     site: SiteInfo
@@ -147,6 +148,7 @@ class MapInfo:
     samples_too_unsure: int
     cells: int
     bounds: tuple[int, int, int, int] | None
+    first_ns: int
     stamp_ns: int
     wall_ns: int
     version: str
@@ -155,6 +157,7 @@ class MapInfo:
     distrusted: tuple[str, ...]
     counters: Mapping[str, int]
     layers: tuple[str, ...]
+    boundaries: tuple[float, ...]
 
 
 @dataclass(frozen=True)

@@ -123,8 +123,9 @@ class Door:
             if info.bounds:
                 table["bounds"] = await _geodetic_bounds(door, info)
             if kind == "value":
+                scale, offset = mercator.coding(layer)
                 coding = "value = offset + scale * (65536 * red + 256 * green + blue); red = green = blue = 0: unknown"
-                table |= {"encoding": coding, "scale": mercator.SCALE, "offset": mercator.OFFSET, "unknown": 0}
+                table |= {"encoding": coding, "scale": scale, "offset": offset, "unknown": 0}
             return _json(table)
         except Exception as error:
             return _failed(request, error)
@@ -160,10 +161,10 @@ class Door:
     async def _metrics(self, _: Request) -> Response:
         lines = ["# TYPE sitegrid_web_total counter"]
         lines += [f'sitegrid_web_total{{event="{name}"}} {n}' for name, n in sorted(self.guard.counts.items())]
-        lines += ["# TYPE sitegrid_web_pages gauge"]
-        lines += [f'sitegrid_web_pages{{site="{door.name}"}} {door.watchers}' for door in self._doors.values()]
-        lines += ["# TYPE sitegrid_web_server_away gauge"]
-        lines += [f'sitegrid_web_server_away{{site="{door.name}"}} {int(door.is_away)}' for door in self._doors.values()]
+        doors = self._doors.values()
+        for name, figures in (("pages", [d.watchers for d in doors]), ("server_away", [int(d.is_away) for d in doors])):
+            lines.append(f"# TYPE sitegrid_web_{name} gauge")
+            lines += [f'sitegrid_web_{name}{{site="{d.name}"}} {n}' for d, n in zip(doors, figures, strict=True)]
         return PlainTextResponse("\n".join(lines) + "\n", media_type="text/plain; version=0.0.4")
 
 
@@ -179,7 +180,7 @@ async def _png(door: SiteDoor, info: MapInfo, kind: str, layer: str, place: tupl
     region = await door.ask(door.client.region, bounds, (layer,))
     edges = region.bounds
     found = pixels.sample(region[layer], edges.west_m, edges.south_m, cell_m)
-    return mercator.value_png(found) if kind == "value" else mercator.colour_png(found, layer)
+    return mercator.value_png(found, layer) if kind == "value" else mercator.colour_png(found, layer)
 
 
 def _common(bounds: Bounds, info: MapInfo) -> Bounds | None:

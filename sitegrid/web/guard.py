@@ -71,9 +71,8 @@ class Guard:
             raise Problem(HTTPStatus.REQUEST_URI_TOO_LONG, "too_large", f"more than {MAX_QUERY} bytes of address")
         if int(headers.get("content-length", "0") or 0) or "transfer-encoding" in headers:
             raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too_large", "the door takes no body")
-        if origin := headers.get("origin"):
-            if urlsplit(origin).netloc != headers.get("host"):
-                raise Problem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
+        if (origin := headers.get("origin")) and urlsplit(origin).netloc != headers.get("host"):
+            raise Problem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
         self._count_rate(scope)
         if self._person and scope["path"] not in OPEN_PATHS and not self._person(_token(scope, headers)):
             detail = "a visitor's token is needed: ask the office for one, and open the link with it"

@@ -81,12 +81,11 @@ class _Page:
             news = {"state": "away"} if door.is_away else {"state": "live", "site": door.state}
             await self._timely(socket.send_text(json.dumps(news if door.state or door.is_away else {})))
         if self._sent is None and not door.is_away and (answer := door.since(self._version)):
-            if answer.tiles or answer.version != self._version:
-                if answer.tiles or self._version is None or answer.whole:
-                    self._sent, self._sent_s = answer.version, now_s
-                    await self._timely(socket.send_bytes(frame(answer)))
-                else:
-                    self._version = answer.version  # nothing that the page shows is another one
+            if answer.tiles or answer.whole:
+                self._sent, self._sent_s = answer.version, now_s
+                await self._timely(socket.send_bytes(frame(answer)))
+            else:
+                self._version = answer.version  # nothing that the page shows is another one
         if now_s - self._poses_s >= 0.2 and (poses := door.poses()):
             self._poses_s = now_s
             await self._timely(socket.send_text(json.dumps({"poses": poses})))
@@ -95,7 +94,7 @@ class _Page:
         """Send; a page whose link takes nothing for long is given up."""
         try:
             await asyncio.wait_for(sending, TAKEN_S)
-        except asyncio.TimeoutError:
+        except TimeoutError:
             raise WebSocketDisconnect(TOO_SLOW) from None
 
 

@@ -16,9 +16,11 @@ from protocol.site.site_config import Projection
 SIDE_PX = 256
 MAX_ZOOM = 24
 RADIUS_M = 6378137.0  # of the sphere of Web Mercator
-# Values as 24 bits in red, green, blue: value = offset + scale (65536 r + 256 g + b); 0 is unknown. A step of 1e-6 keeps
-# single precision for everything below 16.
-SCALE, OFFSET = 1e-6, -4.0
+# Values as 24 bits in red, green, blue: value = offset + scale (65536 r + 256 g + b); 0 is unknown.
+COARSE = dict.fromkeys(("age_s", "changed_s"), (1.0, -1.0)) | dict.fromkeys(
+    ("visits", "machines", "weight"), (1e-3, -1e-3)
+)
+FINE = (1e-6, -4.0)  # single precision, and all of a slope's or angle's range
 MOST = 2**24 - 1
 
 
@@ -61,10 +63,17 @@ def tile_at(lat_deg: float, lon_deg: float, z: int) -> tuple[int, int]:
     return int(x), int(y)
 
 
-def value_png(values: Floats) -> bytes:
+def coding(layer: str) -> tuple[float, float]:
+    """Scale and offset of a layer's values in 24 bits."""
+    return COARSE.get(layer, FINE)
+
+
+def value_png(values: Floats, layer: str) -> bytes:
     """Values (256, 256) in 24 bits; what is beyond them takes the end."""
     known = ~np.isnan(values)
-    steps = np.where(known, np.clip(np.rint((np.where(known, values, 0) - OFFSET) / SCALE), 1, MOST), 0).astype(np.int64)
+    scale, offset = coding(layer)
+    found = np.clip(np.rint((np.where(known, values, 0) - offset) / scale), 1, MOST)
+    steps = np.where(known, found, 0).astype(np.int64)
     return _png(np.stack([steps & 255, steps >> 8 & 255, steps >> 16 & 255], axis=-1).astype(np.uint8))
 
 
@@ -83,7 +92,9 @@ ENDS = {"grade": (0.0, 0.3), "grade_std": (0.0, 0.2), "grade_east": (-0.3, 0.3),
 LOGARITHMIC = {"resistance": (0.006, 0.3), "visits": (1.0, 60.0), "age_s": (10.0, 86400.0), "weight": (0.1, 1000.0)}
 LOGARITHMIC |= {"resistance_std": (0.0005, 0.1), "changed_s": (10.0, 86400.0), "machines": (1.0, 60.0)}
 # Dark blue to yellow: ends of the page's ordered palette and points between them, even in OKLab; BGR.
-ORDERED = np.array([(119, 55, 36), (127, 71, 51), (140, 108, 90), (141, 139, 130), (131, 154, 155), (120, 190, 186), (92, 221, 251)])
+ORDERED = np.array(
+    [(119, 55, 36), (127, 71, 51), (140, 108, 90), (141, 139, 130), (131, 154, 155), (120, 190, 186), (92, 221, 251)]
+)
 
 
 def _colours(values: Floats, layer: str) -> AnyArray:
@@ -103,5 +114,3 @@ def _colours(values: Floats, layer: str) -> AnyArray:
 
 def _png(image: AnyArray) -> bytes:
     return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
-
-

@@ -39,7 +39,7 @@ def description() -> dict[str, Any]:
     sites = {"summary": "Sites of this door", "operationId": "sites", "responses": _responses(("application/json",))}
     return {
         "openapi": "3.1.0",
-        "info": {"title": "sitegrid", "version": package_version(), "summary": "The ground of a site, as machines found it"},
+        "info": {"title": "sitegrid", "version": package_version(), "summary": "The ground, as machines found it"},
         "paths": {f"{PREFIX}/sites": {"get": sites}, **paths},
         "components": {"schemas": {"Problem": PROBLEM_SCHEMA}},
     }

@@ -11,7 +11,7 @@ from starlette.responses import Response
 from protocol.errors import LinkError, QueryError, Refusal, SitegridError
 
 # What a reason of the protocol is over HTTP; any other one is the asker's mistake.
-STATUS = {
+STATUS: dict[str, HTTPStatus] = {
     Refusal.UNKNOWN_QUERY: HTTPStatus.NOT_FOUND,
     Refusal.UNKNOWN_MACHINE: HTTPStatus.NOT_FOUND,
     Refusal.TOO_LARGE: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
@@ -21,7 +21,7 @@ STATUS = {
 }
 
 
-class Problem(SitegridError):
+class Problem(SitegridError):  # noqa: N818 - the word of RFC 9457
     """A request that is refused, or that cannot be answered. reason: a word for programs, as in the protocol."""
 
     def __init__(self, status: HTTPStatus, reason: str, detail: str, headers: dict[str, str] | None = None) -> None:
@@ -39,9 +39,7 @@ def problem_of(error: Exception) -> Problem:
     if isinstance(error, Problem):
         return error
     if isinstance(error, QueryError):
-        status = STATUS.get(Refusal(error.reason), HTTPStatus.BAD_REQUEST) if error.reason in Refusal else None
-        if status is None:
-            status = HTTPStatus.BAD_GATEWAY
+        status = STATUS.get(error.reason, HTTPStatus.BAD_REQUEST)
         headers = {"Retry-After": "1"} if status == HTTPStatus.SERVICE_UNAVAILABLE else {}
         return Problem(status, error.reason, str(error), headers)
     if isinstance(error, LinkError):

@@ -1,4 +1,4 @@
-"""The resources of a site: what each answers, from which parameters. A new one is a function and a line in RESOURCES."""
+"""Resources of a site: what each answers, from which parameters. A new one: a function and a line in RESOURCES."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ MAX_CELLS_NPZ = 4_000_000
 AGES = ("age_s", "changed_s")  # layers that change with the site's now
 Answer = Callable[[SiteDoor, Parameters], Awaitable[Response]]
 
-PLACE = {"x": "east of the site's origin [m]", "y": "north of it [m]", "lat": "latitude [deg], with lon in place of x, y"}
-PLACE |= {"lon": "longitude [deg]"}
+PLACE = {"x": "east of the site's origin [m]", "y": "north of it [m]"}
+PLACE |= {"lat": "latitude [deg], with lon in place of x and y", "lon": "longitude [deg]"}
 AS_OF = {"as_of": "the map as of this time, ISO 8601 or nanoseconds since 1970 (UTC)"}
 LAYERS = {"layers": "names, comma-separated; without it all"}
 
@@ -220,9 +220,7 @@ def _outline(parameters: Parameters) -> list[tuple[float, float]] | None:
     corners = [part.split(",") for part in parameters["polygon"].split(";")]
     if not 3 <= len(corners) <= 1000 or any(len(corner) != 2 for corner in corners):
         raise bad(Refusal.OUT_OF_RANGE, "parameter `polygon` must be x,y;x,y;... with 3 to 1000 corners, in metres")
-    return [
-        (values.number({"polygon": x}, "polygon"), values.number({"polygon": y}, "polygon")) for x, y in corners
-    ]
+    return [(values.number({"polygon": x}, "polygon"), values.number({"polygon": y}, "polygon")) for x, y in corners]
 
 
 def _around(outline: list[tuple[float, float]]) -> Bounds:

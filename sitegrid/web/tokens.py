@@ -75,7 +75,7 @@ def save_tokens(folder: Path, tokens: Tokens) -> None:
 
 
 class TokenFile:
-    """Tokens of a folder as they are now: read again whenever the file changes, so that a revoked one counts no more."""
+    """Tokens of a folder as they are now: the file is read again when it changes, so a revoked one counts no more."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

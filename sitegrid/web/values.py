@@ -89,7 +89,7 @@ def iso(stamp_ns: int) -> str | None:
 
 
 def plain(value: Any) -> Any:
-    """Records as tables, arrays as lists, and NaN, which JSON does not know, as None; a stamp gets its time beside it."""
+    """Records as tables, arrays as lists, NaN, which JSON does not know, as None; a stamp gets its time beside it."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, np.ndarray):
