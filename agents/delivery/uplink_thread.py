@@ -30,8 +30,8 @@ def perform(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
                 return uplink.on_head(spool.head(limit), spool.spool_id)
             case Send(payload):
                 return uplink.on_reply(*ask(payload))
-            case Delete(spool_id, watermark):
-                spool.acknowledge(spool_id, watermark)
+            case Delete(spool_id, watermark, store):
+                spool.acknowledge(spool_id, watermark, store)
             case LowerWatermark(spool_id, watermark):
                 spool.lower_watermark(spool_id, watermark)
             case StartNewRun():
