@@ -147,8 +147,9 @@ Action = ReadHead | Send | SpoolAction | Wait
 class Uplink:
     """Delivery of one machine's samples.
 
-    held: why nothing is sent although it could be, empty if it is. problem: what keeps samples from the server now.
-    ack_s_max: the longest time from the first sending of a batch until samples of it were acknowledged.
+    held: why nothing is sent although it could be, empty if it is. problem: what keeps samples from the server now;
+    stuck: the same, where only a person can mend it. ack_s_max: the longest time from the first sending of a batch
+    until samples of it were acknowledged.
     """
 
     def __init__(
@@ -163,6 +164,7 @@ class Uplink:
         self.timeout_s = timeout_s
         self.counters: Counter[str] = Counter()
         self.problem = ""
+        self.stuck = ""
         self.held = ""
         self.ack_s_max = 0.0
         self._frame = frame
@@ -241,6 +243,7 @@ class Uplink:
         if head.store and head.store not in (ack.store, ack.replaces):  # what it deleted on that one's word is not here
             self.counters["other_store"] += 1
             self.problem = f"store {ack.store} acknowledges samples whose predecessors are in store {head.store}"
+            self.stuck = self.problem
             return self._back_off()
         if not len(head.rows):  # an earlier run is closed, even if the server is older than the run
             return Delete(head.spool_id, max(ack.watermark, head.first_seq - 1), ack.store)
@@ -259,6 +262,7 @@ class Uplink:
         head = self._head
         self.counters[f"refused_{refused.reason}"] += 1
         self.problem = refused.problem
+        self.stuck = refused.problem if refused.reason in BLOCKING else ""
         if refused.reason in PASSING or refused.reason in BLOCKING or head is None or not len(head.rows):
             return self._back_off()
         if refused.reason == Refusal.GAP:
@@ -270,7 +274,7 @@ class Uplink:
         return Quarantine(head, refused.problem)
 
     def _succeed(self, pause_s: float) -> Wait:
-        self.problem, self._failures, self._has_met_server = "", 0, True
+        self.problem, self.stuck, self._failures, self._has_met_server = "", "", 0, True
         return Wait(pause_s)
 
     def _adapt(self, n: int) -> None:

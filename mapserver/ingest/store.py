@@ -17,11 +17,12 @@ from typing import Any
 
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
-from mapserver.evidence.grid import LIVE_ROWS, REFOLD_ROWS, Grid
+from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, admit, check_store, parse
 from mapserver.journal.archive import FOLDER, Archive
-from mapserver.journal.history import History, history_rows
+from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
+from mapserver.journal.refold import fold_history
 from mapserver.journal.rows import Admission, Selection
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
@@ -81,9 +82,7 @@ class Store:
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
-            self.grid.resize_buffer(REFOLD_ROWS)
-            self._fold_tail(self.grid, self.merged, self.excluded)
-            self.grid.resize_buffer(LIVE_ROWS)
+            fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
             self.merged = last_row
             self.newest_ns = self.journal.newest_ns()
             self.fact = self._last_fact()
@@ -139,14 +138,19 @@ class Store:
 
         return write
 
-    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
-        """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines."""
-        self._fold_tail(grid, row, excluded)
-        grid.resize_buffer(LIVE_ROWS)
-        self.grid, self.excluded = grid, excluded
+    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> Grid:
+        """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines.
+
+        The rows beyond it are folded here, while batches wait: let them be few. Returns the grid that was used so far,
+        so that another thread may spend the time to let go of it.
+        """
+        grid.touch_all()
+        for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
+            grid.fold_all(rows.samples, rows.names())
+        before, self.grid, self.excluded = self.grid, grid, excluded
         self.fact = self._last_fact()
         self.snapshot_row = 0  # what is on disk has other machines in it
-        self.grid.touch_all()
+        return before
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
@@ -245,11 +249,8 @@ class Store:
         self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
         self.merged = row
 
-    def _fold_tail(self, grid: Grid, merged: int, excluded: frozenset[str]) -> None:
-        """Fold what a grid does not hold yet."""
-        history = History(self.journal, Archive(self.folder / FOLDER))
-        for row in history_rows(history, after=merged, selection=Selection(without=excluded)):
-            grid.fold(row.rows, row.machine)
+    def _history(self) -> History:
+        return History(self.journal, Archive(self.folder / FOLDER))
 
 
 @contextmanager

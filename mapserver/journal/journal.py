@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
-from mapserver.journal.rows import Admission, Watermark, checksum, extent_checksum, pack
+from mapserver.journal.records import record
+from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, extent_checksum
 from protocol.errors import StoreError
 
 _WAL_LIMIT = 64 * 2**20
@@ -63,18 +64,11 @@ class Journal(JournalQueries):
     def append(self, admission: Admission, received_ns: int) -> int:
         """Write one row and its watermark into the open transaction; returns the row's number."""
         batch = admission.batch
-        payload = pack(batch.rows)
         x_m, y_m, stamps = (batch.rows[name] for name in ("x_m", "y_m", "stamp_ns"))
         first_ns, last_ns = int(stamps.min()), int(stamps.max())
-        spool = _spool_bytes(batch.spool_id)
         row = self.last_row + 1
-        crc32 = checksum(row, batch.machine, spool, batch.first_seq, received_ns, payload)
-        values = (row, batch.machine, spool, batch.first_seq, len(batch.rows), received_ns)
-        self._db.execute(
-            "INSERT INTO journal (row, machine, spool_id, first_seq, n, received_ns, first_stamp_ns, last_stamp_ns,"
-            " payload, crc32) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*values, first_ns, last_ns, payload, crc32),
-        )
+        written = JournalRow(row, batch.machine, batch.spool_id, batch.first_seq, batch.rows, received_ns)
+        self._db.execute("INSERT INTO journal VALUES (?, ?)", (row, record(written)))
         box = (float(x_m.min()), float(y_m.min()), float(x_m.max()), float(y_m.max()))
         extent = (row, first_ns, last_ns, *box)
         self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, extent_checksum(*extent)))
