@@ -21,9 +21,9 @@ from protocol.queries.answers import (
     Region,
     TrustAnswer,
 )
-from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
-from protocol.queries.tiles import TilesAnswer, decode_tiles
+from protocol.queries.map_tiles import TilesAnswer, decode_tiles
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
@@ -147,6 +147,11 @@ class Client:
     def judge_automatically(self, machine: str, *, wait_s: float = 30.0) -> TrustAnswer:
         """Leave it to the server again whether a machine's samples are used."""
         return self._command(TrustCommand(machine, None, "", wait_s))
+
+    def accept(self, store: str, reason: str) -> MapInfo:
+        """Let the map server's store take the place of another one, which is gone: machines go on with it."""
+        command = AcceptCommand(store, reason)
+        return answer_codec.decode_info(self._get(keys.admin(self.site, command.name), encode_command(command), 0.0))
 
     def close(self) -> None:
         """Close the session and its listeners."""

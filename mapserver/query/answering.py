@@ -22,7 +22,7 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
 from protocol.queries.answers import CellReasons, HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
-from protocol.queries.commands import TrustCommand, parse_command
+from protocol.queries.commands import AcceptCommand, TrustCommand, parse_command
 from protocol.queries.requests import (
     MAX_SPANS,
     HistoryQuery,
@@ -33,7 +33,7 @@ from protocol.queries.requests import (
     When,
     WhyQuery,
 )
-from protocol.queries.tiles import TilesAnswer, encode_tiles
+from protocol.queries.map_tiles import TilesAnswer, encode_tiles
 from protocol.site.geometry import Bounds, CellWindow
 
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
@@ -56,7 +56,11 @@ class Answers:
 
     def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and carry out one command; QueryError says what is wrong with it."""
-        return codec.encode_machine(self.trust(parse_command(name, parameters)))
+        command = parse_command(name, parameters)
+        if isinstance(command, AcceptCommand):
+            self._writer.run(lambda store: store.accept(command.store, command.reason))
+            return codec.encode_info(self.info())
+        return codec.encode_machine(self.trust(command))
 
     def _encode(self, query: MapQuery) -> bytes:
         match query:

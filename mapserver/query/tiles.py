@@ -25,7 +25,7 @@ from mapserver.query.views import View
 from protocol.arrays import AnyArray, Ints
 from protocol.queries.answers import MapVersion
 from protocol.queries.requests import TilesQuery
-from protocol.queries.tiles import PLANES, TILE_CELLS, Plane, Tile, TilesAnswer
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, Plane, MapTile, TilesAnswer
 from protocol.site.geometry import BLOCK_CELLS
 
 BLOCKS = TILE_CELLS // BLOCK_CELLS  # of a tile, along one side
@@ -46,11 +46,11 @@ class _Square:
         planes = np.zeros((len(PLANES), TILE_CELLS, TILE_CELLS), np.uint8)
         return cls(planes, np.zeros((TILE_CELLS, TILE_CELLS), np.int64))
 
-    def tile(self, place: Place, row: int, fact: int) -> Tile:
+    def tile(self, place: Place, row: int, fact: int) -> MapTile:
         newest_ns = int(self.newest_ns.max())
         since_s = np.where(self.newest_ns > 0, (newest_ns - self.newest_ns) / 1e9, np.nan)
         self.planes[-1] = PLANES["since"].quantised(since_s)
-        return Tile(*place, row, fact, newest_ns, zlib.compress(self.planes.tobytes(), LEVEL))
+        return MapTile(*place, row, fact, newest_ns, zlib.compress(self.planes.tobytes(), LEVEL))
 
 
 class Tiles:
@@ -62,7 +62,7 @@ class Tiles:
         self._reach = reach_blocks(self._cell_m, self._config.change)
         self._lock = threading.Lock()
         self._squares: dict[Place, _Square] = {}
-        self._tiles: dict[Place, Tile] = {}
+        self._tiles: dict[Place, MapTile] = {}
         self._turn, self._fact = -1, -1
 
     def answer(self, query: TilesQuery) -> TilesAnswer:
@@ -99,7 +99,7 @@ class Tiles:
         return [block for block in blocks if block in pages], pages, turn, store.version, store.newest_ns
 
 
-def _is_newer(tile: Tile, since: MapVersion | None) -> bool:
+def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:
     return since is None or tile.row > since.row or tile.fact > since.fact
 
 

@@ -131,15 +131,17 @@ class ServerProcess:
 class MapInfo:
     """State of the map and its server.
 
-    store: its id; descends: ids of the stores that it was folded from; fact: see MapVersion. journalled, merged,
-    snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks with evidence; None
-    without any. first_ns, stamp_ns: the map's oldest stamp, and the site's now; 0 without any. wall_ns: the server's
-    clock. distrusted: machines whose samples are excluded. boundaries: of the classes of resistance.
+    store: its id; descends: ids of the stores that it was folded from; accepted: ids of those whose place a person let
+    it take; fact: see MapVersion. journalled, merged, snapshot: journal rows. bounds: first column, first row, end
+    column and end row of the blocks with evidence; None without any. first_ns, stamp_ns: the map's oldest stamp, and
+    the site's now; 0 without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    boundaries: of the classes of resistance.
     """
 
     site: SiteInfo
     store: str
     descends: tuple[str, ...]
+    accepted: tuple[str, ...]
     fact: int
     journalled: int
     merged: int

@@ -10,7 +10,7 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Bools, Floats
 from protocol.queries.answers import GroundChange
-from protocol.queries.tiles import PLANES, TILE_CELLS, TilesAnswer
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, TilesAnswer
 from protocol.site.ground_classes import ZONES
 from protocol.site.site_config import Projection
 from sitegrid.web.values import iso

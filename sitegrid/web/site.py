@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from protocol.errors import LinkError, MessageError, QueryError
 from protocol.queries.answers import MapInfo, MapVersion
-from protocol.queries.tiles import PLANES, Tile, TilesAnswer
+from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_pose
@@ -43,7 +43,7 @@ class SiteDoor:
 
     def __init__(self, client: Client) -> None:
         self.client, self.name = client, client.site
-        self.tiles: dict[tuple[int, int], Tile] = {}
+        self.tiles: dict[tuple[int, int], MapTile] = {}
         self.answer: TilesAnswer | None = None
         self.state: dict[str, Any] = {}
         self.is_away = False
@@ -204,12 +204,12 @@ def frame(answer: TilesAnswer) -> bytes:
     return b"".join([struct.pack(">I", len(text)), text, *(tile.planes for tile in answer.tiles)])
 
 
-def _head(tile: Tile) -> dict[str, Any]:
+def _head(tile: MapTile) -> dict[str, Any]:
     numbers = {"x": tile.x, "y": tile.y, "row": tile.row, "fact": tile.fact, "newest_ns": tile.newest_ns}
     return {**numbers, "bytes": len(tile.planes)}
 
 
-def _is_newer(tile: Tile, version: MapVersion) -> bool:
+def _is_newer(tile: MapTile, version: MapVersion) -> bool:
     return tile.row > version.row or tile.fact > version.fact
 
 

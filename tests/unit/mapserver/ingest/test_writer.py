@@ -373,6 +373,8 @@ BATCHES = [
     (Refusal.GAP, table(first_seq=2)),
     (Refusal.WRONG_FRAME, table(frame="00000000")),
     (Refusal.WRONG_MACHINE, table(machine="b")),
+    (Refusal.OTHER_STORE, table(store="0123456789abcdef")),
+    (Refusal.OUT_OF_RANGE, table(store="0123")),
     (Refusal.WALL_CLOCK, one(stamp_ns=NOW_NS + 10**13)),
 ]
 
@@ -412,7 +414,7 @@ def test_a_refused_query_says_why(start, reason, name, parameters):
 
 def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
-    elsewhere |= {Refusal.FAR_FUTURE, Refusal.SERVER_CLOCK, Refusal.OTHER_STORE, Refusal.NOT_WRITER}
+    elsewhere |= {Refusal.FAR_FUTURE, Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}
     elsewhere |= {Refusal.UNKNOWN_MACHINE}  # commands, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 

@@ -9,13 +9,13 @@ from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import MapVersion
 from protocol.queries.requests import PointQuery, RegionQuery, TilesQuery, WhyQuery, parse_query
-from protocol.queries.tiles import PLANES, TILE_CELLS, Tile, TilesAnswer, decode_tiles, encode_tiles
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, SITE, incoming, open_writer, random_samples, samples, send
 from tests.unit.mapserver.query.fake_follower import FakeFollower
 
 
-def content(tiles: dict[tuple[int, int], Tile]) -> dict[tuple[int, int], tuple[int, bytes]]:
+def content(tiles: dict[tuple[int, int], MapTile]) -> dict[tuple[int, int], tuple[int, bytes]]:
     return {place: (tile.newest_ns, tile.planes) for place, tile in tiles.items()}
 
 
@@ -25,7 +25,7 @@ class Page:
     def __init__(self, answers: Answers) -> None:
         self.answers = answers
         self.version: MapVersion | None = None
-        self.tiles: dict[tuple[int, int], Tile] = {}
+        self.tiles: dict[tuple[int, int], MapTile] = {}
 
     def ask(self) -> TilesAnswer:
         answer = decode_tiles(encode_tiles(self.answers.tiles(TilesQuery(self.version))))

@@ -80,7 +80,7 @@ PLANES: dict[str, Scale] = {
 
 
 @dataclass(frozen=True)
-class Tile:
+class MapTile:
     """One square: x, y columns and rows of tiles from the origin.
 
     row, fact: the version of the map in which it was last another one. newest_ns: stamp of its newest sample. planes:
@@ -108,7 +108,7 @@ class TilesAnswer:
     stamp_ns: int
     cell_m: float
     whole: bool
-    tiles: tuple[Tile, ...]
+    tiles: tuple[MapTile, ...]
 
 
 def encode_tiles(answer: TilesAnswer) -> bytes:
@@ -130,7 +130,7 @@ def decode_tiles(data: bytes) -> TilesAnswer:
     return TilesAnswer(version, stamp_ns, cell_m, take(table, "whole", bool), tiles)
 
 
-def _tile(row: Any, index: int) -> Tile:
+def _tile(row: Any, index: int) -> MapTile:
     if type(row) is not list or [type(value) for value in row] != [int] * 5 + [bytes]:
         raise MessageError(Refusal.WRONG_TYPE, "five whole numbers and bytes are expected", field="tiles", row=index)
     x, y, version_row, fact, newest_ns, planes = row
@@ -144,4 +144,4 @@ def _tile(row: Any, index: int) -> Tile:
     if length != len(PLANES) * AREA or not stream.eof:
         problem = f"{length} bytes of planes, {len(PLANES)} take {len(PLANES) * AREA}"
         raise MessageError(Refusal.COLUMN_LENGTH, problem, field="tiles", row=index)
-    return Tile(x, y, version_row, fact, newest_ns, planes)
+    return MapTile(x, y, version_row, fact, newest_ns, planes)
