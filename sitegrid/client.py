@@ -191,7 +191,7 @@ class Client:
                     return reply.ok.payload.to_bytes()
                 if reply.err is not None and (text := reply.err.payload.to_bytes()) != TIMED_OUT:
                     error, held_s = answer_codec.decode_error(text), time.monotonic()
-                    if not 0 < error.retry_after_s < end_s - held_s:
+                    if not 0 < error.retry_after_s < end_s - held_s - AGAIN_S:
                         raise error
                     time.sleep(error.retry_after_s)
             if time.monotonic() > asked_s + AGAIN_S:
