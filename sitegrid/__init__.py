@@ -6,16 +6,20 @@ with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
 
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
 from protocol.queries.answers import (
+    CellReasons,
     GroundChange,
     HistorySpan,
     MachineState,
     MapInfo,
+    MapVersion,
     PointAnswer,
     Region,
     SampleCounts,
     SiteInfo,
     TrustAnswer,
+    Votes,
 )
+from protocol.queries.map_tiles import MapTile, TilesAnswer
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
 from protocol.version import package_version
@@ -25,5 +29,6 @@ from sitegrid.listener import Listener
 __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
 __all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
+__all__ += ["CellReasons", "MapTile", "MapVersion", "TilesAnswer", "Votes"]
 __all__ += ["Bounds", "KnownGround", "SampleCounts", "SiteInfo"]
 __version__ = package_version()

@@ -1,138 +1,150 @@
-"""Tiles of the map as it is, kept and brought up to date where evidence came in; and of the map as of any time.
+"""Regions in tiles: how they are cut, and the views that are kept while a reader takes tile after tile.
 
-A tile is a function of the evidence alone: the age of a cell is counted from the tile's newest sample, so that time
-alone changes no tile.
+One answer is so small that the router can hold it for a reader that does not read (protocol/wire/session.py): nobody
+else waits for that one. All tiles are of one version of the map, so the pages that they are read from are kept, which
+costs little: pages never change, and the grid shares them.
 """
 
 from __future__ import annotations
 
+import math
+import secrets
 import threading
-import zlib
-from collections.abc import Iterable
+import time
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
-import numpy as np
-
-from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Pages, around, valid_pages
-from mapserver.config import ServerConfig
-from mapserver.evidence.grid import chunks
-from mapserver.evidence.timeline import Block, evidence
-from mapserver.ingest.store import Store
-from mapserver.ingest.writer import Writer
-from mapserver.layers import cell_layers
 from mapserver.query.views import View
-from protocol.arrays import AnyArray, Ints
-from protocol.queries.answers import MapVersion
-from protocol.queries.requests import TilesQuery
-from protocol.queries.map_tiles import PLANES, TILE_CELLS, Plane, MapTile, TilesAnswer
-from protocol.site.geometry import BLOCK_CELLS
+from protocol.errors import QueryError, Refusal
+from protocol.queries.answers import Tile
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-BLOCKS = TILE_CELLS // BLOCK_CELLS  # of a tile, along one side
-LEVEL = 6  # of deflate: 9 takes three times as long for 1 % less
-LAYERS = ("resistance", "confidence", "grade", "grade_std", "visits")  # as in PLANES; `since` is of the evidence
-Place = tuple[int, int]  # column and row of a tile
+TILE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
+MOST_OPEN = 8  # regions that are answered at the same time
+IDLE_S = 10.0  # a region of which nobody takes a tile for so long makes room
+OPEN_S = 600.0  # ... and one that is open for so long, since its pages leave the grid one by one
+RETRY_AFTER_S = 2.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a region is read from: layers, and the view that they are read from, less another one if there are two."""
+
+    window: CellWindow
+    layers: tuple[str, ...]
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """Tiles of a window, row by row from its south-western corner; edges lie between blocks, where they can.
+
+    width, height: of a tile [cells].
+    """
+
+    window: CellWindow
+    width: int
+    height: int
+
+    @classmethod
+    def of_layers(cls, window: CellWindow, layers: int) -> TileGrid:
+        """Tiles with at most TILE_BYTES each: square, unless the window is narrow."""
+        cells = TILE_BYTES // (4 * layers)
+        if window.columns * window.rows <= cells:
+            return cls(window, window.columns + BLOCK_CELLS, window.rows + BLOCK_CELLS)
+        side = math.isqrt(cells)
+        if window.rows < side:
+            return cls(window, _whole_blocks(cells // window.rows), window.rows + BLOCK_CELLS)
+        if window.columns < side:
+            return cls(window, window.columns + BLOCK_CELLS, _whole_blocks(cells // window.columns))
+        return cls(window, _whole_blocks(side), _whole_blocks(side))
+
+    @property
+    def count(self) -> int:
+        """How many tiles there are."""
+        return len(self._columns) * len(self._rows)
+
+    def tile(self, number: int) -> CellWindow:
+        """One of them."""
+        left, right = self._columns[number % len(self._columns)]
+        bottom, top = self._rows[number // len(self._columns)]
+        return CellWindow(left, bottom, right - left, top - bottom)
+
+    def place(self, number: int, cursor: int) -> Tile:
+        """Where one of them lies."""
+        tile, whole = self.tile(number), self.window
+        corner = (tile.column - whole.column, tile.row - whole.row)
+        return Tile(cursor, number, self.count, *corner, whole.columns, whole.rows)
+
+    @cached_property
+    def _columns(self) -> list[tuple[int, int]]:
+        return _cut(self.window.column, self.window.columns, self.width)
+
+    @cached_property
+    def _rows(self) -> list[tuple[int, int]]:
+        return _cut(self.window.row, self.window.rows, self.height)
+
+
+def _whole_blocks(cells: int) -> int:
+    return max(BLOCK_CELLS, cells // BLOCK_CELLS * BLOCK_CELLS)
+
+
+def _cut(first: int, count: int, length: int) -> list[tuple[int, int]]:
+    """Begin and end of each piece of an axis."""
+    edges = [first, *range(first // BLOCK_CELLS * BLOCK_CELLS + length, first + count, length), first + count]
+    return list(pairwise(edges))
 
 
 @dataclass
-class _Square:
-    """A tile in the making. planes: (planes, 64, 64). newest_ns: (64, 64), 0 for none."""
-
-    planes: Plane
-    newest_ns: Ints
-
-    @classmethod
-    def empty(cls) -> _Square:
-        planes = np.zeros((len(PLANES), TILE_CELLS, TILE_CELLS), np.uint8)
-        return cls(planes, np.zeros((TILE_CELLS, TILE_CELLS), np.int64))
-
-    def tile(self, place: Place, row: int, fact: int) -> MapTile:
-        newest_ns = int(self.newest_ns.max())
-        since_s = np.where(self.newest_ns > 0, (newest_ns - self.newest_ns) / 1e9, np.nan)
-        self.planes[-1] = PLANES["since"].quantised(since_s)
-        return MapTile(*place, row, fact, newest_ns, zlib.compress(self.planes.tobytes(), LEVEL))
+class _Open:
+    reading: Reading
+    opened_s: float
+    used_s: float
+    is_read: bool = False  # to its last tile
 
 
-class Tiles:
-    """Tiles of the map as it is; for any thread. What it costs is for what changed since somebody last asked."""
+class OpenRegions:
+    """Regions of which readers take tiles, by cursor."""
 
-    def __init__(self, writer: Writer) -> None:
-        self._writer, self._config = writer, writer.config
-        self._cell_m = writer.site.cell_m
-        self._reach = reach_blocks(self._cell_m, self._config.change)
+    def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._squares: dict[Place, _Square] = {}
-        self._tiles: dict[Place, MapTile] = {}
-        self._turn, self._fact = -1, -1
+        self._open: dict[int, _Open] = {}
 
-    def answer(self, query: TilesQuery) -> TilesAnswer:
-        """Tiles that differ since the version that the query names; all where it names none of this store."""
+    def make_room(self) -> None:
+        """Forget what is read or left; QueryError while too many regions are being read."""
         with self._lock:
-            version, stamp_ns = self._update()
-            since = query.since
-            whole = (
-                since is None or since.store != version.store or since.row > version.row or since.fact > version.fact
-            )
-            tiles = (tile for tile in self._tiles.values() if whole or _is_newer(tile, since))
-            return TilesAnswer(version, stamp_ns, self._cell_m, whole, tuple(tiles))
+            self._forget()
+            read = [cursor for cursor, one in self._open.items() if one.is_read]
+            for cursor in read[: max(0, len(self._open) + 1 - MOST_OPEN)]:
+                del self._open[cursor]
+            if len(self._open) >= MOST_OPEN:
+                problem = f"{MOST_OPEN} large regions are being read; ask again later, or for a smaller one"
+                raise QueryError(Refusal.OVERLOADED, problem, RETRY_AFTER_S)
 
-    def _update(self) -> tuple[MapVersion, int]:
-        """Make anew what evidence came into, and what lies so near that a change of the ground there counts for it."""
-        blocks, pages, turn, version, stamp_ns = self._writer.run(self._folded)
-        whole = version.fact != self._fact
-        squares: dict[Place, _Square] = {} if whole else self._squares
-        changed = fill(squares, pages, blocks, self._cell_m, self._config)
-        for place in changed | (self._tiles.keys() - squares.keys()):
-            tile = squares.setdefault(place, _Square.empty()).tile(place, version.row, version.fact)
-            known = self._tiles.get(place)
-            if known is None or (known.planes, known.newest_ns) != (tile.planes, tile.newest_ns):
-                self._tiles[place] = tile
-        self._squares, self._turn, self._fact = squares, turn, version.fact
-        return version, stamp_ns
+    def open(self, reading: Reading) -> int:
+        """Keep what a region is read from; returns its cursor. QueryError as `make_room`."""
+        self.make_room()
+        cursor, now_s = 1 + secrets.randbelow(2**48), time.monotonic()
+        with self._lock:
+            self._open[cursor] = _Open(reading, now_s, now_s)
+        return cursor
 
-    def _folded(self, store: Store) -> tuple[list[Block], Pages, int, MapVersion, int]:
-        grid, whole = store.grid, store.fact != self._fact  # after a fact, the map may be another grid
-        folded, turn = grid.folded_since(-1 if whole else self._turn)
-        blocks = folded if whole else sorted({near for one in folded for near in around(one, self._reach)})
-        wide = sorted({near for block in blocks for near in around(block, self._reach)})
-        pages = {block: pages for block, pages in zip(wide, grid.pages(wide), strict=True) if pages}
-        return [block for block in blocks if block in pages], pages, turn, store.version, store.newest_ns
+    def reading(self, cursor: int, number: int) -> tuple[Reading, TileGrid]:
+        """What a tile is read from; QueryError if that is not kept any more, or there is no such tile."""
+        with self._lock:
+            self._forget()
+            one = self._open.get(cursor)
+            if one is None:
+                raise QueryError(Refusal.EXPIRED, f"no region is open under cursor {cursor}: ask for it again")
+            tiles = TileGrid.of_layers(one.reading.window, len(one.reading.layers))
+            if number >= tiles.count:
+                raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `number`: {number} of {tiles.count} tiles, from 0")
+            one.used_s, one.is_read = time.monotonic(), one.is_read or number == tiles.count - 1
+            return one.reading, tiles
 
-
-def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:
-    return since is None or tile.row > since.row or tile.fact > since.fact
-
-
-def tiles_of(view: View, version: MapVersion, cell_m: float, config: ServerConfig) -> TilesAnswer:
-    """All tiles of a view."""
-    squares: dict[Place, _Square] = {}
-    fill(squares, view.pages, list(view.pages), cell_m, config)
-    tiles = tuple(square.tile(place, version.row, version.fact) for place, square in sorted(squares.items()))
-    return TilesAnswer(version, view.stamp_ns, cell_m, whole=True, tiles=tiles)
-
-
-def fill(
-    squares: dict[Place, _Square], pages: Pages, blocks: Iterable[Block], cell_m: float, config: ServerConfig
-) -> set[Place]:
-    """Write blocks into their squares, with pages of all that lies around them; returns which squares these are."""
-    first = valid_pages(pages, cell_m, config.change)
-    places = set()
-    for some in chunks(list(blocks)):
-        sums = evidence([pages[block] for block in some], [first[block] for block in some])
-        values = cell_layers.read(sums, LAYERS, config.read)
-        planes = np.stack([PLANES[name].quantised(layer.astype(np.float64)) for name, layer in values.items()])
-        newest_ns = np.where(np.isnan(values["visits"]), 0, sums.newest_ns)
-        for index, block in enumerate(some):
-            places.add(_put(squares, block, planes[:, index], newest_ns[index]))
-    return places
-
-
-def _put(squares: dict[Place, _Square], block: Block, planes: Plane, newest_ns: AnyArray) -> Place:
-    """Write one block: planes (layers, 256), newest_ns (256,)."""
-    place = block[0] // BLOCKS, block[1] // BLOCKS
-    square = squares.setdefault(place, _Square.empty())
-    column, row = (BLOCK_CELLS * (at % BLOCKS) for at in block)
-    rows, columns = slice(row, row + BLOCK_CELLS), slice(column, column + BLOCK_CELLS)
-    square.planes[: len(planes), rows, columns] = planes.reshape(-1, BLOCK_CELLS, BLOCK_CELLS)
-    square.newest_ns[rows, columns] = newest_ns.reshape(BLOCK_CELLS, BLOCK_CELLS)
-    return place
+    def _forget(self) -> None:
+        now_s = time.monotonic()
+        for cursor, one in list(self._open.items()):
+            if now_s > min(one.used_s + IDLE_S, one.opened_s + OPEN_S):
+                del self._open[cursor]

@@ -61,6 +61,17 @@ class RegionQuery:
 
 
 @dataclass(frozen=True)
+class TileQuery:
+    """One more tile of a region that is answered in tiles; cursor: from its first tile. number: from 0 on."""
+
+    cursor: int
+    number: int
+    fresh = Freshness()
+
+    name = "tile"
+
+
+@dataclass(frozen=True)
 class HistoryQuery:
     """The cell at a position in `map` [m] over time, span by span.
 
@@ -130,11 +141,22 @@ class WhyQuery:
     name = "why"
 
 
-MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | MachinesQuery | ChangesQuery | TilesQuery | WhyQuery
+MapQuery = (
+    # of cells, of all of it, of the server
+    PointQuery
+    | RegionQuery
+    | TileQuery
+    | HistoryQuery
+    | WhyQuery
+    | TilesQuery
+    | InfoQuery
+    | MachinesQuery
+    | ChangesQuery
+)
 
 
 def check_size(columns: int, rows: int) -> None:
-    """Refuse a region with more cells than one reply may hold."""
+    """Refuse a region with too many cells."""
     if columns * rows > MAX_CELLS:
         raise QueryError(Refusal.TOO_LARGE, f"region of {columns} x {rows} cells; at most {MAX_CELLS} are answered")
 
@@ -144,28 +166,43 @@ def check_size(columns: int, rows: int) -> None:
 
 def encode_query(query: MapQuery) -> dict[str, str]:
     """Selector parameters."""
-    if isinstance(query, ChangesQuery):
-        return {"after": str(query.after)} if query.after else {}
-    parameters: dict[str, str] = {}
-    if isinstance(query, TilesQuery) and query.since:
-        parameters |= {"store": query.since.store, "row": str(query.since.row), "fact": str(query.since.fact)}
-    if isinstance(query, TilesQuery | WhyQuery):
-        parameters |= _stamps({"as_of": query.as_of_ns})
-    if isinstance(query, PointQuery | HistoryQuery | WhyQuery):
-        parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
-    if isinstance(query, RegionQuery):
-        b = query.bounds
-        parameters["bounds"] = ",".join(ps.text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
-    if isinstance(query, PointQuery | RegionQuery | HistoryQuery) and query.layers:
-        parameters["layers"] = ",".join(query.layers)
-    if isinstance(query, PointQuery | RegionQuery):
-        parameters |= _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
-    if isinstance(query, HistoryQuery):
-        parameters |= _stamps({"from": query.from_ns, "to": query.to_ns})
-        parameters |= {"span": ps.text_of(query.span_s)} if query.span_s is not None else {}
+    match query:
+        case ChangesQuery():
+            return {"after": str(query.after)} if query.after else {}
+        case TileQuery():
+            return {"cursor": str(query.cursor), "number": str(query.number)}
+        case TilesQuery(None):
+            return _stamps({"as_of": query.as_of_ns})
+        case TilesQuery(MapVersion() as since):
+            return {"store": since.store, "row": str(since.row), "fact": str(since.fact)}
+        case WhyQuery():
+            return {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m), **_stamps({"as_of": query.as_of_ns})}
+    parameters = _of_map(query) if isinstance(query, PointQuery | RegionQuery | HistoryQuery) else {}
     if query.fresh.after:
         parameters |= {"after": str(query.fresh.after), "wait": ps.text_of(query.fresh.wait_s)}
     return parameters
+
+
+def reads_past(query: MapQuery) -> bool:
+    """Whether the server has to read its journal for a query, which takes a while."""
+    if isinstance(query, TilesQuery | WhyQuery):
+        return query.as_of_ns is not None
+    if isinstance(query, PointQuery | RegionQuery):
+        return query.when != NOW
+    return isinstance(query, HistoryQuery)
+
+
+def _of_map(query: PointQuery | RegionQuery | HistoryQuery) -> dict[str, str]:
+    parameters = {"layers": ",".join(query.layers)} if query.layers else {}
+    if isinstance(query, RegionQuery):
+        b = query.bounds
+        parameters["bounds"] = ",".join(ps.text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
+    else:
+        parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
+    if isinstance(query, HistoryQuery):
+        parameters |= _stamps({"from": query.from_ns, "to": query.to_ns})
+        return parameters | ({"span": ps.text_of(query.span_s)} if query.span_s is not None else {})
+    return parameters | _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
 
 
 def _stamps(stamps: Mapping[str, int | None]) -> dict[str, str]:
@@ -190,6 +227,10 @@ def _parse_point(parameters: ps.Parameters) -> PointQuery:
 
 def _parse_region(parameters: ps.Parameters) -> RegionQuery:
     return RegionQuery(_bounds(parameters), _layers(parameters), _freshness(parameters), _when(parameters))
+
+
+def _parse_tile(parameters: ps.Parameters) -> TileQuery:
+    return TileQuery(*(ps.count({name: ps.required(parameters, name)}, name) for name in ("cursor", "number")))
 
 
 def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
@@ -223,6 +264,7 @@ _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
     "point": (("x", "y", "layers", "as_of", "minus", *_FRESH), _parse_point),
     "region": (("bounds", "layers", "as_of", "minus", *_FRESH), _parse_region),
+    "tile": (("cursor", "number"), _parse_tile),
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
