@@ -18,7 +18,7 @@ from typing import Any
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, admit, check_store, parse
+from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, parse
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
@@ -70,7 +70,6 @@ class Store:
         self._verify = verify
         self.counters: Counter[str] = Counter()
         self.commits, self.commit_s = 0, 0.0
-        self.newest_ns = 0
         with ExitStack() as opened:
             opened.enter_context(_hold(folder))
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
@@ -84,7 +83,8 @@ class Store:
             self.snapshot_row = self.merged
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
             self.merged = last_row
-            self.newest_ns = self.journal.newest_ns()
+            self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
+            self._received_ns = self._last_received(last_row)
             self.fact = self._last_fact()
             self._opened = opened.pop_all()
 
@@ -92,6 +92,11 @@ class Store:
     def journalled(self) -> int:
         """The last row on disk."""
         return self.journal.last_row
+
+    @property
+    def newest_ns(self) -> int:
+        """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
+        return self._newest_but("")
 
     @property
     def version(self) -> MapVersion:
@@ -207,17 +212,32 @@ class Store:
         try:
             if self._verify:
                 self._check_signature(self._verify, incoming)
-            batch = parse(incoming.payload, incoming.machine, self.site, self.now_ns)
+            batch = parse(incoming.payload, incoming.machine, self.site, self.now_ns, self._seen)
             replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
         new = len(admission.batch.rows) > 0
-        row = self.journal.append(admission, self.now_ns()) if new else self.journalled
+        if new:
+            self._received_ns = self.now_ns()
+        row = self.journal.append(admission, self._received_ns) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
         return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces), admission
+
+    def _newest_but(self, machine: str) -> int:
+        """The newest stamp of the machines in the map but one."""
+        hidden = self.excluded | {machine}
+        return max((newest_ns for name, newest_ns in self._newest.items() if name not in hidden), default=0)
+
+    def _seen(self, machine: str) -> SeenTime:
+        return SeenTime(self._newest_but(machine), self.newest_ns, self._received_ns)
+
+    def _last_received(self, last_row: int) -> int:
+        """The server's clock when the last row came in, 0 where none is in the journal."""
+        is_there = last_row > self.journal.archived_row
+        return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
 
     def _last_fact(self) -> int:
         """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""
@@ -246,7 +266,8 @@ class Store:
     def _fold(self, row: int, batch: SampleBatch) -> None:
         if batch.machine not in self.excluded:
             self.grid.fold(batch.rows, batch.machine)
-        self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
+        newest_ns = int(batch.rows["stamp_ns"].max())
+        self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)
         self.merged = row
 
     def _history(self) -> History:
