@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from mapserver.journal.rows import Admission, StoreIdentity
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
-from protocol.wire.codec import decode_batch
 from protocol.wire.messages import SampleBatch
 
 DAY_NS = 86_400_000_000_000
@@ -43,18 +42,17 @@ def nothing_seen(_: str) -> SeenTime:
     return SeenTime()
 
 
-def parse(
-    payload: bytes,
+def judge(
+    batch: SampleBatch,
     machine: str,
     site: SiteConfig,
     now_ns: Callable[[], int],
     seen: Callable[[str], SeenTime] = nothing_seen,
-) -> SampleBatch:
-    """Decode and judge a batch that came in under the key of `machine`; MessageError says what is wrong with it.
+) -> None:
+    """Judge a decoded batch that came in under the key of `machine`; MessageError says what is wrong with it.
 
     seen: of a sender; it is asked for batches from the future alone.
     """
-    batch = decode_batch(payload, site.extent_m)
     if batch.machine != machine:
         problem = f"{batch.machine!r} sends under the key of {machine!r}"
         raise MessageError(Refusal.WRONG_MACHINE, problem, field="machine")
@@ -63,7 +61,6 @@ def parse(
         raise MessageError(Refusal.WRONG_FRAME, problem, field="frame")
     if len(batch.rows):
         _check_newest(batch, site, now_ns(), seen)
-    return batch
 
 
 def _check_newest(batch: SampleBatch, site: SiteConfig, now_ns: int, seen: Callable[[str], SeenTime]) -> None:

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import socket
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
+from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, parse
+from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
+from mapserver.ingest.batches import decode_batches
+from mapserver.ingest.lock import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
@@ -26,7 +30,8 @@ from mapserver.journal.refold import fold_history
 from mapserver.journal.rows import Admission, Selection
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
-from protocol.errors import MessageError, Refusal, StoreError
+from protocol.errors import MessageError, Refusal
+from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
@@ -37,7 +42,6 @@ log = logging.getLogger("mapserver.ingest.store")
 
 JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
-LOCK_FILE = "lock"
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
 
@@ -71,7 +75,7 @@ class Store:
         self.counters: Counter[str] = Counter()
         self.commits, self.commit_s = 0, 0.0
         with ExitStack() as opened:
-            opened.enter_context(_hold(folder))
+            opened.enter_context(hold(folder))
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
@@ -108,9 +112,10 @@ class Store:
 
         Nothing is acknowledged before its commit; where the commit fails, every batch of the group is refused.
         """
+        batches = self._decode(group)
         try:
             self.journal.begin()
-            answers = [self._admit(incoming) for incoming in group]
+            answers = [self._admit(incoming, batch) for incoming, batch in zip(group, batches, strict=True)]
             began_s = time.monotonic()
             self.journal.commit()
             self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
@@ -120,8 +125,7 @@ class Store:
             return [Refused(Refusal.STORE, f"the server cannot write: {error}") for _ in group]
         for answer, admission in answers:
             self._count(answer, admission)
-            if isinstance(answer, Ack) and admission and len(admission.batch.rows):
-                self._fold(answer.row, admission.batch)
+        self._fold([admission.batch for _, admission in answers if admission and len(admission.batch.rows)])
         return [answer for answer, _ in answers]
 
     def save_snapshot(self) -> None:
@@ -208,11 +212,30 @@ class Store:
             entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
         return machines
 
-    def _admit(self, incoming: Incoming) -> tuple[Ack | Refused, Admission | None]:
+    def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
+        """What each batch holds, or why it is refused; one that is not signed is not looked at."""
+        refused = [self._signature_problem(incoming) for incoming in group]
+        signed = (incoming.payload for incoming, error in zip(group, refused, strict=True) if error is None)
+        decoded = iter(decode_batches(list(signed), self.site.extent_m))
+        return [error or next(decoded) for error in refused]
+
+    def _signature_problem(self, incoming: Incoming) -> MessageError | None:
+        if not self._verify:
+            return None
+        if not incoming.machine:
+            return MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
+        key = keys.ingest(self.site.name, incoming.machine)
         try:
-            if self._verify:
-                self._check_signature(self._verify, incoming)
-            batch = parse(incoming.payload, incoming.machine, self.site, self.now_ns, self._seen)
+            self._verify(incoming.machine, key, incoming.payload, incoming.signature)
+        except MessageError as error:
+            return error
+        return None
+
+    def _admit(self, incoming: Incoming, batch: SampleBatch | MessageError) -> tuple[Ack | Refused, Admission | None]:
+        try:
+            if isinstance(batch, MessageError):
+                raise batch
+            judge(batch, incoming.machine, self.site, self.now_ns, self._seen)
             replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
@@ -248,12 +271,6 @@ class Store:
                 fact = event.id
         return fact
 
-    def _check_signature(self, verify: Verify, incoming: Incoming) -> None:
-        if not incoming.machine:
-            raise MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
-        key = keys.ingest(self.site.name, incoming.machine)
-        verify(incoming.machine, key, incoming.payload, incoming.signature)
-
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count what became of a batch, once it is certain."""
         if isinstance(answer, Refused):
@@ -263,25 +280,16 @@ class Store:
             self.counters["samples_trimmed"] += admission.trimmed
             self.counters["samples_lost"] += admission.lost
 
-    def _fold(self, row: int, batch: SampleBatch) -> None:
-        if batch.machine not in self.excluded:
-            self.grid.fold(batch.rows, batch.machine)
-        newest_ns = int(batch.rows["stamp_ns"].max())
-        self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)
-        self.merged = row
+    def _fold(self, batches: list[SampleBatch]) -> None:
+        """Fold what was committed: all of it that there is, up to the last journal row."""
+        folded = [batch for batch in batches if batch.machine not in self.excluded]
+        names = np.array([name_hash(batch.machine) for batch in folded], np.uint64)
+        rows = joined([batch.rows for batch in folded])
+        self.grid.fold_all(rows, np.repeat(names, [len(batch.rows) for batch in folded]))
+        for batch in batches:
+            newest_ns = int(batch.rows["stamp_ns"].max())
+            self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)
+        self.merged = self.journalled
 
     def _history(self) -> History:
         return History(self.journal, Archive(self.folder / FOLDER))
-
-
-@contextmanager
-def _hold(folder: Path) -> Iterator[None]:
-    """Keep a second server off the folder: each would take the samples that the other has. A crash releases it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK_FILE).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            problem = "another server is using this store; stop it, or choose another --store"
-            raise StoreError(folder, problem) from None
-        yield
