@@ -141,18 +141,8 @@ class WhyQuery:
     name = "why"
 
 
-MapQuery = (
-    # of cells, of all of it, of the server
-    PointQuery
-    | RegionQuery
-    | TileQuery
-    | HistoryQuery
-    | WhyQuery
-    | TilesQuery
-    | InfoQuery
-    | MachinesQuery
-    | ChangesQuery
-)
+CellQuery = PointQuery | RegionQuery | TileQuery | HistoryQuery | WhyQuery
+MapQuery = CellQuery | TilesQuery | InfoQuery | MachinesQuery | ChangesQuery
 
 
 def check_size(columns: int, rows: int) -> None:

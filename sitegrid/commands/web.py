@@ -1,4 +1,4 @@
-"""`sitegrid web`: the live page and the map's HTTP door, beside the map server."""
+"""`sitegrid web`: the live page and the map over HTTP, beside the map server."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from sitegrid.options.groups import add_network
 from sitegrid.options.values import address
 from sitegrid.process.lifetime import stop_flag
 
+EXTRA = "web"
 HELP = "show the map in browsers, and to other tools over HTTP"
 
 
@@ -33,7 +34,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> int:
     """Serve until stopped."""
-    from sitegrid.web.door import serve
+    from sitegrid.web.process import serve
 
     host, port = arguments.listen
     if not arguments.tokens and not _is_loopback(host):

@@ -25,19 +25,19 @@ def zones(answer: TilesAnswer, boundaries: Sequence[float], projection: Projecti
         return _collection([])
     image, column, row = _resistance(answer)
     classes = np.where(np.isnan(image), -1, np.digitize(image, boundaries))
-    found = []
+    areas = []
     for kind in range(len(boundaries) + 1):
         for rings in _polygons(classes == kind):
             outline = [[_corner(x + column, y + row, answer.cell_m, projection) for x, y in ring] for ring in rings]
             name = ZONES[kind].name if len(boundaries) + 1 == len(ZONES) else str(kind)
-            found.append(_feature("Polygon", [[*ring, ring[0]] for ring in outline], {"class": kind, "name": name}))
-    return _collection(found)
+            areas.append(_feature("Polygon", [[*ring, ring[0]] for ring in outline], {"class": kind, "name": name}))
+    return _collection(areas)
 
 
-def changes(found: Iterable[GroundChange], projection: Projection) -> dict[str, Any]:
+def changes(ground_changes: Iterable[GroundChange], projection: Projection) -> dict[str, Any]:
     """Rectangles around changes of the ground."""
     out = []
-    for change in found:
+    for change in ground_changes:
         west, south, east, north = change.bounds
         ring = [(west, south), (east, south), (east, north), (west, north), (west, south)]
         properties = {
@@ -116,5 +116,5 @@ def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[st
     return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
 
 
-def _collection(found: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"type": "FeatureCollection", "features": found}
+def _collection(features: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"type": "FeatureCollection", "features": features}

@@ -70,7 +70,7 @@ class Guard:
         if len(scope["raw_path"]) + len(scope["query_string"]) > MAX_QUERY:
             raise Problem(HTTPStatus.REQUEST_URI_TOO_LONG, "too_large", f"more than {MAX_QUERY} bytes of address")
         if int(headers.get("content-length", "0") or 0) or "transfer-encoding" in headers:
-            raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too_large", "the door takes no body")
+            raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too_large", "no body is taken")
         if (origin := headers.get("origin")) and urlsplit(origin).netloc != headers.get("host"):
             raise Problem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
         self._count_rate(scope)

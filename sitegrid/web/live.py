@@ -14,18 +14,18 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from protocol.queries.answers import MapVersion
-from sitegrid.web.site import SiteDoor, frame
+from sitegrid.web.site import SiteFeed, frame
 
 TAKEN_S = 30.0  # a page that has not taken a map in for so long is disconnected; it comes back by itself
 QUIET_S = 1.0  # poses are sent at least so often
 NO_PERMISSION, TOO_SLOW = 4401, 4408
 
 
-async def serve(socket: WebSocket, door: SiteDoor) -> None:
+async def serve(socket: WebSocket, feed: SiteFeed) -> None:
     """Serve one page until it goes, or takes nothing any more."""
     await socket.accept()
-    page = _Page(socket, door, _version(socket.query_params))
-    async with door.watched():
+    page = _Page(socket, feed, _version(socket.query_params))
+    async with feed.watched():
         tasks = [asyncio.create_task(page.receive()), asyncio.create_task(page.send())]
         done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in rest:
@@ -38,8 +38,8 @@ async def serve(socket: WebSocket, door: SiteDoor) -> None:
 class _Page:
     """One page. version: the map that it has taken in."""
 
-    def __init__(self, socket: WebSocket, door: SiteDoor, version: MapVersion | None) -> None:
-        self._socket, self._door, self._version = socket, door, version
+    def __init__(self, socket: WebSocket, feed: SiteFeed, version: MapVersion | None) -> None:
+        self._socket, self._door, self._version = socket, feed, version
         self._sent: MapVersion | None = None  # on its way
         self._sent_s = 0.0
         self._state: Any = None
@@ -62,31 +62,31 @@ class _Page:
 
     async def send(self) -> None:
         """Send what is new, whenever there is anything."""
-        door, loop = self._door, asyncio.get_running_loop()
+        feed, loop = self._door, asyncio.get_running_loop()
         while True:
             now_s = loop.time()
             if self._sent and now_s - self._sent_s > TAKEN_S:
                 await self._socket.close(TOO_SLOW, "nothing was taken in")
                 return
             await self._send_news(now_s)
-            async with door.moved:
+            async with feed.moved:
                 with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(door.moved.wait(), QUIET_S)
+                    await asyncio.wait_for(feed.moved.wait(), QUIET_S)
 
     async def _send_news(self, now_s: float) -> None:
-        door, socket = self._door, self._socket
-        state = (door.is_away, json.dumps(door.state))
+        feed, socket = self._door, self._socket
+        state = (feed.is_away, json.dumps(feed.state))
         if state != self._state:
             self._state = state
-            news = {"state": "away"} if door.is_away else {"state": "live", "site": door.state}
-            await self._timely(socket.send_text(json.dumps(news if door.state or door.is_away else {})))
-        if self._sent is None and not door.is_away and (answer := door.since(self._version)):
+            news = {"state": "away"} if feed.is_away else {"state": "live", "site": feed.state}
+            await self._timely(socket.send_text(json.dumps(news if feed.state or feed.is_away else {})))
+        if self._sent is None and not feed.is_away and (answer := feed.since(self._version)):
             if answer.tiles or answer.whole:
                 self._sent, self._sent_s = answer.version, now_s
                 await self._timely(socket.send_bytes(frame(answer)))
             else:
                 self._version = answer.version  # nothing that the page shows is another one
-        if now_s - self._poses_s >= 0.2 and (poses := door.poses()):
+        if now_s - self._poses_s >= 0.2 and (poses := feed.poses()):
             self._poses_s = now_s
             await self._timely(socket.send_text(json.dumps({"poses": poses})))
 

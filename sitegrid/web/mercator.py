@@ -72,8 +72,8 @@ def value_png(values: Floats, layer: str) -> bytes:
     """Values (256, 256) in 24 bits; what is beyond them takes the end."""
     known = ~np.isnan(values)
     scale, offset = coding(layer)
-    found = np.clip(np.rint((np.where(known, values, 0) - offset) / scale), 1, MOST)
-    steps = np.where(known, found, 0).astype(np.int64)
+    steps = np.clip(np.rint((np.where(known, values, 0) - offset) / scale), 1, MOST)
+    steps = np.where(known, steps, 0).astype(np.int64)
     return _png(np.stack([steps & 255, steps >> 8 & 255, steps >> 16 & 255], axis=-1).astype(np.uint8))
 
 

@@ -36,7 +36,11 @@ PROBLEM_SCHEMA = {
 def description() -> dict[str, Any]:
     """All of it."""
     paths = {f"{PREFIX}/sites/{{site}}/{name}": {"get": _operation(name, one)} for name, one in RESOURCES.items()}
-    sites = {"summary": "Sites of this door", "operationId": "sites", "responses": _responses(("application/json",))}
+    sites = {
+        "summary": "Sites that are served here",
+        "operationId": "sites",
+        "responses": _responses(("application/json",)),
+    }
     return {
         "openapi": "3.1.0",
         "info": {"title": "sitegrid", "version": package_version(), "summary": "The ground, as machines found it"},
@@ -59,6 +63,6 @@ def _operation(name: str, resource: Resource) -> dict[str, Any]:
 
 
 def _responses(media: tuple[str, ...]) -> dict[str, Any]:
-    found = {"description": "As asked", "content": {kind: {} for kind in media}}
+    answer = {"description": "As asked", "content": {kind: {} for kind in media}}
     codes = ("400", "401", "403", "404", "413", "414", "429", "502", "503", "504")
-    return {"200": found, "304": {"description": "As the asker has it"}, **dict.fromkeys(codes, PROBLEM)}
+    return {"200": answer, "304": {"description": "As the asker has it"}, **dict.fromkeys(codes, PROBLEM)}

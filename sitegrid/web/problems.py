@@ -47,7 +47,7 @@ def problem_of(error: Exception) -> Problem:
         return Problem(HTTPStatus.SERVICE_UNAVAILABLE, "no_server", detail, {"Retry-After": "2"})
     if isinstance(error, SitegridError):
         return Problem(HTTPStatus.BAD_GATEWAY, "bad_answer", "the map server's answer cannot be read")
-    return Problem(HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "the door failed; its log has more")
+    return Problem(HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "the web server failed; its log has more")
 
 
 def problem_response(error: Exception) -> Response:

@@ -16,13 +16,13 @@ from protocol.queries.answers import MapVersion
 from protocol.site.geometry import Bounds
 from sitegrid.web import features, values
 from sitegrid.web.problems import bad
-from sitegrid.web.site import SiteDoor, frame
+from sitegrid.web.site import SiteFeed, frame
 from sitegrid.web.values import Parameters
 
 MAX_CELLS_JSON = 250_000  # of a region as text: 2 MB a layer
 MAX_CELLS_NPZ = 4_000_000
 AGES = ("age_s", "changed_s")  # layers that change with the site's now
-Answer = Callable[[SiteDoor, Parameters], Awaitable[Response]]
+Answer = Callable[[SiteFeed, Parameters], Awaitable[Response]]
 
 PLACE = {"x": "east of the site's origin [m]", "y": "north of it [m]"}
 PLACE |= {"lat": "latitude [deg], with lon in place of x and y", "lon": "longitude [deg]"}
@@ -41,36 +41,36 @@ class Resource:
     follows_now: bool = False  # whether it changes with the site's now, not with the map alone
 
 
-async def point(door: SiteDoor, parameters: Parameters) -> Response:
+async def point(feed: SiteFeed, parameters: Parameters) -> Response:
     """Layers of the cell at a position."""
-    x_m, y_m = values.place(parameters, await door.projection())
+    x_m, y_m = values.place(parameters, await feed.projection())
     as_of_ns = values.stamp(parameters, "as_of")
-    answer = await door.ask(door.client.point, x_m, y_m, values.layers(parameters), as_of_ns=as_of_ns)
-    lat_deg, lon_deg, _ = (await door.projection()).to_geodetic(answer.x_m, answer.y_m)
+    answer = await feed.ask(feed.client.point, x_m, y_m, values.layers(parameters), as_of_ns=as_of_ns)
+    lat_deg, lon_deg, _ = (await feed.projection()).to_geodetic(answer.x_m, answer.y_m)
     place = {"x_m": answer.x_m, "y_m": answer.y_m, "lat_deg": lat_deg, "lon_deg": lon_deg}
     return _json({**place, "values": answer.values, **_version(answer.version), "stamp_ns": answer.stamp_ns})
 
 
-async def why(door: SiteDoor, parameters: Parameters) -> Response:
+async def why(feed: SiteFeed, parameters: Parameters) -> Response:
     """Everything that is known of the cell at a position."""
-    x_m, y_m = values.place(parameters, await door.projection())
-    return _json(await door.ask(door.client.why, x_m, y_m, as_of_ns=values.stamp(parameters, "as_of")))
+    x_m, y_m = values.place(parameters, await feed.projection())
+    return _json(await feed.ask(feed.client.why, x_m, y_m, as_of_ns=values.stamp(parameters, "as_of")))
 
 
-async def region(door: SiteDoor, parameters: Parameters) -> Response:
+async def region(feed: SiteFeed, parameters: Parameters) -> Response:
     """Layers of the cells that a rectangle touches, or that lie in a polygon."""
     outline = _outline(parameters)
     bounds = _bounds(parameters) if outline is None else _around(outline)
     as_npz = parameters.get("format", "json") == "npz"
     if parameters.get("format", "json") not in ("json", "npz"):
         raise bad(Refusal.OUT_OF_RANGE, "parameter `format`: json or npz")
-    cell_m = (await door.info()).site.cell_m
+    cell_m = (await feed.info()).site.cell_m
     cells = (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) / cell_m**2
     if cells > (most := MAX_CELLS_NPZ if as_npz else MAX_CELLS_JSON):
         problem = f"a region of about {cells:.0f} cells; at most {most} as {'npz' if as_npz else 'json'}"
         raise bad(Refusal.TOO_LARGE, problem)
     as_of_ns = values.stamp(parameters, "as_of")
-    answer = await door.ask(door.client.region, bounds, values.layers(parameters), as_of_ns=as_of_ns)
+    answer = await feed.ask(feed.client.region, bounds, values.layers(parameters), as_of_ns=as_of_ns)
     layers = dict(answer.layers)
     if outline is not None:
         inside = features.inside(outline, answer.x_m, answer.y_m)
@@ -84,64 +84,64 @@ async def region(door: SiteDoor, parameters: Parameters) -> Response:
     return _json({**axes, "layers": layers, **_version(answer.version), "stamp_ns": answer.stamp_ns})
 
 
-async def history(door: SiteDoor, parameters: Parameters) -> Response:
+async def history(feed: SiteFeed, parameters: Parameters) -> Response:
     """Layers of the cell at a position, span by span."""
-    x_m, y_m = values.place(parameters, await door.projection())
+    x_m, y_m = values.place(parameters, await feed.projection())
     times = {"from_ns": values.stamp(parameters, "from"), "to_ns": values.stamp(parameters, "to")}
     span_s = values.number(parameters, "span") if "span" in parameters else None
-    spans = await door.ask(door.client.history, x_m, y_m, values.layers(parameters), **times, span_s=span_s)
+    spans = await feed.ask(feed.client.history, x_m, y_m, values.layers(parameters), **times, span_s=span_s)
     return _json({"spans": spans})
 
 
-async def info(door: SiteDoor, _: Parameters) -> Response:
+async def info(feed: SiteFeed, _: Parameters) -> Response:
     """State of the map and of its server."""
-    return _json(await door.info(0.0))
+    return _json(await feed.info(0.0))
 
 
-async def machines(door: SiteDoor, _: Parameters) -> Response:
+async def machines(feed: SiteFeed, _: Parameters) -> Response:
     """What the map server knows of each machine."""
-    return _json({"machines": await door.ask(door.client.machines)})
+    return _json({"machines": await feed.ask(feed.client.machines)})
 
 
-async def changes(door: SiteDoor, parameters: Parameters) -> Response:
+async def changes(feed: SiteFeed, parameters: Parameters) -> Response:
     """Changes of the ground."""
     after = values.number(parameters, "after", 0.0)
     if after < 0 or after != int(after):
         raise bad(Refusal.OUT_OF_RANGE, f"parameter `after`: {after:g} is no whole number from 0 on")
-    return _json({"changes": await door.ask(door.client.changes, int(after))})
+    return _json({"changes": await feed.ask(feed.client.changes, int(after))})
 
 
-async def tiles(door: SiteDoor, parameters: Parameters) -> Response:
+async def tiles(feed: SiteFeed, parameters: Parameters) -> Response:
     """The map in tiles of 8-bit layers, as the live page reads it: all, those since a version, or as of a time."""
     as_of_ns = values.stamp(parameters, "as_of")
     if as_of_ns is not None:
-        answer = await door.tiles_as_of(as_of_ns)
+        answer = await feed.tiles_as_of(as_of_ns)
     else:
         known = {"store", "row", "fact"} & set(parameters)
         numbers = (int(values.number(parameters, name, -1.0)) for name in ("row", "fact"))
         since = MapVersion(parameters.get("store", ""), *numbers) if known else None
-        answer = await door.ask(door.client.tiles, since)
+        answer = await feed.ask(feed.client.tiles, since)
     return Response(frame(answer), media_type="application/octet-stream")
 
 
-async def zones(door: SiteDoor, _: Parameters) -> Response:
+async def zones(feed: SiteFeed, _: Parameters) -> Response:
     """Areas of one kind of ground, as features."""
-    info_now = await door.info()
-    answer = await door.ask(door.client.tiles)
-    return _geojson(features.zones(answer, info_now.boundaries, await door.projection()))
+    info_now = await feed.info()
+    answer = await feed.ask(feed.client.tiles)
+    return _geojson(features.zones(answer, info_now.boundaries, await feed.projection()))
 
 
-async def change_features(door: SiteDoor, _: Parameters) -> Response:
+async def change_features(feed: SiteFeed, _: Parameters) -> Response:
     """Changes of the ground, as features."""
-    found = await door.ask(door.client.changes)
-    return _geojson(features.changes(found, await door.projection()))
+    ground_changes = await feed.ask(feed.client.changes)
+    return _geojson(features.changes(ground_changes, await feed.projection()))
 
 
-async def machine_features(door: SiteDoor, _: Parameters) -> Response:
+async def machine_features(feed: SiteFeed, _: Parameters) -> Response:
     """Where machines are, as features: those that said so while somebody looks."""
-    async with door.watched():
-        await door.heard()
-        return _geojson(features.machines(door.poses(), await door.projection()))
+    async with feed.watched():
+        await feed.heard()
+        return _geojson(features.machines(feed.poses(), await feed.projection()))
 
 
 RESOURCES: dict[str, Resource] = {

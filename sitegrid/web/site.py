@@ -1,4 +1,4 @@
-"""One site as the door sees it: a client of its map server, and what all pages share of it."""
+"""One site as its pages see it: a client of its map server, and what all pages share of it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ THREADS = 8  # questions at once: more visitors wait for each other, not on the 
 PAST_KEPT = 128  # maps of the past that are kept ready: a day by minutes has more, a slider moves by fewer
 
 
-class SiteDoor:
+class SiteFeed:
     """Asks one site's map server for all pages together. Its methods are for the event loop's thread.
 
     watchers: how many look at it now. is_away: whether the map server did not answer the last time.
@@ -218,6 +218,6 @@ def _site_of(info: MapInfo) -> SiteConfig:
     return SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m, site.cell_m)
 
 
-def names(doors: Iterable[SiteDoor]) -> list[str]:
+def names(feeds: Iterable[SiteFeed]) -> list[str]:
     """Names of sites."""
-    return [door.name for door in doors]
+    return [feed.name for feed in feeds]

@@ -1,4 +1,4 @@
-"""The door's process: sockets, TLS, and the event loop."""
+"""The web server's process: sockets, TLS, and the event loop."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from protocol.errors import ConfigError
 from protocol.wire.credentials import CERTIFICATE_FILE, KEY_FILE
 from sitegrid.client import connect
 from sitegrid.process.lifetime import say
-from sitegrid.web.app import Door
-from sitegrid.web.site import SiteDoor
+from sitegrid.web.app import WebApp
+from sitegrid.web.site import SiteFeed
 from sitegrid.web.tokens import TokenFile
 
 FIRST_S = 10.0  # until a new connection has sent its first request; a slow one holds a place that others need
@@ -53,9 +53,9 @@ def serve(
     clients = [connect(endpoint, name, keys=arguments.keys) for name, endpoint in sites]
 
     async def run() -> None:
-        door = Door([SiteDoor(client) for client in clients], person)
+        web = WebApp([SiteFeed(client) for client in clients], person)
         config = uvicorn.Config(
-            door.app,
+            web.app,
             http=PatientProtocol,
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
