@@ -59,6 +59,20 @@ class GridState:
         ]
 
 
+@dataclass(frozen=True)
+class GridCounts:
+    """What a grid holds, in numbers.
+
+    folded: samples that vote; skipped: those too uncertain of their position. cells: how many have evidence; bounds:
+    first column, first row, end column, end row of all blocks with evidence; both without the samples that wait.
+    """
+
+    folded: int
+    skipped: int
+    cells: int
+    bounds: tuple[int, int, int, int] | None
+
+
 class Grid:
     """Evidence of one site. newest_ns: the newest stamp of all samples."""
 
@@ -67,7 +81,8 @@ class Grid:
         self.cell_m = cell_m
         self.config = config
         self.newest_ns = 0
-        self._folded = self._skipped = 0
+        self._folded = self._skipped = self._cells = 0
+        self._blocks: tuple[int, int, int, int] | None = None  # bounds of all blocks: west, south, east, north
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
@@ -110,8 +125,9 @@ class Grid:
             raise ValueError(f"folded otherwise: {other.cell_m} m, {other.config}; {self.cell_m} m, {self.config}")
         self._drain()
         other._drain()
+        self._extend(other._timelines)
         for block, timeline in other._timelines.items():
-            self._timeline(block).add(timeline.settled().expanded())
+            self._cells += self._timeline(block).add(timeline.settled().expanded())
             self._touched.add(block)
         self._folded += other._folded
         self._skipped += other._skipped
@@ -162,16 +178,22 @@ class Grid:
     def bounds(self) -> tuple[int, int, int, int] | None:
         """First column, first row, end column, end row of all blocks with evidence."""
         self._drain()
-        if not self._timelines:
-            return None
-        xs, ys = zip(*self._timelines, strict=True)
-        n = BLOCK_CELLS
-        return min(xs) * n, min(ys) * n, (max(xs) + 1) * n, (max(ys) + 1) * n
+        return self.counts().bounds
 
     def known_cells(self) -> int:
         """How many cells have any evidence."""
         self._drain()
-        return sum(timeline.known_cells for timeline in self._timelines.values())
+        return self._cells
+
+    def counts(self) -> GridCounts:
+        """What is there, from counters: nothing is folded or looked through for it."""
+        waiting = is_foldable(self._rows[: self._waiting].view(SAMPLE_DTYPE), self.config)
+        voting, n = int(np.count_nonzero(waiting)), BLOCK_CELLS
+        bounds = None
+        if self._blocks:
+            west, south, east, north = self._blocks
+            bounds = west * n, south * n, (east + 1) * n, (north + 1) * n
+        return GridCounts(self._folded + voting, self._skipped + len(waiting) - voting, self._cells, bounds)
 
     def state(self) -> GridState:
         """Everything, in the order of places, so that equal grids have equal states."""
@@ -183,8 +205,10 @@ class Grid:
     def from_state(cls, cell_m: float, config: FoldConfig, state: GridState) -> Grid:
         """Undo `state`."""
         grid = cls(cell_m, config)
+        grid._extend((x, y) for x, y, _ in state.blocks)
         for x, y, pages in state.blocks:
-            grid._timelines[x, y] = Timeline(grid._tiers, grid._spaces[0], pages)
+            timeline = grid._timelines[x, y] = Timeline(grid._tiers, grid._spaces[0], pages)
+            grid._cells += timeline.known_cells
         grid._folded, grid._skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
         return grid
 
@@ -210,6 +234,7 @@ class Grid:
         rows, names = self._rows[: self._waiting].view(SAMPLE_DTYPE), self._names[: self._waiting]
         count = self._workers.count
         pages: list[list[tuple[Block, PackedPages]]] = [[] for _ in range(count)]  # of each worker's blocks
+        cells = [0] * count
 
         def fold_share(worker: int) -> None:
             """Fold a stretch of the samples."""
@@ -222,11 +247,13 @@ class Grid:
             for block, packed in pages[worker]:
                 timeline = self._timeline(block)
                 timeline.space = self._spaces[worker]
-                timeline.add(packed)
+                cells[worker] += timeline.add(packed)
                 self._touched.add(block)
 
         self._workers.each(fold_share)
         self._workers.each(add_share)
+        self._cells += sum(cells)
+        self._extend({block for share in pages for block, _ in share})
         voting = int(is_foldable(rows, self.config).sum())
         self._folded += voting
         self._skipped += len(rows) - voting
@@ -237,6 +264,12 @@ class Grid:
         if timeline is None:
             timeline = self._timelines[block] = Timeline(self._tiers, self._spaces[0])
         return timeline
+
+    def _extend(self, blocks: Iterable[Block]) -> None:
+        """Keep the bounds of all blocks."""
+        for x, y in blocks:
+            west, south, east, north = self._blocks or (x, y, x, y)
+            self._blocks = min(west, x), min(south, y), max(east, x), max(north, y)
 
     def _settle(self, worker: int) -> None:
         """Settle a worker's own blocks."""

@@ -162,7 +162,8 @@ class Store:
         self._opened.close()
 
     def info(self) -> dict[str, Any]:
-        """State of the store in plain values."""
+        """State of the store in plain values, from counters."""
+        counts = self.grid.counts()
         return {
             "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
             "store": self.identity.id,
@@ -171,10 +172,10 @@ class Store:
             "journalled": self.journalled,
             "merged": self.merged,
             "snapshot": self.snapshot_row,
-            "samples_merged": self.grid.folded,
-            "samples_too_unsure": self.grid.skipped,
-            "cells": self.grid.known_cells(),
-            "bounds": self.grid.bounds(),
+            "samples_merged": counts.folded,
+            "samples_too_unsure": counts.skipped,
+            "cells": counts.cells,
+            "bounds": counts.bounds,
             "stamp_ns": self.newest_ns,
             "wall_ns": self.now_ns(),
             "version": package_version(),
@@ -186,14 +187,7 @@ class Store:
 
     def machines(self) -> dict[str, dict[str, int]]:
         """What each machine sent: spools, samples, samples that it declared lost, newest stamp."""
-        machines: dict[str, dict[str, int]] = {}
-        for (machine, _), mark in self.journal.watermarks().items():
-            entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0})
-            entry["spools"] += 1
-            entry["samples"] += mark.seq - mark.lost
-            entry["lost"] += mark.lost
-            entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
-        return machines
+        return {name: dict(vars(totals)) for name, totals in self.journal.machines().items()}
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
         """What each batch holds, or why it is refused; one that is not signed is not looked at."""
