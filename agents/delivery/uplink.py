@@ -250,6 +250,8 @@ class Uplink:
         head = self._head
         self.counters[f"refused_{refused.reason}"] += 1
         self.problem = refused.problem
+        if refused.reason in PASSING and refused.retry_after_s > 0:
+            return self._wait_for_room(refused.retry_after_s)
         if refused.reason in PASSING or refused.reason in BLOCKING or head is None or not len(head.rows):
             return self._back_off()
         if refused.reason == Refusal.GAP:
@@ -273,6 +275,11 @@ class Uplink:
             self._limit = min(max(self._limit, 2 * n), self._pacing.max_batch)
         elif n < first and self._took_s < self.timeout_s / 2:
             self._limit = max(self._limit, n + 1 + n // 4)
+
+    def _wait_for_room(self, retry_after_s: float) -> Wait:
+        """Come again when the server asks for it, no sooner and not all at once; it need not be asked less and less."""
+        pause_s = min(retry_after_s, self._pacing.max_backoff_s)
+        return Wait(float(pause_s * self._rng.uniform(1.0, 1.5)))
 
     def _back_off(self) -> Wait:
         self._failures += 1

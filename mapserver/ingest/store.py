@@ -82,8 +82,11 @@ class Store:
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
+            in_snapshot = self.grid.counts()
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
-            self.merged = last_row
+            self.merged, counts = last_row, self.grid.counts()
+            tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
+            self._snapshot_samples = self.journal.samples - tail
             self.newest_ns = self.journal.newest_ns()
             self.fact = self._last_fact()
             self._opened = opened.pop_all()
@@ -92,6 +95,11 @@ class Store:
     def journalled(self) -> int:
         """The last row on disk."""
         return self.journal.last_row
+
+    @property
+    def samples_behind(self) -> int:
+        """How many samples the newest snapshot lacks: a start would have to fold them."""
+        return self.journal.samples - self._snapshot_samples
 
     @property
     def version(self) -> MapVersion:
@@ -128,13 +136,13 @@ class Store:
         """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
         if self.merged <= self.snapshot_row:
             return None
-        row, grid, excluded = self.merged, self.grid, self.excluded
+        row, grid, excluded, samples = self.merged, self.grid, self.excluded, self.journal.samples
         state = grid.state()
 
         def write() -> None:
             snapshot.save(self.folder, row, state, self.site.cell_m, self.config.fold, excluded)
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
-                self.snapshot_row = row
+                self.snapshot_row, self._snapshot_samples = row, samples
 
         return write
 
@@ -149,7 +157,7 @@ class Store:
             grid.fold_all(rows.samples, rows.names())
         before, self.grid, self.excluded = self.grid, grid, excluded
         self.fact = self._last_fact()
-        self.snapshot_row = 0  # what is on disk has other machines in it
+        self.snapshot_row = self._snapshot_samples = 0  # what is on disk has other machines in it
         return before
 
     def decide(self, decision: TrustDecision) -> None:

@@ -62,6 +62,11 @@ class Journal(JournalQueries):
         """What each machine sent."""
         return self._progress.machines()
 
+    @property
+    def samples(self) -> int:
+        """How many samples all machines sent."""
+        return self._progress.samples
+
     def begin(self) -> None:
         """Open a transaction; rows appended from here on are one group commit."""
         self._db.execute("BEGIN IMMEDIATE")

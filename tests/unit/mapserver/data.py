@@ -1,5 +1,6 @@
 """Samples, batches and stores for the tests of the map server."""
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -167,8 +168,10 @@ def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = S
     return Store(folder, site, config, now_ns)
 
 
-def open_writer(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Writer:
-    return Writer(open_store(folder, config, site))
+def open_writer(
+    folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE, clock: Callable[[], float] = time.monotonic
+) -> Writer:
+    return Writer(open_store(folder, config, site), clock)
 
 
 class Replies:

@@ -21,6 +21,7 @@ def test_totals_of_machines_are_the_sums_over_their_spools(puts):
         lost = sum(mark.lost for mark in own)
         expected[machine] = MachineTotals(len(own), sum(mark.seq for mark in own) - lost, lost, newest[machine])
     assert progress.machines() == expected
+    assert progress.samples == sum(totals.samples for totals in expected.values())
     assert marks == {(machine, spool_id): mark for machine, spool_id, mark in puts}
 
 
