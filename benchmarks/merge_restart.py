@@ -20,8 +20,8 @@ from benchmarks.merge_work import A_SECOND, BATCH, batches, seconds_of
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES
+from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Admission
 from protocol.arrays import Table

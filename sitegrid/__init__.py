@@ -13,6 +13,7 @@ from protocol.queries.answers import (
     PointAnswer,
     Region,
     SampleCounts,
+    ServerAlive,
     SiteInfo,
     TrustAnswer,
 )
@@ -25,5 +26,5 @@ from sitegrid.listener import Listener
 __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
 __all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
-__all__ += ["Bounds", "KnownGround", "SampleCounts", "SiteInfo"]
+__all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __version__ = package_version()

@@ -10,8 +10,17 @@ import zenoh
 
 from protocol.errors import LinkError
 from protocol.queries import answer_codec, requests
-from protocol.queries.answers import GroundChange, HistorySpan, MachineState, MapInfo, PointAnswer, Region, TrustAnswer
-from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.answers import (
+    GroundChange,
+    HistorySpan,
+    MachineState,
+    MapInfo,
+    PointAnswer,
+    Region,
+    ServerAlive,
+    TrustAnswer,
+)
+from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
@@ -92,6 +101,10 @@ class Client:
         query = requests.HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, fresh)
         return answer_codec.decode_history(self._ask(query)).spans
 
+    def alive(self) -> ServerAlive:
+        """Whether the server takes batches: for probes, since it waits for nothing."""
+        return answer_codec.decode_alive(self._ask(requests.AliveQuery()))
+
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
         return answer_codec.decode_info(self._ask(requests.InfoQuery(requests.Freshness(after, wait_s))))
@@ -128,6 +141,11 @@ class Client:
     def judge_automatically(self, machine: str, *, wait_s: float = 30.0) -> TrustAnswer:
         """Leave it to the server again whether a machine's samples are used."""
         return self._command(TrustCommand(machine, None, "", wait_s))
+
+    def accept(self, store: str, reason: str) -> MapInfo:
+        """Let the map server's store take the place of another one, which is gone: machines go on with it."""
+        command = AcceptCommand(store, reason)
+        return answer_codec.decode_info(self._get(keys.admin(self.site, command.name), encode_command(command), 0.0))
 
     def close(self) -> None:
         """Close the session and its listeners."""

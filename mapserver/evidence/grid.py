@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import fold, scratch_block
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
-from mapserver.evidence.pages import CompactPages, PackedPages, Page
+from mapserver.evidence.grid_state import GridCounts, GridState
+from mapserver.evidence.pages import PackedPages
 from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
 from mapserver.evidence.workers import ALONE, Workers
 from protocol.arrays import AnyArray, Table
@@ -24,53 +24,6 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 LIVE_ROWS, REFOLD_ROWS = 8192, 131_072
 PIECE = 4096  # samples whose weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
-
-
-@dataclass(frozen=True)
-class PlacedPage:
-    """A page, and where it belongs: the block's column and row, the tier of its timeline and the index there."""
-
-    x: int
-    y: int
-    tier: int
-    index: int
-    page: Page
-
-
-@dataclass(frozen=True)
-class GridState:
-    """Everything that a snapshot keeps; equal grids have equal states.
-
-    blocks: column, row and pages of each block, in the order of places. newest_ns: of all samples, 0 for none.
-    """
-
-    blocks: tuple[tuple[int, int, CompactPages], ...]
-    folded: int
-    skipped: int
-    newest_ns: int
-
-    @property
-    def pages(self) -> list[PlacedPage]:
-        """All pages, one by one."""
-        return [
-            PlacedPage(x, y, tier, index, page)
-            for x, y, pages in self.blocks
-            for tier, index, page in pages.expanded().items()
-        ]
-
-
-@dataclass(frozen=True)
-class GridCounts:
-    """What a grid holds, in numbers.
-
-    folded: samples that vote; skipped: those too uncertain of their position. cells: how many have evidence; bounds:
-    first column, first row, end column, end row of all blocks with evidence; both without the samples that wait.
-    """
-
-    folded: int
-    skipped: int
-    cells: int
-    bounds: tuple[int, int, int, int] | None
 
 
 class Grid:

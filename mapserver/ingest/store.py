@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import logging
 import os
 import socket
 import sqlite3
@@ -20,7 +21,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, admit, judge
+from mapserver.ingest.admission import GapError, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
@@ -37,7 +38,10 @@ from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
+log = logging.getLogger("mapserver.ingest.store")
+
 JOURNAL_FILE = "journal.db"
+ACCEPTED = "accepted_store"  # kind of an event
 LOCK_FILE = "lock"
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
@@ -54,8 +58,8 @@ class Incoming:
 class Store:
     """Journal, grid, watermarks and counters of one site.
 
-    identity: which store this is. excluded: machines whose rows are not in the grid. merged: the last journal row that
-    is; fact: the last decision that counts in it. newest_ns: the site's now.
+    identity: which store this is; accepted: ids of those whose place it takes. excluded: machines whose rows are not in
+    the grid. merged: the last journal row that is; fact: the last decision in it. newest_ns: the site's now.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class Store:
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
+            self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
             last_row = self.journal.last_row
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
             snapshot.remove_beyond(folder, last_row)
@@ -165,6 +170,13 @@ class Store:
         self.journal.append_event(TRUST, decision.stamp_ns, asdict(decision))
         self.fact = self._last_fact()
 
+    def accept(self, store: str, reason: str) -> None:
+        """Take the place of another store for good, since a person says so: its runs are taken on here."""
+        if store != self.identity.id and store not in self.accepted:
+            self.journal.append_event(ACCEPTED, self.newest_ns, {"store": store, "reason": reason})
+            self.accepted |= {store}
+            log.warning("accepted store=%s reason=%r", store, reason)
+
     def close(self) -> None:
         """Close the journal and let go of the folder."""
         self._opened.close()
@@ -176,6 +188,7 @@ class Store:
             "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
             "store": self.identity.id,
             "descends": list(self.identity.descends),
+            "accepted": sorted(self.accepted),
             "fact": self.fact,
             "journalled": self.journalled,
             "merged": self.merged,
@@ -221,6 +234,7 @@ class Store:
             if isinstance(batch, MessageError):
                 raise batch
             judge(batch, incoming.machine, self.site, self.now_ns)
+            replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
@@ -229,7 +243,7 @@ class Store:
         row = self.journal.append(admission, self.now_ns()) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
-        return Ack(admission.watermark, row, admission.trimmed, self.identity.id), admission
+        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces), admission
 
     def _last_fact(self) -> int:
         """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""

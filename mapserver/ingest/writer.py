@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,12 +15,15 @@ from mapserver.ingest.backlog import Backlog, Pace, size_of
 from mapserver.ingest.snapshot_times import SnapshotTimes
 from mapserver.ingest.store import Incoming, Store
 from protocol.errors import QueryError, Refusal
+from protocol.queries.answers import ServerAlive
 from protocol.wire.messages import Ack, Refused
 
 T = TypeVar("T")
 Reply = Callable[[Ack | Refused], None]
 _Batch = tuple[Incoming, Reply]
 log = logging.getLogger("mapserver.ingest.writer")
+
+HANGS_S = 30.0  # at one piece of work: a group or a look takes less than a second, a disk that hangs for ever
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class Writer:
         self._group: list[_Batch] = []  # of this turn, as far as nobody has an answer
         self._works: deque[_Work] = deque()
         self._pace = Pace()
-        self._overloaded = 0
+        self._refusals: Counter[str] = Counter()  # of what never comes to the store
         self._is_closing = False
         self._ended = ""  # why nothing is taken any more
         self._busy_since_s: float | None = None
@@ -63,7 +66,7 @@ class Writer:
         with self._turn:
             ended = self._ended
             gone = [] if ended else self._backlog.add(incoming.machine, size_of(incoming.payload), (incoming, reply))
-            self._overloaded += len(gone)
+            self._refusals[f"refused_{Refusal.OVERLOADED}"] += len(gone)
             retry_after_s = self._pace.retry_after_s(self._backlog.size)
             self._turn.notify()
         if ended:
@@ -91,18 +94,19 @@ class Writer:
 
     def count_refusal(self, reason: str) -> None:
         """Count a refused query."""
-        self.run(lambda store: store.counters.update({f"refused_query_{reason}": 1}))
+        with self._turn:
+            self._refusals[f"refused_query_{reason}"] += 1
 
-    def alive(self) -> dict[str, int | float]:
-        """Whether batches are taken, without waiting for the owner: rows, and how long it has been at its present work.
-
-        Raises QueryError where it has ended.
-        """
+    def alive(self) -> ServerAlive:
+        """Whether batches are taken, without waiting for the owner; QueryError where it has ended, or hangs."""
         if self._ended:
             raise QueryError(Refusal.STORE, self._ended)
         since_s = self._busy_since_s
         busy_s = 0.0 if since_s is None else max(0.0, self._clock() - since_s)
-        return {"journalled": self._store.journalled, "merged": self._store.merged, "busy_s": busy_s}
+        if busy_s > HANGS_S:
+            problem = f"the writer has been at one piece of work for {busy_s:.0f} s; look at the server's disk and log"
+            raise QueryError(Refusal.STORE, problem)
+        return ServerAlive(self.store_id, self._store.journalled, self._store.merged, busy_s)
 
     def info(self) -> dict[str, Any]:
         """State of the store."""
@@ -110,8 +114,8 @@ class Writer:
         commits, commit_s = self._store.commits, self._store.commit_s
         waiting = {"waiting": len(self._backlog), "waiting_bytes": self._backlog.size}
         info["writer"] = {**waiting, "commits": commits, "commit_s": commit_s}
-        if self._overloaded:
-            info["counters"][f"refused_{Refusal.OVERLOADED}"] = self._overloaded
+        with self._turn:
+            info["counters"] |= +self._refusals
         return info
 
     def close(self) -> None:

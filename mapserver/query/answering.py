@@ -20,7 +20,7 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
 from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
-from protocol.queries.commands import TrustCommand, parse_command
+from protocol.queries.commands import AcceptCommand, TrustCommand, parse_command
 from protocol.queries.requests import MAX_SPANS, HistoryQuery, MapQuery, PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds, CellWindow
 
@@ -43,7 +43,11 @@ class Answers:
 
     def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and carry out one command; QueryError says what is wrong with it."""
-        return codec.encode_machine(self.trust(parse_command(name, parameters)))
+        command = parse_command(name, parameters)
+        if isinstance(command, AcceptCommand):
+            self._writer.run(lambda store: store.accept(command.store, command.reason))
+            return codec.encode_info(self.info())
+        return codec.encode_machine(self.trust(command))
 
     def _encode(self, query: MapQuery) -> bytes:
         match query:
@@ -53,6 +57,8 @@ class Answers:
                 return codec.encode_region(self.region(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
+            case requests.AliveQuery():
+                return codec.encode_alive(self._writer.alive())
             case requests.MachinesQuery():
                 return codec.encode_machines(self._follower.machines(), self._version())
             case requests.ChangesQuery():

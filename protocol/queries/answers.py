@@ -131,14 +131,16 @@ class ServerProcess:
 class MapInfo:
     """State of the map and its server.
 
-    store: its id; descends: ids of the stores that it was folded from; fact: see MapVersion. journalled, merged,
-    snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks with evidence; None
-    without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    store: its id; descends: ids of the stores that it was folded from; accepted: ids of those whose place a person let
+    it take; fact: see MapVersion. journalled, merged, snapshot: journal rows. bounds: first column, first row, end
+    column and end row of the blocks with evidence; None without any. wall_ns: the server's clock. distrusted: machines
+    whose samples are excluded.
     """
 
     site: SiteInfo
     store: str
     descends: tuple[str, ...]
+    accepted: tuple[str, ...]
     fact: int
     journalled: int
     merged: int
@@ -155,6 +157,19 @@ class MapInfo:
     distrusted: tuple[str, ...]
     counters: Mapping[str, int]
     layers: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ServerAlive:
+    """A map server that takes batches. journalled, merged: journal rows.
+
+    busy_s: how long it has been at the work that it does now, 0 for none.
+    """
+
+    store: str
+    journalled: int
+    merged: int
+    busy_s: float
 
 
 @dataclass(frozen=True)

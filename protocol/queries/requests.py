@@ -88,6 +88,15 @@ class InfoQuery:
 
 
 @dataclass(frozen=True)
+class AliveQuery:
+    """Whether the server takes batches: for probes, since it waits for nothing."""
+
+    fresh = Freshness()
+
+    name = "alive"
+
+
+@dataclass(frozen=True)
 class MachinesQuery:
     """What the server knows of each machine."""
 
@@ -106,7 +115,7 @@ class ChangesQuery:
     name = "changes"
 
 
-MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | MachinesQuery | ChangesQuery
+MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | AliveQuery | MachinesQuery | ChangesQuery
 
 
 def check_size(columns: int, rows: int) -> None:
@@ -120,6 +129,8 @@ def check_size(columns: int, rows: int) -> None:
 
 def encode_query(query: MapQuery) -> dict[str, str]:
     """Selector parameters."""
+    if isinstance(query, AliveQuery):
+        return {}
     if isinstance(query, ChangesQuery):
         return {"after": str(query.after)} if query.after else {}
     parameters: dict[str, str] = {}
@@ -183,6 +194,7 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
+    "alive": ((), lambda _: AliveQuery()),
     "info": (_FRESH, lambda parameters: InfoQuery(_freshness(parameters))),
 }
 

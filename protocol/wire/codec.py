@@ -177,6 +177,7 @@ def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
 
 def encode_reply(reply: Ack | Refused) -> bytes:
     """The server's answer to a batch."""
+    table: dict[str, Any]
     if isinstance(reply, Ack):
         table = {"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed}
         return pack({**table, "store": reply.store} | ({"replaces": reply.replaces} if reply.replaces else {}))

@@ -154,6 +154,7 @@ GOLDEN: dict[str, Golden] = {
         answers.decode_changes,
     ),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
+    "alive.bin": Golden(records.ServerAlive(STORE, 18, 17, 0.25), answers.encode_alive, answers.decode_alive),
     "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, answers.encode_info, decode_info_table),
     "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),
 }

@@ -14,7 +14,8 @@ import zenoh
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
-from mapserver.evidence.grid import LIVE_ROWS, Grid, GridState, PlacedPage
+from mapserver.evidence.grid import LIVE_ROWS, Grid
+from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import CompactPages, Page
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer

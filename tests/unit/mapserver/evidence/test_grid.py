@@ -3,7 +3,8 @@ import pytest
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
-from mapserver.evidence.grid import READ_BLOCKS, Grid, GridCounts, chunks
+from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks
+from mapserver.evidence.grid_state import GridCounts
 from protocol.site.geometry import CellWindow
 from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
 

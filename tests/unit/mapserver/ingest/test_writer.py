@@ -15,10 +15,11 @@ from mapserver.ingest import backlog, snapshot_times
 from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, MOST_RETRY_S
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
-from mapserver.ingest.writer import Writer
+from mapserver.ingest.writer import HANGS_S, Writer
 from mapserver.journal.journal import Journal
 from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
+from protocol.queries.answers import ServerAlive
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
 from protocol.wire.messages import Ack
 from tests.unit.mapserver.data import (
@@ -370,6 +371,35 @@ def test_a_bug_in_the_snapshot_is_logged(start, monkeypatch, caplog):
     assert writer.failed or "snapshot failed" in caplog.text
 
 
+# --- probes ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_probe_waits_for_nobody_and_hears_of_a_writer_that_hangs(start):
+    clock = Clock()
+    writer = start(clock=clock)
+    send(writer, [incoming(samples(3))])
+    turn(writer)
+    with held(writer):
+        clock.now_s += HANGS_S
+        assert writer.alive() == ServerAlive(writer.store_id, 1, 1, HANGS_S)
+        clock.now_s += 1.0
+        with pytest.raises(QueryError, match="at one piece of work for 31 s") as caught:
+            writer.alive()
+        assert caught.value.reason == Refusal.STORE
+    turn(writer)
+    writer.close()
+    with pytest.raises(QueryError, match="the server is ending"):
+        writer.alive()
+
+
+def test_what_comes_after_the_end_is_refused_at_once(start):
+    writer = start()
+    writer.close()
+    assert [answer.reason for answer in send(writer, [incoming(samples(1))])] == [Refusal.STORE]
+    with pytest.raises(QueryError, match="the server is ending"):
+        writer.run(lambda _: None)
+
+
 # --- the end of the thread -------------------------------------------------------------------------------------------
 
 
@@ -448,6 +478,8 @@ BATCHES = [
     (Refusal.GAP, table(first_seq=2)),
     (Refusal.WRONG_FRAME, table(frame="00000000")),
     (Refusal.WRONG_MACHINE, table(machine="b")),
+    (Refusal.OTHER_STORE, table(store="0123456789abcdef")),
+    (Refusal.OUT_OF_RANGE, table(store="0123")),
     (Refusal.WALL_CLOCK, one(stamp_ns=NOW_NS + 10**13)),
 ]
 
@@ -487,7 +519,7 @@ def test_a_refused_query_says_why(start, reason, name, parameters):
 
 def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
-    elsewhere |= {Refusal.FAR_FUTURE, Refusal.SERVER_CLOCK, Refusal.OTHER_STORE, Refusal.NOT_WRITER}
+    elsewhere |= {Refusal.FAR_FUTURE, Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}
     elsewhere |= {Refusal.UNKNOWN_MACHINE}  # commands, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 
