@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import socket
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,16 +20,17 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, admit, check_store, judge
+from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
+from mapserver.ingest.lock import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
-from mapserver.journal.refold import fold_history
+from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
-from protocol.errors import MessageError, Refusal, StoreError
+from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
@@ -42,7 +42,6 @@ log = logging.getLogger("mapserver.ingest.store")
 
 JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
-LOCK_FILE = "lock"
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
 
@@ -75,9 +74,8 @@ class Store:
         self._verify = verify
         self.counters: Counter[str] = Counter()
         self.commits, self.commit_s = 0, 0.0
-        self.newest_ns = 0
         with ExitStack() as opened:
-            opened.enter_context(_hold(folder))
+            opened.enter_context(hold(folder))
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
@@ -89,10 +87,12 @@ class Store:
             self.snapshot_row = self.merged
             in_snapshot = self.grid.counts()
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
+            release_memory()
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
             self._snapshot_samples = self.journal.samples - tail
-            self.newest_ns = self.journal.newest_ns()
+            self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
+            self._received_ns = self._last_received(last_row)
             self.fact = self._last_fact()
             self._opened = opened.pop_all()
 
@@ -105,6 +105,11 @@ class Store:
     def samples_behind(self) -> int:
         """How many samples the newest snapshot lacks: a start would have to fold them."""
         return self.journal.samples - self._snapshot_samples
+
+    @property
+    def newest_ns(self) -> int:
+        """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
+        return self._newest_but("")
 
     @property
     def version(self) -> MapVersion:
@@ -151,19 +156,17 @@ class Store:
 
         return write
 
-    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> Grid:
+    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
         """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines.
 
-        The rows beyond it are folded here, while batches wait: let them be few. Returns the grid that was used so far,
-        so that another thread may spend the time to let go of it.
+        The rows beyond it are folded here, while batches wait: let them be few.
         """
         grid.touch_all()
         for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
             grid.fold_all(rows.samples, rows.names())
-        before, self.grid, self.excluded = self.grid, grid, excluded
+        self.grid, self.excluded = grid, excluded
         self.fact = self._last_fact()
         self.snapshot_row = self._snapshot_samples = 0  # what is on disk has other machines in it
-        return before
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
@@ -233,17 +236,32 @@ class Store:
         try:
             if isinstance(batch, MessageError):
                 raise batch
-            judge(batch, incoming.machine, self.site, self.now_ns)
+            judge(batch, incoming.machine, self.site, self.now_ns, self._seen)
             replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
         new = len(admission.batch.rows) > 0
-        row = self.journal.append(admission, self.now_ns()) if new else self.journalled
+        if new:
+            self._received_ns = self.now_ns()
+        row = self.journal.append(admission, self._received_ns) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
         return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces), admission
+
+    def _newest_but(self, machine: str) -> int:
+        """The newest stamp of the machines in the map but one."""
+        hidden = self.excluded | {machine}
+        return max((newest_ns for name, newest_ns in self._newest.items() if name not in hidden), default=0)
+
+    def _seen(self, machine: str) -> SeenTime:
+        return SeenTime(self._newest_but(machine), self.newest_ns, self._received_ns)
+
+    def _last_received(self, last_row: int) -> int:
+        """The server's clock when the last row came in, 0 where none is in the journal."""
+        is_there = last_row > self.journal.archived_row
+        return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
 
     def _last_fact(self) -> int:
         """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""
@@ -269,21 +287,10 @@ class Store:
         names = np.array([name_hash(batch.machine) for batch in folded], np.uint64)
         rows = joined([batch.rows for batch in folded])
         self.grid.fold_all(rows, np.repeat(names, [len(batch.rows) for batch in folded]))
-        self.newest_ns = max([self.newest_ns, *(int(batch.rows["stamp_ns"].max()) for batch in batches)])
+        for batch in batches:
+            newest_ns = int(batch.rows["stamp_ns"].max())
+            self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)
         self.merged = self.journalled
 
     def _history(self) -> History:
         return History(self.journal, Archive(self.folder / FOLDER))
-
-
-@contextmanager
-def _hold(folder: Path) -> Iterator[None]:
-    """Keep a second server off the folder: each would take the samples that the other has. A crash releases it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK_FILE).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            problem = "another server is using this store; stop it, or choose another --store"
-            raise StoreError(folder, problem) from None
-        yield

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from mapserver.ingest.backlog import Backlog, Pace, size_of
+from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.ingest.snapshot_times import SnapshotTimes
 from mapserver.ingest.store import Incoming, Store
 from protocol.errors import QueryError, Refusal
@@ -38,6 +39,7 @@ class Writer:
     """Owns a Store on a thread of its own, from here on; site, config, folder, now_ns, store_id: of the store.
 
     `submit` and `run` may be called from any thread; both return at once or wait for the owner, never touch the store.
+    waits: who waits for a row to be merged.
     """
 
     def __init__(self, store: Store, clock: Callable[[], float] = time.monotonic) -> None:
@@ -54,7 +56,7 @@ class Writer:
         self._is_closing = False
         self._ended = ""  # why nothing is taken any more
         self._busy_since_s: float | None = None
-        self._merged = threading.Condition()
+        self.waits = MergeWaits(store.merged)
         self.failed = False
         self._times = SnapshotTimes(self.config.store.snapshot_s, clock())
         self._snapshots = ThreadPoolExecutor(1, thread_name_prefix="snapshot")
@@ -85,13 +87,6 @@ class Writer:
             self._turn.notify()
         return result.result(timeout_s)
 
-    def wait_merged(self, row: int, wait_s: float) -> None:
-        """Wait until a journal row is merged; QueryError if that takes longer than wait_s."""
-        with self._merged:
-            if not self._merged.wait_for(lambda: self._store.merged >= row, wait_s):
-                problem = f"journal row {row} is not merged after {wait_s:g} s; merged is {self._store.merged}"
-                raise QueryError(Refusal.AFTER_TIMEOUT, problem)
-
     def count_refusal(self, reason: str) -> None:
         """Count a refused query."""
         with self._turn:
@@ -120,6 +115,7 @@ class Writer:
 
     def close(self) -> None:
         """Finish what is waiting, snapshot, close; once more does nothing."""
+        self.waits.close()
         with self._turn:
             self._is_closing = True
             self._turn.notify()
@@ -177,8 +173,7 @@ class Writer:
         began_s = self._clock()
         answers = self._store.commit([incoming for incoming, _ in self._group])
         self._pace.worked(sum(size_of(incoming.payload) for incoming, _ in self._group), self._clock() - began_s)
-        with self._merged:
-            self._merged.notify_all()
+        self.waits.advance(self._store.merged)
         for answer in answers:
             incoming, reply = self._group.pop(0)
             if isinstance(answer, Refused):
