@@ -16,9 +16,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mapserver.journal.progress import Progress
 from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
 from mapserver.journal.records import extent_of, record
-from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, extent_checksum
+from mapserver.journal.rows import Admission, JournalRow, MachineTotals, Watermark, checksum, extent_checksum
 from protocol.errors import StoreError
 
 _WAL_LIMIT = 64 * 2**20
@@ -51,11 +52,20 @@ class Journal(JournalQueries):
 
     def watermark(self, machine: str, spool_id: int) -> Watermark:
         """Progress of a spool."""
-        return self._watermarks.get((machine, spool_id), Watermark())
+        return self._progress.watermark(machine, spool_id)
 
     def watermarks(self) -> dict[tuple[str, int], Watermark]:
         """Progress of all spools."""
-        return dict(self._watermarks)
+        return self._progress.watermarks()
+
+    def machines(self) -> dict[str, MachineTotals]:
+        """What each machine sent."""
+        return self._progress.machines()
+
+    @property
+    def samples(self) -> int:
+        """How many samples all machines sent."""
+        return self._progress.samples
 
     def begin(self) -> None:
         """Open a transaction; rows appended from here on are one group commit."""
@@ -86,7 +96,7 @@ class Journal(JournalQueries):
         """Write a watermark into the open transaction."""
         values = (machine, _spool_bytes(spool_id), watermark.seq, watermark.lost, watermark.newest_ns)
         self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", (*values, checksum(*values)))
-        self._watermarks[machine, spool_id] = watermark
+        self._progress.put(machine, spool_id, watermark)
 
     def commit(self) -> None:
         """Commit to disk; only then may anything be acknowledged."""
@@ -162,7 +172,7 @@ class Journal(JournalQueries):
                 raise StoreError(self.path, problem)
 
     def _return_to_disk(self) -> None:
-        self._watermarks = self._load_watermarks()
+        self._progress = Progress(self._load_watermarks())
         self.last_row = self._last_row()
 
 

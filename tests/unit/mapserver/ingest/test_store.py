@@ -120,6 +120,7 @@ def test_info_tells_the_state_in_plain_values(store):
         incoming(samples(2), spool_id=8),
         incoming(samples(2, cov_xx_m2=10.0, x_m=900.0, stamp_ns=NOW_NS + 10**12), machine="b"),
     ])  # fmt: skip
+    store.grid.known_cells()  # folds what waits: cells and bounds follow then
     info = store.info()
     assert info["site"]["name"] == SITE.name
     assert info["site"]["frame"] == SITE.frame
