@@ -25,7 +25,7 @@ from protocol.errors import QueryError, Refusal, SitegridError
 
 FEW_ROWS = 8  # may be left to the writer's thread: some ms
 MOST_ROUNDS = 20  # where batches come in as fast as they are folded, the writer has to make them wait
-RETRY_S = 1.0  # after rows that could not be read
+RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after rows that could not be read; doubled, as a fold up to them may take minutes
 log = logging.getLogger("mapserver.follower.exclusion")
 
 
@@ -105,28 +105,39 @@ class Exclusion:
 
     def _run(self) -> None:
         """Have the map follow the decisions; those that were made in the meantime are followed together."""
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._ending or self._folded < self._decided)
-                if self._ending:
-                    return
-                number, excluded = self._decided, self._wanted
-            try:
-                follows = self._follow(excluded)
-                problem = ""
-            except (SitegridError, OSError) as error:
-                follows, problem = False, str(error)
-                log.error("follower failed job=exclusion error=%r", problem)
-            except Exception:  # a bug here must not end the server, nor pass unseen
-                follows, problem = False, "the server failed; see its log"
-                log.exception("follower failed job=exclusion")
+        retry_s = RETRY_S
+        while decided := self._next():
+            number, excluded = decided
+            follows, problem = self._attempt(excluded)
             with self._changed:
                 self._problem = problem
                 if follows:
                     self._folded = number
                     self._changed.notify_all()
-                elif problem:
-                    self._changed.wait_for(lambda: self._ending, RETRY_S)
+            retry_s = self._pause(number, retry_s) if problem else RETRY_S
+
+    def _next(self) -> tuple[int, frozenset[str]] | None:
+        """Wait for decisions that the map does not follow yet: how many there are, and whom they leave out."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ending or self._folded < self._decided)
+            return None if self._ending else (self._decided, self._wanted)
+
+    def _pause(self, number: int, retry_s: float) -> float:
+        """Wait after a fold that failed, unless something else is decided; returns how long the next time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ending or self._decided > number, retry_s)
+        return min(2 * retry_s, MOST_RETRY_S)
+
+    def _attempt(self, excluded: frozenset[str]) -> tuple[bool, str]:
+        """Whether the map follows, and what keeps it from that."""
+        try:
+            return self._follow(excluded), ""
+        except (SitegridError, OSError) as error:
+            log.error("follower failed job=exclusion error=%r", str(error))
+            return False, str(error)
+        except Exception:  # a bug here must not end the server, nor pass unseen
+            log.exception("follower failed job=exclusion")
+            return False, "the server failed; see its log"
 
     def _follow(self, excluded: frozenset[str]) -> bool:
         """Have a map without these machines; whether it is there, else it is to be another one meanwhile."""
