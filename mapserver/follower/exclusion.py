@@ -10,7 +10,8 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import JOURNAL_FILE, Store
@@ -26,6 +27,7 @@ from protocol.errors import QueryError, Refusal, SitegridError
 FEW_ROWS = 8  # may be left to the writer's thread: some ms
 MOST_ROUNDS = 20  # where batches come in as fast as they are folded, the writer has to make them wait
 RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after rows that could not be read; doubled, as a fold up to them may take minutes
+T = TypeVar("T")
 log = logging.getLogger("mapserver.follower.exclusion")
 
 
@@ -54,26 +56,19 @@ class Exclusion:
             return self._decisions.newest(machine)
 
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
-        """Decide what the audit may decide, which may be nothing: `machines` names its verdicts in any case."""
+        """Decide what the audit may decide, which may be nothing: `machines` names its verdicts in any case.
+
+        Raises QueryError as `decide` does; the audit then decides the same the next time.
+        """
         if self._writer.config.trust.exclude:
-            with self._changed:
-                decisions = self._decisions.judge(verdicts, stamp_ns)
-            for decision in decisions:
-                self.decide(decision)
+            self._write(lambda store: self._judge(store, verdicts, stamp_ns))
 
     def decide(self, decision: TrustDecision) -> int:
         """Keep a decision on disk, then have the map folded so; returns its number, to wait for.
 
         Raises QueryError where it cannot be written: nothing has changed then.
         """
-        try:
-            number = self._writer.run(lambda store: self._keep(store, decision))
-        except (sqlite3.Error, OSError) as error:
-            problem = f"the decision about `{decision.machine}` cannot be written, so it does not count: {error}"
-            raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
-        values = (decision.machine, decision.trusted, decision.by, decision.reason)
-        log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
-        return number
+        return self._write(lambda store: self._keep(store, decision))
 
     def wait(self, number: int, wait_s: float) -> None:
         """Wait until a decision, which is kept, counts in the map; QueryError after wait_s."""
@@ -93,9 +88,27 @@ class Exclusion:
         self._thread.join()
         self._reader.close()
 
+    def _write(self, work: Callable[[Store], T]) -> T:
+        """Have work done on the writer's thread, one at a time: what is in memory is what is on disk, in its order."""
+        try:
+            return self._writer.run(work)
+        except TimeoutError:  # an OSError, but the work still waits
+            problem = "the server has not written the decision yet, and may still do so; ask for `machines`"
+            raise QueryError(Refusal.AFTER_TIMEOUT, problem) from None
+        except (sqlite3.Error, OSError) as error:
+            problem = f"the decision cannot be written, so it does not count: {error}"
+            raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
+
+    def _judge(self, store: Store, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
+        with self._changed:
+            decisions = self._decisions.judge(verdicts, stamp_ns)
+        for decision in decisions:
+            self._keep(store, decision)
+
     def _keep(self, store: Store, decision: TrustDecision) -> int:
-        """On the writer's thread, so that what is in memory is what is on disk, also where nobody waits any more."""
         store.decide(decision)
+        values = (decision.machine, decision.trusted, decision.by, decision.reason)
+        log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
         with self._changed:
             self._decisions.add(decision)
             self._wanted = self._decisions.distrusted
