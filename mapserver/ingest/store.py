@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import fcntl
+import logging
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,9 +21,12 @@ from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Admission, Selection
+from mapserver.journal.shortfall import KIND as SHORTFALL
+from mapserver.journal.shortfall import Shortfall, missing
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecisions
 from protocol.errors import MessageError, Refusal, StoreError
+from protocol.files import make_private
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
 from protocol.wire import keys
@@ -30,6 +34,7 @@ from protocol.wire.messages import Ack, Refused, SampleBatch
 
 JOURNAL_FILE = "journal.db"
 LOCK_FILE = "lock"
+log = logging.getLogger("mapserver.ingest.store")
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
 
@@ -68,6 +73,7 @@ class Store:
             opened.callback(self.journal.close)
             last_row = self.journal.last_row
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
+            self.shortfalls = self._name_shortfall(snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
@@ -151,14 +157,20 @@ class Store:
             "version": package_version(),
             "machines": self.machines(),
             "distrusted": sorted(self.excluded),
+            "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
             "counters": dict(self.counters),
         }
 
     def machines(self) -> dict[str, dict[str, int]]:
-        """What each machine sent: spools, samples, samples that it declared lost, newest stamp."""
-        machines: dict[str, dict[str, int]] = {}
-        for (machine, _), mark in self.journal.watermarks().items():
-            entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0})
+        """What each machine sent: spools, samples, samples that it declared lost, newest stamp, and what is missing."""
+        watermarks = self.journal.watermarks()
+        gone = missing(self.shortfalls, watermarks)
+        names = dict.fromkeys([*(machine for machine, _ in watermarks), *gone])
+        machines = {
+            name: {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0, "missing": gone[name]} for name in names
+        }
+        for (machine, _), mark in watermarks.items():
+            entry = machines[machine]
             entry["spools"] += 1
             entry["samples"] += mark.seq - mark.lost
             entry["lost"] += mark.lost
@@ -180,6 +192,17 @@ class Store:
             self.journal.declare_lost(admission)
         return Ack(admission.watermark, row, admission.trimmed), admission
 
+    def _name_shortfall(self, snapshot_rows: Sequence[int]) -> list[Shortfall]:
+        """Say what was acknowledged and is not in the journal, by what lies beside it; returns all that ever was."""
+        shortfall, last_row = self.journal.shortfall, self.journal.last_row
+        newest = max(snapshot_rows, default=0)
+        if newest > max(last_row, shortfall.expected_row if shortfall else 0):
+            shortfall = Shortfall(last_row, newest, damage=f"a snapshot of row {newest} lies beyond the journal")
+            self.journal.note_shortfall(shortfall)
+        if shortfall:
+            log.error("acknowledged samples are missing store=%s shortfall=%r", self.folder, str(shortfall))
+        return [Shortfall.from_event(event) for event in self.journal.events(SHORTFALL)]
+
     def _check_signature(self, verify: Verify, incoming: Incoming) -> None:
         if not incoming.machine:
             raise MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
@@ -194,6 +217,8 @@ class Store:
             self.counters["batches"] += len(admission.batch.rows) > 0
             self.counters["samples_trimmed"] += admission.trimmed
             self.counters["samples_lost"] += admission.lost
+            if admission.lost:
+                log.warning("declared lost machine=%s samples=%d", admission.batch.machine, admission.lost)
 
     def _fold(self, row: int, batch: SampleBatch) -> None:
         if batch.machine not in self.excluded:
@@ -212,6 +237,7 @@ class Store:
 def _hold(folder: Path) -> Iterator[None]:
     """Keep a second server off the folder: each would take the samples that the other has. A crash releases it."""
     folder.mkdir(parents=True, exist_ok=True)
+    make_private(folder / LOCK_FILE)
     with (folder / LOCK_FILE).open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -30,6 +30,7 @@ FILE_SAMPLES = 2_000_000  # about; an hour with more is cut into several files
 GROUP_SAMPLES = 50_000  # of a row group, about: a batch is never cut
 HOUR_NS = 3_600_000_000_000
 TEMPORARY = "next.parquet.tmp"
+READABLE = 0o640  # its files never change and are for other programs too: their users come into its owner's group
 
 
 class Archive:
@@ -133,7 +134,7 @@ def write_file(folder: Path, site: SiteConfig, rows: Iterator[JournalRow]) -> Pa
     temporary = folder / TEMPORARY
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(temporary) as file:
+        with whole_file(temporary, READABLE) as file:
             last_row = write_parquet(file, site, chain([first], rows))
             seal(file)
         hour = datetime.fromtimestamp(first.received_ns // HOUR_NS * 3600, UTC).strftime("%Y-%m-%dT%H")

@@ -88,12 +88,16 @@ class SiteInfo:
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """What one machine sent: spools, samples accepted, samples declared lost, and its newest stamp."""
+    """What one machine sent: spools, samples accepted, samples that it declared lost, and its newest stamp.
+
+    missing: samples that were acknowledged, are gone, and that it has neither sent again nor declared lost since.
+    """
 
     spools: int
     samples: int
     lost: int
     newest_ns: int
+    missing: int
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,7 @@ class MapInfo:
 
     journalled, merged, snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks
     with evidence; None without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    shortfalls: what the journal lacked of what was acknowledged, one line for each time that it was found so.
     """
 
     site: SiteInfo
@@ -117,6 +122,7 @@ class MapInfo:
     version: str
     machines: Mapping[str, SampleCounts]
     distrusted: tuple[str, ...]
+    shortfalls: tuple[str, ...]
     counters: Mapping[str, int]
     layers: tuple[str, ...]
 
@@ -142,6 +148,7 @@ class MachineState:
     samples: int
     lost: int
     newest_ns: int
+    missing: int
 
 
 @dataclass(frozen=True)

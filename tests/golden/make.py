@@ -109,6 +109,7 @@ MACHINE = records.MachineState(
     samples=1200,
     lost=3,
     newest_ns=T0 + 1,
+    missing=5,
 )
 TRUST = records.TrustAnswer(**vars(MACHINE), merged=17)
 CHANGE = records.GroundChange(

@@ -39,8 +39,8 @@ INFO: dict[str, Any] = {
     "cells": 250,
     "stamp_ns": NOW_NS,
     "machines": {
-        "loader-1": {"spools": 1, "samples": 200, "lost": 3, "newest_ns": NOW_NS},
-        "loader-2": {"spools": 2, "samples": 104, "lost": 0, "newest_ns": NOW_NS - 10**9},
+        "loader-1": {"spools": 1, "samples": 200, "lost": 3, "newest_ns": NOW_NS, "missing": 0},
+        "loader-2": {"spools": 2, "samples": 104, "lost": 0, "newest_ns": NOW_NS - 10**9, "missing": 0},
     },
     "distrusted": ["loader-2"],
     "counters": {"batches": 12, "samples_trimmed": 7, "refused_gap": 2, "refused_query_unknown_layer": 1},
