@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from protocol.files import make_private
+
 SCHEMA = 3
 LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
 _TABLES = (
@@ -13,13 +15,14 @@ _TABLES = (
     "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INTEGER, closed INTEGER, crc32 INTEGER)",
     "CREATE TABLE sample (number INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL, crc32 INTEGER)",
     "CREATE TABLE quarantine (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL)",
-    "INSERT INTO meta VALUES ('newest', '0'), ('dropped', '0'), ('recorded', '0')",
+    "INSERT INTO meta VALUES ('newest', '0'), ('dropped', '0'), ('recorded', '0'), ('gone', '0')",
     f"PRAGMA user_version={SCHEMA}",
 )
 
 
 def connect(path: Path, kind: type[sqlite3.Connection] = sqlite3.Connection) -> sqlite3.Connection:
     """Open a file for this process alone: two agents on one file would send one sample twice, or not at all."""
+    make_private(path)
     db = sqlite3.connect(path, LOCK_WAIT_S, isolation_level=None, check_same_thread=False, factory=kind)
     db.execute("PRAGMA locking_mode=EXCLUSIVE")
     return db

@@ -20,7 +20,7 @@ from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, e
 from mapserver.journal.shortfall import EVENT, ROW, Shortfall, compare, marked, spool_name
 from mapserver.journal.shortfall import KIND as SHORTFALL
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
-from protocol.disk.traces import Traces, keep_log, look_beside
+from protocol.disk.traces import Traces, look_beside
 from protocol.errors import StoreError
 from protocol.files import make_private
 
@@ -198,13 +198,11 @@ class Journal(JournalQueries):
         present = marked(self.last_row, self._number(_LAST_EVENT), self._watermarks)
         if shortfall := compare(traces, present):
             with suppress(OSError):  # a full disk: the shortfall is named all the same
-                keep_log(traces, self.last_row)
+                traces.keep_log(self.last_row)
             self._require_agreement()
             self.note_shortfall(shortfall)
-        known = self._mark.values
-        present = {**dict.fromkeys(known, 0), **marked(self.last_row, self._number(_LAST_EVENT), self._watermarks)}
-        if news := {name: n for name, n in present.items() if known.get(name) != n}:
-            self._mark.write(news)
+        with suppress(OSError):  # it stays behind, which is no alarm, or is compared again
+            self._mark.replace(marked(self.last_row, self._number(_LAST_EVENT), self._watermarks))
 
     def _require_agreement(self) -> None:
         """StoreError where pages of different times are in the file, as a damaged log may leave them.

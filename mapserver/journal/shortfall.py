@@ -30,6 +30,7 @@ class SpoolShortfall:
 
     @property
     def samples(self) -> int:
+        """How many."""
         return self.until - self.after
 
 

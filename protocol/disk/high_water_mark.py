@@ -1,11 +1,11 @@
 """A high-water mark beside a database: numbers that were committed to it, to be compared when it is opened again.
 
-The file NAME-mark is a chain of records; a record has the numbers that a commit changed, and a checksum that begins with
-that of the record before. It is read up to the first record that is not sound, and the newest value of a name counts.
+The file NAME-mark is a chain of records; a record has the numbers that a commit changed, and a checksum that begins
+with that of the record before. It is read up to the first record that is not sound; the newest value of a name counts.
 
-A record is written after its commit is on disk, and is not synced: a mark never claims more than the database had, and a
-power cut may leave it behind or torn, which is no alarm. So it costs one write and no sync; what it proves is that
-nothing committed is gone after a kill, or once the system has written it to disk by itself.
+A record is written after its commit is on disk, and is not synced: a mark never claims more than the database had, and
+a power cut may leave it behind or torn, which is no alarm. So it costs one write and no sync, and tells of all that was
+committed before a kill, or some seconds before a power cut: then the system has written it to disk by itself.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from protocol.files import PRIVATE, whole_file
 
 _RECORD = struct.Struct("<II")  # length and checksum, before the values
 LIMIT = 2**20  # bytes; a longer file is written anew with the newest values alone
+_OFTEN = 400  # bytes for each value: about ten times what it needs
 
 
 def mark_path(database: Path) -> Path:
@@ -49,18 +50,22 @@ class HighWaterMark:
         self.values.update(values)
         self._unwritten.update(values)
         with contextlib.suppress(OSError):
-            if self._end > max(LIMIT, 8 * self._compact_bytes):
+            if self._end > max(LIMIT, _OFTEN * len(self.values)):
                 self._write_anew()
             else:
                 self._append()
 
-    def close(self) -> None:
-        """Close the file."""
-        os.close(self._file)
+    def replace(self, values: Mapping[str, int]) -> None:
+        """Note these values and no others, when the database was compared with the mark; raises OSError."""
+        if values != self.values:
+            self.values = dict(values)
+            self._write_anew()
 
-    @property
-    def _compact_bytes(self) -> int:
-        return 40 * len(self.values)
+    def close(self) -> None:
+        """Close the file; nothing is written from then on."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1  # never a number that another file gets
 
     def _append(self) -> None:
         record, crc = _record(self._unwritten, self._crc)

@@ -6,18 +6,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from protocol.disk.high_water_mark import mark_path, read_mark
-from protocol.disk.write_ahead_log import LogScan, scan
+from protocol.disk.write_ahead_log import FRAME_HEADER, HEADER, LogScan, scan
 from protocol.errors import StoreError
 from protocol.files import PRIVATE, write_whole
 
 
 @dataclass(frozen=True)
 class Traces:
-    """What lies beside a database that nobody has open. mark: see `HighWaterMark`; log: its write-ahead log."""
+    """What lies beside a database that nobody has open. mark: see `HighWaterMark`; log: its write-ahead log.
+
+    cut_short: the bytes of a log that SQLite does not take to its end, and soon writes over; else empty.
+    """
 
     mark: dict[str, int]
     log: LogScan
     log_path: Path
+    cut_short: bytes
 
     @property
     def damage(self) -> str:
@@ -27,19 +31,21 @@ class Traces:
         dropped = self.log.frames - self.log.recovered
         return f"{self.log_path.name} is damaged at byte {self.log.damaged_at}: its last {dropped} pages cannot be used"
 
+    def keep_log(self, number: int) -> None:
+        """Keep a copy of a log that was cut short, for a person; raises OSError."""
+        if self.cut_short:
+            write_whole(self.log_path.with_name(f"{self.log_path.name}.damaged-{number}"), self.cut_short, PRIVATE)
+
 
 def look_beside(database: Path) -> Traces:
     """Look before SQLite opens a database, and drops what it cannot use; StoreError where that cannot be read."""
     log_path = database.with_name(f"{database.name}-wal")
     try:
-        log = scan(log_path.read_bytes()) if log_path.exists() else LogScan()
-        return Traces(read_mark(mark_path(database)), log, log_path)
+        log = log_path.read_bytes() if log_path.exists() else b""
+        mark = read_mark(mark_path(database))
     except OSError as error:
         raise StoreError(database, f"cannot be read: {error}") from None
-
-
-def keep_log(traces: Traces, number: int) -> None:
-    """Keep a copy of a log whose end SQLite is about to write over, for a person; raises OSError."""
-    if traces.log.frames:
-        kept = traces.log_path.with_name(f"{traces.log_path.name}.damaged-{number}")
-        write_whole(kept, traces.log_path.read_bytes(), PRIVATE)
+    found = scan(log)
+    has_frames = len(log) > HEADER + FRAME_HEADER
+    is_cut_short = has_frames and (found.recovered < found.frames or not found.recovered)
+    return Traces(mark, found, log_path, log if is_cut_short else b"")

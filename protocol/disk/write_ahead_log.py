@@ -1,9 +1,9 @@
 """SQLite's write-ahead log, looked at to its end: damage in the middle is told from a torn tail.
 
-SQLite recovers a log up to the first frame that is not sound, and drops what follows without a word. That is right for a
-power cut, which may leave any part of the last, unsynced transaction, also later frames without earlier ones. But with
-`synchronous=FULL` a transaction begins only once the one before it is on disk. So a frame that follows soundly on a
-commit beyond the first unsound frame proves that this commit was on disk, and that the log was damaged since.
+SQLite recovers a log up to the first frame that is not sound, and drops what follows without a word. That is right
+for a power cut, which may leave any part of the last, unsynced transaction, also later frames without earlier ones.
+But with `synchronous=FULL` a transaction begins only once the one before it is on disk. So a frame that follows soundly
+on a commit beyond the first unsound frame proves that this commit was on disk, and that the log was damaged since.
 
 The format is that of https://sqlite.org/fileformat2.html#walformat: a header of 32 bytes, then frames of 24 bytes and a
 page. Each frame has the salts of the header, and a checksum that begins with that of the frame before. A frame is
@@ -50,7 +50,9 @@ def scan(log: bytes) -> LogScan:
     magic, page = int(words[0]), int(words[2])
     if magic & ~1 == _MAGIC and page in _PAGE_SIZES:
         order = _WORD_ORDERS[magic & 1]
-        start = _checksums(np.frombuffer(log[:FRAME_HEADER], order).astype(np.uint32)[None, :], np.zeros((1, 2), np.uint32))
+        start = _checksums(
+            np.frombuffer(log[:FRAME_HEADER], order).astype(np.uint32)[None, :], np.zeros((1, 2), np.uint32)
+        )
         if (start[0] == words[6:8]).all():
             return _scan_frames(log, page, order, log[16:24], words[6:8].astype(np.uint32))
     return _without_header(log)

@@ -75,6 +75,7 @@ def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, carele
             spool = None
     if spool:
         spool._db.close()  # as a kill leaves it
+        spool._mark.close()
 
 
 def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
@@ -96,6 +97,7 @@ def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, carele
                 store.save_snapshot()
     if store:
         store.journal._db.close()
+        store.journal._mark.close()
 
 
 def _sync(db: sqlite3.Connection, careless: bool) -> None:
