@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from benchmarks import filter as filters
-from benchmarks import ingest, merge, merge_memory, merge_restart, sim
+from benchmarks import ingest, live, merge, merge_memory, merge_restart, query, sim
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 
@@ -30,8 +30,9 @@ OPTIONS = {
     "runs": ("N", _count, "of each variant; the median counts"),
     "samples": ("N", _count, "in a run, or a journal"),
     "steps": ("N", _count, "in a run"),
+    "queries": ("N", _count, "of each kind"),
     "hours": ("H", _positive, "of work"),
-    "seconds": ("S", _positive, "simulated, in a run"),
+    "seconds": ("S", _positive, "simulated, or of the site's time, in a run"),
 }
 # Of each: what runs it, what it measures, and its options, named as the parameters of `run`, with their defaults.
 BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
@@ -42,6 +43,12 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
     ),
     "memory": (merge_memory.run, "memory that a day of work on 1 km2 takes of the map server", {"hours": HOURS}),
     "restart": (merge_restart.run, "time to open a store with a long journal", {"samples": 20_000_000}),
+    "live": (
+        live.run,
+        "processor time of a server at work, by thread",
+        {"hours": 2.0, "seconds": 120.0},
+    ),
+    "query": (query.run, "queries of a real server, while samples come in", {"hours": HOURS, "queries": 200}),
     "ingest": (ingest.run, "samples that the server takes, from bytes to the grid", {"runs": 5, "samples": 20_000}),
     "sim": (sim.run, "simulated time of small and large fleets, sensors on", {"runs": 5, "seconds": 20.0}),
     "filter": (filters.run, "steps of the filters, and a whole agent's CPU and memory", {"runs": 5, "steps": 1000}),

@@ -74,9 +74,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join("  ".join(w.rjust(width) for w, width in zip(line, widths, strict=True)) for line in lines)
 
 
-def memory_mb(name: str = "VmRSS") -> float:
-    """Memory of this process: resident now, or with VmHWM the most that ever was (getrusage counts a parent's too)."""
-    lines = Path("/proc/self/status").read_text().splitlines()
+def memory_mb(name: str = "VmRSS", pid: int | None = None) -> float:
+    """Memory of this process or another: resident now, or with VmHWM the most that ever was.
+
+    getrusage would count a parent's too.
+    """
+    lines = Path(f"/proc/{pid or 'self'}/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(name)) * 1024 / 1e6
 
 

@@ -11,11 +11,12 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from itertools import islice
+from collections.abc import Iterator
+from itertools import chain, islice
 from pathlib import Path
 
 from benchmarks.measure import START_NS, Report, in_child, machine, timed
-from benchmarks.merge_work import BATCH, batches
+from benchmarks.merge_work import A_SECOND, BATCH, batches, seconds_of
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
@@ -23,26 +24,32 @@ from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import SNAPSHOT_ROWS
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Admission
+from protocol.arrays import Table
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch
 
 SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()
-GOAL_S = 5.0
+GOAL_S = 4.0
 TAIL_ROWS = SNAPSHOT_ROWS  # as many as a crash can leave without a snapshot
 IN_ONE_COMMIT = 10_000  # journal rows: what is measured is the opening, not the writing
 MB = 1e6
 
 
 def run(samples: int) -> Report:
-    """Write a store of so many samples, in batches of BATCH, and open it; every one is folded into its snapshot.
+    """Write stores of so many samples, in rows of BATCH and in rows of A_SECOND, and open each.
 
-    The row: open_s of the store alone, open_cpu_s on the CPU (less, where others work as well), process_s with the
-    start of Python and its imports, and the sizes on disk.
+    Rows: samples in a journal row; open_s of the store alone, open_cpu_s on the CPU (less, where others work as well),
+    process_s with the start of Python and its imports, and the sizes on disk.
     """
-    rows = -(-samples // BATCH)
+    rows = [_opened(samples, in_row) for in_row in (BATCH, A_SECOND)]
+    return {"benchmark": "restart", "samples": samples, **machine(), "goal_s": GOAL_S, "rows": rows}
+
+
+def _opened(samples: int, in_row: int) -> dict[str, float]:
+    rows = -(-samples // in_row)
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
-        build_s = timed(lambda: build(folder, rows))
+        build_s = timed(lambda: build(folder, rows, TAIL_ROWS, in_row))
         opened_store: Report = {}
         process_s = timed(lambda: opened_store.update(in_child("benchmarks.merge_restart", path)))
         if opened_store["journalled"] != rows or opened_store["merged"] != rows:
@@ -52,8 +59,9 @@ def run(samples: int) -> Report:
             "journal_mb": round((folder / JOURNAL_FILE).stat().st_size / MB, 1),
             "snapshot_mb": round(sum(file.stat().st_size for file in folder.glob("snapshot-*")) / MB, 1),
         }
-    row = {
-        "samples": rows * BATCH,
+    return {
+        "samples_in_row": in_row,
+        "samples": rows * in_row,
         "journal_rows": rows,
         "tail_rows": rows - opened_store["snapshot_row"],
         **sizes,
@@ -62,27 +70,33 @@ def run(samples: int) -> Report:
         "open_cpu_s": round(opened_store["open_cpu_s"], 3),
         "process_s": round(process_s, 3),
     }
-    return {"benchmark": "restart", "samples": rows * BATCH, **machine(), "goal_s": GOAL_S, "rows": [row]}
 
 
-def build(folder: Path, rows: int) -> None:
-    """Write a journal of so many rows and a snapshot TAIL_ROWS before its end, none where it is shorter."""
+def build(folder: Path, rows: int, tail_rows: int, in_row: int = BATCH) -> None:
+    """Write a journal of so many rows and a snapshot tail_rows before its end, none where it is shorter.
+
+    in_row: samples in a row: BATCH, or A_SECOND as machines send them that are always connected.
+    """
     journal, grid = Journal(folder / JOURNAL_FILE, SITE.name, SITE.frame), Grid(SITE.cell_m, CONFIG.fold)
     sent: Counter[str] = Counter()
     journal.begin()
-    for number, (name, batch) in enumerate(islice(batches(), rows), start=1):
+    for number, (name, batch) in enumerate(islice(_rows(in_row), rows), start=1):
         new = SampleBatch(name, 1, sent[name] + 1, batch, SITE.frame)
         journal.append(Admission(new, trimmed=0, lost=0), START_NS)
         sent[name] += len(batch)
-        if number <= rows - TAIL_ROWS:
+        if number <= rows - tail_rows:
             grid.fold(batch, name)
-        if number == rows - TAIL_ROWS:
+        if number == rows - tail_rows:
             snapshot.save(folder, number, grid.state(), SITE.cell_m, CONFIG.fold)
         if number % IN_ONE_COMMIT == 0:
             journal.commit()
             journal.begin()
     journal.commit()
     journal.close()
+
+
+def _rows(in_row: int) -> Iterator[tuple[str, Table]]:
+    return batches() if in_row == BATCH else chain.from_iterable(seconds_of(batches()))
 
 
 def open_timed(folder: Path) -> Report:

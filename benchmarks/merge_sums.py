@@ -1,4 +1,4 @@
-"""Count, sum and sum of squares per cell, the plain way of merging samples, by five libraries.
+"""Count, sum and sum of squares per cell, the plain way of merging samples, by several libraries and in C.
 
 Each takes structured rows, as the fold of the map server does, makes of them what its library wants, and adds to what
 it has: no covariance, no histograms, no time. polars and duckdb group a batch's rows by their cells, and what they find
@@ -8,13 +8,20 @@ imported where they are used.
 
 from __future__ import annotations
 
+import ctypes
+import shutil
+import subprocess
+import tempfile
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 
 from protocol.arrays import Floats, Ints, Table
+from protocol.machine.samples import SAMPLE_DTYPE
 
 QUERY = "SELECT cell, count(*) AS n, sum(value) AS s, sum(value * value) AS q FROM samples GROUP BY cell"
 
@@ -63,6 +70,53 @@ def _add(rows: Any, sums: Any, side: int) -> None:
         sums[at] += 1.0
         sums[at + one] += value
         sums[at + two] += value * value
+
+
+class PlainC(Sums):
+    """The same loop in C, compiled here; FileNotFoundError without a compiler."""
+
+    def __init__(self, side: int) -> None:
+        super().__init__(side)
+        self._add = _compiled(ADD_IN_C)
+
+    def fold(self, rows: Table) -> None:
+        """See Sums."""
+        self._add(rows.ctypes.data, len(rows), self._sums.ctypes.data, self._side)
+
+
+ADD_IN_C = """
+#include <stddef.h>
+#include <stdint.h>
+struct __attribute__((packed)) row {{ {fields} }};
+
+void add(const struct row *rows, ptrdiff_t n, double *sums, ptrdiff_t side) {{
+    for (ptrdiff_t k = 0; k < n; k++) {{
+        double *cell = sums + 3 * ((ptrdiff_t)rows[k].y_m * side + (ptrdiff_t)rows[k].x_m);
+        double value = rows[k].c_rr;
+        cell[0] += 1;
+        cell[1] += value;
+        cell[2] += value * value;
+    }}
+}}
+"""
+_C_TYPES = {"i8": "int64_t", "f8": "double", "f4": "float"}
+
+
+def _compiled(source: str) -> Callable[[int, int, int, int], None]:
+    """Function `add` of C source with the fields of a sample."""
+    if (compiler := shutil.which("cc")) is None:
+        raise FileNotFoundError("cc")
+    kinds = {name: SAMPLE_DTYPE[name].str[1:] for name in SAMPLE_DTYPE.names or ()}
+    fields = " ".join(f"{_C_TYPES[kind]} {name};" for name, kind in kinds.items())
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "add.so"
+        command = [compiler, "-O3", "-march=native", "-shared", "-fPIC", "-x", "c", "-o", str(library), "-"]
+        subprocess.run(command, input=source.format(fields=fields).encode(), check=True)  # noqa: S603
+        add = ctypes.CDLL(str(library)).add  # stays mapped without its file
+    add.argtypes = [ctypes.c_void_p, ctypes.c_ssize_t, ctypes.c_void_p, ctypes.c_ssize_t]
+    add.restype = None
+    call: Callable[[int, int, int, int], None] = add
+    return call
 
 
 class AddAt(Sums):

@@ -7,9 +7,9 @@ position is off by one and the same error, as errors of satellite positions last
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, islice
 
 import numpy as np
 
@@ -23,12 +23,14 @@ SPEED_MPS, SPACING_M = 3.0, 0.5
 STD_M = 1.2  # of a position
 HOURS = 10.0  # of a working day
 BATCH = 100  # samples that a machine sends at once
+A_SECOND = 6  # likewise, each second
 LEG_SAMPLES = int(LEG_M / SPACING_M)
 SAMPLE_NS, DAY_NS = int(SPACING_M / SPEED_MPS * 1e9), 86_400 * 10**9
 # Ground: patches of 50 m with one resistance each, on gentle hills.
 RESISTANCES = np.array([0.015, 0.03, 0.05, 0.08])
 PATCH_M, HILL_M, GRADE = 50.0, 120.0, 0.08
 RESISTANCE_STD, GRADE_STD = 0.004, 0.01
+Batches = Sequence[tuple[str, Table]]
 HEADINGS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # of the roads: columns and rows of crossings per leg
 
 
@@ -56,6 +58,14 @@ def batches(seed: int = 0) -> Iterator[tuple[str, Table]]:
         for first in range(0, LEG_SAMPLES, BATCH):
             for number, rows in enumerate(driven, start=1):
                 yield f"loader-{number}", rows[first : first + BATCH]
+
+
+def seconds_of(work: Iterator[tuple[str, Table]]) -> Iterator[Batches]:
+    """What each machine sends in each second, as it drives on; work: as of `batches`, where all begin a leg."""
+    while leg := list(islice(work, MACHINES * LEG_SAMPLES // BATCH)):
+        machines = {name: np.concatenate([rows for other, rows in leg if other == name]) for name, _ in leg}
+        for first in range(0, LEG_SAMPLES, A_SECOND):
+            yield [(name, rows[first : first + A_SECOND]) for name, rows in machines.items()]
 
 
 def _legs(draw: np.random.Generator) -> Iterator[RoadLeg]:

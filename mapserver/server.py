@@ -26,6 +26,7 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_reply
 from protocol.wire.messages import Ack, Refused
 
+COMMAND_THREADS = 8  # a command waits for its map; those given meanwhile are kept at once, and folded together
 log = logging.getLogger("mapserver")
 
 
@@ -53,9 +54,9 @@ class Server:
         self._follower = Follower(self._writer, self._publish)
         self.answers = Answers(self._writer, self._follower)
         self._threads = ThreadPoolExecutor(config.query_threads, thread_name_prefix="query")
-        # One each: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
+        # Others: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
         self._past_thread = ThreadPoolExecutor(1, thread_name_prefix="past")
-        self._command_thread = ThreadPoolExecutor(1, thread_name_prefix="command")
+        self._command_threads = ThreadPoolExecutor(COMMAND_THREADS, thread_name_prefix="command")
         self._queryables = [
             ingest.declare_queryable(keys.ingest_all(site.name), self._on_batch),
             readers.declare_queryable(keys.map_queries_all(site.name), self._on_query),
@@ -71,7 +72,7 @@ class Server:
         """Stop listening, finish what has come in, commit, snapshot."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
-        for threads in (self._threads, self._past_thread, self._command_thread):
+        for threads in (self._threads, self._past_thread, self._command_threads):
             threads.shutdown(wait=False, cancel_futures=True)  # nobody waits for an answer longer than for the end
         self._follower.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
@@ -101,7 +102,7 @@ class Server:
 
     def _on_command(self, query: zenoh.Query) -> None:
         name, parameters = _asked(query)
-        self._command_thread.submit(self._reply, query, lambda: self.answers.obey(name, parameters))
+        self._command_threads.submit(self._reply, query, lambda: self.answers.obey(name, parameters))
 
     def _reply(self, query: zenoh.Query, answer: Callable[[], bytes]) -> None:
         with query:

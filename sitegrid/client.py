@@ -98,11 +98,12 @@ class Client:
 
     def machines(self, *, after: int = 0, wait_s: float = 10.0) -> list[MachineState]:
         """What the server knows of each machine: whether it is trusted, why, and what it sent."""
-        return answer_codec.decode_machines(self._ask(requests.MachinesQuery(requests.Freshness(after, wait_s))))
+        asked = requests.MachinesQuery(requests.Freshness(after, wait_s))
+        return list(answer_codec.decode_machines(self._ask(asked)).machines)
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with an id beyond `after`: when, where, how many cells, from what to what."""
-        return answer_codec.decode_changes(self._ask(requests.ChangesQuery(after)))
+        return list(answer_codec.decode_changes(self._ask(requests.ChangesQuery(after))).changes)
 
     def on_change(self, callback: Callable[[GroundChange], object]) -> Listener[GroundChange]:
         """Call `callback`, on a thread of its own, with each change that is found or grows, until the handle is closed.

@@ -61,7 +61,7 @@ class Soak:
     late_s: float
 
     def growth_pct(self) -> float:
-        """Growth of the server from the middle third of the run to its last: medians, as each look is up to a tenth off.
+        """Growth of the server from the middle third of the run to its last: medians: one look is up to a tenth off.
 
         In the first third everything is used for the first time. Between two looks memory goes up and down with what is
         being answered and folded.

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import fold, scratch_block
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
-from mapserver.evidence.pages import CompactPages, Page
+from mapserver.evidence.pages import CompactPages, PackedPages, Page
 from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
+from mapserver.evidence.workers import ALONE, Workers
 from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 # Samples that wait to be folded together: the more, the fewer pages. While machines drive, the map is read every second
-# and a fold must not take long (8 ms); when a journal is folded again, only the sum counts.
+# and a fold must not take long (8 ms); when a journal is folded again, only the sum counts: so many for each worker.
 LIVE_ROWS, REFOLD_ROWS = 8192, 131_072
 PIECE = 4096  # samples whose weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
@@ -69,7 +72,7 @@ class Grid:
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
-        self._scratch, self._space = scratch_block(), Space()
+        self._workers, self._scratch, self._spaces = ALONE, [scratch_block()], [Space()]
         self._rows: AnyArray = np.empty(waiting_rows, _RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
         self._waiting, self._weight = 0, 0
@@ -88,12 +91,15 @@ class Grid:
 
     def fold(self, rows: Table, machine: str) -> None:
         """Fold samples of one machine; commutative, not idempotent: exactly-once is decided at the journal."""
+        self.fold_all(rows, np.full(len(rows), name_hash(machine), np.uint64))
+
+    def fold_all(self, rows: Table, names: NDArray[np.uint64]) -> None:
+        """Fold samples of several machines; names (n,): hash of each one's name."""
         if not len(rows):
             return
         self.newest_ns = max(self.newest_ns, int(rows["stamp_ns"].max()))
-        name = name_hash(machine)
         for first in range(0, len(rows), PIECE):
-            self._take(np.ascontiguousarray(rows[first : first + PIECE]), name)
+            self._take(np.ascontiguousarray(rows[first : first + PIECE]), names[first : first + PIECE])
 
     def merge(self, other: Grid) -> None:
         """Add the evidence of another grid: the fold of both sets of samples, bit for bit.
@@ -112,10 +118,18 @@ class Grid:
         self._skipped += other._skipped
         self.newest_ns = max(self.newest_ns, other.newest_ns)
 
-    def resize_buffer(self, waiting_rows: int) -> None:
-        """Let so many samples wait from now on."""
+    @contextmanager
+    def bulk(self, workers: Workers = ALONE) -> Iterator[None]:
+        """Fold a long history: many samples at a time, by these workers, and settled in the end.
+
+        Meanwhile one thread may call `fold`, and nothing else. The grid is the same, bit for bit, for any workers;
+        after an error it is of no use.
+        """
+        self._engage(workers, REFOLD_ROWS * workers.count)
+        yield
         self._drain()
-        self._rows, self._names = np.empty(waiting_rows, _RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
+        workers.each(self._settle)
+        self._engage(ALONE, LIVE_ROWS)
 
     def blocks_in(self, window: CellWindow) -> list[Block]:
         """Block columns and rows with evidence that the window touches."""
@@ -171,11 +185,11 @@ class Grid:
         """Undo `state`."""
         grid = cls(cell_m, config)
         for x, y, pages in state.blocks:
-            grid._timelines[x, y] = Timeline(grid._tiers, grid._space, pages)
+            grid._timelines[x, y] = Timeline(grid._tiers, grid._spaces[0], pages)
         grid._folded, grid._skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
         return grid
 
-    def _take(self, rows: Table, name: int) -> None:
+    def _take(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Let rows wait; what waits is folded before its weight could exceed a count."""
         weight = int(rows["distance_m"].sum(dtype=np.float64) * ev.WEIGHT_UNITS_PER_M) + len(rows)
         if self._weight + weight > ev.COUNT_MAX:
@@ -185,8 +199,8 @@ class Grid:
             part = rows[: len(self._rows) - self._waiting]
             end = self._waiting + len(part)
             self._rows[self._waiting : end] = part.view(_RAW_SAMPLE)
-            self._names[self._waiting : end] = name
-            self._waiting, rows = end, rows[len(part) :]
+            self._names[self._waiting : end] = names[: len(part)]
+            self._waiting, rows, names = end, rows[len(part) :], names[len(part) :]
             if end == len(self._rows):
                 self._drain()
 
@@ -195,9 +209,25 @@ class Grid:
         if not self._waiting:
             return
         rows, names = self._rows[: self._waiting].view(SAMPLE_DTYPE), self._names[: self._waiting]
-        for x, y, pages in fold(rows, names, self.cell_m, self.config, self._scratch):
-            self._timeline((x, y)).add(pages)
-            self._touched.add((x, y))
+        count = self._workers.count
+        pages: list[list[tuple[Block, PackedPages]]] = [[] for _ in range(count)]  # of each worker's blocks
+
+        def fold_share(worker: int) -> None:
+            """Fold a stretch of the samples."""
+            share = slice(worker * len(rows) // count, (worker + 1) * len(rows) // count)
+            for x, y, packed in fold(rows[share], names[share], self.cell_m, self.config, self._scratch[worker]):
+                pages[_worker_of((x, y), count)].append(((x, y), packed))
+
+        def add_share(worker: int) -> None:
+            """Add what all have folded to one's own blocks: no timeline is changed by two."""
+            for block, packed in pages[worker]:
+                timeline = self._timeline(block)
+                timeline.space = self._spaces[worker]
+                timeline.add(packed)
+                self._touched.add(block)
+
+        self._workers.each(fold_share)
+        self._workers.each(add_share)
         voting = int(is_foldable(rows, self.config).sum())
         self._folded += voting
         self._skipped += len(rows) - voting
@@ -206,8 +236,30 @@ class Grid:
     def _timeline(self, block: Block) -> Timeline:
         timeline = self._timelines.get(block)
         if timeline is None:
-            timeline = self._timelines[block] = Timeline(self._tiers, self._space)
+            timeline = self._timelines[block] = Timeline(self._tiers, self._spaces[0])
         return timeline
+
+    def _settle(self, worker: int) -> None:
+        """Settle a worker's own blocks."""
+        for block, timeline in self._timelines.items():
+            if _worker_of(block, self._workers.count) == worker:
+                timeline.space = self._spaces[worker]
+                timeline.settled()
+
+    def _engage(self, workers: Workers, waiting_rows: int) -> None:
+        """Go on with other workers, each with space of its own."""
+        self._drain()
+        self._workers = workers
+        self._rows, self._names = np.empty(waiting_rows, _RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
+        self._scratch = [*self._scratch, *(scratch_block() for _ in range(workers.count))][: workers.count]
+        self._spaces = [*self._spaces, *(Space() for _ in range(workers.count))][: workers.count]
+        for timeline in self._timelines.values():
+            timeline.space = self._spaces[0]
+
+
+def _worker_of(block: Block, count: int) -> int:
+    """Whose block this is: neighbours, which the same machines drive over, are of different workers."""
+    return (block[0] + block[1]) % count
 
 
 def warm_up(config: FoldConfig) -> None:

@@ -114,12 +114,15 @@ class Space:
 
 
 class Timeline:
-    """Pages of one block: settled ones, and those that came since. known_cells: how many cells have evidence."""
+    """Pages of one block: settled ones, and those that came since.
 
-    __slots__ = ("_fresh", "_known", "_settled", "_space", "_tiers", "_timed", "_waiting", "known_cells")
+    known_cells: how many cells have evidence. space: where it is settled, that of the thread which adds or reads.
+    """
+
+    __slots__ = ("_fresh", "_known", "_settled", "_tiers", "_timed", "_waiting", "known_cells", "space")
 
     def __init__(self, tiers: Tiers, space: Space, settled: CompactPages = EMPTY) -> None:
-        self._tiers, self._space = tiers, space
+        self._tiers, self.space = tiers, space
         self._settled = settled
         self._fresh: list[PackedPages] = []
         self._waiting = 0
@@ -140,7 +143,7 @@ class Timeline:
     def settled(self) -> CompactPages:
         """All pages, in the order of tier and index, each cell's newest spans apart."""
         if self._fresh:
-            self._settled = _settled(self._settled, self._fresh, self._tiers, self._space)
+            self._settled = _settled(self._settled, self._fresh, self._tiers, self.space)
             self._fresh, self._waiting, self._timed = [], 0, None
         return self._settled
 

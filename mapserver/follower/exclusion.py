@@ -1,43 +1,48 @@
 """Exclusion of machines: decisions are kept with the journal, then the map is folded again without those excluded.
 
-The grid belongs to the writer's thread. So a map without a machine is folded here from all rows, then handed to the
-writer, which folds what came in meanwhile and goes on with it.
+The grid belongs to the writer's thread. So a map without a machine is folded on a thread of its own, in rounds, each
+with what came in during the one before; the writer folds what the last round left, a few rows, and goes on with it.
 """
 
 from __future__ import annotations
 
 import logging
+import sqlite3
 import threading
+import time
 from collections.abc import Mapping
-from dataclasses import asdict
 
-from mapserver.evidence.grid import REFOLD_ROWS, Grid
+from mapserver.evidence.grid import Grid
+from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
-from mapserver.journal.history import History, history_rows
+from mapserver.journal.history import History
 from mapserver.journal.reader import JournalReader
+from mapserver.journal.refold import fold_history
 from mapserver.journal.rows import Selection
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import KIND, TrustDecision, TrustDecisions
+from protocol.errors import QueryError, Refusal, SitegridError
 
+FEW_ROWS = 8  # may be left to the writer's thread: some ms
+MOST_ROUNDS = 20  # where batches come in as fast as they are folded, the writer has to make them wait
+RETRY_S = 1.0  # after rows that could not be read
 log = logging.getLogger("mapserver.follower.exclusion")
 
 
 class Exclusion:
-    """Decisions about machines, and which of them the map is folded without. All but `run` are for any thread."""
+    """Decisions about machines, and a thread that folds the map without those excluded. All of it is for any thread."""
 
-    name = "exclusion"
-
-    def __init__(self, writer: Writer, reader: JournalReader, ending: threading.Event) -> None:
-        self._writer, self._reader, self._ending = writer, reader, ending
-        self._decisions = TrustDecisions(reader.events(KIND))
-        self._requested: list[TrustDecision] = []
-        self._unfolded: list[TrustDecision] = []  # kept with the journal, but not in the map yet
-        self._changed = threading.Condition()
-
-    @property
-    def requested(self) -> bool:
-        """Whether a decision waits for the next run."""
-        return bool(self._requested)
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._reader = JournalReader(writer.folder / JOURNAL_FILE)
+        self._decisions = TrustDecisions(self._reader.events(KIND))
+        self._wanted = self._decisions.distrusted
+        self._changed = threading.Condition()  # its holder never waits for the writer, which takes it
+        self._decided = self._folded = 0  # decisions kept since the start, and so many of them that the map follows
+        self._problem = ""  # of the last fold, until one succeeds
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
+        self._thread.start()
 
     def excluded(self) -> frozenset[str]:
         """Machines whose rows are not in the map."""
@@ -49,47 +54,96 @@ class Exclusion:
             return self._decisions.newest(machine)
 
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
-        """Have decided what the audit may decide, which may be nothing: `machines` names its verdicts in any case."""
-        with self._changed:
-            if self._writer.config.trust.exclude:
-                self._requested += self._decisions.judge(verdicts, stamp_ns)
+        """Decide what the audit may decide, which may be nothing: `machines` names its verdicts in any case."""
+        if self._writer.config.trust.exclude:
+            with self._changed:
+                decisions = self._decisions.judge(verdicts, stamp_ns)
+            for decision in decisions:
+                self.decide(decision)
 
-    def request(self, decision: TrustDecision) -> None:
-        """Have a decision made."""
-        with self._changed:
-            self._requested.append(decision)
+    def decide(self, decision: TrustDecision) -> int:
+        """Keep a decision on disk, then have the map folded so; returns its number, to wait for.
 
-    def wait(self, decision: TrustDecision, wait_s: float) -> bool:
-        """Whether a decision counts in the map, after waiting for it."""
-        with self._changed:
-            return self._changed.wait_for(lambda: decision not in self._requested + self._unfolded, wait_s)
-
-    def run(self) -> None:
-        """Keep what was decided, fold the map again where that changes who is excluded, tell who waits."""
-        for decision in list(self._requested):
-            self._keep(decision)
-        if not self._unfolded:
-            return
-        if self._decisions.distrusted != self.excluded():
-            self._fold_again(self._decisions.distrusted)
-        with self._changed:
-            self._unfolded.clear()
-            self._changed.notify_all()
-
-    def _keep(self, decision: TrustDecision) -> None:
-        self._writer.run(lambda store: store.journal.append_event(KIND, decision.stamp_ns, asdict(decision)))
+        Raises QueryError where it cannot be written: nothing has changed then.
+        """
+        try:
+            number = self._writer.run(lambda store: self._keep(store, decision))
+        except (sqlite3.Error, OSError) as error:
+            problem = f"the decision about `{decision.machine}` cannot be written, so it does not count: {error}"
+            raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
         values = (decision.machine, decision.trusted, decision.by, decision.reason)
         log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
+        return number
+
+    def wait(self, number: int, wait_s: float) -> None:
+        """Wait until a decision, which is kept, counts in the map; QueryError after wait_s."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._folded >= number or self._ending, wait_s)
+            if self._folded >= number:
+                return
+            why = "the server is stopping" if self._ending else f"the map is not folded again after {wait_s:g} s"
+            problem = f"the decision is kept, but {why}" + (f": {self._problem}" if self._problem else "")
+        raise QueryError(Refusal.AFTER_TIMEOUT, f"{problem}; ask for `machines`")
+
+    def close(self) -> None:
+        """End the thread; a fold is given up, and the next start makes it."""
+        with self._changed:
+            self._ending = True
+            self._changed.notify_all()
+        self._thread.join()
+        self._reader.close()
+
+    def _keep(self, store: Store, decision: TrustDecision) -> int:
+        """On the writer's thread, so that what is in memory is what is on disk, also where nobody waits any more."""
+        store.decide(decision)
         with self._changed:
             self._decisions.add(decision)
-            self._requested.remove(decision)
-            self._unfolded.append(decision)
+            self._wanted = self._decisions.distrusted
+            self._decided += 1
+            self._changed.notify_all()
+            return self._decided
 
-    def _fold_again(self, excluded: frozenset[str]) -> None:
-        until = self._reader.last_row
-        grid = Grid(self._writer.site.cell_m, self._writer.config.fold, REFOLD_ROWS)
-        for row in history_rows(History.beside(self._reader), until=until, selection=Selection(without=excluded)):
-            grid.fold(row.rows, row.machine)
-            if self._ending.is_set():
-                return
-        self._writer.run(lambda store: store.adopt(grid, until, excluded))
+    def _run(self) -> None:
+        """Have the map follow the decisions; those that were made in the meantime are followed together."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._ending or self._folded < self._decided)
+                if self._ending:
+                    return
+                number, excluded = self._decided, self._wanted
+            try:
+                follows = self._follow(excluded)
+                problem = ""
+            except (SitegridError, OSError) as error:
+                follows, problem = False, str(error)
+                log.error("follower failed job=exclusion error=%r", problem)
+            except Exception:  # a bug here must not end the server, nor pass unseen
+                follows, problem = False, "the server failed; see its log"
+                log.exception("follower failed job=exclusion")
+            with self._changed:
+                self._problem = problem
+                if follows:
+                    self._folded = number
+                    self._changed.notify_all()
+                elif problem:
+                    self._changed.wait_for(lambda: self._ending, RETRY_S)
+
+    def _follow(self, excluded: frozenset[str]) -> bool:
+        """Have a map without these machines; whether it is there, else it is to be another one meanwhile."""
+        if excluded == self.excluded():
+            return True
+        began_s = time.monotonic()
+        grid, row, rounds = Grid(self._writer.site.cell_m, self._writer.config.fold), 0, 0
+        history, selection = History.beside(self._reader), Selection(without=excluded)
+        while (last := self._reader.last_row) - row > FEW_ROWS and rounds < MOST_ROUNDS:
+            if not fold_history(grid, history, row, last, selection, lambda: self._superseded(excluded)):
+                return False
+            row, rounds = last, rounds + 1
+        self._writer.run(lambda store: store.adopt(grid, row, excluded))
+        values = (",".join(sorted(excluded)), rounds, time.monotonic() - began_s)
+        log.info("map folded again without=%s rounds=%d seconds=%.1f", *values)
+        return True
+
+    def _superseded(self, excluded: frozenset[str]) -> bool:
+        """Whether what is being folded is not wanted any more."""
+        return self._ending or self._wanted != excluded

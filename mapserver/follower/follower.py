@@ -1,4 +1,4 @@
-"""The follower: a thread beside the writer that runs four jobs in turn; other threads ask it for their results."""
+"""The follower: a thread beside the writer that runs three jobs in turn, and one that folds the map again."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Follower:
     def __init__(self, writer: Writer, publish: Publish) -> None:
         self._writer = writer
         self._reader = reader = JournalReader(writer.folder / JOURNAL_FILE)
-        self._wake, self._ending = threading.Event(), threading.Event()
-        self._exclusion = Exclusion(writer, reader, self._ending)
-        self._audit = Audit(writer, reader, self._exclusion.judge, self._interrupted)
+        self._ending = threading.Event()
+        self._exclusion = Exclusion(writer)
+        self._audit = Audit(writer, reader, self._exclusion.judge, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
-        self._jobs = (self._audit, self._exclusion, self._changes, Archiving(writer, reader, self._ending))
+        self._jobs = (self._audit, self._changes, Archiving(writer, reader, self._ending))
         self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
         self._thread.start()
 
@@ -52,24 +52,21 @@ class Follower:
     def trust(self, machine: str, trusted: bool | None, reason: str, wait_s: float) -> dict[str, Any]:  # noqa: FBT001
         """Trust a machine or not, None leaves it to the audit; waits until the map is folded so.
 
-        Returns the state of the machine. Raises QueryError for a machine that has sent nothing, or after wait_s.
+        Returns the state of the machine. Raises QueryError for a machine that has sent nothing, where the decision
+        cannot be written, or after wait_s; then it is kept all the same.
         """
         sent = self._writer.run(lambda store: store.machines())
         if machine not in sent:
             names = ", ".join(sorted(sent)) or "none"
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
-        decision = self._decision(machine, trusted, reason)
-        self._exclusion.request(decision)
-        self._wake.set()
-        if not self._exclusion.wait(decision, wait_s):
-            problem = f"the map is not folded again after {wait_s:g} s; ask for `machines`"
-            raise QueryError(Refusal.AFTER_TIMEOUT, problem)
+        number = self._exclusion.decide(self._decision(machine, trusted, reason))
+        self._exclusion.wait(number, wait_s)
         return next(row for row in self.machines() if row["name"] == machine)
 
     def close(self) -> None:
-        """End the thread."""
+        """End the threads."""
         self._ending.set()
-        self._wake.set()
+        self._exclusion.close()
         self._thread.join()
         self._reader.close()
 
@@ -95,9 +92,6 @@ class Follower:
             return TrustDecision(machine, not contradicts, AUDIT, reason or "left to the audit", stamp_ns)
         return TrustDecision(machine, trusted, PERSON, reason, stamp_ns)
 
-    def _interrupted(self) -> bool:
-        return self._ending.is_set() or self._exclusion.requested
-
     def _run(self) -> None:
         while not self._ending.is_set():
             for job in self._jobs:
@@ -109,5 +103,4 @@ class Follower:
                     log.error("follower failed job=%s error=%r", job.name, str(error))
                 except Exception:  # a bug here must not end the server, nor pass unseen
                     log.exception("follower failed job=%s", job.name)
-            self._wake.wait(TURN_S)
-            self._wake.clear()
+            self._ending.wait(TURN_S)

@@ -33,14 +33,14 @@ log = logging.getLogger("mapserver.follower.jobs")
 class Audit:
     """Hands what is journalled to an auditor, and judges all machines from time to time.
 
-    report: is given all verdicts, and the site's now [ns]. interrupted: whether other work waits for the thread.
+    report: is given all verdicts, and the site's now [ns].
     """
 
     name = "audit"
 
-    def __init__(self, writer: Writer, reader: JournalReader, report: Report, interrupted: Callable[[], bool]) -> None:
+    def __init__(self, writer: Writer, reader: JournalReader, report: Report, ending: threading.Event) -> None:
         self.verdicts: Mapping[str, Verdict] = {}
-        self._writer, self._reader, self._report, self._interrupted = writer, reader, report, interrupted
+        self._writer, self._reader, self._report, self._ending = writer, reader, report, ending
         self._auditor = Auditor(writer.site.cell_m, writer.config.fold)
         self._followed = reader.archived_row
         self._due_s = 0.0
@@ -60,7 +60,7 @@ class Audit:
         for row in self._reader.read(after=max(self._followed, self._reader.archived_row), until=until):
             self._auditor.add(row.machine, row.rows)
             self._followed = row.row
-            if self._interrupted():
+            if self._ending.is_set():
                 return
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import logging
+import os
+import socket
 import sqlite3
 import time
 from collections import Counter
@@ -15,18 +17,20 @@ from typing import Any
 
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
-from mapserver.evidence.grid import LIVE_ROWS, REFOLD_ROWS, Grid
+from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, admit, parse
 from mapserver.journal.archive import FOLDER, Archive
-from mapserver.journal.history import History, history_rows
+from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
+from mapserver.journal.refold import fold_history
 from mapserver.journal.rows import Admission, Selection
 from mapserver.journal.shortfall import KIND as SHORTFALL
 from mapserver.journal.shortfall import Shortfall, missing
 from mapserver.trust.decisions import KIND as TRUST
-from mapserver.trust.decisions import TrustDecisions
+from mapserver.trust.decisions import TrustDecision, TrustDecisions
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.files import make_private
+from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
 from protocol.wire import keys
@@ -50,7 +54,8 @@ class Incoming:
 class Store:
     """Journal, grid, watermarks and counters of one site.
 
-    excluded: machines whose rows are not in the grid. merged: the last journal row that is; newest_ns: the site's now.
+    identity: which store this is. excluded: machines whose rows are not in the grid. merged: the last journal row that
+    is; fact: the last decision that counts in it. newest_ns: the site's now.
     """
 
     def __init__(
@@ -71,23 +76,28 @@ class Store:
             opened.enter_context(_hold(folder))
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
             opened.callback(self.journal.close)
+            self.identity = self.journal.identity()
             last_row = self.journal.last_row
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
             self.shortfalls = self._name_shortfall(snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
-            self.grid.resize_buffer(REFOLD_ROWS)
-            self._fold_tail(self.grid, self.merged, self.excluded)
-            self.grid.resize_buffer(LIVE_ROWS)
+            fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
             self.merged = last_row
             self.newest_ns = self.journal.newest_ns()
+            self.fact = self._last_fact()
             self._opened = opened.pop_all()
 
     @property
     def journalled(self) -> int:
         """The last row on disk."""
         return self.journal.last_row
+
+    @property
+    def version(self) -> MapVersion:
+        """The version of the map as it is."""
+        return MapVersion(self.identity.id, self.merged, self.fact)
 
     def commit(self, group: list[Incoming]) -> list[Ack | Refused]:
         """Journal a group of batches in one commit, fold it, and return the answer to each.
@@ -129,13 +139,24 @@ class Store:
 
         return write
 
-    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
-        """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines."""
-        self._fold_tail(grid, row, excluded)
-        grid.resize_buffer(LIVE_ROWS)
-        self.grid, self.excluded = grid, excluded
+    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> Grid:
+        """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines.
+
+        The rows beyond it are folded here, while batches wait: let them be few. Returns the grid that was used so far,
+        so that another thread may spend the time to let go of it.
+        """
+        grid.touch_all()
+        for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
+            grid.fold_all(rows.samples, rows.names())
+        before, self.grid, self.excluded = self.grid, grid, excluded
+        self.fact = self._last_fact()
         self.snapshot_row = 0  # what is on disk has other machines in it
-        self.grid.touch_all()
+        return before
+
+    def decide(self, decision: TrustDecision) -> None:
+        """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
+        self.journal.append_event(TRUST, decision.stamp_ns, asdict(decision))
+        self.fact = self._last_fact()
 
     def close(self) -> None:
         """Close the journal and let go of the folder."""
@@ -145,6 +166,9 @@ class Store:
         """State of the store in plain values."""
         return {
             "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
+            "store": self.identity.id,
+            "descends": list(self.identity.descends),
+            "fact": self.fact,
             "journalled": self.journalled,
             "merged": self.merged,
             "snapshot": self.snapshot_row,
@@ -155,6 +179,7 @@ class Store:
             "stamp_ns": self.newest_ns,
             "wall_ns": self.now_ns(),
             "version": package_version(),
+            "server": {"host": socket.gethostname(), "pid": os.getpid()},
             "machines": self.machines(),
             "distrusted": sorted(self.excluded),
             "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
@@ -190,7 +215,16 @@ class Store:
         row = self.journal.append(admission, self.now_ns()) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
-        return Ack(admission.watermark, row, admission.trimmed), admission
+        return Ack(admission.watermark, row, admission.trimmed, self.identity.id), admission
+
+    def _last_fact(self) -> int:
+        """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""
+        decisions, fact = TrustDecisions(()), 0
+        for event in self.journal.events(TRUST):
+            decisions.add(TrustDecision(**event.body))
+            if decisions.distrusted == self.excluded:
+                fact = event.id
+        return fact
 
     def _name_shortfall(self, snapshot_rows: Sequence[int]) -> list[Shortfall]:
         """Say what was acknowledged and is not in the journal, by what lies beside it; returns all that ever was."""
@@ -226,11 +260,8 @@ class Store:
         self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
         self.merged = row
 
-    def _fold_tail(self, grid: Grid, merged: int, excluded: frozenset[str]) -> None:
-        """Fold what a grid does not hold yet."""
-        history = History(self.journal, Archive(self.folder / FOLDER))
-        for row in history_rows(history, after=merged, selection=Selection(without=excluded)):
-            grid.fold(row.rows, row.machine)
+    def _history(self) -> History:
+        return History(self.journal, Archive(self.folder / FOLDER))
 
 
 @contextmanager

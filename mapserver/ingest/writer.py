@@ -33,13 +33,14 @@ class _Work:
 
 
 class Writer:
-    """Owns a Store on a thread of its own, from here on; site, config, folder, now_ns: of the store.
+    """Owns a Store on a thread of its own, from here on; site, config, folder, now_ns, store_id: of the store.
 
     `submit` and `run` may be called from any thread; both return at once or wait for the owner, never touch the store.
     """
 
     def __init__(self, store: Store) -> None:
         self.site, self.config, self.folder, self.now_ns = store.site, store.config, store.folder, store.now_ns
+        self.store_id = store.identity.id
         self._snapshot_s = self.config.store.snapshot_s
         self._store = store
         self._batches: queue.Queue[tuple[Incoming, Reply] | _Work | None] = queue.Queue()

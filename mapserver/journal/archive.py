@@ -19,7 +19,7 @@ import numpy as np
 
 from mapserver.journal.archive_file import KEY, NAME, ArchiveFile, ArchiveHeader, arrow, row_range, seal
 from mapserver.journal.reader import JournalReader
-from mapserver.journal.rows import ALL, JournalRow, Selection
+from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
 from protocol.errors import StoreError
 from protocol.files import sync_folder, whole_file
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
@@ -50,8 +50,8 @@ class Archive:
             self._opened[path] = ArchiveFile(path)
         return self._opened[path]
 
-    def read(self, after: int, until: int, selection: Selection = ALL) -> Iterator[JournalRow]:
-        """Rows after < row <= until; StoreError where a file is missing, or two hold the same row."""
+    def read_many(self, after: int, until: int, selection: Selection = ALL) -> Iterator[JournalRows]:
+        """Rows after < row <= until, many at a time; StoreError where a file is missing, or two hold the same row."""
         reached = after
         for path in self.paths():
             first, last = row_range(path)
@@ -61,7 +61,7 @@ class Archive:
                 break
             if after < first <= reached:
                 raise StoreError(path, f"row {first} is also in another file; move one of them away")
-            yield from self.open(path).read(after, until, selection)
+            yield from self.open(path).read_many(after, until, selection)
             reached = last
         if reached < until:
             problem = f"the file with row {reached + 1} is missing; restore it from a backup"

@@ -14,13 +14,14 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from mapserver.journal.reader import LAST
-from mapserver.journal.rows import ALL, JournalRow, Selection
+from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.config import from_table
 from protocol.errors import ConfigError, StoreError
@@ -88,12 +89,17 @@ class ArchiveFile:
 
     def read(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRow]:
         """Journal rows exactly as they were, in order; selected as by `JournalReader.read`."""
+        return chain.from_iterable(self.read_many(after, until, selection))
+
+    def read_many(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRows]:
+        """As `read`, many at a time."""
         groups = np.flatnonzero(self._groups.may_hold(after, until, selection)).tolist()
         if not groups or selection.without.issuperset(self.header.machines):
             return
         file = arrow("parquet").ParquetFile(arrow().BufferReader(_checked(self.path)))
         for group in groups:
-            yield from _batches(file.read_row_group(group), after, until, selection)
+            if len(rows := _rows(file.read_row_group(group), after, until, selection)):
+                yield rows
 
 
 def row_range(path: Path) -> tuple[int, int]:
@@ -102,23 +108,23 @@ def row_range(path: Path) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def _batches(table: Any, after: int, until: int, selection: Selection) -> Iterator[JournalRow]:
-    """The selected batches of a row group."""
-    samples: Table = np.zeros(table.num_rows, SAMPLE_DTYPE)
+def _rows(table: Any, after: int, until: int, selection: Selection) -> JournalRows:
+    """The selected journal rows of a row group."""
+    samples: Table = np.empty(table.num_rows, SAMPLE_DTYPE)
     for name in COLUMNS:
         samples[name] = table.column(name).to_numpy()
     numbers = table.column("row").to_numpy()
     starts = np.flatnonzero(np.diff(numbers, prepend=-1))
-    ends = np.append(starts[1:], len(samples))
     ranged = {"row": numbers, **{name: samples[name] for name in ("stamp_ns", "x_m", "y_m")}}
     low, high = (
         {name: f.reduceat(values, starts) for name, values in ranged.items()} for f in (np.minimum, np.maximum)
     )
-    batches = table.select(["row", "machine", "spool_id", "seq", "received_ns"]).take(starts).to_pylist()
-    for i in np.flatnonzero(_spans(low, high).may_hold(after, until, selection)).tolist():
-        row, machine, spool_id, seq, received_ns = batches[i].values()
-        if machine not in selection.without:
-            yield JournalRow(row, machine, spool_id, seq, samples[starts[i] : ends[i]], received_ns)
+    heads = table.select(["machine", "row", "spool_id", "seq", "received_ns"]).take(starts)
+    names = heads.column("machine").combine_chunks().dictionary_encode()
+    columns = (heads.column(name).to_numpy() for name in ("row", "spool_id", "seq", "received_ns"))
+    machines, machine = tuple(names.dictionary.to_pylist()), names.indices.to_numpy().astype(np.int64)
+    rows = JournalRows(samples, np.diff(starts, append=len(samples)), machines, machine, *columns)
+    return rows.chosen(_spans(low, high).may_hold(after, until, selection)).without(selection.without)
 
 
 def _statistics(metadata: Any) -> tuple[dict[str, AnyArray], dict[str, AnyArray]]:

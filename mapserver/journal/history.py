@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.grid import REFOLD_ROWS, Grid
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.reader import LAST, ArchivedError, JournalQueries
-from mapserver.journal.rows import ALL, JournalRow, Selection
+from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
 from protocol.arrays import Table
 from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow, GridGeometry
 
@@ -43,30 +44,36 @@ class SpanEvidence:
     evidence: ev.Evidence
 
 
-def history_rows(
+def read_history(
     history: History, after: int = 0, until: int = LAST, selection: Selection = ALL
-) -> Iterator[JournalRow]:
-    """Rows after < row <= until in order, from archive and journal, each once, also while rows move between them."""
+) -> Iterator[JournalRows]:
+    """Rows after < row <= until in order, from archive and journal, each once, also while rows move between them.
+
+    Many at a time, and never none.
+    """
     while True:
         try:
-            for row in history.journal.read(after, until, selection):
-                yield row
-                after = row.row
+            for rows in history.journal.read_many(after, until, selection):
+                yield rows
+                after = int(rows.numbers[-1])
         except ArchivedError as error:
             archived = min(error.archived_row, until)
         else:
             return
-        yield from history.archive.read(after, archived, selection)
+        yield from history.archive.read_many(after, archived, selection)
         after = archived
+
+
+def history_rows(
+    history: History, after: int = 0, until: int = LAST, selection: Selection = ALL
+) -> Iterator[JournalRow]:
+    """As `read_history`, one by one."""
+    return chain.from_iterable(read_history(history, after, until, selection))
 
 
 def samples_of(row: JournalRow, selection: Selection) -> Table:
     """Samples of a row that are selected by stamp and place, in their order."""
-    stamps, x_m, y_m = (row.rows[name] for name in ("stamp_ns", "x_m", "y_m"))
-    chosen = (stamps >= selection.from_ns) & (stamps <= selection.to_ns)
-    if place := selection.bounds:
-        chosen &= (x_m >= place.west_m) & (x_m <= place.east_m) & (y_m >= place.south_m) & (y_m <= place.north_m)
-    return row.rows[chosen]
+    return row.rows[selection.includes(row.rows)]
 
 
 def grid_as_of(

@@ -8,15 +8,17 @@ decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulate
 from __future__ import annotations
 
 import json
+import secrets
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
-from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, extent_checksum, pack
+from mapserver.journal.records import record
+from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, extent_checksum
 from mapserver.journal.shortfall import EVENT, ROW, Shortfall, compare, marked, spool_name
 from mapserver.journal.shortfall import KIND as SHORTFALL
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
@@ -38,7 +40,8 @@ class Journal(JournalQueries):
     last_row: int
     shortfall: Shortfall | None = None
 
-    def __init__(self, path: Path, site: str, frame: str) -> None:
+    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
+        """descends: ids of the stores that a new one is made from."""
         self.path = path
         self._changed: dict[str, int] = {}  # by the open transaction, for the mark
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -52,7 +55,7 @@ class Journal(JournalQueries):
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
-                self._create_or_check(site, frame)
+                self._create_or_check(site, frame, descends)
                 self.check()
                 self._return_to_disk()
                 self._mark = HighWaterMark(mark_path(path))
@@ -77,18 +80,11 @@ class Journal(JournalQueries):
     def append(self, admission: Admission, received_ns: int) -> int:
         """Write one row and its watermark into the open transaction; returns the row's number."""
         batch = admission.batch
-        payload = pack(batch.rows)
         x_m, y_m, stamps = (batch.rows[name] for name in ("x_m", "y_m", "stamp_ns"))
         first_ns, last_ns = int(stamps.min()), int(stamps.max())
-        spool = _spool_bytes(batch.spool_id)
         row = self.last_row + 1
-        crc32 = checksum(row, batch.machine, spool, batch.first_seq, received_ns, payload)
-        values = (row, batch.machine, spool, batch.first_seq, len(batch.rows), received_ns)
-        self._db.execute(
-            "INSERT INTO journal (row, machine, spool_id, first_seq, n, received_ns, first_stamp_ns, last_stamp_ns,"
-            " payload, crc32) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*values, first_ns, last_ns, payload, crc32),
-        )
+        written = JournalRow(row, batch.machine, batch.spool_id, batch.first_seq, batch.rows, received_ns)
+        self._db.execute("INSERT INTO journal VALUES (?, ?)", (row, record(written)))
         box = (float(x_m.min()), float(y_m.min()), float(x_m.max()), float(y_m.max()))
         extent = (row, first_ns, last_ns, *box)
         self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, extent_checksum(*extent)))
@@ -181,12 +177,15 @@ class Journal(JournalQueries):
             self.rollback()
             raise
 
-    def _create_or_check(self, site: str, frame: str) -> None:
+    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
         expected = {"schema": str(SCHEMA), "site": site, "frame": frame}
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
             self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
-            self._db.executemany("INSERT INTO meta VALUES (?, ?)", expected.items())
+            words = (secrets.token_hex(8), *descends)
+            store = " ".join((*words, f"{checksum(*words):08x}"))
+            self._db.executemany("INSERT INTO meta VALUES (?, ?)", {**expected, "store": store}.items())
             self._db.execute("COMMIT")
+            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # no damage of a log takes the store's id away
         meta = self._meta()
         for key, value in expected.items():
             if meta.get(key) != value:

@@ -8,13 +8,27 @@ import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from mapserver.journal.rows import ALL, Event, JournalRow, Selection, Watermark, checksum, extent_checksum, unpack
+import numpy as np
+
+from mapserver.journal.records import decoded
+from mapserver.journal.rows import (
+    ALL,
+    Event,
+    JournalRow,
+    JournalRows,
+    Selection,
+    StoreIdentity,
+    Watermark,
+    checksum,
+    extent_checksum,
+)
 from protocol.errors import StoreError
 
-SCHEMA = 3  # the only one: a journal of another one is refused
+SCHEMA = 4  # the only one: a journal of another one is refused
 # When and where the samples of a row lie is a table of its own: 50 bytes a row, so that a read by time and place passes
 # over rows without touching the pages of their payloads. Such a read cannot see that it misses a row where a bit of its
 # extent has flipped; so extents have a checksum of their own, which is checked on opening.
@@ -22,11 +36,8 @@ TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE journal (
     row INTEGER PRIMARY KEY AUTOINCREMENT,
-    machine TEXT NOT NULL, spool_id BLOB NOT NULL, first_seq INTEGER NOT NULL, n INTEGER NOT NULL,
-    received_ns INTEGER NOT NULL, first_stamp_ns INTEGER NOT NULL, last_stamp_ns INTEGER NOT NULL,
-    payload BLOB NOT NULL, crc32 INTEGER NOT NULL
+    record BLOB NOT NULL
 );
-CREATE INDEX journal_machine ON journal (machine, row);
 CREATE TABLE watermark (
     machine TEXT NOT NULL, spool_id BLOB NOT NULL,
     seq INTEGER NOT NULL, lost INTEGER NOT NULL, newest_ns INTEGER NOT NULL, crc32 INTEGER NOT NULL,
@@ -43,15 +54,15 @@ CREATE TABLE events (
     kind TEXT NOT NULL, stamp_ns INTEGER NOT NULL, body TEXT NOT NULL, crc32 INTEGER NOT NULL
 );
 """
-_COLUMNS = "SELECT row, machine, spool_id, first_seq, received_ns, payload, journal.crc32 FROM "
-_IN_ORDER = "AND row > :after AND row <= :until ORDER BY row LIMIT :most"
-_READ_ALL = f"{_COLUMNS} journal WHERE TRUE {_IN_ORDER}"
+_READ_ALL = "SELECT row, record FROM journal WHERE row > :after AND row <= :until ORDER BY row"
 # LEFT JOIN keeps SQLite from walking the journal first, and shows a row that is not there.
-_READ_SOME = f"""{_COLUMNS} extent LEFT JOIN journal USING (row)
+_READ_SOME = """SELECT row, record FROM extent LEFT JOIN journal USING (row)
 WHERE extent.last_stamp_ns >= :from_ns AND extent.first_stamp_ns <= :to_ns
     AND west_m <= :east_m AND east_m >= :west_m AND south_m <= :north_m AND north_m >= :south_m
-{_IN_ORDER}"""
-ROWS_AT_ONCE = 200  # read or removed in one transaction: short ones keep the write-ahead log small
+    AND row > :after AND row <= :until ORDER BY row"""
+# Read or removed in one transaction: short ones keep the write-ahead log small.
+ROWS_AT_ONCE = 200
+BYTES_AT_ONCE = 2**20  # or the rows that pass it; what is read of them stays in the processor's cache
 _EXTENTS_AT_ONCE = 10_000
 LAST = 2**63 - 1
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
@@ -65,6 +76,19 @@ class ArchivedError(StoreError):
         self.archived_row = archived_row
 
 
+def _dense(numbers: Sequence[int], after: int) -> int:
+    """How many of the first numbers follow each other, from `after` on."""
+    gaps = np.flatnonzero(np.array(numbers, np.int64) != np.arange(after + 1, after + 1 + len(numbers)))
+    return int(gaps[0]) if len(gaps) else len(numbers)
+
+
+def _size(records: Sequence[Any]) -> int:
+    try:
+        return sum(map(len, records))
+    except TypeError:  # damage has turned one into a number
+        return BYTES_AT_ONCE
+
+
 class JournalQueries:
     """What can be read of a journal, on its owner's connection as on a reader's."""
 
@@ -72,27 +96,43 @@ class JournalQueries:
     _db: sqlite3.Connection
 
     def read(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRow]:
-        """Rows after < row <= until in order, also those that are committed meanwhile.
+        """As `read_many`, one by one."""
+        return chain.from_iterable(self.read_many(after, until, selection))
 
-        StoreError where a row is missing or not what was written; ArchivedError as soon as one of them is archived.
+    def read_many(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRows]:
+        """Rows after < row <= until in order, also those that are committed meanwhile; many at a time, and never none.
+
+        StoreError where a row is missing or not what was written, after those before it; ArchivedError as soon as one
+        of them is archived.
         """
         while True:
             last = min(until, self._last_row())  # asked before the rows are read: all up to this one must be there
-            piece = self._piece(after, until, selection)
+            numbers, records, is_end = self._piece(after, until, selection)
             # Asked after the rows were read: none beyond this one had been removed then.
             if after < min(archived := self.archived_row, until):
                 raise ArchivedError(self.path, archived)
-            is_end = len(piece) < ROWS_AT_ONCE
-            if selection.everywhere:
-                self._require_each((row for row, *_ in piece), after, last if is_end else 0)
-            yield from (self._row(*values) for values in piece if values[1] not in selection.without)
+            there = _dense(numbers, after) if selection.everywhere else len(numbers)
+            rows = decoded(numbers[:there], records[:there])
+            if len(others := rows.without(selection.without)):
+                yield others
+            if (n := len(rows)) < there:
+                raise self._damaged(f"journal row {numbers[n]}")
+            after = numbers[n - 1] if n else after
+            if n < len(numbers) or (is_end and selection.everywhere and after < last):
+                raise self._damaged(f"what follows number {after}")
             if is_end:
                 return
-            after = piece[-1][0]
 
     def newest_ns(self) -> int:
         """The newest stamp of all samples, archived or not: the site's now."""
         return self._number("SELECT COALESCE(MAX(newest_ns), 0) FROM watermark")
+
+    def identity(self) -> StoreIdentity:
+        """Which store this is; StoreError where that is damaged."""
+        words = self._meta().get("store", "").split()
+        if len(words) < 2 or words[-1] != f"{checksum(*words[:-1]):08x}":
+            raise self._damaged("the id of the store")
+        return StoreIdentity(words[0], tuple(words[1:-1]))
 
     @property
     def archived_row(self) -> int:
@@ -107,12 +147,14 @@ class JournalQueries:
         return [self._event(*values) for values in self._query(query, (after, kind))]
 
     def check(self) -> None:
-        """Check extents, events and watermarks; StoreError where one is damaged. Rows are checked when they are read.
+        """Check identity, extents, events and watermarks; StoreError where one is damaged.
 
-        A damaged extent would hide its row from a read by time and place, without any error.
+        Rows are checked when they are read. A damaged extent would hide its row from a read by time and place, without
+        any error.
         """
         self._db.execute("BEGIN")  # one state for all of it, also while a server writes
         try:
+            self.identity()
             self._require_each(self._extent_rows(), self.archived_row, self._last_row())
             self._require_each((event.id for event in self.events()), 0)
             self._load_watermarks()
@@ -144,12 +186,28 @@ class JournalQueries:
     def _last_row(self) -> int:  # also where all rows are archived
         return self._number("SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'")
 
-    def _piece(self, after: int, until: int, selection: Selection) -> list[tuple[Any, ...]]:
-        span = {"after": after, "until": until, "most": ROWS_AT_ONCE}
+    def _piece(self, after: int, until: int, selection: Selection) -> tuple[list[int], list[Any], bool]:
+        """Numbers and records of the next rows, and whether there are no more."""
+        span: dict[str, float] = {"after": after, "until": until}
         if selection.everywhere:
-            return self._query(_READ_ALL, span)
-        box = asdict(selection.bounds) if selection.bounds else _EVERYWHERE
-        return self._query(_READ_SOME, {**span, **box, "from_ns": selection.from_ns, "to_ns": selection.to_ns})
+            query, values = _READ_ALL, span
+        else:
+            box = asdict(selection.bounds) if selection.bounds else _EVERYWHERE
+            query, values = _READ_SOME, {**span, **box, "from_ns": selection.from_ns, "to_ns": selection.to_ns}
+        numbers: list[int] = []
+        records: list[Any] = []
+        size = 0
+        try:
+            cursor = self._db.execute(query, values)
+            while size < BYTES_AT_ONCE and (part := cursor.fetchmany(ROWS_AT_ONCE)):
+                more, some = zip(*part, strict=True)
+                numbers += more
+                records += some
+                size += _size(some)
+            cursor.close()  # which ends the transaction
+        except sqlite3.Error as error:
+            raise StoreError(self.path, f"cannot be read: {error}") from None
+        return numbers, records, size < BYTES_AT_ONCE
 
     def _require_each(self, numbers: Iterable[int], after: int, last: int = 0) -> None:
         """StoreError unless each number follows the one before, from `after` on, to `last` at least."""
@@ -162,13 +220,6 @@ class JournalQueries:
 
     def _damaged(self, what: str) -> StoreError:
         return StoreError(self.path, f"{what} is damaged; restore the file from a backup")
-
-    def _row(
-        self, row: int, machine: str, spool: bytes, first_seq: int, received_ns: int, payload: bytes, crc32: int
-    ) -> JournalRow:
-        if checksum(row, machine, spool, first_seq, received_ns, payload) != crc32:
-            raise self._damaged(f"journal row {row}")
-        return JournalRow(row, machine, int.from_bytes(spool, "big"), first_seq, unpack(payload), received_ns)
 
     def _extent_rows(self) -> Iterator[int]:
         """The rows that have an extent, in order; read in pieces, since there may be millions."""

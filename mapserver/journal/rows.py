@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
-import msgpack
 import numpy as np
+from numpy.typing import NDArray
 
-from protocol.arrays import Table
+from mapserver.evidence.fold_config import name_hash
+from protocol.arrays import Bools, Ints, Table
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
 
+_RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records field by field, and these at once
 _EXTENT = struct.Struct("<3q4d")
 
 
@@ -47,6 +49,63 @@ class JournalRow:
 
 
 @dataclass(frozen=True)
+class JournalRows:
+    """Journal rows in one table; iterated over, they are the rows one by one.
+
+    samples (n,): of all rows, one behind the other. lengths (k,): samples of each row. machines: names, each once;
+    machine (k,): index of each row's in them. The others (k,): as in JournalRow.
+    """
+
+    samples: Table
+    lengths: Ints
+    machines: tuple[str, ...]
+    machine: Ints
+    numbers: Ints
+    spool_ids: NDArray[np.uint64]
+    first_seqs: Ints
+    received_ns: Ints
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[JournalRow]:
+        ends = np.cumsum(self.lengths)
+        columns = (self.numbers, self.machine, self.spool_ids, self.first_seqs, ends - self.lengths, ends)
+        for values in zip(*(column.tolist() for column in (*columns, self.received_ns)), strict=True):
+            number, machine, spool_id, first_seq, begin, end, received_ns = values
+            yield JournalRow(number, self.machines[machine], spool_id, first_seq, self.samples[begin:end], received_ns)
+
+    def names(self) -> NDArray[np.uint64]:
+        """Hash of its machine's name for each sample (n,), as `Grid.fold_all` wants it."""
+        hashes = np.array([name_hash(machine) for machine in self.machines], np.uint64)
+        return np.repeat(hashes[self.machine], self.lengths)
+
+    def chosen(self, rows: Bools) -> JournalRows:
+        """Those rows (k,) alone."""
+        if rows.all():
+            return self
+        columns = ("lengths", "machine", "numbers", "spool_ids", "first_seqs", "received_ns")
+        samples = self.samples.view(_RAW_SAMPLE)[np.repeat(rows, self.lengths)].view(SAMPLE_DTYPE)
+        return replace(self, samples=samples, **{name: getattr(self, name)[rows] for name in columns})
+
+    def first(self, n: int) -> JournalRows:
+        """The first `n` rows alone."""
+        return self.chosen(np.arange(len(self)) < n)
+
+    def without(self, machines: frozenset[str]) -> JournalRows:
+        """Rows of all other machines."""
+        others = np.array([machine not in machines for machine in self.machines], np.bool_)
+        return self.chosen(others[self.machine])
+
+    def selected(self, selection: Selection) -> tuple[Table, NDArray[np.uint64]]:
+        """Samples that are selected by stamp and place, (m,), and the hashes of their machines' names, (m,)."""
+        chosen = selection.includes(self.samples)
+        if chosen.all():
+            return self.samples, self.names()
+        return self.samples.view(_RAW_SAMPLE)[chosen].view(SAMPLE_DTYPE), self.names()[chosen]
+
+
+@dataclass(frozen=True)
 class Selection:
     """Which journal rows to read. A row that may hold a selected sample is given whole.
 
@@ -64,6 +123,14 @@ class Selection:
         """Whether neither time nor place excludes a row."""
         return self == Selection(without=self.without)
 
+    def includes(self, samples: Table) -> Bools:
+        """Which samples (n,) are selected by stamp and place."""
+        stamps, x_m, y_m = (samples[name] for name in ("stamp_ns", "x_m", "y_m"))
+        chosen: Bools = (stamps >= self.from_ns) & (stamps <= self.to_ns)
+        if place := self.bounds:
+            chosen &= (x_m >= place.west_m) & (x_m <= place.east_m) & (y_m >= place.south_m) & (y_m <= place.north_m)
+        return chosen
+
 
 ALL = Selection()
 
@@ -78,6 +145,14 @@ class Watermark:
 
 
 @dataclass(frozen=True)
+class StoreIdentity:
+    """Which store this is. id: drawn when it is made, and kept by its copies; descends: of what it was folded from."""
+
+    id: str
+    descends: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Event:
     """Something that the server has to remember and that is no sample; body: plain values."""
 
@@ -85,21 +160,6 @@ class Event:
     kind: str
     stamp_ns: int
     body: Mapping[str, Any]
-
-
-def pack(rows: Table) -> bytes:
-    """Encode samples for a journal row: a map from the name of each column to its bytes."""
-    packed: bytes = msgpack.packb({name: rows[name].tobytes() for name in SAMPLE_DTYPE.names or ()})
-    return packed
-
-
-def unpack(payload: bytes) -> Table:
-    """Undo `pack`."""
-    columns = msgpack.unpackb(payload)
-    rows = np.zeros(len(columns["stamp_ns"]) // 8, SAMPLE_DTYPE)
-    for name in SAMPLE_DTYPE.names or ():
-        rows[name] = np.frombuffer(columns[name], SAMPLE_DTYPE[name])
-    return rows
 
 
 def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float) -> int:

@@ -19,7 +19,7 @@ from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now,
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
-from protocol.queries.answers import HistoryAnswer, HistorySpan, PointAnswer, Region
+from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
 from protocol.queries.commands import TrustCommand, parse_command
 from protocol.queries.requests import MAX_SPANS, HistoryQuery, MapQuery, PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds, CellWindow
@@ -54,9 +54,9 @@ class Answers:
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
             case requests.MachinesQuery():
-                return codec.encode_machines(self._follower.machines())
+                return codec.encode_machines(self._follower.machines(), self._version())
             case requests.ChangesQuery():
-                return codec.encode_changes(self._follower.changes(query.after))
+                return codec.encode_changes(self._follower.changes(query.after), self._version())
         return codec.encode_info(self.info())
 
     def info(self) -> dict[str, Any]:
@@ -67,7 +67,7 @@ class Answers:
         """Layers of the cell that a position lies in."""
         region = self._read(self._cell(query.x_m, query.y_m), query.layers, query.when)
         values = {name: float(layer[0, 0]) for name, layer in region.layers.items()}
-        return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.merged, region.stamp_ns)
+        return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.version, region.stamp_ns)
 
     def region(self, query: RegionQuery) -> Region:
         """Layers of all cells that a rectangle touches."""
@@ -76,19 +76,24 @@ class Answers:
     def history(self, query: HistoryQuery) -> HistoryAnswer:
         """Layers of the cell that a position lies in, span by span."""
         names = _of_cells(query.layers)
-        now_ns = self._writer.run(lambda store: store.newest_ns)
+        now_ns, fact = self._writer.run(lambda store: (store.newest_ns, store.fact))
         span_s = query.span_s or self._config.fold.bucket_s
         from_ns, to_ns = _time_of(query, now_ns, span_s)
         cell = self._cell(query.x_m, query.y_m)
         selection = Selection(from_ns, to_ns, without=self._follower.excluded())
         moments, merged = self._past.moments((cell.column, cell.row), selection, span_s)
         x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
-        return HistoryAnswer(x_m, y_m, tuple(self._span(moment, names) for moment in moments), merged, now_ns)
+        version = MapVersion(self._writer.store_id, merged, fact)
+        return HistoryAnswer(x_m, y_m, tuple(self._span(moment, names) for moment in moments), version, now_ns)
 
     def trust(self, command: TrustCommand) -> dict[str, Any]:
-        """What is known of the machine once the command counts, and the journal row of the map that it counts in."""
+        """What is known of the machine once the command counts, and the version of the map that it counts in."""
         row = self._follower.trust(command.machine, command.trusted, command.reason, command.wait_s)
-        return {**row, "merged": self._writer.run(lambda store: store.merged)}
+        version = self._version()
+        return {**row, "store": version.store, "merged": version.row, "fact": version.fact}
+
+    def _version(self) -> MapVersion:
+        return self._writer.run(lambda store: store.version)
 
     def _cell(self, x_m: float, y_m: float) -> CellWindow:
         window = self._site.geometry.window(Bounds(x_m, y_m, np.nextafter(x_m, np.inf), np.nextafter(y_m, np.inf)))
@@ -101,7 +106,8 @@ class Answers:
         names = _with_difference(names)
         newer, older = (self._map(window, names, as_of_ns) for as_of_ns in (when.as_of_ns, when.minus_ns))
         differences = {name: newer[name] - older[name] for name in names}
-        return replace(newer, layers=differences, merged=min(newer.merged, older.merged))
+        version = replace(newer.version, row=min(newer.merged, older.merged))
+        return replace(newer, layers=differences, version=version)
 
     def _map(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None) -> Region:
         wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
@@ -114,14 +120,15 @@ class Answers:
             y_m=geometry.centres(window.row, window.rows),
             cell_m=self._site.cell_m,
             layers={name: cropped(layer, wide, window) for name, layer in areas.items()},
-            merged=view.merged,
+            version=MapVersion(self._writer.store_id, view.merged, view.fact),
             stamp_ns=view.stamp_ns,
         )
 
     def _view(self, window: CellWindow, as_of_ns: int | None) -> View:
         if as_of_ns is None:
             return self._writer.run(lambda store: view_now(store, window))
-        return self._past.view(window, as_of_ns, self._follower.excluded())
+        fact = self._writer.run(lambda store: store.fact)
+        return replace(self._past.view(window, as_of_ns, self._follower.excluded()), fact=fact)
 
     def _span(self, moment: SpanEvidence, names: tuple[str, ...]) -> HistorySpan:
         values = cell_layers.read(moment.evidence, names, self._config.read, moment.last_ns)

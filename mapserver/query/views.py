@@ -28,12 +28,13 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 class View:
     """Pages of a window's blocks and of those around them: a change is seen with its surroundings.
 
-    merged: the journal row that they are true for. stamp_ns: the time that they are as of.
+    merged, fact: the journal row and the fact that they are true for. stamp_ns: the time that they are as of.
     """
 
     pages: Pages
     merged: int
     stamp_ns: int
+    fact: int = 0
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class PastMaps:
 def view_now(store: Store, window: CellWindow) -> View:
     """The map as it is; on the thread that owns the store."""
     reach = reach_blocks(store.site.cell_m, store.config.change)
-    return View(_pages(store.grid, window, reach), store.merged, store.newest_ns)
+    return View(_pages(store.grid, window, reach), store.merged, store.newest_ns, store.fact)
 
 
 def view_of(grid: Grid, window: CellWindow, config: ServerConfig) -> View:

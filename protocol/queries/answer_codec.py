@@ -16,7 +16,7 @@ from protocol.arrays import Floats32
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.queries import answers
 from protocol.site.geometry import MAX_CELLS
-from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, unpack
+from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_store, unpack
 
 MAX_REPLY_BYTES = 2**30
 MAX_CELL_M = 1e4
@@ -32,14 +32,14 @@ _hints = functools.cache(typing.get_type_hints)
 def encode_point(answer: answers.PointAnswer) -> bytes:
     """Answer of `point`."""
     place = {"x_m": answer.x_m, "y_m": answer.y_m}
-    return pack({**place, "values": _plain(answer.values), "merged": answer.merged, "stamp_ns": answer.stamp_ns})
+    return pack({**place, "values": _plain(answer.values), **_version(answer.version), "stamp_ns": answer.stamp_ns})
 
 
 def decode_point(data: bytes) -> answers.PointAnswer:
     """Undo `encode_point`."""
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     x, y, values = take(table, "x_m", float), take(table, "y_m", float), _take_values(table)
-    return answers.PointAnswer(x, y, values, take(table, "merged", int), take(table, "stamp_ns", int))
+    return answers.PointAnswer(x, y, values, _take_version(table), take(table, "stamp_ns", int))
 
 
 def encode_region(region: answers.Region) -> bytes:
@@ -53,7 +53,7 @@ def encode_region(region: answers.Region) -> bytes:
             "columns": len(region.x_m),
             "rows": len(region.y_m),
             "layers": layers,
-            "merged": region.merged,
+            **_version(region.version),
             "stamp_ns": region.stamp_ns,
         }
     )
@@ -74,7 +74,7 @@ def decode_region(data: bytes) -> answers.Region:
         y_m=south_m + (np.arange(rows) + 0.5) * cell_m,
         cell_m=cell_m,
         layers=layers,
-        merged=take(table, "merged", int),
+        version=_take_version(table),
         stamp_ns=take(table, "stamp_ns", int),
     )
 
@@ -98,7 +98,7 @@ def encode_history(answer: answers.HistoryAnswer) -> bytes:
     """Answer of `history`."""
     spans = [{"first_ns": s.first_ns, "last_ns": s.last_ns, "values": _plain(s.values)} for s in answer.spans]
     place = {"x_m": answer.x_m, "y_m": answer.y_m}
-    return pack({**place, "spans": spans, "merged": answer.merged, "stamp_ns": answer.stamp_ns})
+    return pack({**place, "spans": spans, **_version(answer.version), "stamp_ns": answer.stamp_ns})
 
 
 def decode_history(data: bytes) -> answers.HistoryAnswer:
@@ -109,7 +109,15 @@ def decode_history(data: bytes) -> answers.HistoryAnswer:
         for span in _take_tables(table, "spans")
     )
     x, y = take(table, "x_m", float), take(table, "y_m", float)
-    return answers.HistoryAnswer(x, y, spans, take(table, "merged", int), take(table, "stamp_ns", int))
+    return answers.HistoryAnswer(x, y, spans, _take_version(table), take(table, "stamp_ns", int))
+
+
+def _version(version: answers.MapVersion) -> dict[str, Any]:
+    return {"store": version.store, "merged": version.row, "fact": version.fact}
+
+
+def _take_version(table: dict[str, Any]) -> answers.MapVersion:
+    return answers.MapVersion(take_store(table), take(table, "merged", int), take(table, "fact", int))
 
 
 def _plain(values: Mapping[str, float]) -> dict[str, float]:
@@ -145,14 +153,14 @@ def decode_info(data: bytes) -> answers.MapInfo:
     return _record(answers.MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
 
 
-def encode_machines(machines: Iterable[answers.MachineState | Mapping[str, Any]]) -> bytes:
+def encode_machines(machines: Iterable[answers.MachineState | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
     """Answer of `machines`."""
-    return pack({"machines": [_table(machine) for machine in machines]})
+    return pack({"machines": [_table(machine) for machine in machines], **_version(version)})
 
 
-def decode_machines(data: bytes) -> list[answers.MachineState]:
+def decode_machines(data: bytes) -> answers.MachinesAnswer:
     """Undo `encode_machines`."""
-    return _take_records(answers.MachineState, data, "machines")
+    return answers.MachinesAnswer(*_take_records(answers.MachineState, data, "machines"))
 
 
 def encode_machine(machine: answers.TrustAnswer | Mapping[str, Any]) -> bytes:
@@ -165,14 +173,14 @@ def decode_machine(data: bytes) -> answers.TrustAnswer:
     return _record(answers.TrustAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
 
 
-def encode_changes(changes: Iterable[answers.GroundChange | Mapping[str, Any]]) -> bytes:
+def encode_changes(changes: Iterable[answers.GroundChange | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
     """Answer of `changes`."""
-    return pack({"changes": [_table(change) for change in changes]})
+    return pack({"changes": [_table(change) for change in changes], **_version(version)})
 
 
-def decode_changes(data: bytes) -> list[answers.GroundChange]:
+def decode_changes(data: bytes) -> answers.ChangesAnswer:
     """Undo `encode_changes`."""
-    return _take_records(answers.GroundChange, data, "changes")
+    return answers.ChangesAnswer(*_take_records(answers.GroundChange, data, "changes"))
 
 
 def encode_change(change: answers.GroundChange | Mapping[str, Any]) -> bytes:
@@ -195,9 +203,10 @@ def _record(cls: type[T], table: dict[str, Any], name: str) -> T:
     return record
 
 
-def _take_records(cls: type[T], data: bytes, name: str) -> list[T]:
-    rows: list[Any] = take(unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), name, list)
-    return [_value(cls, row, f"{name}[{index}]") for index, row in enumerate(rows)]
+def _take_records(cls: type[T], data: bytes, name: str) -> tuple[tuple[T, ...], answers.MapVersion]:
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    rows: list[Any] = take(table, name, list)
+    return tuple(_value(cls, row, f"{name}[{index}]") for index, row in enumerate(rows)), _take_version(table)
 
 
 def _value(hint: Any, value: Any, field: str) -> Any:

@@ -1,7 +1,7 @@
 """Answers to map queries as values (docs/protocol.md, "Map queries"); their bytes: `answer_codec.py`.
 
-Stamps are UTC in nanoseconds. `merged` is the journal row that an answer is true for; `stamp_ns` is the site's now, or
-the time that the map is as of.
+Stamps are UTC in nanoseconds. `version` is the version of the map that an answer is true for, `merged` its journal row;
+`stamp_ns` is the site's now, or the time that the map is as of.
 """
 
 from collections.abc import Mapping
@@ -14,18 +14,41 @@ from protocol.site.site_config import KnownGround
 
 
 @dataclass(frozen=True)
-class PointAnswer:
+class MapVersion:
+    """A map that anybody can make again. store: id of the store; row: its last journal row that is in the map.
+
+    fact: number of the last fact that is, 0 for none; a fact is a decision about a machine.
+    """
+
+    store: str
+    row: int
+    fact: int
+
+
+class _OfVersion:
+    """An answer that is true for one version of the map."""
+
+    version: MapVersion
+
+    @property
+    def merged(self) -> int:
+        """The last journal row in the map."""
+        return self.version.row
+
+
+@dataclass(frozen=True)
+class PointAnswer(_OfVersion):
     """Layer values of the cell with centre (x_m, y_m); NaN is unknown."""
 
     x_m: float
     y_m: float
     values: Mapping[str, float]
-    merged: int
+    version: MapVersion
     stamp_ns: int
 
 
 @dataclass(frozen=True)
-class Region:
+class Region(_OfVersion):
     """A rectangle of cells.
 
     x_m (columns,), y_m (rows,): cell centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
@@ -36,7 +59,7 @@ class Region:
     y_m: Floats
     cell_m: float
     layers: Mapping[str, Floats32]
-    merged: int
+    version: MapVersion
     stamp_ns: int
 
     def __getitem__(self, layer: str) -> Floats32:
@@ -59,13 +82,13 @@ class HistorySpan:
 
 
 @dataclass(frozen=True)
-class HistoryAnswer:
+class HistoryAnswer(_OfVersion):
     """The cell with centre (x_m, y_m) over time, oldest first; a span without samples is not there."""
 
     x_m: float
     y_m: float
     spans: tuple[HistorySpan, ...]
-    merged: int
+    version: MapVersion
     stamp_ns: int
 
 
@@ -101,15 +124,27 @@ class SampleCounts:
 
 
 @dataclass(frozen=True)
+class ServerProcess:
+    """Where a map server runs."""
+
+    host: str
+    pid: int
+
+
+@dataclass(frozen=True)
 class MapInfo:
     """State of the map and its server.
 
-    journalled, merged, snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks
-    with evidence; None without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    store: its id; descends: ids of the stores that it was folded from; fact: see MapVersion. journalled, merged,
+    snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks with evidence; None
+    without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
     shortfalls: what the journal lacked of what was acknowledged, one line for each time that it was found so.
     """
 
     site: SiteInfo
+    store: str
+    descends: tuple[str, ...]
+    fact: int
     journalled: int
     merged: int
     snapshot: int
@@ -120,6 +155,7 @@ class MapInfo:
     stamp_ns: int
     wall_ns: int
     version: str
+    server: ServerProcess
     machines: Mapping[str, SampleCounts]
     distrusted: tuple[str, ...]
     shortfalls: tuple[str, ...]
@@ -153,9 +189,19 @@ class MachineState:
 
 @dataclass(frozen=True)
 class TrustAnswer(MachineState):
-    """The machine after a command, and the journal row of the map that the command counts in."""
+    """The machine after a command, and the version of the map that the command counts in: see MapVersion."""
 
+    store: str
     merged: int
+    fact: int
+
+
+@dataclass(frozen=True)
+class MachinesAnswer(_OfVersion):
+    """All machines that have sent something."""
+
+    machines: tuple[MachineState, ...]
+    version: MapVersion
 
 
 @dataclass(frozen=True)
@@ -175,3 +221,11 @@ class GroundChange:
     resistance_after: float | None
     grade_before: float | None
     grade_after: float | None
+
+
+@dataclass(frozen=True)
+class ChangesAnswer(_OfVersion):
+    """Changes of the ground, in the order of their ids."""
+
+    changes: tuple[GroundChange, ...]
+    version: MapVersion

@@ -1,6 +1,7 @@
 """Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong."""
 
 import math
+import re
 from collections import Counter
 from typing import Any
 
@@ -22,6 +23,7 @@ MAX_ITEMS = 1000  # of one list, except in answers: the decoder reserves memory 
 MAX_DEPTH = 16  # of plain values
 MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
+STORE_ID = re.compile(r"[0-9a-f]{16}")
 
 
 def pack(table: dict[str, Any]) -> bytes:
@@ -96,6 +98,14 @@ def _take_name(table: dict[str, Any], field: str = "machine") -> str:
     return name
 
 
+def take_store(table: dict[str, Any], name: str = "store", *, optional: bool = False) -> str:
+    """Take the id of a store; empty where it is optional and missing."""
+    text: str = take(table, name, str, "" if optional else None)
+    if not STORE_ID.fullmatch(text) and (text or not optional):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{text[:40]!r} is no id of a store", field=name)
+    return text
+
+
 def _take_stamp(table: dict[str, Any]) -> int:
     return _take_int(table, "stamp_ns", 1, MAX_STAMP_NS)
 
@@ -115,6 +125,8 @@ def encode_batch(batch: SampleBatch) -> bytes:
     }
     if batch.lost_before:
         table["lost_before"] = batch.lost_before
+    if batch.store:
+        table["store"] = batch.store
     return pack(table)
 
 
@@ -136,6 +148,7 @@ def decode_batch(data: bytes, extent_m: float) -> SampleBatch:
         rows=rows,
         frame=take(table, "frame", str),
         lost_before=lost_before,
+        store=take_store(table, optional=True),
     )
 
 
@@ -154,7 +167,8 @@ def _decode_rows(cols: dict[str, Any], n: int) -> Table:
 def encode_reply(reply: Ack | Refused) -> bytes:
     """The server's answer to a batch."""
     if isinstance(reply, Ack):
-        return pack({"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed})
+        table = {"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed}
+        return pack({**table, "store": reply.store} | ({"replaces": reply.replaces} if reply.replaces else {}))
     return pack({"ack": False, "reason": reply.reason, "problem": reply.problem, "expected": reply.expected})
 
 
@@ -162,8 +176,8 @@ def decode_reply(data: bytes) -> Ack | Refused:
     """Undo `encode_reply`."""
     table = unpack(data, MAX_SMALL_BYTES)
     if take(table, "ack", bool):
-        numbers = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
-        return Ack(*numbers)
+        watermark, row, trimmed = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
+        return Ack(watermark, row, trimmed, take_store(table), take_store(table, "replaces", optional=True))
     return Refused(take(table, "reason", str), take(table, "problem", str), _take_int(table, "expected", 0, MAX_SEQ))
 
 

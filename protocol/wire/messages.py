@@ -16,7 +16,8 @@ class SampleBatch:
     """Samples first_seq, first_seq + 1, ... of one spool.
 
     frame: the site frame of the positions (`SiteConfig.frame`). lost_before: how many samples directly before
-    first_seq the bounded spool dropped. An empty batch asks for the watermark.
+    first_seq the bounded spool dropped. An empty batch asks for the watermark. store: id of the store that has
+    acknowledged earlier samples of the spool, empty where none has.
     """
 
     machine: str
@@ -25,6 +26,7 @@ class SampleBatch:
     rows: Table
     frame: str
     lost_before: int = 0
+    store: str = ""
 
     @property
     def last_seq(self) -> int:
@@ -34,11 +36,17 @@ class SampleBatch:
 
 @dataclass(frozen=True)
 class Ack:
-    """Everything up to `watermark` is on the server's disk. row: the journal row; trimmed: samples it had already."""
+    """Everything up to `watermark` is on the server's disk.
+
+    row: the journal row; trimmed: samples it had already. store: id of the server's store; replaces: that of the batch,
+    where it is another one, whose place this store takes.
+    """
 
     watermark: int
     row: int
     trimmed: int = 0
+    store: str = ""
+    replaces: str = ""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
-from protocol.queries.answers import GroundChange, MachineState
+from protocol.queries.answers import GroundChange, MachineState, PointAnswer, Region
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.times import HELP as TIME_HELP
@@ -89,7 +89,7 @@ def run(arguments: Namespace) -> int:
 def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
     point = client.point(arguments.x_m, arguments.y_m, layers, **when, after=arguments.after)
-    table = {"x_m": point.x_m, "y_m": point.y_m, **point.values, "merged": point.merged, "stamp_ns": point.stamp_ns}
+    table = {"x_m": point.x_m, "y_m": point.y_m, **point.values, **_version(point)}
     head = f"cell at {point.x_m:g}, {point.y_m:g} m{_as_of(when, point.stamp_ns)}"
     return table, [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
 
@@ -112,7 +112,12 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     for name, row in summary.items():
         span = f"min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
         lines.append(f"  {name:18} {row['known']:7d} known   {span}")
-    return {**size, "merged": region.merged, "stamp_ns": region.stamp_ns, "layers": summary}, lines
+    return {**size, **_version(region), "layers": summary}, lines
+
+
+def _version(answer: PointAnswer | Region) -> dict[str, Any]:
+    version = answer.version
+    return {"store": version.store, "merged": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
 
 
 def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:

@@ -241,19 +241,19 @@ def _kept() -> Iterator[Decoder]:
 
 
 def _journal(folder: Path) -> Decoder:
-    """A row whose payload is another one, its checksum left as it was."""
+    """A row whose record is another one."""
     expected = _write_journal(folder)
     path = folder / "journal.db"
     db = sqlite3.connect(path, isolation_level=None)
     db.execute("PRAGMA synchronous=OFF")
-    payload = db.execute("SELECT payload FROM journal WHERE row = 2").fetchone()[0]
+    record = db.execute("SELECT record FROM journal WHERE row = 2").fetchone()[0]
 
     def decode(data: bytes) -> None:
-        db.execute("UPDATE journal SET payload = ? WHERE row = 2", (data,))
+        db.execute("UPDATE journal SET record = ? WHERE row = 2", (data,))
         with JournalReader(path) as reader:
             _compare(list(reader.read()), expected)
 
-    return Decoder("journal", (payload,), decode, (StoreError,), messages, "row 2 is damaged")
+    return Decoder("journal", (record,), decode, (StoreError,), files, "row 2 is damaged")
 
 
 def _archive(folder: Path) -> Decoder:

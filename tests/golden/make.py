@@ -22,6 +22,8 @@ from protocol.wire import codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
 FOLDER = Path(__file__).parent
+STORE = "0123456789abcdef"
+VERSION = records.MapVersion(STORE, 17, 3)
 EXTENT_M = 20_000.0
 T0 = 1_750_000_000_000_000_000
 NAN = float("nan")
@@ -70,7 +72,7 @@ def region() -> records.Region:
         y_m=np.array([2.25, 2.75]),
         cell_m=0.5,
         layers={"resistance": resistance, "visits": np.arange(6, dtype=np.float32).reshape(2, 3)},
-        merged=17,
+        version=VERSION,
         stamp_ns=T0,
     )
 
@@ -86,16 +88,16 @@ def decode_info_table(data: bytes) -> dict[str, Any]:
 
 
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
-LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60)
+LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60, store=STORE)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
-POINT = records.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, 17, T0)
+POINT = records.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, VERSION, T0)
 SPANS = (
     records.HistorySpan(T0, T0 + 299_999_999_999, {"resistance": 0.25, "visits": 3.0}),
     records.HistorySpan(T0 + 600_000_000_000, T0 + 899_999_999_999, {"resistance": 0.02, "visits": 1.0}),
 )
-HISTORY = records.HistoryAnswer(0.5, 1.5, SPANS, 17, T0 + 700_000_000_000)
+HISTORY = records.HistoryAnswer(0.5, 1.5, SPANS, VERSION, T0 + 700_000_000_000)
 MACHINE = records.MachineState(
     name="loader-2",
     trusted=False,
@@ -111,7 +113,7 @@ MACHINE = records.MachineState(
     newest_ns=T0 + 1,
     missing=5,
 )
-TRUST = records.TrustAnswer(**vars(MACHINE), merged=17)
+TRUST = records.TrustAnswer(**vars(MACHINE), store=STORE, merged=17, fact=3)
 CHANGE = records.GroundChange(
     id=4,
     first_ns=T0,
@@ -129,7 +131,8 @@ GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
     "batch_lost.bin": Golden(LOST, codec.encode_batch, decode_batch),
     "batch_empty.bin": Golden(ASK, codec.encode_batch, decode_batch),
-    "ack.bin": Golden(Ack(43, 17, 2), codec.encode_reply, codec.decode_reply),
+    "ack.bin": Golden(Ack(43, 17, 2, STORE), codec.encode_reply, codec.decode_reply),
+    "ack_replaces.bin": Golden(Ack(43, 17, 2, STORE, "fedcba9876543210"), codec.encode_reply, codec.decode_reply),
     "refused.bin": Golden(Refused("gap", "first_seq: 41: 12 is expected", 12), codec.encode_reply, codec.decode_reply),
     "bundle.bin": Golden(SensorBundle("loader-1", 5, readings(), last=True), codec.encode_bundle, codec.decode_bundle),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
@@ -137,9 +140,17 @@ GOLDEN: dict[str, Golden] = {
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
-    "machines.bin": Golden([MACHINE], answers.encode_machines, answers.decode_machines),
+    "machines.bin": Golden(
+        records.MachinesAnswer((MACHINE,), VERSION),
+        lambda answer: answers.encode_machines(answer.machines, answer.version),
+        answers.decode_machines,
+    ),
     "machine.bin": Golden(TRUST, answers.encode_machine, answers.decode_machine),
-    "changes.bin": Golden([CHANGE], answers.encode_changes, answers.decode_changes),
+    "changes.bin": Golden(
+        records.ChangesAnswer((CHANGE,), VERSION),
+        lambda answer: answers.encode_changes(answer.changes, answer.version),
+        answers.decode_changes,
+    ),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
     "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, answers.encode_info, decode_info_table),
     "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from protocol.queries.answers import MachineState, MapInfo, SampleCounts, SiteInfo
+from protocol.queries.answers import MachineState, MapInfo, MapVersion, SampleCounts, ServerProcess, SiteInfo
 from protocol.site.site_config import SiteConfig
+
+STORE = "0123456789abcdef"
+
+
+def version(row: int = 0, fact: int = 0) -> MapVersion:
+    return MapVersion(STORE, row, fact)
 
 
 def map_info(site: SiteConfig, **values: Any) -> MapInfo:
-    zeros = ("journalled", "merged", "snapshot", "samples_merged", "samples_too_unsure", "cells", "stamp_ns", "wall_ns")
+    rows = ("fact", "journalled", "merged", "snapshot")
+    zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "stamp_ns", "wall_ns")
     defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
     defaults |= {"site": SiteInfo(**vars(site), frame=site.frame, crs=site.crs), "version": "1.0", "bounds": None}
+    defaults |= {"store": STORE, "descends": (), "server": ServerProcess("office", 7)}
     defaults |= {"machines": {}, "distrusted": (), "shortfalls": (), "counters": {}, "layers": ()}
     return MapInfo(**(defaults | values))
 

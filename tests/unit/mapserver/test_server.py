@@ -8,6 +8,7 @@ import zenoh
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
+from protocol.queries.answers import MapVersion
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
 from protocol.queries.requests import Freshness, HistoryQuery, InfoQuery, PointQuery, RegionQuery, encode_query
@@ -58,7 +59,7 @@ def counters(client: zenoh.Session) -> dict[str, int]:
 def test_a_batch_is_acknowledged_and_seen_by_a_query_that_waits_for_it(served):
     _, client = served
     ack = deliver(client, batch(samples(5, c_rr=0.25)))
-    assert ack == Ack(5, 1)
+    assert ack == Ack(5, 1, store=ack.store)
     query = RegionQuery(Bounds(0, 0, 16, 16), ("resistance", "grade_north"), Freshness(after=ack.row))
     region = codec.decode_region(ask(client, query))
     assert region["resistance"][8, 8] == pytest.approx(0.25, rel=1e-3)
@@ -142,7 +143,8 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     assert not server.failed
     assert list(client.get(keys.ingest("pit", "a"), payload=b"", timeout=WAIT_S)) == []  # nobody listens
     server = Server(router, router, tmp_path, SITE, CONFIG, now_ns)
-    assert deliver(client, batch(samples(0))) == Ack(5, 1)
+    ack = deliver(client, batch(samples(0)))
+    assert ack == Ack(5, 1, store=ack.store)
     assert server.answers.info()["samples_merged"] == 5
     server.close()
 
@@ -170,15 +172,18 @@ def test_a_command_reaches_the_follower_with_its_reason(served):
     deliver(client, batch(samples(5)))
     command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")
     row = codec.decode_machine(get(client, keys.admin("pit", "trust"), encode_command(command)).ok.payload.to_bytes())
-    assert (row.name, row.trusted, row.merged) == ("a", False, 1)
+    assert (row.name, row.trusted, row.merged, row.fact) == ("a", False, 1, 1)
     assert row.reason == command.reason
     gone = {"x": "8.5", "y": "8.5", "layers": "weight"}
     for more in ({}, {"as_of": str(NOW_NS + 3600 * 10**9)}):
         point = codec.decode_point(get(client, keys.map_query("pit", "point"), gone | more).ok.payload.to_bytes())
         assert np.isnan(point.values["weight"])
-    [machine] = codec.decode_machines(get(client, keys.map_query("pit", "machines"), {}).ok.payload.to_bytes())
+        assert point.version == MapVersion(row.store, 1, 1)
+    answer = codec.decode_machines(get(client, keys.map_query("pit", "machines"), {}).ok.payload.to_bytes())
+    [machine] = answer.machines
     assert machine.name == "a"
     assert not machine.trusted
+    assert answer.version == MapVersion(row.store, 1, 1)
 
 
 @pytest.mark.parametrize(

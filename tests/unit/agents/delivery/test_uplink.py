@@ -37,7 +37,6 @@ from tests.unit.agents.drives import SITE, made_up_samples
 ROWS = made_up_samples(500)
 QUICK_S = 0.01  # an exchange over a good link
 TIMEOUT_S = UplinkConfig().timeout_s
-MEMORY = Path(":memory:")  # the spool's files have tests of their own
 
 
 class Server:
@@ -67,8 +66,11 @@ class Server:
 class Delivery:
     """An uplink and its spool; the actions between them are carried out, what is sent and replied is up to a test."""
 
+    folder: Path  # of the test, for spools
+    _names = itertools.count()
+
     def __init__(self, n: int = 0, spool: Spool | None = None, max_samples: int = 10_000, **pacing: Any) -> None:
-        self.spool = spool or Spool(MEMORY, SpoolConfig(max_samples))
+        self.spool = spool or Spool(self.folder / f"{next(self._names)}.db", SpoolConfig(max_samples))
         if n:
             self.spool.record(ROWS[:n])
         self.quarantined: list[tuple[int, str]] = []
@@ -101,6 +103,11 @@ class Delivery:
                 self.quarantined += [(action.head.first_seq, content_hash(row)) for row in action.head.rows]
             action = perform(action, self.uplink, self.spool, lambda _: (None, 0.0))
         return action
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Delivery, "folder", tmp_path, raising=False)
 
 
 def met(n: int = 0, **options: Any) -> Delivery:

@@ -6,6 +6,7 @@ import pytest
 from evaluation.maps.score import by_border_distance, driven_cells, score, score_driven
 from protocol.queries.answers import Region
 from protocol.site.ground_classes import SLOPE_LIMIT, UNKNOWN
+from tests.unit.records import version
 
 NAN = np.nan
 
@@ -16,7 +17,7 @@ def region(resistance, east=0.0, north=0.0, west_m: float = 100.0) -> Region:
     slopes = (np.where(np.isfinite(values), np.float32(slope), np.float32(NAN)) for slope in (east, north))
     layers = dict(zip(("resistance", "grade_east", "grade_north"), (values, *slopes), strict=True))
     rows, columns = values.shape
-    return Region(west_m + np.arange(columns) + 0.5, np.arange(rows) + 0.5, 1.0, layers, merged=1, stamp_ns=1)
+    return Region(west_m + np.arange(columns) + 0.5, np.arange(rows) + 0.5, 1.0, layers, version=version(1), stamp_ns=1)
 
 
 TRUE = region([[0.04, 0.04, 0.04, 0.06, 0.06, 0.06]] * 2)

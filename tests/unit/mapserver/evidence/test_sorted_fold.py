@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapserver.evidence import grid as grid_module
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import LIVE_ROWS, Grid
+from mapserver.journal.refold import threads
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from tests.reference.grid import by_definition, of_grid, plain
@@ -72,6 +74,36 @@ def test_reading_meanwhile_does_not_matter(seed: int, days: float) -> None:
         read.fold(rows, machine)
         read.state()
     assert same(read, grid_of(parts))
+
+
+@settings(max_examples=12)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([0.01, 1.0, 60.0, 400.0]),
+    st.sampled_from([1, 2, 3]),
+    st.sampled_from([1, 9, 131_072]),
+)
+def test_how_many_threads_fold_does_not_matter(seed: int, days: float, count: int, rows: int) -> None:
+    parts = batches(seed, days=days, spread_m=30.0)
+    grid = grid_of(parts[:2])
+    with pytest.MonkeyPatch.context() as patch, threads(count) as workers:
+        patch.setattr(grid_module, "REFOLD_ROWS", rows)
+        with grid.bulk(workers):
+            for machine, part in parts[2:]:
+                grid.fold(part, machine)
+    assert same(grid, grid_of(parts))
+    more = batches(seed + 1, days=days)
+    for machine, part in more:
+        grid.fold(part, machine)
+    assert same(grid, grid_of(parts + more)), "it is an ordinary grid again"
+
+
+def test_an_error_in_a_thread_reaches_the_caller() -> None:
+    def fails(_: int) -> None:
+        raise MemoryError
+
+    with threads(2) as workers, pytest.raises(MemoryError):
+        workers.each(fails)
 
 
 @settings(max_examples=40)

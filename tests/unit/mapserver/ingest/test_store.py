@@ -43,12 +43,12 @@ def test_a_group_is_answered_in_order(store):
         incoming(samples(0), 1),
     ]
     answers = store.commit(group)
-    assert answers[0] == Ack(3, 1)
+    assert answers[0] == Ack(3, 1, store=store.identity.id)
     assert answers[1] == Refused(Refusal.GAP, answers[1].problem, expected=4)
-    assert answers[2] == Ack(4, 2)
+    assert answers[2] == Ack(4, 2, store=store.identity.id)
     assert answers[3].reason == Refusal.NOT_MSGPACK
-    assert answers[4] == Ack(6, 3, trimmed=2)
-    assert answers[5] == Ack(6, 3)
+    assert answers[4] == Ack(6, 3, trimmed=2, store=store.identity.id)
+    assert answers[5] == Ack(6, 3, store=store.identity.id)
     assert (store.merged, store.journalled, store.grid.folded) == (3, 3, 10)
 
 
@@ -57,7 +57,7 @@ def test_a_refused_batch_leaves_no_trace(store):
     answer = store.commit([incoming(bad)])[0]
     assert answer == Refused(Refusal.OUT_OF_RANGE, "speed_mps[1]: 1e+06: not between -100 and 100", 0)
     assert store.journalled == store.grid.folded == 0
-    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1)
+    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1, store=store.identity.id)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -102,7 +102,7 @@ def test_a_journal_that_cannot_be_written_refuses(store, monkeypatch, method):
     with monkeypatch.context() as patched:
         patched.setattr(store.journal, method, locked)
         assert store.commit([incoming(samples(3))])[0].reason == Refusal.STORE
-    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1)
+    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1, store=store.identity.id)
 
 
 def test_losses_and_repeats_are_counted(store):
@@ -144,7 +144,7 @@ def test_a_restart_goes_on_where_it_ended(tmp_path):
     store.commit([incoming(samples(3)), incoming(samples(1), machine="b")])
     store.close()
     store = open_store(tmp_path)
-    assert store.commit([incoming(samples(5))])[0] == Ack(5, 3, trimmed=3)
+    assert store.commit([incoming(samples(5))])[0] == Ack(5, 3, trimmed=3, store=store.identity.id)
     assert store.grid.folded == 6
     store.close()
 
@@ -170,7 +170,7 @@ def test_a_damaged_journal_is_named_at_the_start(tmp_path):
     store.commit([incoming(samples(3))])
     store.close()
     db = sqlite3.connect(tmp_path / "journal.db")
-    db.execute("UPDATE journal SET crc32 = crc32 + 1")
+    db.execute("UPDATE journal SET record = substr(record, 1, 100)")
     db.commit()
     db.close()
     with pytest.raises(StoreError, match="row 1 is damaged; restore"):

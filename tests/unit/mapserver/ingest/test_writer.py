@@ -73,7 +73,7 @@ def test_batches_are_acknowledged_in_order_and_merged(start):
     writer = start()
     parts = np.split(random_samples(200, 9), 20)
     answers = send(writer, [incoming(part, 1 + 10 * i) for i, part in enumerate(parts)])
-    assert answers == [Ack(10 * (i + 1), i + 1) for i in range(20)]
+    assert answers == [Ack(10 * (i + 1), i + 1, store=writer.store_id) for i in range(20)]
     assert same(writer.run(lambda store: store.grid), folded(np.concatenate(parts)))
 
 
@@ -116,7 +116,7 @@ def test_a_failed_commit_refuses_all_and_later_batches_work(start, monkeypatch):
     assert [a.reason for a in replies.wait(3)] == [Refusal.STORE] * 3
     assert writer.info()["samples_merged"] == 0
     monkeypatch.undo()
-    assert send(writer, [incoming(samples(6))]) == [Ack(6, 1)]
+    assert send(writer, [incoming(samples(6))]) == [Ack(6, 1, store=writer.store_id)]
     assert writer.info()["samples_merged"] == 6
     assert writer.info()["counters"]["refused_store"] == 3
     assert not writer.failed
@@ -221,7 +221,7 @@ def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start
     monkeypatch.setattr(snapshot, "save", slow)
     writer = start(snapshot_rows=2)
     for row in range(1, 7):
-        assert send(writer, [incoming(samples(1), row)]) == [Ack(row, row)]
+        assert send(writer, [incoming(samples(1), row)]) == [Ack(row, row, store=writer.store_id)]
     assert entered.wait(WAIT_S)
     assert snapshot.rows_on_disk(tmp_path) == []
     release.set()
@@ -276,7 +276,7 @@ def test_a_snapshot_that_fails_is_tried_again_only_when_due(start, tmp_path, mon
     monkeypatch.setattr(snapshot, "save", full)
     writer = start(snapshot_rows=3)
     for i in range(7):
-        assert send(writer, [incoming(samples(1), i + 1)]) == [Ack(i + 1, i + 1)]
+        assert send(writer, [incoming(samples(1), i + 1)]) == [Ack(i + 1, i + 1, store=writer.store_id)]
         writer.info()
         wait_for(lambda i=i: len(tries) == (i + 1) // 3 and writer._snapshot.done())
     assert tries == [3, 6]
@@ -334,7 +334,7 @@ def test_after_a_bug_a_restart_folds_what_was_committed(start, monkeypatch, tmp_
         writer.close()
     assert snapshot.rows_on_disk(tmp_path) == []  # a grid that may be half-folded is not kept
     again = start()
-    assert send(again, [incoming(samples(4))]) == [Ack(4, 1, trimmed=4)]
+    assert send(again, [incoming(samples(4))]) == [Ack(4, 1, trimmed=4, store=writer.store_id)]
     assert again.info()["samples_merged"] == 4
 
 
@@ -412,6 +412,7 @@ def test_a_refused_query_says_why(start, reason, name, parameters):
 
 def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
+    elsewhere |= {Refusal.FAR_FUTURE, Refusal.SERVER_CLOCK, Refusal.OTHER_STORE, Refusal.NOT_WRITER}
     elsewhere |= {Refusal.UNKNOWN_MACHINE}  # commands, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 

@@ -6,8 +6,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,8 @@ from mapserver.journal.archive import HOUR_NS, Archive, archive, next_file
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import JournalReader
-from mapserver.journal.rows import ALL, Admission, JournalRow, Selection, checksum
+from mapserver.journal.records import record
+from mapserver.journal.rows import ALL, Admission, JournalRow, Selection
 from protocol import files
 from protocol.errors import ConfigError, StoreError
 from protocol.site.geometry import Bounds
@@ -56,14 +58,16 @@ class Machines:
 
     def both(self, selection: Selection = ALL) -> list[tuple]:
         """All rows, from archive and journal."""
-        archived = self.journal.archived_row
-        return plain(
-            [*Archive(self.folder).read(0, archived, selection), *self.reader.read(archived, selection=selection)]
-        )
+        until = self.journal.archived_row
+        return plain([*archived(self.folder, 0, until, selection), *self.reader.read(until, selection=selection)])
 
     def close(self) -> None:
         self.reader.close()
         self.journal.close()
+
+
+def archived(folder: Path, after: int, until: int, selection: Selection = ALL) -> Iterator[JournalRow]:
+    return chain.from_iterable(Archive(folder).read_many(after, until, selection))
 
 
 def plain(rows: list[JournalRow] | Iterator[JournalRow]) -> list[tuple]:
@@ -217,7 +221,7 @@ def test_filters_choose_the_same_rows_in_journal_and_archive(day, selection):
 def test_any_span_of_rows_is_read(day, after, until):
     before = plain(day.reader.read(after, until))
     day.archive()
-    assert plain(Archive(day.folder).read(after, until)) == before
+    assert plain(archived(day.folder, after, until)) == before
 
 
 def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
@@ -230,8 +234,8 @@ def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
             machines.journal.commit()
         machines.archive()
         decoded: list[int] = []
-        real = archive_file._batches
-        monkeypatch.setattr(archive_file, "_batches", lambda table, *rest: decoded.append(1) or real(table, *rest))
+        real = archive_file._rows
+        monkeypatch.setattr(archive_file, "_rows", lambda table, *rest: decoded.append(1) or real(table, *rest))
         checked: list[Path] = []
         whole = archive_file._checked
         monkeypatch.setattr(archive_file, "_checked", lambda path: checked.append(path) or whole(path))
@@ -243,7 +247,7 @@ def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
             (Selection(without=frozenset({"a"})), 0, 0),
         ):
             decoded.clear(), checked.clear()
-            list(Archive(machines.folder).read(0, 4, selection))
+            list(archived(machines.folder, 0, 4, selection))
             assert (len(decoded), len(checked)) == (groups, files), selection
 
 
@@ -308,7 +312,7 @@ def test_damaged_statistics_do_not_hide_rows(file, day):
     data[-60] ^= 1
     path.write_bytes(data)
     with pytest.raises(StoreError, match="is damaged"):
-        list(Archive(day.folder).read(0, 7, Selection(from_ns=FUTURE)))
+        list(archived(day.folder, 0, 7, Selection(from_ns=FUTURE)))
 
 
 def test_a_parquet_file_of_somebody_else_is_refused(tmp_path):
@@ -342,20 +346,20 @@ def test_a_renamed_file_is_found(file):
 def test_a_missing_file_is_an_error(day):
     names = day.archive()
     (day.folder / names[1]).unlink()
-    assert len(plain(Archive(day.folder).read(0, 3))) == 3
+    assert len(plain(archived(day.folder, 0, 3))) == 3
     for after, until in ((0, 7), (3, 6), (0, 4)):
         with pytest.raises(StoreError, match="the file with row 4 is missing"):
-            list(Archive(day.folder).read(after, until))
+            list(archived(day.folder, after, until))
     (day.folder / names[2]).unlink()
     with pytest.raises(StoreError, match="the file with row 7 is missing"):
-        list(Archive(day.folder).read(6, 7))
+        list(archived(day.folder, 6, 7))
 
 
 def test_two_files_with_the_same_row_are_an_error(day):
     names = day.archive()
     ar.write_file(day.folder, SITE, iter([row for row in ArchiveFile(day.folder / names[0]).read() if row.row == 3]))
     with pytest.raises(StoreError, match="row 3 is also in another file"):
-        list(Archive(day.folder).read(0, 7))
+        list(archived(day.folder, 0, 7))
 
 
 # --- crashes ---------------------------------------------------------------------------------------------------------
@@ -437,6 +441,7 @@ def test_what_a_kill_left_half_written_is_removed(day):
 KILLED = """
 import os, signal, sys
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from mapserver.journal.archive import archive
 from mapserver.journal.journal import Journal
@@ -505,19 +510,21 @@ def test_a_killed_process_loses_and_doubles_nothing(tmp_path, step, calls):
 def test_a_file_that_is_not_the_journal_s_is_never_a_reason_to_forget(day):
     """The journal was restored from a backup, and went on with other rows."""
     path = next_file(day.folder, day.reader, SITE, FUTURE)
-    db = sqlite3.connect(day.journal.path, isolation_level=None)
-    db.create_function("checksum", -1, checksum)
-    db.execute(
-        "UPDATE journal SET received_ns = received_ns + 1,"
-        " crc32 = checksum(row, machine, spool_id, first_seq, received_ns + 1, payload) WHERE row = 3"
-    )
-    with pytest.raises(StoreError, match=r"000003\.parquet: row 3 is not the journal's; .* move this file away"):
-        day.archive()
-    db.execute("UPDATE journal SET machine = 'c' WHERE row = 1")
-    with pytest.raises(StoreError, match="row 1 is damaged"):
-        day.archive()
-    db.execute("UPDATE journal SET machine = 'a' WHERE row = 1")
-    db.close()
+    third = list(day.reader.read())[2]
+    with closing(sqlite3.connect(day.journal.path, isolation_level=None)) as db:
+
+        def put(row: int, value: bytes) -> bytes:
+            ((before,),) = db.execute("SELECT record FROM journal WHERE row = ?", (row,)).fetchall()
+            db.execute("UPDATE journal SET record = ? WHERE row = ?", (value, row))
+            return before
+
+        put(3, record(replace(third, received_ns=third.received_ns + 1)))
+        with pytest.raises(StoreError, match=r"000003\.parquet: row 3 is not the journal's; .* move this file away"):
+            day.archive()
+        before = put(1, b"damaged")
+        with pytest.raises(StoreError, match="row 1 is damaged"):
+            day.archive()
+        put(1, before)
     assert day.journal.archived_row == 0
     path.rename(path.with_suffix(".away"))
     assert len(day.archive()) == 3

@@ -1,4 +1,5 @@
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
@@ -6,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapserver.evidence.fold_config import name_hash
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import ArchivedError, JournalQueries, JournalReader
 from mapserver.journal.rows import ALL, Admission, Event, Selection, Watermark
@@ -69,6 +71,13 @@ def test_spool_ids_beyond_signed_integers_are_kept_apart(tmp_path):
     journal.close()
 
 
+def change_record(journal: JournalQueries, row: int, offset: int) -> None:
+    """Flip a bit."""
+    record = bytearray(sql(journal, f"SELECT record FROM journal WHERE row = {row}")[0][0])
+    record[offset] ^= 1
+    sql(journal, f"UPDATE journal SET record = x'{record.hex()}' WHERE row = {row}")
+
+
 def test_rollback_leaves_neither_row_nor_watermark(journal):
     write(journal, admission(3))
     journal.begin()
@@ -107,14 +116,14 @@ def test_a_failed_watermark_takes_its_row_with_it(journal):
     assert (list(journal.read()), journal.watermarks(), journal.last_row) == ([], {}, 0)
 
 
-@pytest.mark.parametrize("offset", [0, 40, -1])
+@pytest.mark.parametrize("offset", [0, 8, 16, 24, 32, 33, 40, -5, -1])  # all fields, name, samples, checksum
 def test_a_damaged_row_is_detected(journal, offset):
     write(journal, admission(), admission(first_seq=4), admission(first_seq=7))
-    payload = bytearray(sql(journal, "SELECT payload FROM journal WHERE row = 2")[0][0])
-    payload[offset] ^= 1
-    sql(journal, f"UPDATE journal SET payload = x'{payload.hex()}' WHERE row = 2")
+    change_record(journal, 2, offset)
+    rows = journal.read()
+    assert next(rows).row == 1  # what is before it can be used
     with pytest.raises(StoreError, match=r"journal\.db: journal row 2 is damaged"):
-        list(journal.read())
+        next(rows)
     assert [r.row for r in journal.read(after=2)] == [3]
 
 
@@ -127,13 +136,13 @@ def test_the_store_of_another_site_is_refused(tmp_path, site, frame, named):
         open_journal(tmp_path, site, frame)
 
 
-@pytest.mark.parametrize("schema", [2, 99])
+@pytest.mark.parametrize("schema", [3, 99])
 def test_a_journal_of_another_schema_is_refused_with_what_to_do(tmp_path, schema):
     journal = open_journal(tmp_path)
     sql(journal, f"UPDATE meta SET value = '{schema}' WHERE key = 'schema'")
     journal.close()
     for opened in (lambda: open_journal(tmp_path), lambda: JournalReader(journal.path)):
-        with pytest.raises(StoreError, match=f"schema '{schema}', this version knows 3; open it with the version that"):
+        with pytest.raises(StoreError, match=f"schema '{schema}', this version knows 4; open it with the version that"):
             opened()
 
 
@@ -182,7 +191,7 @@ def test_newest_stamp_is_that_of_all_rows(journal):
     for first, stamps in ((1, [50, 90, 10]), (4, [60, 20, 30])):
         write(journal, Admission(batch(samples(3, stamp_ns=stamps), first), trimmed=0, lost=0))
     assert journal.newest_ns() == 90
-    assert sql(journal, "SELECT first_stamp_ns, last_stamp_ns FROM journal ORDER BY row") == [(10, 90), (20, 60)]
+    assert sql(journal, "SELECT first_stamp_ns, last_stamp_ns FROM extent ORDER BY row") == [(10, 90), (20, 60)]
 
 
 def test_closing_folds_the_log_into_the_file(tmp_path):
@@ -265,6 +274,34 @@ def test_opening_and_the_newest_stamp_read_no_journal_row(placed):
     assert not tables & {(sqlite3.SQLITE_READ, name) for name in ("journal", "extent")}
 
 
+def test_many_rows_are_one_table(journal, monkeypatch):
+    """Names of all lengths that share beginnings; a machine's rows lie between those of others."""
+    monkeypatch.setattr("mapserver.journal.reader.BYTES_AT_ONCE", 2**17)
+    machines = ["a", "ab", "b", "a" * 63, "a" * 62 + "b", *(f"loader-{i}" for i in range(300))]
+    drawn = np.random.default_rng(8).choice(machines, 900).tolist()
+    reached = Counter()
+    for i, machine in enumerate(drawn):
+        rows = random_samples(1 + i % 9, seed=i)
+        write(journal, Admission(batch(rows, reached[machine] + 1, machine, 2**64 - 1 - i), trimmed=0, lost=0))
+        reached[machine] += len(rows)
+    many = list(journal.read_many())
+    assert 1 < len(many) < 20
+    assert [row.machine for rows in many for row in rows] == drawn
+    assert all(len(set(rows.machines)) == len(rows.machines) for rows in many)
+    whole = np.concatenate([rows.samples for rows in many])
+    assert whole.tobytes() == b"".join(row.rows.tobytes() for row in journal.read())
+    hashes = np.repeat([np.uint64(name_hash(machine)) for machine in drawn], [1 + i % 9 for i in range(900)])
+    assert (np.concatenate([rows.names() for rows in many]) == hashes).all()
+
+
+def test_samples_are_selected_from_many_rows(placed):
+    selection = Selection(to_ns=350, bounds=Bounds(20, -50, 33, 0), without=frozenset("b"))
+    (rows,) = placed.read_many(selection=selection)
+    samples, names = rows.selected(selection)
+    assert samples["x_m"].tolist() == [30.0, 32.0]
+    assert names.tolist() == [name_hash("a")] * 2
+
+
 # --- readers ---------------------------------------------------------------------------------------------------------
 
 
@@ -288,7 +325,8 @@ def test_a_reader_cannot_write(tmp_path):
     reader.close()
 
 
-def test_a_reader_in_the_middle_holds_no_lock_on_the_log(journal):
+def test_a_reader_in_the_middle_holds_no_lock_on_the_log(journal, monkeypatch):
+    monkeypatch.setattr("mapserver.journal.reader.BYTES_AT_ONCE", 1)  # the fewest rows at a time
     write(journal, *(admission(1, first_seq=i + 1) for i in range(300)))
     reader = JournalReader(journal.path)
     rows = reader.read()
@@ -395,20 +433,19 @@ def test_an_event_that_cannot_be_numbered_leaves_no_transaction_open(journal, mo
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        "machine = 'b'",
-        "spool_id = x'0000000000000009'",
-        "first_seq = 2",
-        "received_ns = 5",
-        "payload = x'00'",
-        "crc32 = 1",
-    ],
+    "change", ["record = x''", "record = x'00'", "record = 'text'", "record = 5", "record = zeroblob(300)"]
 )
 def test_a_row_that_is_not_what_was_written_is_named_and_not_read(journal, change):
     write(journal, admission(3))
     sql(journal, f"UPDATE journal SET {change} WHERE row = 1")
     with pytest.raises(StoreError, match="journal row 1 is damaged"):
+        list(journal.read())
+
+
+def test_a_row_under_the_number_of_another_is_named(journal):
+    write(journal, admission(3), admission(3, first_seq=4), admission(3, first_seq=7))
+    sql(journal, "UPDATE journal SET record = (SELECT record FROM journal WHERE row = 3) WHERE row = 2")
+    with pytest.raises(StoreError, match="journal row 2 is damaged"):
         list(journal.read())
 
 

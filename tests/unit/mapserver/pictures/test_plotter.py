@@ -8,6 +8,7 @@ from mapserver.pictures import frame, plotter
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.queries.answers import Region
 from protocol.site.ground_classes import ZONES
+from tests.unit.records import version
 
 NAN = np.float32(np.nan)
 
@@ -15,7 +16,7 @@ NAN = np.float32(np.nan)
 def region(columns: int, rows: int, *, west: float = 0.0, south: float = 0.0, cell: float = 1.0, **layers) -> Region:
     x, y = west + (np.arange(columns) + 0.5) * cell, south + (np.arange(rows) + 0.5) * cell
     full = {name: np.broadcast_to(np.asarray(v, np.float32), (rows, columns)).copy() for name, v in layers.items()}
-    return Region(x, y, cell, full, merged=1, stamp_ns=1)
+    return Region(x, y, cell, full, version=version(1), stamp_ns=1)
 
 
 def cell_colour(image: np.ndarray, column: int, row: int, rows: int, cell_px: int) -> tuple[int, ...]:

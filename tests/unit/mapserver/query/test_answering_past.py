@@ -276,9 +276,10 @@ def test_the_follower_is_asked(served):
     follower = FakeFollower()
     answers = served(follower=follower)
     assert [
-        (machine.name, machine.trusted) for machine in codec.decode_machines(answers.answer("machines", {"after": "1"}))
+        (machine.name, machine.trusted)
+        for machine in codec.decode_machines(answers.answer("machines", {"after": "1"})).machines
     ] == [("a", True), ("b", False)]
-    assert [change.id for change in codec.decode_changes(answers.answer("changes", {"after": "41"}))] == [42]
+    assert [change.id for change in codec.decode_changes(answers.answer("changes", {"after": "41"})).changes] == [42]
     row = codec.decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
     assert (row.name, row.trusted, row.merged) == ("b", False, 4)
     answers.obey("trust", {"machine": "b", "trusted": "auto"})

@@ -28,6 +28,7 @@ from protocol.queries.requests import (
 from protocol.site.geometry import MAX_CELLS, Bounds
 from protocol.site.site_config import KnownGround, SiteConfig
 from protocol.wire.codec import pack
+from tests.unit.records import STORE, version
 
 positions = st.floats(-1e15, 1e15)
 layers = st.lists(st.sampled_from(["resistance", "grade_east", "age_s"]), max_size=3).map(tuple)
@@ -117,7 +118,9 @@ def test_what_divides_parameters_survives_in_a_text():
 
 
 def test_bounds_of_an_answer_can_be_asked_again():
-    region = answers.Region(np.array([0.5, 1.5]), np.array([-0.5]), 1.0, {}, 0, 1)  # its bounds are numpy's numbers
+    region = answers.Region(
+        np.array([0.5, 1.5]), np.array([-0.5]), 1.0, {}, version(), 1
+    )  # its bounds are numpy's numbers
     query = RegionQuery(region.bounds)
     assert parse_query("region", encode_query(query)).bounds == Bounds(0.0, -1.0, 2.0, 0.0)
     point = PointQuery(np.float64(1.5), np.float32(0.5))
@@ -208,7 +211,7 @@ def test_region_round_trip(columns, rows, west, data):
     flat = data.draw(st.lists(values, min_size=rows * columns, max_size=rows * columns))
     table = np.array(flat, np.float32).reshape(rows, columns)
     x_m, y_m = (west + np.arange(columns) + 0.5) * 0.5, (np.arange(rows) + 0.5) * 0.5
-    region = answers.Region(x_m, y_m, 0.5, {"resistance": table}, 7, 8)
+    region = answers.Region(x_m, y_m, 0.5, {"resistance": table}, version(7), 8)
     got = codec.decode_region(codec.encode_region(region))
     assert got["resistance"].tobytes() == table.tobytes()
     assert (got.x_m == region.x_m).all()
@@ -218,7 +221,7 @@ def test_region_round_trip(columns, rows, west, data):
 
 def test_region_may_hold_layers_that_are_no_float32():
     table = np.arange(6, dtype=np.int64).reshape(3, 2).T  # nor in one piece
-    region = answers.Region(np.arange(3) + 0.5, np.arange(2) + 0.5, 1.0, {"visits": table}, 0, 1)
+    region = answers.Region(np.arange(3) + 0.5, np.arange(2) + 0.5, 1.0, {"visits": table}, version(), 1)
     assert codec.decode_region(codec.encode_region(region))["visits"].tolist() == table.tolist()
 
 
@@ -248,7 +251,7 @@ def test_malformed_region_is_refused(fields, reason):
 
 
 def test_point_keeps_unknown_as_nan():
-    answer = answers.PointAnswer(0.5, -0.5, {"resistance": math.nan, "visits": 3}, 7, 8)
+    answer = answers.PointAnswer(0.5, -0.5, {"resistance": math.nan, "visits": 3}, version(7), 8)
     got = codec.decode_point(codec.encode_point(answer))
     assert math.isnan(got.values["resistance"])
     assert got.values["visits"] == 3.0
@@ -266,7 +269,7 @@ def test_history_round_trips_and_keeps_unknown_as_nan():
         answers.HistorySpan(10, 19, {"resistance": math.nan, "visits": 3}),
         answers.HistorySpan(30, 39, {"resistance": 0.5, "visits": 1.0}),
     )
-    got = codec.decode_history(codec.encode_history(answers.HistoryAnswer(0.5, -0.5, spans, 7, 8)))
+    got = codec.decode_history(codec.encode_history(answers.HistoryAnswer(0.5, -0.5, spans, version(7), 8)))
     assert (got.x_m, got.y_m, got.merged, got.stamp_ns) == (0.5, -0.5, 7, 8)
     assert [(span.first_ns, span.last_ns) for span in got.spans] == [(10, 19), (30, 39)]
     assert math.isnan(got.spans[0].values["resistance"])
@@ -285,7 +288,9 @@ def test_history_round_trips_and_keeps_unknown_as_nan():
 )
 def test_malformed_history_is_refused(spans, words):
     with pytest.raises(MessageError, match=words):
-        codec.decode_history(pack({"x_m": 0.5, "y_m": 0.5, "spans": spans, "merged": 1, "stamp_ns": 1}))
+        codec.decode_history(
+            pack({"x_m": 0.5, "y_m": 0.5, "spans": spans, "store": STORE, "merged": 1, "fact": 0, "stamp_ns": 1})
+        )
 
 
 MACHINE = answers.MachineState("a", True, "", "", 0, False, ("gain",), {"shift_m": 1.5}, 1, 7, 0, 5, 2)
@@ -293,6 +298,9 @@ CHANGE = answers.GroundChange(1, 5, 6, (0.0, 0.0, 1.0, 2.0), 7, 0.25, None, None
 SITE = SiteConfig("pit", 48.0, 11.0, known_ground=(KnownGround("pad", 0.01, ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))),))
 INFO = answers.MapInfo(
     site=answers.SiteInfo(**vars(SITE), frame=SITE.frame, crs=SITE.crs),
+    store=STORE,
+    descends=("f" * 16,),
+    fact=2,
     journalled=5,
     merged=5,
     snapshot=0,
@@ -303,6 +311,7 @@ INFO = answers.MapInfo(
     stamp_ns=9,
     wall_ns=10,
     version="1.0",
+    server=answers.ServerProcess("office", 7),
     machines={"a": answers.SampleCounts(1, 42, 0, 9, 0)},
     distrusted=("b",),
     shortfalls=("3 journal rows after row 5 are gone",),
@@ -312,17 +321,20 @@ INFO = answers.MapInfo(
 
 
 def test_records_round_trip():
-    assert codec.decode_machines(codec.encode_machines([MACHINE])) == [MACHINE]
-    assert codec.decode_changes(codec.encode_changes([CHANGE])) == [CHANGE]
+    machines = answers.MachinesAnswer((MACHINE,), version(5, 2))
+    assert codec.decode_machines(codec.encode_machines([MACHINE], machines.version)) == machines
+    changes = answers.ChangesAnswer((CHANGE,), version(5, 2))
+    assert codec.decode_changes(codec.encode_changes([CHANGE], changes.version)) == changes
     assert codec.decode_change(codec.encode_change(CHANGE)) == CHANGE
     assert codec.decode_info(codec.encode_info(INFO)) == INFO
     assert codec.decode_info(codec.encode_info(replace(INFO, bounds=None))).bounds is None
-    answer = answers.TrustAnswer(**vars(MACHINE), merged=3)
+    answer = answers.TrustAnswer(**vars(MACHINE), store=STORE, merged=3, fact=2)
     assert codec.decode_machine(codec.encode_machine(answer)) == answer
 
 
 def test_fields_of_a_newer_server_are_ignored():
-    assert codec.decode_changes(codec.encode_changes([{**asdict(CHANGE), "volume_m3": 4.0}])) == [CHANGE]
+    newer = codec.encode_changes([{**asdict(CHANGE), "volume_m3": 4.0}], version())
+    assert codec.decode_changes(newer).changes == (CHANGE,)
     site = {**asdict(INFO.site), "datum": "WGS84"}
     assert codec.decode_info(codec.encode_info({**asdict(INFO), "site": site, "load": 0.5})) == INFO
 
@@ -356,9 +368,17 @@ def test_info_of_other_types_is_refused(values, words):
         codec.decode_info(codec.encode_info({**asdict(INFO), **values}))
 
 
+@pytest.mark.parametrize("values", [{"store": "here"}, {"store": None}, {"fact": None}, {"merged": "7"}])
+def test_an_answer_without_the_version_of_its_map_is_refused(values):
+    fields_of = {"values": {}, "x_m": 0.0, "y_m": 0.0, "store": STORE, "merged": 1, "fact": 0, "stamp_ns": 1}
+    assert codec.decode_point(pack(fields_of)).version == version(1)
+    with pytest.raises(MessageError, match=next(iter(values))):
+        codec.decode_point(pack(fields_of | values))
+
+
 def test_evidence_is_plain():
     with pytest.raises(MessageError, match="bytes is no plain value"):
-        codec.decode_machines(codec.encode_machines([{**asdict(MACHINE), "evidence": {"x": b"1"}}]))
+        codec.decode_machines(codec.encode_machines([{**asdict(MACHINE), "evidence": {"x": b"1"}}], version()))
 
 
 @pytest.mark.parametrize("decode", [codec.decode_machines, codec.decode_changes])

@@ -218,7 +218,11 @@ def test_batch_round_trip(table, machine, spool_id, first_seq, data):
 counts = st.integers(0, codec.MAX_SEQ)
 
 
-@given(st.builds(Ack, counts, counts, counts) | st.builds(Refused, st.text(max_size=20), st.text(max_size=200), counts))
+stores = st.from_regex(codec.STORE_ID, fullmatch=True)
+acks = st.builds(Ack, counts, counts, counts, stores, stores | st.just(""))
+
+
+@given(acks | st.builds(Refused, st.text(max_size=20), st.text(max_size=200), counts))
 def test_reply_round_trip(reply):
     assert codec.decode_reply(codec.encode_reply(reply)) == reply
 

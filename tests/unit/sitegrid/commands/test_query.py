@@ -29,7 +29,7 @@ from protocol.site.site_config import SiteConfig
 from sitegrid.cli import main
 from sitegrid.client import PAST_S, Client
 from sitegrid.commands import query
-from tests.unit.records import map_info
+from tests.unit.records import STORE, map_info, version
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
 S = 10**9
@@ -59,13 +59,13 @@ class Session:
         if isinstance(asked, HistoryQuery):
             first = HistorySpan(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
             spans = (first, HistorySpan(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
-            return encode_history(HistoryAnswer(0.5, 1.5, () if asked.x_m < 0 else spans, 17, T0))
+            return encode_history(HistoryAnswer(0.5, 1.5, () if asked.x_m < 0 else spans, version(17, 3), T0))
         assert isinstance(asked, PointQuery | RegionQuery)
         stamp_ns = asked.when.as_of_ns or self.now_ns
         if isinstance(asked, PointQuery):
-            return encode_point(PointAnswer(0.5, 1.5, {"visits": 2.0}, 17, stamp_ns))
+            return encode_point(PointAnswer(0.5, 1.5, {"visits": 2.0}, version(17, 3), stamp_ns))
         layers = {"visits": np.ones((1, 1), np.float32)}
-        return encode_region(Region(np.array([0.5]), np.array([1.5]), 1.0, layers, 17, stamp_ns))
+        return encode_region(Region(np.array([0.5]), np.array([1.5]), 1.0, layers, version(17, 3), stamp_ns))
 
 
 class Reply:
@@ -162,10 +162,13 @@ def test_people_see_the_time_of_an_answer(session: Session, capsys):
     assert "as of 2025-06-15 15:06:00Z, minus that of 2025-06-15 15:05:00Z, journal row 17" in line
 
 
+VERSION = {"store": STORE, "merged": 17, "fact": 3}
+
+
 def test_machines_see_stamps(session: Session, capsys, tmp_path: Path):
     main(["query", "point", "1", "2", "--as-of", "-1h", "--json"])
     answer = json.loads(capsys.readouterr().out)
-    assert answer == {"x_m": 0.5, "y_m": 1.5, "visits": 2.0, "merged": 17, "stamp_ns": T0 - 3600 * S}
+    assert answer == {"x_m": 0.5, "y_m": 1.5, "visits": 2.0, **VERSION, "stamp_ns": T0 - 3600 * S}
     main(["query", "region", "0", "1", "1", "2", "--as-of", "-1h", "--json", "--out", str(tmp_path / "a.npz")])
     assert json.loads(capsys.readouterr().out)["stamp_ns"] == T0 - 3600 * S
     assert np.load(tmp_path / "a.npz")["visits"].tolist() == [[1.0]]

@@ -24,7 +24,7 @@ from sitegrid.cli import build_parser, main
 from sitegrid.client import Client, connect
 from sitegrid.commands import query
 from sitegrid.process.lifetime import plain
-from tests.unit.records import machine_state
+from tests.unit.records import STORE, machine_state, version
 
 WAIT_S = 20.0
 T0 = 1_750_000_000_000_000_000
@@ -53,7 +53,10 @@ class FakeServer:
             parsed = parse_query(keys.query_of(str(query.key_expr)), split_selector(str(query.parameters)))
             self.asked.append(parsed)
             machines = isinstance(parsed, MachinesQuery)
-            query.reply(query.key_expr, encode_machines(MACHINES) if machines else encode_changes([CHANGE]))
+            query.reply(
+                query.key_expr,
+                encode_machines(MACHINES, version()) if machines else encode_changes([CHANGE], version()),
+            )
 
     def _on_command(self, query: zenoh.Query) -> None:
         with query:
@@ -63,7 +66,7 @@ class FakeServer:
                 query.reply_err(encode_error(QueryError(Refusal.UNKNOWN_MACHINE, "machine `nobody` is not known")))
                 return
             machine = machine_state(command.machine, trusted=command.trusted is not False)
-            query.reply(query.key_expr, encode_machine(TrustAnswer(**vars(machine), merged=17)))
+            query.reply(query.key_expr, encode_machine(TrustAnswer(**vars(machine), store=STORE, merged=17, fact=3)))
 
     def publish(self, payload: bytes) -> None:
         self.session.put(keys.changed("pit"), payload)
@@ -102,7 +105,7 @@ def sitegrid(server: FakeServer, *words: str) -> int:
 
 
 def test_commands_say_what_was_meant(server: FakeServer, client: Client):
-    assert client.trust("a") == TrustAnswer(**vars(machine_state("a")), merged=17)
+    assert client.trust("a") == TrustAnswer(**vars(machine_state("a")), store=STORE, merged=17, fact=3)
     assert not client.distrust("a", "gain; x=1.6", wait_s=3.0).trusted
     client.judge_automatically("a", wait_s=4.0)
     client.trust("a", "checked")
@@ -200,7 +203,9 @@ def test_trust_and_distrust_reach_the_server(server: FakeServer, capsys):
     assert sitegrid(server, "trust", "b") == 0
     assert capsys.readouterr().out == "b is trusted, as of journal row 17\n"
     assert sitegrid(server, "trust", "b", "--auto", "--json") == 0
-    assert json.loads(capsys.readouterr().out) == plain(TrustAnswer(**vars(machine_state("b")), merged=17))
+    assert json.loads(capsys.readouterr().out) == plain(
+        TrustAnswer(**vars(machine_state("b")), store=STORE, merged=17, fact=3)
+    )
     assert server.asked == [
         TrustCommand("b", False, "hit a wall; 3 m off", 5.0),
         TrustCommand("b", True),

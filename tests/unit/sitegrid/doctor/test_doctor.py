@@ -296,7 +296,7 @@ def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
     filled_store(tmp_path)
     with closing(Store(tmp_path, SITE, ServerConfig(), time.time_ns)):
         state = disk.read_store(tmp_path, time.time() + 100)
-    assert state == StoreState("pit", SITE.frame, 3, 2, 0, 1, 1, state.snapshot_age_s)
+    assert state == StoreState("pit", SITE.frame, 4, 2, 0, 1, 1, state.snapshot_age_s)
     assert 99 < state.snapshot_age_s < 160
 
 
@@ -412,7 +412,7 @@ def test_a_server_of_another_kind_is_a_finding(site: Site, capsys):
     with answering(site, keys.map_query("pit", InfoQuery.name), encode_info({"site": 3})):
         code, findings = site.doctor(capsys, "--site", "pit")
     assert (code, findings["server"].level, findings["permission"].level) == (1, Level.FAIL, Level.SKIP)
-    assert findings["server"].message.endswith("cannot be read: info.journalled: missing")
+    assert findings["server"].message.endswith("cannot be read: info.store: missing")
 
 
 def test_a_running_agent_is_heard(site: Site, capsys):

@@ -9,11 +9,12 @@ from protocol.errors import ConfigError
 from protocol.queries.answers import Region
 from sim.truth import TruthMap
 from sitegrid.pictures.draw import truth_layers
+from tests.unit.records import version
 
 
 def region(west: float, south: float, columns: int, rows: int, cell_m: float = 1.0) -> Region:
     x, y = west + (np.arange(columns) + 0.5) * cell_m, south + (np.arange(rows) + 0.5) * cell_m
-    return Region(x, y, cell_m, {"resistance": np.zeros((rows, columns), np.float32)}, 0, 0)
+    return Region(x, y, cell_m, {"resistance": np.zeros((rows, columns), np.float32)}, version(), 0)
 
 
 @pytest.fixture

@@ -1,0 +1,104 @@
+"""Real processes on loopback, for benchmarks from outside: router, map server, and a service that answers at once.
+
+The latter is this module, `python -m benchmarks.processes ENDPOINT`: it replies with as many bytes as it is asked for.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import zenoh
+
+from protocol.config import toml_lines
+from protocol.site.site_config import SiteConfig
+from protocol.wire import keys
+from protocol.wire.codec import decode_reply, encode_batch
+from protocol.wire.messages import Ack, SampleBatch
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
+
+EMPTY_KEY = "bench/empty"
+OPTIONS = "[store]\narchive_after_h = 0.0\n"  # samples of a benchmark are older than what a server keeps in its journal
+END_S, ANSWER_S = 30.0, 120.0
+
+
+@contextmanager
+def process(*words: str) -> Iterator[int]:
+    """Run `python -m words` until left; gives its process id once it says that it is ready."""
+    command, root = [sys.executable, "-m", *words], Path(__file__).parent.parent
+    with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stdin=subprocess.PIPE) as child:  # noqa: S603
+        try:
+            if child.stdout is None or "ready" not in json.loads(child.stdout.readline() or "{}"):
+                raise RuntimeError(f"{' '.join(words[:2])} did not start: nothing was measured")
+            yield child.pid
+        finally:
+            child.terminate()
+            try:
+                child.communicate(timeout=END_S)
+            except subprocess.TimeoutExpired:
+                child.kill()
+
+
+@contextmanager
+def served(folder: Path, site: SiteConfig, options: str = OPTIONS) -> Iterator[tuple[str, int]]:
+    """A router, and a map server with a store in the folder; gives the router's endpoint and the server's process id.
+
+    options: of the server's configuration file.
+    """
+    site_file, config = folder / "site.toml", folder / "server.toml"
+    site_file.write_text("\n".join(toml_lines(asdict(site))))
+    config.write_text(options)
+    with ExitStack() as opened:
+        endpoint = free_endpoint()
+        opened.enter_context(process("sitegrid.cli", "router", "--listen", endpoint))
+        where = ("--endpoint", endpoint, "--site-file", str(site_file), "--store", str(folder), "--config", str(config))
+        yield endpoint, opened.enter_context(process("sitegrid.cli", "server", *where))
+
+
+@contextmanager
+def session(endpoint: str) -> Iterator[zenoh.Session]:
+    """A session with the router."""
+    opened = open_session(SessionConfig(endpoint))
+    try:
+        yield opened
+    finally:
+        opened.close()  # type: ignore[no-untyped-call]
+
+
+def ask(link: zenoh.Session, selector: str, payload: bytes | None = None) -> list[bytes]:
+    """All replies to a query."""
+    replies = list(link.get(selector, payload=payload, timeout=ANSWER_S))
+    if not replies or any(reply.ok is None for reply in replies):
+        problems = [reply.err.payload.to_string() for reply in replies if reply.err is not None]
+        raise RuntimeError(f"{selector}: {problems or 'no answer'}")
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+
+def send(link: zenoh.Session, site: SiteConfig, batch: SampleBatch) -> None:
+    """Send a batch, and wait for its acknowledgement."""
+    (reply,) = ask(link, keys.ingest(site.name, batch.machine), encode_batch(batch))
+    if not isinstance(answer := decode_reply(reply), Ack):
+        raise RuntimeError(f"the server refused a batch: {answer}")
+
+
+def main() -> None:
+    """Answer at once, until ended."""
+    with session(sys.argv[1]) as link:
+
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                query.reply(query.key_expr, bytes(int(str(query.parameters))))
+
+        with link.declare_queryable(EMPTY_KEY, reply):
+            print(json.dumps({"ready": EMPTY_KEY}), flush=True)
+            threading.Event().wait()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Journal rows as bytes: one record each, checked and taken apart many at a time.
+
+A record is little-endian: HEAD, the machine's name, the samples as SAMPLE_DTYPE, and the CRC-32 of all that. The CRC-32
+of a whole record is then the same number for all, SOUND: a record is checked before anything in it is believed.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+
+from mapserver.journal.rows import JournalRow, JournalRows
+from protocol.arrays import AnyArray, Bools, Ints, Table
+from protocol.machine.samples import SAMPLE_DTYPE
+
+HEAD = np.dtype(
+    [("row", "<i8"), ("received_ns", "<i8"), ("spool_id", "<u8"), ("first_seq", "<i8"), ("name_bytes", "u1")]
+)
+SOUND = 0x2144DF1C  # what a CRC-32 behind its own data always comes to
+_HEAD_BYTES, _SAMPLE_BYTES, _CRC_BYTES = HEAD.itemsize, SAMPLE_DTYPE.itemsize, 4
+
+
+def record(row: JournalRow) -> bytes:
+    """Encode a row."""
+    name = row.machine.encode()
+    head = np.array((row.row, row.received_ns, row.spool_id, row.first_seq, len(name)), HEAD)
+    body = head.tobytes() + name + row.rows.tobytes()
+    return body + zlib.crc32(body).to_bytes(_CRC_BYTES, "little")
+
+
+def decoded(numbers: Sequence[int], records: Sequence[Any]) -> JournalRows:
+    """Decode rows up to the first record that is not what was written under its number."""
+    n = _first(_checks(records) != SOUND)
+    ends = np.cumsum(np.fromiter(map(len, records[:n]), np.int64, n))
+    data = np.frombuffer(b"".join(records[:n]), np.uint8)
+    heads = np.empty((n, _HEAD_BYTES), np.uint8)
+    lengths, machine, firsts = (np.empty(n, np.int64) for _ in range(3))
+    samples: Table = np.empty(len(data) // _SAMPLE_BYTES, SAMPLE_DTYPE)
+    slots = np.full(1 << (2 * n + 1).bit_length(), -1)
+    used, machines = _split(data, ends, heads, lengths, machine, firsts, samples.view(np.uint8), slots)
+    head = heads.view(HEAD)[:, 0]
+    names = (records[at][_HEAD_BYTES : _HEAD_BYTES + head["name_bytes"][at]] for at in firsts[:machines].tolist())
+    columns = (np.ascontiguousarray(head[name]) for name in ("row", "spool_id", "first_seq", "received_ns"))
+    rows = JournalRows(samples[:used], lengths, tuple(name.decode() for name in names), machine, *columns)
+    return rows.first(_first(rows.numbers != np.array(numbers[:n], np.int64)))
+
+
+def _checks(records: Sequence[Any]) -> Ints:
+    try:
+        return np.fromiter(map(zlib.crc32, records), np.int64, len(records))
+    except TypeError:  # damage has turned one into what is no bytes at all
+        return np.array([zlib.crc32(each) if isinstance(each, bytes) else -1 for each in records], np.int64)
+
+
+def _first(wrong: Bools) -> int:
+    """How many are right before the first wrong one."""
+    return int(wrong.argmax()) if wrong.any() else len(wrong)
+
+
+@numba.njit(cache=True, nogil=True)
+def _split(
+    data: AnyArray,
+    ends: Any,
+    heads: AnyArray,
+    lengths: Any,
+    machine: Any,
+    firsts: Any,
+    samples: AnyArray,
+    slots: Any,
+) -> tuple[int, int]:
+    """Cut records into their parts; returns how many samples, and how many machines they are of.
+
+    data: records one behind the other, up to ends (k,). Fills heads (k, bytes), lengths (k,) in samples, machine (k,):
+    numbers of names, firsts: the first record of each name, samples (bytes). slots: -1, more than twice as many as
+    records.
+    """
+    begin, used, names = 0, 0, 0
+    for k in range(len(ends)):
+        for i in range(_HEAD_BYTES):
+            heads[k, i] = data[begin + i]
+        first = begin + _HEAD_BYTES
+        middle = first + data[first - 1]
+        machine[k] = _number_of(data, first, middle, k, names, ends, firsts, slots)
+        names = max(names, machine[k] + 1)
+        n = ends[k] - _CRC_BYTES - middle
+        samples[used : used + n] = data[middle : middle + n]
+        lengths[k] = n // _SAMPLE_BYTES
+        begin, used = ends[k], used + n
+    return used // _SAMPLE_BYTES, names
+
+
+@numba.njit(cache=True, nogil=True)
+def _number_of(data: AnyArray, first: int, end: int, k: int, names: int, ends: Any, firsts: Any, slots: Any) -> int:
+    """Number of the name in data[first:end], a new one (`names`) where it is the first of record k."""
+    place = np.uint64(14695981039346656037)  # FNV-1a, spread over slots
+    for i in range(first, end):
+        place = (place ^ np.uint64(data[i])) * np.uint64(1099511628211)
+    slot = np.int64(place & np.uint64(len(slots) - 1))
+    while slots[slot] >= 0:
+        other = firsts[slots[slot]]
+        begin = (ends[other - 1] if other else 0) + _HEAD_BYTES
+        if data[begin - 1] == end - first:
+            same = True
+            for i in range(end - first):
+                same &= data[begin + i] == data[first + i]
+            if same:
+                return int(slots[slot])
+        slot = (slot + 1) & (len(slots) - 1)
+    slots[slot], firsts[names] = names, k
+    return names

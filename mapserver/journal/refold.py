@@ -1,0 +1,47 @@
+"""Long folds of a history on several threads: after a decision about a machine, and when a store is opened."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.workers import ALONE, Workers
+from mapserver.journal.history import History, read_history
+from mapserver.journal.reader import LAST
+from mapserver.journal.rows import ALL, Selection
+
+# The kernels run beside each other, what is Python between them does not.
+THREADS = min(2, len(os.sched_getaffinity(0)))
+
+
+@contextmanager
+def threads(count: int = THREADS) -> Iterator[Workers]:
+    """Lend so many threads to a grid (`Grid.bulk`)."""
+    if count == 1:
+        yield ALONE
+        return
+    with ThreadPoolExecutor(count, thread_name_prefix="fold") as pool:
+        yield Workers(count, pool.map)
+
+
+def fold_history(
+    grid: Grid,
+    history: History,
+    after: int = 0,
+    until: int = LAST,
+    selection: Selection = ALL,
+    stopped: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Fold the selected samples of rows after < row <= until, and settle the grid.
+
+    Whether it came to the end: where `stopped` says so it ends early, and the grid is of no use.
+    """
+    with threads() as workers, grid.bulk(workers):
+        for rows in read_history(history, after, until, selection):
+            grid.fold_all(*rows.selected(selection))
+            if stopped():
+                return False
+    return True

@@ -1,0 +1,213 @@
+"""Maps folded again beside the writer: decisions, batches and the end meanwhile; decisions on a full disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import pytest
+
+from mapserver.evidence.grid import Grid
+from mapserver.follower import exclusion
+from mapserver.follower.exclusion import Exclusion
+from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.writer import Writer
+from mapserver.journal.reader import JournalReader
+from mapserver.trust.decisions import KIND, PERSON, TrustDecision
+from protocol.errors import QueryError, Refusal
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    WAIT_S,
+    grid_copy,
+    incoming,
+    open_store,
+    open_writer,
+    random_samples,
+    same,
+    send,
+    wait_for,
+)
+
+MACHINES = "abcd"
+BATCH = 20
+
+
+class HeldFold:
+    """Stands in front of `fold_history`: each fold waits until it may go on. without: of each fold that began."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.without: list[set[str]] = []
+        self.rows: list[tuple[int, int]] = []
+        self.came_to_an_end: list[bool] = []
+        self.may_go_on = Event()
+        self._fold = exclusion.fold_history
+        monkeypatch.setattr(exclusion, "fold_history", self)
+
+    def __call__(self, grid: Grid, history: Any, after: int, until: int, selection: Any, stopped: Any) -> bool:
+        self.without.append(set(selection.without))
+        self.rows.append((after, until))
+        assert self.may_go_on.wait(WAIT_S)
+        self.came_to_an_end.append(self._fold(grid, history, after, until, selection, stopped))
+        return self.came_to_an_end[-1]
+
+    def wait(self, folds: int) -> None:
+        wait_for(lambda: len(self.without) >= folds)
+
+
+@pytest.fixture
+def fold(monkeypatch: pytest.MonkeyPatch) -> HeldFold:
+    return HeldFold(monkeypatch)
+
+
+@pytest.fixture
+def writer(tmp_path: Path) -> Iterator[Writer]:
+    with closing(open_writer(tmp_path)) as opened:
+        deliver(opened, range(5))
+        yield opened
+
+
+def rows_of(machine: str, number: int) -> Any:
+    return random_samples(BATCH, seed=MACHINES.index(machine) + 10 * number)
+
+
+def deliver(writer: Writer, numbers: range) -> None:
+    for number in numbers:
+        send(writer, [incoming(rows_of(name, number), 1 + BATCH * number, name) for name in MACHINES])
+
+
+def map_without(machines: str, batches: int) -> Grid:
+    grid = Grid(SITE.cell_m, CONFIG.fold)
+    for name in set(MACHINES) - set(machines):
+        for number in range(batches):
+            grid.fold(rows_of(name, number), name)
+    return grid
+
+
+def decision(machine: str, *, trusted: bool = False, reason: str = "why") -> TrustDecision:
+    return TrustDecision(machine, trusted, PERSON, reason, NOW_NS)
+
+
+def test_batches_are_acknowledged_during_a_fold_and_are_in_the_map_afterwards(writer, fold):
+    with closing(Exclusion(writer)) as excluding:
+        number = excluding.decide(decision("b"))
+        fold.wait(1)
+        deliver(writer, range(5, 10))
+        assert same(writer.run(grid_copy), map_without("", 10)), "the map answers as it was, with what came in"
+        fold.may_go_on.set()
+        excluding.wait(number, WAIT_S)
+        assert same(writer.run(grid_copy), map_without("b", 10))
+        assert fold.rows == [(0, 20), (20, 40)], "what came in was folded beside the writer, too"
+        deliver(writer, range(10, 12))
+        assert same(writer.run(grid_copy), map_without("b", 12))
+
+
+def test_a_few_rows_are_left_to_the_writer(writer, fold):
+    with closing(Exclusion(writer)) as excluding:
+        number = excluding.decide(decision("b"))
+        fold.wait(1)
+        deliver(writer, range(5, 7))
+        fold.may_go_on.set()
+        excluding.wait(number, WAIT_S)
+        assert fold.rows == [(0, 20)]
+        assert same(writer.run(grid_copy), map_without("b", 7))
+
+
+def test_where_batches_never_end_the_writer_has_them_wait(writer, monkeypatch):
+    monkeypatch.setattr(exclusion, "FEW_ROWS", -1)
+    with closing(Exclusion(writer)) as excluding:
+        excluding.wait(excluding.decide(decision("b")), WAIT_S)
+    assert same(writer.run(grid_copy), map_without("b", 5))
+
+
+def test_decisions_during_a_fold_are_folded_together_and_the_old_fold_is_given_up(writer, fold):
+    with closing(Exclusion(writer)) as excluding:
+        first = excluding.decide(decision("b"))
+        fold.wait(1)
+        excluding.decide(decision("c"))
+        last = excluding.decide(decision("d"))
+        assert excluding.decision("d") == decision("d"), "it counts at once"
+        fold.may_go_on.set()
+        for number in (first, last):
+            excluding.wait(number, WAIT_S)
+        assert fold.without == [{"b"}, {"b", "c", "d"}]
+        assert fold.came_to_an_end == [False, True]
+        assert same(writer.run(grid_copy), map_without("bcd", 5))
+
+
+def test_a_decision_that_leaves_the_same_machines_out_lets_the_fold_go_on(writer, fold):
+    with closing(Exclusion(writer)) as excluding:
+        excluding.decide(decision("b"))
+        fold.wait(1)
+        excluding.decide(decision("c"))
+        excluding.decide(decision("c", trusted=True))
+        number = excluding.decide(decision("b", reason="a better reason"))
+        fold.may_go_on.set()
+        excluding.wait(number, WAIT_S)
+        assert (fold.without, fold.came_to_an_end) == ([{"b"}], [True])
+
+
+def test_a_decision_that_is_taken_back_during_its_fold_leaves_the_map(writer, fold):
+    before = writer.run(lambda store: store.grid)
+    with closing(Exclusion(writer)) as excluding:
+        excluding.decide(decision("b"))
+        fold.wait(1)
+        number = excluding.decide(decision("b", trusted=True))
+        fold.may_go_on.set()
+        excluding.wait(number, WAIT_S)
+        assert fold.came_to_an_end == [False]
+        assert writer.run(lambda store: store.grid) is before
+
+
+def test_the_end_during_a_fold_gives_it_up_and_the_next_start_has_the_map(writer, fold, tmp_path):
+    excluding = Exclusion(writer)
+    number = excluding.decide(decision("b"))
+    problems: list[str] = []
+
+    def wait() -> None:
+        with pytest.raises(QueryError) as refused:
+            excluding.wait(number, WAIT_S)
+        problems.append(str(refused.value))
+
+    waits, ends = Thread(target=wait), Thread(target=excluding.close)
+    waits.start()
+    fold.wait(1)
+    ends.start()
+    waits.join(WAIT_S)
+    fold.may_go_on.set()
+    ends.join(WAIT_S)
+    assert not ends.is_alive()
+    assert fold.came_to_an_end == [False]
+    assert problems
+    assert "the decision is kept, but the server is stopping" in problems[0]
+    writer.close()
+    with closing(open_store(tmp_path)) as store:
+        assert store.excluded == {"b"}
+        assert same(store.grid, map_without("b", 5))
+
+
+def room(store: Store, *, full: bool) -> None:
+    """Let the journal's file grow no further, as on a full disk."""
+    store.journal._db.execute(f"PRAGMA max_page_count={1 if full else 2**30}")  # 1: the file as large as it is
+
+
+def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer, tmp_path):
+    long = decision("b", reason="a reason that needs new pages" * 1000)
+    before = writer.run(lambda store: store.grid)
+    with closing(Exclusion(writer)) as excluding, JournalReader(tmp_path / JOURNAL_FILE) as reader:
+        writer.run(lambda store: room(store, full=True))
+        with pytest.raises(QueryError, match=r"`b` cannot be written, so it does not count: .*full; make") as refused:
+            excluding.decide(long)
+        assert refused.value.reason == Refusal.STORE
+        assert (excluding.decision("b"), excluding.excluded(), reader.events(KIND)) == (None, frozenset(), [])
+        assert writer.run(lambda store: store.grid) is before
+        writer.run(lambda store: room(store, full=False))
+        excluding.wait(excluding.decide(long), WAIT_S)
+        assert excluding.excluded() == {"b"}
+        assert [event.body["machine"] for event in reader.events(KIND)] == ["b"]
+        deliver(writer, range(5, 6))
+    assert same(writer.run(grid_copy), map_without("b", 6))
