@@ -13,9 +13,12 @@ from pathlib import Path
 import zenoh
 
 from mapserver.config import ServerConfig
+from mapserver.evidence import grid
 from mapserver.follower.follower import Follower
+from mapserver.ingest import batches
 from mapserver.ingest.store import Incoming, Store, Verify
 from mapserver.ingest.writer import Writer
+from mapserver.journal import records
 from mapserver.query.answering import Answers, reads_past
 from protocol.errors import ConfigError, QueryError
 from protocol.queries.answer_codec import encode_change, encode_error
@@ -119,6 +122,13 @@ class Server:
 
     def _publish(self, change: GroundChange) -> None:
         self._changed.put(encode_change(change))
+
+
+def warm_up(config: ServerConfig) -> None:
+    """Have all kernels that ingest needs, before the first batch."""
+    grid.warm_up(config.fold)
+    batches.warm_up()
+    records.warm_up()
 
 
 def _asked(query: zenoh.Query) -> tuple[str, dict[str, str]]:

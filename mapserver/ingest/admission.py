@@ -8,7 +8,6 @@ from dataclasses import replace
 from mapserver.journal.rows import Admission
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
-from protocol.wire.codec import decode_batch
 from protocol.wire.messages import SampleBatch
 
 
@@ -21,9 +20,8 @@ class GapError(MessageError):
         self.expected = expected
 
 
-def parse(payload: bytes, machine: str, site: SiteConfig, now_ns: Callable[[], int]) -> SampleBatch:
-    """Decode and judge a batch that came in under the key of `machine`; MessageError says what is wrong with it."""
-    batch = decode_batch(payload, site.extent_m)
+def judge(batch: SampleBatch, machine: str, site: SiteConfig, now_ns: Callable[[], int]) -> None:
+    """Judge a decoded batch that came in under the key of `machine`; MessageError says what is wrong with it."""
     if batch.machine != machine:
         problem = f"{batch.machine!r} sends under the key of {machine!r}"
         raise MessageError(Refusal.WRONG_MACHINE, problem, field="machine")
@@ -36,7 +34,6 @@ def parse(payload: bytes, machine: str, site: SiteConfig, now_ns: Callable[[], i
         if ahead_s > site.clock_tolerance_s:
             problem = f"{ahead_s:.1f} s ahead of the server's clock; set the machine's clock"
             raise MessageError(Refusal.WALL_CLOCK, problem, field="stamp_ns", row=row)
-    return batch
 
 
 def admit(batch: SampleBatch, watermark: int) -> Admission:

@@ -15,10 +15,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
+from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, judge
+from mapserver.ingest.batches import decode_batches
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
@@ -30,6 +34,7 @@ from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.files import make_private
+from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
@@ -104,9 +109,10 @@ class Store:
 
         Nothing is acknowledged before its commit; where the commit fails, every batch of the group is refused.
         """
+        batches = self._decode(group)
         try:
             self.journal.begin()
-            answers = [self._admit(incoming) for incoming in group]
+            answers = [self._admit(incoming, batch) for incoming, batch in zip(group, batches, strict=True)]
             began_s = time.monotonic()
             self.journal.commit()
             self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
@@ -116,8 +122,7 @@ class Store:
             return [Refused(Refusal.STORE, f"the server cannot write: {error}") for _ in group]
         for answer, admission in answers:
             self._count(answer, admission)
-            if isinstance(answer, Ack) and admission and len(admission.batch.rows):
-                self._fold(answer.row, admission.batch)
+        self._fold([admission.batch for _, admission in answers if admission and len(admission.batch.rows)])
         return [answer for answer, _ in answers]
 
     def save_snapshot(self) -> None:
@@ -202,11 +207,30 @@ class Store:
             entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
         return machines
 
-    def _admit(self, incoming: Incoming) -> tuple[Ack | Refused, Admission | None]:
+    def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
+        """What each batch holds, or why it is refused; one that is not signed is not looked at."""
+        refused = [self._signature_problem(incoming) for incoming in group]
+        signed = (incoming.payload for incoming, error in zip(group, refused, strict=True) if error is None)
+        decoded = iter(decode_batches(list(signed), self.site.extent_m))
+        return [error or next(decoded) for error in refused]
+
+    def _signature_problem(self, incoming: Incoming) -> MessageError | None:
+        if not self._verify:
+            return None
+        if not incoming.machine:
+            return MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
+        key = keys.ingest(self.site.name, incoming.machine)
         try:
-            if self._verify:
-                self._check_signature(self._verify, incoming)
-            batch = parse(incoming.payload, incoming.machine, self.site, self.now_ns)
+            self._verify(incoming.machine, key, incoming.payload, incoming.signature)
+        except MessageError as error:
+            return error
+        return None
+
+    def _admit(self, incoming: Incoming, batch: SampleBatch | MessageError) -> tuple[Ack | Refused, Admission | None]:
+        try:
+            if isinstance(batch, MessageError):
+                raise batch
+            judge(batch, incoming.machine, self.site, self.now_ns)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
@@ -237,12 +261,6 @@ class Store:
             log.error("acknowledged samples are missing store=%s shortfall=%r", self.folder, str(shortfall))
         return [Shortfall.from_event(event) for event in self.journal.events(SHORTFALL)]
 
-    def _check_signature(self, verify: Verify, incoming: Incoming) -> None:
-        if not incoming.machine:
-            raise MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
-        key = keys.ingest(self.site.name, incoming.machine)
-        verify(incoming.machine, key, incoming.payload, incoming.signature)
-
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count what became of a batch, once it is certain."""
         if isinstance(answer, Refused):
@@ -254,11 +272,14 @@ class Store:
             if admission.lost:
                 log.warning("declared lost machine=%s samples=%d", admission.batch.machine, admission.lost)
 
-    def _fold(self, row: int, batch: SampleBatch) -> None:
-        if batch.machine not in self.excluded:
-            self.grid.fold(batch.rows, batch.machine)
-        self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
-        self.merged = row
+    def _fold(self, batches: list[SampleBatch]) -> None:
+        """Fold what was committed: all of it that there is, up to the last journal row."""
+        folded = [batch for batch in batches if batch.machine not in self.excluded]
+        names = np.array([name_hash(batch.machine) for batch in folded], np.uint64)
+        rows = joined([batch.rows for batch in folded])
+        self.grid.fold_all(rows, np.repeat(names, [len(batch.rows) for batch in folded]))
+        self.newest_ns = max([self.newest_ns, *(int(batch.rows["stamp_ns"].max()) for batch in batches)])
+        self.merged = self.journalled
 
     def _history(self) -> History:
         return History(self.journal, Archive(self.folder / FOLDER))

@@ -44,8 +44,7 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Serve until stopped; then finish what has come in, commit, snapshot."""
     from mapserver.config import ServerConfig
-    from mapserver.evidence.grid import warm_up
-    from mapserver.server import Server
+    from mapserver.server import Server, warm_up
 
     stop = stop_flag()
     return_large_blocks()
@@ -53,7 +52,7 @@ def run(arguments: Namespace) -> int:
     table = load_toml(arguments.config) if arguments.config else {}
     config = from_table(ServerConfig, table, str(arguments.config))
     with ExitStack() as opened:
-        warm_up(config.fold)
+        warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
         ingest, readers = open_session(joined), open_session(joined)
         for session in (ingest, readers):

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mapserver.config import ServerConfig
-from mapserver.ingest.admission import GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, judge
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Admission
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
+from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused
 from tests.delivery_simulation.faults import Fault, FaultPlan, FaultyConnection, Killed
 
@@ -91,7 +92,8 @@ class ModelServer:
 
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
         try:
-            batch = parse(incoming.payload, incoming.machine, self._site, self._now_ns)
+            batch = decode_batch(incoming.payload, self._site.extent_m)
+            judge(batch, incoming.machine, self._site, self._now_ns)
             seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
             admission = admit(batch, seq)
         except MessageError as error:

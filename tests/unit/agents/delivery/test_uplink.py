@@ -27,7 +27,7 @@ from agents.delivery.uplink import (
     Wait,
 )
 from agents.delivery.uplink_thread import linger, perform
-from mapserver.ingest.admission import GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, judge
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.machine.samples import content_hash
 from protocol.wire.codec import decode_batch, decode_reply, encode_reply
@@ -49,7 +49,8 @@ class Server:
 
     def answer(self, payload: bytes) -> Ack | Refused:
         try:
-            batch = parse(payload, "loader-1", SITE, lambda: 0)
+            batch = decode_batch(payload, SITE.extent_m)
+            judge(batch, "loader-1", SITE, lambda: 0)
             admission = admit(batch, self.watermarks[batch.spool_id])
         except GapError as error:
             return Refused(error.reason, str(error), error.expected)
