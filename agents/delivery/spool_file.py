@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from agents.delivery.spool_mark import RunEnd
 from protocol.files import make_private
 
 SCHEMA = 3
@@ -36,6 +37,15 @@ def make_or_check(db: sqlite3.Connection) -> None:
     (schema,) = db.execute("PRAGMA user_version").fetchone()
     if schema != SCHEMA:
         raise ValueError(f"schema {schema}, this agent knows {SCHEMA}")
+
+
+def run_ends_in(db: sqlite3.Connection) -> list[RunEnd]:
+    """Runs that have samples, or had some, as a file at rest has them."""
+    (newest,) = db.execute("SELECT value FROM meta WHERE key = 'newest'").fetchone()
+    runs = db.execute("SELECT base, spool_id, acknowledged FROM run ORDER BY base").fetchall()
+    ends = [*(base for base, _, _ in runs[1:]), int(newest)]
+    each = zip(runs, ends, strict=True)
+    return [RunEnd(int(name, 16), end - base, acked) for (base, name, acked), end in each if end > base]
 
 
 def checksum(number: int, row: bytes) -> int:

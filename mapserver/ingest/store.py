@@ -29,7 +29,7 @@ from mapserver.journal.journal import Journal
 from mapserver.journal.refold import fold_history
 from mapserver.journal.rows import Admission, Selection
 from mapserver.journal.shortfall import KIND as SHORTFALL
-from mapserver.journal.shortfall import Shortfall, missing
+from mapserver.journal.shortfall import Shortfall, beyond, missing
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
 from protocol.errors import MessageError, Refusal, StoreError
@@ -255,7 +255,7 @@ class Store:
         shortfall, last_row = self.journal.shortfall, self.journal.last_row
         newest = max(snapshot_rows, default=0)
         if newest > max(last_row, shortfall.expected_row if shortfall else 0):
-            shortfall = Shortfall(last_row, newest, damage=f"a snapshot of row {newest} lies beyond the journal")
+            shortfall = beyond(last_row, newest)
             self.journal.note_shortfall(shortfall)
         if shortfall:
             log.error("acknowledged samples are missing store=%s shortfall=%r", self.folder, str(shortfall))
@@ -283,6 +283,18 @@ class Store:
 
     def _history(self) -> History:
         return History(self.journal, Archive(self.folder / FOLDER))
+
+
+def is_in_use(folder: Path) -> bool:
+    """Whether a server has a store open."""
+    try:
+        with (folder / LOCK_FILE).open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except BlockingIOError:
+        return True
+    return False
 
 
 @contextmanager

@@ -102,6 +102,11 @@ def compare(traces: Traces, present: Mapping[str, int]) -> Shortfall | None:
     return shortfall if str(shortfall) else None
 
 
+def beyond(last_row: int, snapshot_row: int) -> Shortfall:
+    """What a snapshot proves that is true for a row which the journal does not reach."""
+    return Shortfall(last_row, snapshot_row, damage=f"a snapshot of row {snapshot_row} lies beyond the journal")
+
+
 def missing(shortfalls: Iterable[Shortfall], watermarks: Mapping[SpoolKey, Watermark]) -> Counter[str]:
     """Samples by machine that were acknowledged, are gone, and that it has neither sent again nor declared lost."""
     until: dict[SpoolKey, int] = {}

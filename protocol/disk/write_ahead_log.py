@@ -77,11 +77,11 @@ def _scan_frames(log: bytes, page: int, order: str, salts: bytes, before: AnyArr
     if n < 1 or len(salts) < 8:
         return LogScan()
     frames = np.frombuffer(log, np.uint8, n * size, HEADER).reshape(n, size)
-    is_present = (frames[:, _SALTS] == np.frombuffer(salts, np.uint8)).all(axis=1)
+    is_present: Bools = np.all(frames[:, _SALTS] == np.frombuffer(salts, np.uint8), axis=1)
     n = int(is_present.nonzero()[0].max(initial=-1)) + 1
     frames, is_present = frames[:n], is_present[:n]
     is_sound = is_present & np.concatenate([*_are_sound(frames, order, before), np.zeros(0, np.bool_)])
-    is_commit = frames[:, 4:8].any(axis=1)
+    is_commit: Bools = np.any(frames[:, 4:8], axis=1)
     first = int(np.append(is_sound, False).argmin())  # that is not sound
     recovered = int(is_commit[:first].nonzero()[0].max(initial=-1)) + 1
     stands_on_commit = (is_commit[:-1] & is_sound[1:])[first:].any()
@@ -108,7 +108,8 @@ def _checksums(words: AnyArray, before: AnyArray) -> AnyArray:
     s = M^k before + sum of M^(k-1-i) (x0, x0 + x1), so each word has a weight of its own.
     """
     weights, power = _weights(words.shape[1] // 2)
-    return words @ weights + before @ power
+    sums: AnyArray = words @ weights + before @ power
+    return sums
 
 
 @lru_cache(maxsize=4)
