@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from mapserver.journal.rows import Admission
+from mapserver.journal.rows import Admission, StoreIdentity
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import SampleBatch
@@ -34,6 +34,20 @@ def judge(batch: SampleBatch, machine: str, site: SiteConfig, now_ns: Callable[[
         if ahead_s > site.clock_tolerance_s:
             problem = f"{ahead_s:.1f} s ahead of the server's clock; set the machine's clock"
             raise MessageError(Refusal.WALL_CLOCK, problem, field="stamp_ns", row=row)
+
+
+def check_store(batch: SampleBatch, identity: StoreIdentity, accepted: Collection[str]) -> str:
+    """The store that this one replaces for a batch, empty where it need not; MessageError where it may not.
+
+    accepted: ids of the stores whose place a person has let this one take.
+    """
+    if batch.store in ("", identity.id):
+        return ""
+    if batch.store in identity.descends or batch.store in accepted:
+        return batch.store
+    problem = f"earlier samples of this run are in store {batch.store}, and this is store {identity.id}: start the"
+    problem += f" server with that one, or `sitegrid accept {batch.store}` if it is gone"
+    raise MessageError(Refusal.OTHER_STORE, problem, field="store")
 
 
 def admit(batch: SampleBatch, watermark: int) -> Admission:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import socket
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,9 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, admit, judge
+from mapserver.ingest.admission import GapError, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
+from mapserver.ingest.store_lock import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
@@ -32,8 +32,7 @@ from mapserver.journal.shortfall import KIND as SHORTFALL
 from mapserver.journal.shortfall import Shortfall, beyond, missing
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
-from protocol.errors import MessageError, Refusal, StoreError
-from protocol.files import make_private
+from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
@@ -41,9 +40,10 @@ from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
-JOURNAL_FILE = "journal.db"
-LOCK_FILE = "lock"
 log = logging.getLogger("mapserver.ingest.store")
+
+JOURNAL_FILE = "journal.db"
+ACCEPTED = "accepted_store"  # kind of an event
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
 
@@ -59,8 +59,8 @@ class Incoming:
 class Store:
     """Journal, grid, watermarks and counters of one site.
 
-    identity: which store this is. excluded: machines whose rows are not in the grid. merged: the last journal row that
-    is; fact: the last decision that counts in it. newest_ns: the site's now.
+    identity: which store this is; accepted: ids of those whose place it takes. excluded: machines whose rows are not in
+    the grid. merged: the last journal row that is; fact: the last decision in it. newest_ns: the site's now.
     """
 
     def __init__(
@@ -78,10 +78,11 @@ class Store:
         self.commits, self.commit_s = 0, 0.0
         self.newest_ns = 0
         with ExitStack() as opened:
-            opened.enter_context(_hold(folder))
+            opened.enter_context(hold(folder))
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
+            self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
             last_row = self.journal.last_row
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
             self.shortfalls = self._name_shortfall(snapshot.rows_on_disk(folder))
@@ -163,6 +164,13 @@ class Store:
         self.journal.append_event(TRUST, decision.stamp_ns, asdict(decision))
         self.fact = self._last_fact()
 
+    def accept(self, store: str, reason: str) -> None:
+        """Take the place of another store for good, since a person says so: its runs are taken on here."""
+        if store != self.identity.id and store not in self.accepted:
+            self.journal.append_event(ACCEPTED, self.newest_ns, {"store": store, "reason": reason})
+            self.accepted |= {store}
+            log.warning("accepted store=%s reason=%r", store, reason)
+
     def close(self) -> None:
         """Close the journal and let go of the folder."""
         self._opened.close()
@@ -173,6 +181,7 @@ class Store:
             "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
             "store": self.identity.id,
             "descends": list(self.identity.descends),
+            "accepted": sorted(self.accepted),
             "fact": self.fact,
             "journalled": self.journalled,
             "merged": self.merged,
@@ -231,6 +240,7 @@ class Store:
             if isinstance(batch, MessageError):
                 raise batch
             judge(batch, incoming.machine, self.site, self.now_ns)
+            replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
@@ -239,7 +249,7 @@ class Store:
         row = self.journal.append(admission, self.now_ns()) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
-        return Ack(admission.watermark, row, admission.trimmed, self.identity.id), admission
+        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces), admission
 
     def _last_fact(self) -> int:
         """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""
@@ -283,29 +293,3 @@ class Store:
 
     def _history(self) -> History:
         return History(self.journal, Archive(self.folder / FOLDER))
-
-
-def is_in_use(folder: Path) -> bool:
-    """Whether a server has a store open."""
-    try:
-        with (folder / LOCK_FILE).open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
-    except BlockingIOError:
-        return True
-    return False
-
-
-@contextmanager
-def _hold(folder: Path) -> Iterator[None]:
-    """Keep a second server off the folder: each would take the samples that the other has. A crash releases it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    make_private(folder / LOCK_FILE)
-    with (folder / LOCK_FILE).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            problem = "another server is using this store; stop it, or choose another --store"
-            raise StoreError(folder, problem) from None
-        yield

@@ -45,7 +45,7 @@ def look_beside(database: Path) -> Traces:
         mark = read_mark(mark_path(database))
     except OSError as error:
         raise StoreError(database, f"cannot be read: {error}") from None
-    found = scan(log)
+    held = scan(log)
     has_frames = len(log) > HEADER + FRAME_HEADER
-    is_cut_short = has_frames and (found.recovered < found.frames or not found.recovered)
-    return Traces(mark, found, log_path, log if is_cut_short else b"")
+    is_cut_short = has_frames and (held.recovered < held.frames or not held.recovered)
+    return Traces(mark, held, log_path, log if is_cut_short else b"")

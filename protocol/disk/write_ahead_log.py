@@ -64,9 +64,9 @@ def _without_header(log: bytes) -> LogScan:
         second = HEADER + FRAME_HEADER + page
         for order in _WORD_ORDERS:
             for at in (HEADER, second):  # the salt of either of the first two frames
-                found = _scan_frames(log, page, order, log[at : at + FRAME_HEADER][_SALTS], None)
-                if found.damaged_at is not None:
-                    return LogScan(found.frames, 0, 0)
+                held = _scan_frames(log, page, order, log[at : at + FRAME_HEADER][_SALTS], None)
+                if held.damaged_at is not None:
+                    return LogScan(held.frames, 0, 0)
     return LogScan()
 
 

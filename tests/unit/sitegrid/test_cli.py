@@ -15,7 +15,21 @@ from sitegrid import cli
 from sitegrid.process.lifetime import plain
 
 COMMANDS = (
-    *("agent", "demo", "distrust", "doctor", "eval", "fold", "keys", "plot", "query", "router", "server", "sim"),
+    *(
+        "accept",
+        "agent",
+        "demo",
+        "distrust",
+        "doctor",
+        "eval",
+        "fold",
+        "keys",
+        "plot",
+        "query",
+        "router",
+        "server",
+        "sim",
+    ),
     "trust",
 )
 

@@ -77,9 +77,9 @@ def test_every_flip_before_the_last_transaction_is_damage(tmp_path, db):
     for _ in range(150):
         at = rng.randrange(end)
         bad = flipped(log, at, rng.randrange(8))
-        found = scan(bad)
-        assert found.damaged_at is not None, at
-        assert found.damaged_at <= at
+        held = scan(bad)
+        assert held.damaged_at is not None, at
+        assert held.damaged_at <= at
         dropped += recovered_rows(tmp_path, bad) < 16
     assert dropped == 150, "SQLite itself says nothing, and drops rows each time"
 
@@ -88,9 +88,9 @@ def test_every_flip_before_the_last_transaction_is_damage(tmp_path, db):
 def test_a_flip_in_the_header_is_damage(tmp_path, db, at):
     fill(db, random.Random(3), 4)
     for bit in range(8):
-        found = scan(flipped(log_of(tmp_path), at, bit))
-        assert (found.recovered, found.damaged_at) == (0, 0)
-        assert found.frames > 4
+        held = scan(flipped(log_of(tmp_path), at, bit))
+        assert (held.recovered, held.damaged_at) == (0, 0)
+        assert held.frames > 4
 
 
 def test_a_torn_tail_is_no_damage(tmp_path, db):
@@ -106,9 +106,9 @@ def test_a_torn_tail_is_no_damage(tmp_path, db):
         for at in range(end, len(log), 512):
             if rng.random() < 0.3:
                 torn[at : at + 512] = bytes(len(torn[at : at + 512]))
-        found = scan(bytes(torn[: rng.choice((len(torn), rng.randint(end, len(torn))))]))
-        assert found.damaged_at is None
-        assert found.recovered >= (end - HEADER) // FRAME
+        held = scan(bytes(torn[: rng.choice((len(torn), rng.randint(end, len(torn))))]))
+        assert held.damaged_at is None
+        assert held.recovered >= (end - HEADER) // FRAME
 
 
 def test_what_rolled_back_transactions_left_is_no_damage(tmp_path, db):
@@ -146,9 +146,9 @@ def test_commits_that_failed_one_after_the_other_are_no_damage(tmp_path, db):
             other.execute("COMMIT")
             log = log_of(folder)
         image[: len(log)] = log
-    found = scan(bytes(image))
-    assert found.frames > found.recovered > (len(base) - HEADER) // FRAME
-    assert found.damaged_at is None
+    held = scan(bytes(image))
+    assert held.frames > held.recovered > (len(base) - HEADER) // FRAME
+    assert held.damaged_at is None
 
 
 def test_frames_of_an_earlier_use_are_not_looked_at(tmp_path, db):
@@ -159,6 +159,6 @@ def test_frames_of_an_earlier_use_are_not_looked_at(tmp_path, db):
     fill(db, rng, 2)
     log = log_of(tmp_path)
     assert len(log) == HEADER + before * FRAME, "the file is used anew from its start"
-    found = scan(log)
-    assert found.frames == found.recovered < before
-    assert found.damaged_at is None
+    held = scan(log)
+    assert held.frames == held.recovered < before
+    assert held.damaged_at is None

@@ -215,7 +215,7 @@ def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch):
         failed = True  # so that the command ends at once
 
         def __init__(self, *given: Any) -> None:
-            configs.append(given[3])
+            configs.append(given[4])
 
     monkeypatch.setattr(server, "stop_flag", Stop)
     monkeypatch.setattr("sitegrid.commands.server.open_session", lambda _: Nothing())
