@@ -8,7 +8,7 @@ import socket
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,16 +20,15 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, admit, check_store, judge
+from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
-from mapserver.ingest.store_lock import hold
+from mapserver.ingest.lock import hold
+from mapserver.ingest.losses import by_machine, name_shortfalls
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
-from mapserver.journal.refold import fold_history
+from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
-from mapserver.journal.shortfall import KIND as SHORTFALL
-from mapserver.journal.shortfall import Shortfall, beyond, missing
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
 from protocol.errors import MessageError, Refusal
@@ -76,7 +75,6 @@ class Store:
         self._verify = verify
         self.counters: Counter[str] = Counter()
         self.commits, self.commit_s = 0, 0.0
-        self.newest_ns = 0
         with ExitStack() as opened:
             opened.enter_context(hold(folder))
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
@@ -85,13 +83,15 @@ class Store:
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
             last_row = self.journal.last_row
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
-            self.shortfalls = self._name_shortfall(snapshot.rows_on_disk(folder))
+            self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
+            release_memory()
             self.merged = last_row
-            self.newest_ns = self.journal.newest_ns()
+            self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
+            self._received_ns = self._last_received(last_row)
             self.fact = self._last_fact()
             self._opened = opened.pop_all()
 
@@ -99,6 +99,11 @@ class Store:
     def journalled(self) -> int:
         """The last row on disk."""
         return self.journal.last_row
+
+    @property
+    def newest_ns(self) -> int:
+        """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
+        return self._newest_but("")
 
     @property
     def version(self) -> MapVersion:
@@ -145,19 +150,17 @@ class Store:
 
         return write
 
-    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> Grid:
+    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
         """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines.
 
-        The rows beyond it are folded here, while batches wait: let them be few. Returns the grid that was used so far,
-        so that another thread may spend the time to let go of it.
+        The rows beyond it are folded here, while batches wait: let them be few.
         """
         grid.touch_all()
         for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
             grid.fold_all(rows.samples, rows.names())
-        before, self.grid, self.excluded = self.grid, grid, excluded
+        self.grid, self.excluded = grid, excluded
         self.fact = self._last_fact()
         self.snapshot_row = 0  # what is on disk has other machines in it
-        return before
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
@@ -201,20 +204,8 @@ class Store:
         }
 
     def machines(self) -> dict[str, dict[str, int]]:
-        """What each machine sent: spools, samples, samples that it declared lost, newest stamp, and what is missing."""
-        watermarks = self.journal.watermarks()
-        gone = missing(self.shortfalls, watermarks)
-        names = dict.fromkeys([*(machine for machine, _ in watermarks), *gone])
-        machines = {
-            name: {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0, "missing": gone[name]} for name in names
-        }
-        for (machine, _), mark in watermarks.items():
-            entry = machines[machine]
-            entry["spools"] += 1
-            entry["samples"] += mark.seq - mark.lost
-            entry["lost"] += mark.lost
-            entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
-        return machines
+        """What each machine sent and lost; see `by_machine`."""
+        return by_machine(self.journal.watermarks(), self.shortfalls)
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
         """What each batch holds, or why it is refused; one that is not signed is not looked at."""
@@ -239,17 +230,32 @@ class Store:
         try:
             if isinstance(batch, MessageError):
                 raise batch
-            judge(batch, incoming.machine, self.site, self.now_ns)
+            judge(batch, incoming.machine, self.site, self.now_ns, self._seen)
             replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
         new = len(admission.batch.rows) > 0
-        row = self.journal.append(admission, self.now_ns()) if new else self.journalled
+        if new:
+            self._received_ns = self.now_ns()
+        row = self.journal.append(admission, self._received_ns) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
         return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces), admission
+
+    def _newest_but(self, machine: str) -> int:
+        """The newest stamp of the machines in the map but one."""
+        hidden = self.excluded | {machine}
+        return max((newest_ns for name, newest_ns in self._newest.items() if name not in hidden), default=0)
+
+    def _seen(self, machine: str) -> SeenTime:
+        return SeenTime(self._newest_but(machine), self.newest_ns, self._received_ns)
+
+    def _last_received(self, last_row: int) -> int:
+        """The server's clock when the last row came in, 0 where none is in the journal."""
+        is_there = last_row > self.journal.archived_row
+        return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
 
     def _last_fact(self) -> int:
         """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""
@@ -259,17 +265,6 @@ class Store:
             if decisions.distrusted == self.excluded:
                 fact = event.id
         return fact
-
-    def _name_shortfall(self, snapshot_rows: Sequence[int]) -> list[Shortfall]:
-        """Say what was acknowledged and is not in the journal, by what lies beside it; returns all that ever was."""
-        shortfall, last_row = self.journal.shortfall, self.journal.last_row
-        newest = max(snapshot_rows, default=0)
-        if newest > max(last_row, shortfall.expected_row if shortfall else 0):
-            shortfall = beyond(last_row, newest)
-            self.journal.note_shortfall(shortfall)
-        if shortfall:
-            log.error("acknowledged samples are missing store=%s shortfall=%r", self.folder, str(shortfall))
-        return [Shortfall.from_event(event) for event in self.journal.events(SHORTFALL)]
 
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count what became of a batch, once it is certain."""
@@ -288,7 +283,9 @@ class Store:
         names = np.array([name_hash(batch.machine) for batch in folded], np.uint64)
         rows = joined([batch.rows for batch in folded])
         self.grid.fold_all(rows, np.repeat(names, [len(batch.rows) for batch in folded]))
-        self.newest_ns = max([self.newest_ns, *(int(batch.rows["stamp_ns"].max()) for batch in batches)])
+        for batch in batches:
+            newest_ns = int(batch.rows["stamp_ns"].max())
+            self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)
         self.merged = self.journalled
 
     def _history(self) -> History:

@@ -131,7 +131,8 @@ class Journal(JournalQueries):
     def note_shortfall(self, shortfall: Shortfall) -> None:
         """Keep what is missing as an event; no file that proves it is needed from then on."""
         self.shortfall = shortfall
-        self.append_event(SHORTFALL, self.newest_ns(), shortfall.body())
+        newest_ns = max((mark.newest_ns for mark in self._watermarks.values()), default=0)
+        self.append_event(SHORTFALL, newest_ns, shortfall.body())
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
         """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.

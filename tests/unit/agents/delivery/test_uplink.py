@@ -38,6 +38,7 @@ from tests.unit.agents.drives import SITE, made_up_samples
 ROWS = made_up_samples(500)
 QUICK_S = 0.01  # an exchange over a good link
 TIMEOUT_S = UplinkConfig().timeout_s
+LAST_NS = int(ROWS["stamp_ns"].max())
 
 
 class Server:
@@ -51,7 +52,7 @@ class Server:
     def answer(self, payload: bytes) -> Ack | Refused:
         try:
             batch = decode_batch(payload, SITE.extent_m)
-            judge(batch, "loader-1", SITE, lambda: 0)
+            judge(batch, "loader-1", SITE, lambda: LAST_NS)
             admission = admit(batch, self.watermarks[batch.spool_id])
         except GapError as error:
             return Refused(error.reason, str(error), error.expected)

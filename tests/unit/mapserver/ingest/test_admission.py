@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapserver.ingest.admission import GapError, admit, judge
+from mapserver.ingest.admission import GapError, SeenTime, admit, judge
 from protocol.errors import MessageError, Refusal
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, now_ns, samples
 
@@ -129,6 +129,48 @@ def test_a_stamp_ahead_of_the_wall_clock_is_refused_where_the_site_says_so():
     with pytest.raises(MessageError, match=r"2\.1 s ahead") as caught:
         judged(batch(beyond), site=wall)
     assert (caught.value.reason, caught.value.row) == (Refusal.WALL_CLOCK, 1)
+
+
+DAY = 86_400 * 10**9
+
+
+@pytest.mark.parametrize("clock", ["data", "wall"])
+@pytest.mark.parametrize(
+    ("ahead_ns", "seen", "reason"),
+    [
+        (DAY + 1, SeenTime(), Refusal.FAR_FUTURE),  # a new store
+        (73 * 365 * DAY, SeenTime(NOW_NS, NOW_NS + DAY, NOW_NS), Refusal.FAR_FUTURE),  # the year 2099
+        (3 * DAY, SeenTime(NOW_NS + DAY, NOW_NS + DAY), Refusal.FAR_FUTURE),  # ahead of all others, too
+        (3 * DAY, SeenTime(0, NOW_NS + DAY, NOW_NS), Refusal.FAR_FUTURE),  # its own earlier stamps prove nothing
+        (3 * DAY, SeenTime(0, 0, NOW_NS + 1), Refusal.SERVER_CLOCK),  # the server's clock went back
+        (3 * DAY, SeenTime(0, NOW_NS + DAY + 1), Refusal.SERVER_CLOCK),
+        (400 * DAY, SeenTime(NOW_NS + 300 * DAY, NOW_NS + 300 * DAY), Refusal.SERVER_CLOCK),
+    ],
+)
+def test_a_stamp_a_day_ahead_of_all_that_is_known_is_refused_with_its_row(clock, ahead_ns, seen, reason):
+    sent = batch(samples(3, stamp_ns=[NOW_NS, NOW_NS + ahead_ns, NOW_NS]))
+    with pytest.raises(MessageError) as caught:
+        judge(sent, "a", replace(SITE, clock=clock), now_ns, lambda machine: {"a": seen}[machine])
+    assert (caught.value.reason, caught.value.field, caught.value.row) == (reason, "stamp_ns", 1)
+
+
+@pytest.mark.parametrize(
+    ("ahead_ns", "seen"),
+    [
+        (DAY, SeenTime()),
+        (3 * DAY, SeenTime(NOW_NS + 2 * DAY, NOW_NS + 2 * DAY)),  # as the others say: the server's clock is behind
+        (-(10**18), SeenTime()),  # a log of 1994
+    ],
+)
+def test_a_stamp_that_others_bear_out_passes__a_site_that_goes_by_its_data(ahead_ns, seen):
+    sent = batch(samples(1, stamp_ns=NOW_NS + ahead_ns))
+    judge(sent, "a", SITE, now_ns, lambda _: seen)
+
+
+def test_a_server_whose_clock_was_never_set_makes_machines_wait():
+    with pytest.raises(MessageError, match="set the server's clock") as caught:
+        judge(batch(samples(1)), "a", SITE, lambda: 1)
+    assert caught.value.reason == Refusal.SERVER_CLOCK
 
 
 def test_an_empty_batch_passes_a_wall_clock():

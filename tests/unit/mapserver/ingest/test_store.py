@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from mapserver.evidence import snapshot
+from mapserver.ingest.store import Store
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import Refusal, StoreError
 from protocol.wire.messages import Ack, Refused
 from tests.unit.mapserver.data import (
+    CONFIG,
     NOW_NS,
     SITE,
     Incoming,
@@ -293,7 +295,7 @@ def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, sa
 @pytest.mark.parametrize("parts", [1, 5, 25])
 def test_a_replay_of_any_part_of_the_journal_after_a_snapshot_gives_the_same_bits(tmp_path, parts):
     rows = random_samples(100, 13, half_m=20.0)
-    rows["stamp_ns"] += np.arange(100) % 9 * 10**9 * 40_000
+    rows["stamp_ns"] += np.arange(100) % 9 * 10**9 * 9_000
     store = open_store(tmp_path / "store")
     for i, part in enumerate(np.split(rows, parts * 4)):
         store.commit([incoming(part, 1 + i * len(part))])
@@ -380,3 +382,44 @@ def test_the_version_of_the_map_names_the_last_decision_that_counts_in_it(tmp_pa
         assert store.fact == 2
     with closing(open_store(tmp_path)) as store:
         assert (store.version.row, store.version.fact) == (2, 2)
+
+
+# --- time ------------------------------------------------------------------------------------------------------------
+
+DAY = 86_400 * 10**9
+
+
+def test_the_site_s_now_is_that_of_trusted_machines_and_is_taken_back(tmp_path):
+    with closing(open_store(tmp_path)) as store:
+        store.commit([incoming(samples(1)), incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
+        assert store.newest_ns == NOW_NS + DAY
+        store.decide(TrustDecision("b", trusted=False, by="person", reason="its clock", stamp_ns=1))
+        store.adopt(folded(samples(1)), 2, frozenset({"b"}))
+        assert store.newest_ns == store.info()["stamp_ns"] == NOW_NS
+        store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), 2, machine="b")])
+        assert (store.newest_ns, store.machines()["b"]["newest_ns"]) == (NOW_NS, NOW_NS + DAY)
+    with closing(open_store(tmp_path)) as store:
+        assert store.newest_ns == NOW_NS
+
+
+def test_a_machine_from_the_future_bears_out_no_other_once_it_is_distrusted(tmp_path):
+    with closing(open_store(tmp_path)) as store:
+        store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
+        later = incoming(samples(1, stamp_ns=NOW_NS + 2 * DAY), machine="c")
+        store.adopt(folded(samples(0)), 1, frozenset({"b"}))
+        assert store.commit([later])[0].reason == Refusal.FAR_FUTURE
+        store.adopt(folded(samples(1, stamp_ns=NOW_NS + DAY)), 1, frozenset())
+        assert isinstance(store.commit([later])[0], Ack)
+
+
+def test_a_server_whose_clock_went_back_says_so_until_it_is_right_again(tmp_path):
+    clock = [NOW_NS + 400 * DAY]
+    with closing(Store(tmp_path, SITE, CONFIG, lambda: clock[0])) as store:
+        assert isinstance(store.commit([incoming(samples(1, stamp_ns=clock[0]))])[0], Ack)
+        clock[0] -= 300 * DAY
+        monday = incoming(samples(1, stamp_ns=NOW_NS + 403 * DAY), 2)
+        assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
+    with closing(Store(tmp_path, SITE, CONFIG, lambda: clock[0])) as store:  # it is known from the journal, too
+        assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
+        clock[0] += 303 * DAY
+        assert isinstance(store.commit([monday])[0], Ack)

@@ -378,6 +378,7 @@ BATCHES = [
     (Refusal.OTHER_STORE, table(store="0123456789abcdef")),
     (Refusal.OUT_OF_RANGE, table(store="0123")),
     (Refusal.WALL_CLOCK, one(stamp_ns=NOW_NS + 10**13)),
+    (Refusal.FAR_FUTURE, one(stamp_ns=NOW_NS + 10**15)),
 ]
 
 
@@ -416,7 +417,7 @@ def test_a_refused_query_says_why(start, reason, name, parameters):
 
 def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
-    elsewhere |= {Refusal.FAR_FUTURE, Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}
+    elsewhere |= {Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}  # in the tests of admission, and of the claim
     elsewhere |= {Refusal.UNKNOWN_MACHINE, Refusal.EXPIRED}  # commands and tiles, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 

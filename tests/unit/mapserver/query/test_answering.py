@@ -165,7 +165,7 @@ def answers_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tupl
     def fold(store: Store) -> None:
         for part in rows:
             store.grid.fold(part, "a")
-        store.newest_ns = store.grid.newest_ns
+        store._newest = {"a": store.grid.newest_ns}
 
     writer.run(fold)
     return writer, asked(writer)

@@ -1,4 +1,4 @@
-"""The lock of a store: one server at a time uses its folder."""
+"""The lock of a store's folder: one server on this host has it open."""
 
 from __future__ import annotations
 

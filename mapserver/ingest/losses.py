@@ -1,0 +1,40 @@
+"""What machines sent, and what of it a store has lost: by machine and number, for logs and `info`."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+from mapserver.journal.journal import Journal
+from mapserver.journal.rows import Watermark
+from mapserver.journal.shortfall import KIND, Shortfall, SpoolKey, beyond, missing
+
+log = logging.getLogger("mapserver.ingest.losses")
+
+
+def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shortfall]:
+    """Say what was acknowledged and was not in a journal that has just been opened; returns all that ever was.
+
+    snapshot_rows: of the snapshots beside it; one that the journal does not reach proves that it was longer.
+    """
+    shortfall, newest = journal.shortfall, max(snapshot_rows, default=0)
+    if newest > max(journal.last_row, shortfall.expected_row if shortfall else 0):
+        shortfall = beyond(journal.last_row, newest)
+        journal.note_shortfall(shortfall)
+    if shortfall:
+        log.error("acknowledged samples are missing journal=%s shortfall=%r", journal.path, str(shortfall))
+    return [Shortfall.from_event(event) for event in journal.events(KIND)]
+
+
+def by_machine(watermarks: Mapping[SpoolKey, Watermark], shortfalls: Sequence[Shortfall]) -> dict[str, dict[str, int]]:
+    """What each machine sent: spools, samples, samples that it declared lost, newest stamp, and what is missing."""
+    gone = missing(shortfalls, watermarks)
+    names = dict.fromkeys([*(machine for machine, _ in watermarks), *gone])
+    machines = {name: {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0, "missing": gone[name]} for name in names}
+    for (machine, _), mark in watermarks.items():
+        entry = machines[machine]
+        entry["spools"] += 1
+        entry["samples"] += mark.seq - mark.lost
+        entry["lost"] += mark.lost
+        entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
+    return machines
