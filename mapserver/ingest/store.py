@@ -193,6 +193,7 @@ class Store:
             "samples_too_unsure": self.grid.skipped,
             "cells": self.grid.known_cells(),
             "bounds": self.grid.bounds(),
+            "first_ns": self.grid.oldest_ns,
             "stamp_ns": self.newest_ns,
             "wall_ns": self.now_ns(),
             "version": package_version(),
