@@ -1,7 +1,7 @@
 """Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers: `answers.py`.
 
-The server parses a query once, into a frozen type; an unknown parameter is refused by name. It is one module because both
-directions of a parameter have to agree.
+The server parses a query once, into a frozen type; an unknown parameter is refused by name. It is one module because
+both directions of a parameter have to agree.
 """
 
 from collections.abc import Callable, Mapping

@@ -118,6 +118,7 @@ MACHINE = records.MachineState(
     samples=1200,
     lost=3,
     newest_ns=T0 + 1,
+    missing=5,
 )
 TRUST = records.TrustAnswer(**vars(MACHINE), store=STORE, merged=17, fact=3)
 CHANGE = records.GroundChange(
