@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,12 +15,14 @@ import numpy as np
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.queries.answers import GroundChange, MachineState, PointAnswer, Region
+from protocol.queries.tiles import Progress
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.times import HELP as TIME_HELP
 from sitegrid.options.times import SiteTime, parse_time, utc_text
 from sitegrid.options.values import positive
-from sitegrid.process.lifetime import plain, say, stop_flag, wait
+from sitegrid.process.lifetime import note, plain, say, stop_flag, wait
+from sitegrid.process.progress import EVERY_S
 
 HELP = "ask the map"
 Answer = tuple[Any, Iterable[str]]  # a table for programs, None where all is printed already; lines for people
@@ -98,7 +101,7 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     sides = (arguments.west_m, arguments.south_m, arguments.east_m, arguments.north_m)
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
     try:
-        region = client.region(sides, layers, **when, after=arguments.after)
+        region = client.region(sides, layers, **when, after=arguments.after, progress=_tiles_shown())
     except ValueError as error:
         raise ConfigError("sitegrid query region", str(error)) from None
     if arguments.out:
@@ -118,6 +121,19 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
 def _version(answer: PointAnswer | Region) -> dict[str, Any]:
     version = answer.version
     return {"store": version.store, "merged": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
+
+
+def _tiles_shown() -> Progress:
+    """What shows on standard error, now and then, how much of a large region is here."""
+    next_s = time.monotonic() + EVERY_S
+
+    def show(here: int, count: int) -> None:
+        nonlocal next_s
+        if time.monotonic() >= next_s:
+            next_s = time.monotonic() + EVERY_S
+            note(f"{here} of {count} tiles")
+
+    return show
 
 
 def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:

@@ -14,7 +14,7 @@ from protocol.config import from_table
 from protocol.files import load_toml
 from protocol.site.site_file import load_site
 from protocol.version import package_version
-from protocol.wire.session import open_session
+from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
 from sitegrid.options.values import address
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
@@ -47,6 +47,7 @@ def run(arguments: Namespace) -> int:
     from mapserver.server import Server, warm_up
 
     stop = stop_flag()
+    use_many_threads()
     return_large_blocks()
     site = load_site(arguments.site_file)
     table = load_toml(arguments.config) if arguments.config else {}
