@@ -18,12 +18,13 @@ from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
-from agents.presence import Owner, Presence
+from agents.presence import Presence
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
+from protocol.wire.owners import Owner
 
 HEALTH_S = 1.0
 MOST_UNSAVED = 100_000  # samples that wait in memory while the disk is full or fails
