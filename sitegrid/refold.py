@@ -30,7 +30,7 @@ from protocol.files import load_toml
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.site_config import SiteConfig, site_toml
 from protocol.site.site_file import load_site
-from sitegrid.process.lifetime import say
+from sitegrid.process.lifetime import raise_interrupts, say, tell
 from sitegrid.process.progress import Display
 
 SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
@@ -58,6 +58,7 @@ class SampleSource:
 
 def run(arguments: Namespace) -> int:
     """Fold once and print what became of the samples."""
+    raise_interrupts()  # a store that is not complete is removed
     selection = Selection(
         from_ns=arguments.from_ns or 0,
         to_ns=MAX_STAMP_NS if arguments.until_ns is None else arguments.until_ns - 1,
@@ -75,7 +76,7 @@ def run(arguments: Namespace) -> int:
             problem = f"{unknown[0]!r} is no machine of these archives; they are: {', '.join(sorted(known))}"
             raise ConfigError("--without", problem)
         summary = _build(arguments, sources, site, selection)
-    say(summary) if arguments.json else print("\n".join(_lines(summary)))
+    say(summary) if arguments.json else tell(*_lines(summary))
     return 0
 
 

@@ -24,7 +24,7 @@ from protocol.files import whole_file
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2
-_TOTALS = ("folded", "skipped", "newest_ns")
+_TOTALS = ("folded", "skipped", "newest_ns", "oldest_ns")
 log = logging.getLogger("mapserver.evidence.snapshot")
 
 

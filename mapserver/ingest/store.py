@@ -26,7 +26,7 @@ from mapserver.ingest.store_folder import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
-from mapserver.journal.refold import fold_history
+from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
@@ -86,6 +86,7 @@ class Store:
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
+            release_memory()
             self.merged = last_row
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
@@ -147,19 +148,17 @@ class Store:
 
         return write
 
-    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> Grid:
+    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
         """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines.
 
-        The rows beyond it are folded here, while batches wait: let them be few. Returns the grid that was used so far,
-        so that another thread may spend the time to let go of it.
+        The rows beyond it are folded here, while batches wait: let them be few.
         """
         grid.touch_all()
         for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
             grid.fold_all(rows.samples, rows.names())
-        before, self.grid, self.excluded = self.grid, grid, excluded
+        self.grid, self.excluded = grid, excluded
         self.fact = self._last_fact()
         self.snapshot_row = 0  # what is on disk has other machines in it
-        return before
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
@@ -192,6 +191,7 @@ class Store:
             "samples_too_unsure": self.grid.skipped,
             "cells": self.grid.known_cells(),
             "bounds": self.grid.bounds(),
+            "first_ns": self.grid.oldest_ns,
             "stamp_ns": self.newest_ns,
             "wall_ns": self.now_ns(),
             "version": package_version(),

@@ -198,4 +198,4 @@ def arrow(module: str = "") -> Any:
     try:
         return import_module(f"pyarrow.{module}" if module else "pyarrow")
     except ModuleNotFoundError:
-        raise ConfigError("archive", "pyarrow is not installed: pip install 'sitegrid[archive]'") from None
+        raise ConfigError("archive", "pyarrow is not installed: pip install '.[archive]'") from None

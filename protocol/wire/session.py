@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from protocol.wire.credentials import Credentials
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_TLS_ENDPOINT = "tls/127.0.0.1:7447"
+_SYSTEM_ERROR = re.compile(r"([^:\[\]()]+) \(os error \d+\)")
 # What keeps a router from stopping for one link:
 ROUTER = {
     # What waits for a link that does not read [batches of 64 kB]: a whole tile of a region, so that it stops no other.
@@ -65,13 +67,22 @@ def open_session(config: SessionConfig) -> zenoh.Session:
             settings.insert_json5(key, json.dumps(value))
         return zenoh.open(settings)
     except zenoh.ZError as error:
-        raise LinkError(config.endpoint, f"cannot {_aim(config)} ({str(error).splitlines()[0][:120]})") from None
+        raise LinkError(config.endpoint, f"cannot {_aim(config)} ({reason_of(error)})") from None
+
+
+def reason_of(error: zenoh.ZError) -> str:
+    """What Zenoh says, without the places in its sources and the errors around the cause."""
+    text = str(error).partition("\n")[0]
+    if of_system := _SYSTEM_ERROR.search(text):
+        return of_system[1].strip().lower()
+    text = text.partition(" at /")[0]
+    return "no answer in time" if text.endswith("Timeout!") else text[:120]
 
 
 def _aim(config: SessionConfig) -> str:
     """What failed, and the likely reasons: a link that is refused looks like one that is not there."""
     if config.mode == "router":
-        return "listen here"
+        return "listen here: end the router that does, or choose another --listen"
     if config.credentials:
         return (
             "reach a router here: start one with `sitegrid router --keys`, or it and these keys do not know each other"

@@ -17,6 +17,7 @@ from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
+from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import address
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
 from sitegrid.security.join import join
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from mapserver.server import Server
 
 HELP = "run the map server of a site"
+EXTRA = "server"
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -34,7 +36,7 @@ def add_options(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add_network(parser)
     add("--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)")
-    add("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
+    add("--store", type=FOLDER, required=True, help="folder with journal, archive and snapshots")
     add("--config", type=Path, help="file with options (config/server.toml)")
     add("--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register")
     over = "have another map server of the site end, and take its place; without this, it stays, and this one ends"

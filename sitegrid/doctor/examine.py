@@ -66,7 +66,7 @@ def _keys(arguments: Namespace) -> tuple[list[Finding], Subject | None]:
     except ConfigError as error:
         return [Finding(Level.FAIL, "certificate", str(error))], None
     except ModuleNotFoundError:
-        return [skipped("certificate", "pip install 'sitegrid[security]'")], subject
+        return [skipped("certificate", "pip install '.[security]' in the folder of this project")], subject
     site = arguments.site or (subject.site_file.name if subject.site_file else "")
     findings = check_certificate(certificate, datetime.now(UTC), site, arguments.machine or "")
     return findings, subject if findings[0].level != Level.FAIL else None

@@ -16,11 +16,11 @@ def version(row: int = 0, fact: int = 0) -> MapVersion:
 
 def map_info(site: SiteConfig, **values: Any) -> MapInfo:
     rows = ("fact", "journalled", "merged", "snapshot")
-    zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "stamp_ns", "wall_ns")
+    zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "first_ns", "stamp_ns", "wall_ns")
     defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
     defaults |= {"site": SiteInfo(**vars(site), frame=site.frame, crs=site.crs), "version": "1.0", "bounds": None}
     defaults |= {"store": STORE, "descends": (), "accepted": (), "server": ServerProcess("office", 7)}
-    defaults |= {"machines": {}, "distrusted": (), "counters": {}, "layers": ()}
+    defaults |= {"machines": {}, "distrusted": (), "counters": {}, "layers": (), "boundaries": ()}
     return MapInfo(**(defaults | values))
 
 

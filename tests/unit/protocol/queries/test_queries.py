@@ -323,6 +323,7 @@ INFO = answers.MapInfo(
     samples_too_unsure=2,
     cells=7,
     bounds=(0, -16, 16, 16),
+    first_ns=3,
     stamp_ns=9,
     wall_ns=10,
     version="1.0",
@@ -331,6 +332,7 @@ INFO = answers.MapInfo(
     distrusted=("b",),
     counters={"refused_gap": 2},
     layers=("resistance",),
+    boundaries=(0.014, 0.03),
 )
 
 

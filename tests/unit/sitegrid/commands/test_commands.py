@@ -21,8 +21,9 @@ from protocol.wire.session import free_endpoint
 from sim.config import resolve
 from sim.scenario.file import FOLDER, load_scenario
 from sim.truth import TruthMap
-from sitegrid.cli import build_parser, main
+from sitegrid.cli import main
 from sitegrid.commands import agent, plot, server, sim
+from sitegrid.door import build_parser
 from sitegrid.pictures import draw
 from tests.paths import ROOT
 
