@@ -1,4 +1,4 @@
-"""A store's folder before it is opened: its lock, since one server on this host has it open, and the id of the store."""
+"""A store's folder before the store is opened: its lock, as one server on this host has it open, and the id."""
 
 from __future__ import annotations
 
