@@ -22,8 +22,8 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
-from mapserver.ingest.lock import hold
 from mapserver.ingest.losses import by_machine, name_shortfalls
+from mapserver.ingest.store_folder import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
