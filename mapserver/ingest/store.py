@@ -22,8 +22,8 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
-from mapserver.ingest.lock import hold
 from mapserver.ingest.losses import by_machine, name_shortfalls
+from mapserver.ingest.store_folder import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
@@ -40,7 +40,6 @@ from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
-
 JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
@@ -81,8 +80,7 @@ class Store:
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
-            last_row = self.journal.last_row
-            self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
+            self.excluded, last_row = TrustDecisions(self.journal.events(TRUST)).distrusted, self.journal.last_row
             self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
