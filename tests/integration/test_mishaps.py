@@ -24,7 +24,7 @@ from tests.integration.site_run import READY_S, SiteRun  # beside this file
 
 pytestmark = pytest.mark.processes
 
-# Ctrl-C as numpy or another library is loaded: before its n-th import. Every line would soon end by itself, if it went on.
+# Ctrl-C as numpy or another library is loaded: before its n-th import. Every line would soon end by itself.
 IMPORTS = (1, 100, 350)
 LINES = {command.words[0]: command.line({"endpoint": "none"}) for command in reversed(COMMANDS)} | {
     "agent": ["agent", "--spool", "x.db"],
