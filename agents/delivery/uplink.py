@@ -28,6 +28,7 @@ BLOCKING = {
     Refusal.WALL_CLOCK,
     Refusal.SERVER_CLOCK,
     Refusal.OTHER_STORE,
+    Refusal.UNSIGNED,
     Refusal.NOT_MSGPACK,
     Refusal.MISSING_FIELD,
     Refusal.WRONG_TYPE,
