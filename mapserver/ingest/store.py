@@ -22,6 +22,7 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
+from mapserver.ingest.losses import by_machine, name_shortfalls
 from mapserver.ingest.store_folder import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
@@ -82,12 +83,16 @@ class Store:
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
             last_row = self.journal.last_row
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
+            self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
+            in_snapshot = self.grid.counts()
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
             release_memory()
-            self.merged = last_row
+            self.merged, counts = last_row, self.grid.counts()
+            tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
+            self._snapshot_samples = self.journal.samples - tail
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
             self.fact = self._last_fact()
@@ -97,6 +102,11 @@ class Store:
     def journalled(self) -> int:
         """The last row on disk."""
         return self.journal.last_row
+
+    @property
+    def samples_behind(self) -> int:
+        """How many samples the newest snapshot lacks: a start would have to fold them."""
+        return self.journal.samples - self._snapshot_samples
 
     @property
     def newest_ns(self) -> int:
@@ -138,13 +148,13 @@ class Store:
         """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
         if self.merged <= self.snapshot_row:
             return None
-        row, grid, excluded = self.merged, self.grid, self.excluded
+        row, grid, excluded, samples = self.merged, self.grid, self.excluded, self.journal.samples
         state = grid.state()
 
         def write() -> None:
             snapshot.save(self.folder, row, state, self.site.cell_m, self.config.fold, excluded)
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
-                self.snapshot_row = row
+                self.snapshot_row, self._snapshot_samples = row, samples
 
         return write
 
@@ -158,7 +168,7 @@ class Store:
             grid.fold_all(rows.samples, rows.names())
         self.grid, self.excluded = grid, excluded
         self.fact = self._last_fact()
-        self.snapshot_row = 0  # what is on disk has other machines in it
+        self.snapshot_row = self._snapshot_samples = 0  # what is on disk has other machines in it
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
@@ -177,7 +187,8 @@ class Store:
         self._opened.close()
 
     def info(self) -> dict[str, Any]:
-        """State of the store in plain values."""
+        """State of the store in plain values, from counters."""
+        counts = self.grid.counts()
         return {
             "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
             "store": self.identity.id,
@@ -187,10 +198,10 @@ class Store:
             "journalled": self.journalled,
             "merged": self.merged,
             "snapshot": self.snapshot_row,
-            "samples_merged": self.grid.folded,
-            "samples_too_unsure": self.grid.skipped,
-            "cells": self.grid.known_cells(),
-            "bounds": self.grid.bounds(),
+            "samples_merged": counts.folded,
+            "samples_too_unsure": counts.skipped,
+            "cells": counts.cells,
+            "bounds": counts.bounds,
             "first_ns": self.grid.oldest_ns,
             "stamp_ns": self.newest_ns,
             "wall_ns": self.now_ns(),
@@ -198,19 +209,13 @@ class Store:
             "server": {"host": socket.gethostname(), "pid": os.getpid()},
             "machines": self.machines(),
             "distrusted": sorted(self.excluded),
+            "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
             "counters": dict(self.counters),
         }
 
     def machines(self) -> dict[str, dict[str, int]]:
-        """What each machine sent: spools, samples, samples that it declared lost, newest stamp."""
-        machines: dict[str, dict[str, int]] = {}
-        for (machine, _), mark in self.journal.watermarks().items():
-            entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0})
-            entry["spools"] += 1
-            entry["samples"] += mark.seq - mark.lost
-            entry["lost"] += mark.lost
-            entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
-        return machines
+        """What each machine sent and lost; see `by_machine`."""
+        return by_machine(self.journal, self.shortfalls)
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
         """What each batch holds, or why it is refused; one that is not signed is not looked at."""
@@ -279,6 +284,8 @@ class Store:
             self.counters["batches"] += len(admission.batch.rows) > 0
             self.counters["samples_trimmed"] += admission.trimmed
             self.counters["samples_lost"] += admission.lost
+            if admission.lost:
+                log.warning("declared lost machine=%s samples=%d", admission.batch.machine, admission.lost)
 
     def _fold(self, batches: list[SampleBatch]) -> None:
         """Fold what was committed: all of it that there is, up to the last journal row."""

@@ -129,12 +129,16 @@ class SiteInfo:
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """What one machine sent: spools, samples accepted, samples declared lost, and its newest stamp."""
+    """What one machine sent: spools, samples accepted, samples that it declared lost, and its newest stamp.
+
+    missing: samples that were acknowledged, are gone, and that it has neither sent again nor declared lost since.
+    """
 
     spools: int
     samples: int
     lost: int
     newest_ns: int
+    missing: int
 
 
 @dataclass(frozen=True)
@@ -153,7 +157,8 @@ class MapInfo:
     it take; fact: see MapVersion. journalled, merged, snapshot: journal rows. bounds: first column, first row, end
     column and end row of the blocks with evidence; None without any. first_ns, stamp_ns: the map's oldest stamp, and
     the site's now; 0 without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
-    boundaries: of the classes of resistance.
+    boundaries: of the classes of resistance. shortfalls: what the journal lacked of what was acknowledged, one line for
+    each start that noticed.
     """
 
     site: SiteInfo
@@ -175,9 +180,23 @@ class MapInfo:
     server: ServerProcess
     machines: Mapping[str, SampleCounts]
     distrusted: tuple[str, ...]
+    shortfalls: tuple[str, ...]
     counters: Mapping[str, int]
     layers: tuple[str, ...]
     boundaries: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ServerAlive:
+    """A map server that takes batches. journalled, merged: journal rows.
+
+    busy_s: how long it has been at the work that it does now, 0 for none.
+    """
+
+    store: str
+    journalled: int
+    merged: int
+    busy_s: float
 
 
 @dataclass(frozen=True)
@@ -201,6 +220,7 @@ class MachineState:
     samples: int
     lost: int
     newest_ns: int
+    missing: int
 
 
 @dataclass(frozen=True)
