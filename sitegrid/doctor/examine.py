@@ -23,7 +23,7 @@ from sitegrid.security.join import join
 
 ANYBODY = "doctor"  # where there are no keys, every name is as good
 ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
-OF_SERVER = ("server", "losses", "clock", "time", "writer", "version", "permission")  # checks that need the server
+OF_SERVER = ("server", "losses", "clock", "time", "writer", "version", "permission")  # checks that need the map server
 
 
 @dataclass(frozen=True)
