@@ -1,5 +1,6 @@
 """One machine's process: driver -> pipeline -> spool -> uplink; it publishes pose and health too."""
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ from protocol.errors import StoreError
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
+
+log = logging.getLogger("agents.agent")
 
 HEALTH_S = 1.0
 MOST_UNSAVED = 100_000  # samples that wait in memory while the disk is full or fails
@@ -58,6 +61,8 @@ class Agent:
         self._pipeline = Pipeline(site, machine, config.pipeline, self._calibration_file.read())
         self._holdout = Holdout(site, machine, config.holdout) if withhold else None
         self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
+        if self._spool.damage:
+            log.error("recorded samples are gone spool=%s problem=%r", places.spool, self._spool.damage)
         self._presence = Presence(session, site.name, machine.name, owner)
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign)
@@ -105,6 +110,7 @@ class Agent:
             "pipeline": self._pipeline.health(),
             "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._given_up},
             "spool_problem": self._spool_problem,
+            "spool_damage": self._spool.damage,
             "calibration_problem": self._calibration_file.problem,
             "uplink": {
                 "problem": uplink.held or uplink.problem,

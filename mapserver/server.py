@@ -19,12 +19,12 @@ from mapserver.ingest.store import Incoming, Store, Verify
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records
 from mapserver.query.answer_pool import AnswerPool
-from mapserver.query.answering import Answers, reads_past
+from mapserver.query.answering import Answers
 from protocol.errors import ConfigError, QueryError, Refusal
 from protocol.queries.answer_codec import encode_change, encode_error
 from protocol.queries.answers import GroundChange
 from protocol.queries.parameters import split_selector
-from protocol.queries.requests import parse_query
+from protocol.queries.requests import parse_query, reads_past
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import encode_reply

@@ -2,17 +2,21 @@
 
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
 from protocol.queries.answers import (
+    CellReasons,
     GroundChange,
     HistorySpan,
     MachineState,
     MapInfo,
+    MapVersion,
     PointAnswer,
     Region,
     SampleCounts,
     ServerAlive,
     SiteInfo,
     TrustAnswer,
+    Votes,
 )
+from protocol.queries.map_tiles import MapTile, TilesAnswer
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
 from protocol.version import package_version
@@ -22,5 +26,6 @@ from sitegrid.listener import Listener
 __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
 __all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
+__all__ += ["CellReasons", "MapTile", "MapVersion", "TilesAnswer", "Votes"]
 __all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __version__ = package_version()

@@ -269,8 +269,10 @@ class Uplink:
         if refused.reason in PASSING or refused.reason in BLOCKING or head is None or not len(head.rows):
             return self._back_off()
         if refused.reason == Refusal.GAP:
-            knows_less = 1 <= refused.expected <= head.acknowledged
-            return LowerWatermark(head.spool_id, refused.expected - 1) if knows_less else self._back_off()
+            if not 1 <= refused.expected <= head.acknowledged:
+                return self._back_off()
+            self.counters["lowered_watermarks"] += 1
+            return LowerWatermark(head.spool_id, refused.expected - 1)
         if len(head.rows) > 1:  # find the sample that is to blame
             self._limit = len(head.rows) // 2
             return Wait(0.0)

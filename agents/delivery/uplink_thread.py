@@ -33,6 +33,7 @@ def perform(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
             case Delete(spool_id, watermark, store):
                 spool.acknowledge(spool_id, watermark, store)
             case LowerWatermark(spool_id, watermark):
+                log.warning("the map server has lost samples run=%016x until=%d", spool_id, watermark)
                 spool.lower_watermark(spool_id, watermark)
             case StartNewRun():
                 spool.start_new_run()

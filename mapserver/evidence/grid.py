@@ -27,18 +27,19 @@ READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
 
 
 class Grid:
-    """Evidence of one site. newest_ns: the newest stamp of all samples."""
+    """Evidence of one site. newest_ns, oldest_ns: the newest and the oldest stamp of all samples, 0 for none."""
 
     def __init__(self, cell_m: float, config: FoldConfig, waiting_rows: int = LIVE_ROWS) -> None:
         """waiting_rows: so many samples are folded together, LIVE_ROWS or REFOLD_ROWS; the grid is the same."""
         self.cell_m = cell_m
         self.config = config
-        self.newest_ns = 0
+        self.newest_ns = self.oldest_ns = 0
         self._folded = self._skipped = self._cells = 0
         self._blocks: tuple[int, int, int, int] | None = None  # bounds of all blocks: west, south, east, north
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
+        self._turn, self._turns = 0, dict[Block, int]()  # how often anything was folded; the last turn of each block
         self._workers, self._scratch, self._spaces = ALONE, [scratch_block()], [Space()]
         self._rows: AnyArray = np.empty(waiting_rows, RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
@@ -64,7 +65,7 @@ class Grid:
         """Fold samples of several machines; names (n,): hash of each one's name."""
         if not len(rows):
             return
-        self.newest_ns = max(self.newest_ns, int(rows["stamp_ns"].max()))
+        self._widen(int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max()))
         for first in range(0, len(rows), PIECE):
             self._take(np.ascontiguousarray(rows[first : first + PIECE]), names[first : first + PIECE])
 
@@ -78,13 +79,15 @@ class Grid:
             raise ValueError(f"folded otherwise: {other.cell_m} m, {other.config}; {self.cell_m} m, {self.config}")
         self._drain()
         other._drain()
+        self._turn += 1
         self._extend(other._timelines)
         for block, timeline in other._timelines.items():
             self._cells += self._timeline(block).add(timeline.settled().expanded())
             self._touched.add(block)
+            self._turns[block] = self._turn
         self._folded += other._folded
         self._skipped += other._skipped
-        self.newest_ns = max(self.newest_ns, other.newest_ns)
+        self._widen(other.oldest_ns, other.newest_ns)
 
     @contextmanager
     def bulk(self, workers: Workers = ALONE) -> Iterator[None]:
@@ -124,6 +127,11 @@ class Grid:
         self._drain()
         return [self._touched.pop() for _ in range(min(most, len(self._touched)))]
 
+    def folded_since(self, turn: int) -> tuple[list[Block], int]:
+        """Blocks that were folded into after a turn of this grid, all after turn -1; and the turn that it is now."""
+        self._drain()
+        return [block for block, last in self._turns.items() if last > turn], self._turn
+
     def evidence(self, blocks: Iterable[Block]) -> ev.Evidence:
         """Everything that was ever seen of these blocks, whether it still holds or not."""
         return evidence(self.pages(blocks))
@@ -152,7 +160,7 @@ class Grid:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()
         blocks = ((x, y, self._timelines[x, y].settled()) for x, y in sorted(self._timelines))
-        return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns)
+        return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns, self.oldest_ns)
 
     @classmethod
     def from_state(cls, cell_m: float, config: FoldConfig, state: GridState) -> Grid:
@@ -161,9 +169,16 @@ class Grid:
         grid._extend((x, y) for x, y, _ in state.blocks)
         for x, y, pages in state.blocks:
             timeline = grid._timelines[x, y] = Timeline(grid._tiers, grid._spaces[0], pages)
+            grid._turns[x, y] = 0
             grid._cells += timeline.known_cells
-        grid._folded, grid._skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
+        grid._folded, grid._skipped = state.folded, state.skipped
+        grid.newest_ns, grid.oldest_ns = state.newest_ns, state.oldest_ns
         return grid
+
+    def _widen(self, oldest_ns: int, newest_ns: int) -> None:
+        """Take in the span of stamps of other samples; 0, 0 for none."""
+        self.newest_ns = max(self.newest_ns, newest_ns)
+        self.oldest_ns = min(self.oldest_ns or oldest_ns, oldest_ns or self.oldest_ns)
 
     def _take(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Let rows wait; what waits is folded before its weight could exceed a count."""
@@ -202,7 +217,9 @@ class Grid:
                 timeline.space = self._spaces[worker]
                 cells[worker] += timeline.add(packed)
                 self._touched.add(block)
+                self._turns[block] = self._turn
 
+        self._turn += 1
         self._workers.each(fold_share)
         self._workers.each(add_share)
         self._cells += sum(cells)

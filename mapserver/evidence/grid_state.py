@@ -22,13 +22,14 @@ class PlacedPage:
 class GridState:
     """Everything that a snapshot keeps; equal grids have equal states.
 
-    blocks: column, row and pages of each block, in the order of places. newest_ns: of all samples, 0 for none.
+    blocks: column, row and pages of each block, in the order of places. newest_ns, oldest_ns: of all samples, or 0.
     """
 
     blocks: tuple[tuple[int, int, CompactPages], ...]
     folded: int
     skipped: int
     newest_ns: int
+    oldest_ns: int
 
     @property
     def pages(self) -> list[PlacedPage]:

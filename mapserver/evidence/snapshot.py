@@ -21,11 +21,11 @@ from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridState
 from mapserver.evidence.pages import EMPTY, CompactPages
 from protocol.arrays import AnyArray
-from protocol.files import whole_file
+from protocol.files import PRIVATE, whole_file
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2
-_TOTALS = ("folded", "skipped", "newest_ns")
+_TOTALS = ("folded", "skipped", "newest_ns", "oldest_ns")
 log = logging.getLogger("mapserver.evidence.snapshot")
 
 
@@ -41,7 +41,7 @@ def save(
         part.unlink(missing_ok=True)
     totals = {name: getattr(state, name) for name in _TOTALS}
     header = {**_parameters(cell_m, config, excluded), "row": row, **totals}
-    with whole_file(path) as file:
+    with whole_file(path, PRIVATE) as file:
         np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.blocks))  # type: ignore[arg-type]
     for old in rows_on_disk(folder)[KEEP:]:
         (folder / f"snapshot-{old}.npz").unlink(missing_ok=True)
@@ -57,10 +57,11 @@ def rows_on_disk(folder: Path) -> list[int]:
 def remove_beyond(folder: Path, last_row: int) -> None:
     """Remove snapshots that the journal does not reach: once it grew past them they would pass for true.
 
-    They are left where the journal was restored from a backup.
+    They are left where the journal was restored from a backup, or lost its end.
     """
     for row in rows_on_disk(folder):
         if row > last_row:
+            log.warning("snapshot removed row=%d problem='the journal ends at row %d'", row, last_row)
             (folder / f"snapshot-{row}.npz").unlink(missing_ok=True)
 
 

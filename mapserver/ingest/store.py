@@ -23,6 +23,7 @@ from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.lock import hold
+from mapserver.ingest.losses import by_machine, name_shortfalls
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
@@ -82,6 +83,7 @@ class Store:
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
             last_row = self.journal.last_row
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
+            self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
@@ -200,18 +202,20 @@ class Store:
             "samples_too_unsure": counts.skipped,
             "cells": counts.cells,
             "bounds": counts.bounds,
+            "first_ns": self.grid.oldest_ns,
             "stamp_ns": self.newest_ns,
             "wall_ns": self.now_ns(),
             "version": package_version(),
             "server": {"host": socket.gethostname(), "pid": os.getpid()},
             "machines": self.machines(),
             "distrusted": sorted(self.excluded),
+            "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
             "counters": dict(self.counters),
         }
 
     def machines(self) -> dict[str, dict[str, int]]:
-        """What each machine sent: spools, samples, samples that it declared lost, newest stamp."""
-        return {name: dict(vars(totals)) for name, totals in self.journal.machines().items()}
+        """What each machine sent and lost; see `by_machine`."""
+        return by_machine(self.journal, self.shortfalls)
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
         """What each batch holds, or why it is refused; one that is not signed is not looked at."""
@@ -280,6 +284,8 @@ class Store:
             self.counters["batches"] += len(admission.batch.rows) > 0
             self.counters["samples_trimmed"] += admission.trimmed
             self.counters["samples_lost"] += admission.lost
+            if admission.lost:
+                log.warning("declared lost machine=%s samples=%d", admission.batch.machine, admission.lost)
 
     def _fold(self, batches: list[SampleBatch]) -> None:
         """Fold what was committed: all of it that there is, up to the last journal row."""

@@ -16,14 +16,26 @@ from mapserver.journal.history import SpanEvidence
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
+from mapserver.query.map_tiles import Tiles, tiles_of
 from mapserver.query.tiles import TILE_BYTES, OpenRegions, Reading, TileGrid
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
+from mapserver.query.why import reasons
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
-from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
+from protocol.queries.answers import CellReasons, HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
 from protocol.queries.commands import AcceptCommand, TrustCommand, parse_command
-from protocol.queries.requests import MAX_SPANS, NOW, HistoryQuery, MapQuery, PointQuery, RegionQuery, When
+from protocol.queries.map_tiles import TilesAnswer, encode_tiles
+from protocol.queries.requests import (
+    MAX_SPANS,
+    HistoryQuery,
+    MapQuery,
+    PointQuery,
+    RegionQuery,
+    TilesQuery,
+    When,
+    WhyQuery,
+)
 from protocol.site.geometry import Bounds, CellWindow
 
 SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
@@ -37,11 +49,12 @@ class Answers:
         self._writer, self._follower = writer, follower
         self._site, self._config = writer.site, writer.config
         self._open = OpenRegions()
+        self._tiles = Tiles(writer)
         self._past = PastMaps(writer.folder / JOURNAL_FILE, self._site.cell_m, self._config)
 
     def size(self, query: MapQuery) -> int:
         """About how many bytes the answer has."""
-        if isinstance(query, requests.TileQuery):
+        if isinstance(query, requests.TileQuery | TilesQuery):
             return TILE_BYTES
         if not isinstance(query, RegionQuery):
             return SMALL_BYTES
@@ -65,6 +78,10 @@ class Answers:
                 return codec.encode_region(self.region(query))
             case requests.TileQuery():
                 return codec.encode_region(self.tile(query))
+            case requests.TilesQuery():
+                return encode_tiles(self.tiles(query))
+            case requests.WhyQuery():
+                return codec.encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
             case requests.AliveQuery():
@@ -78,7 +95,8 @@ class Answers:
 
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
-        return {**self._writer.info(), "layers": [*cell_layers.LAYERS, *AREA_LAYERS]}
+        names = {"layers": [*cell_layers.LAYERS, *AREA_LAYERS], "boundaries": list(self._config.read.boundaries)}
+        return {**self._writer.info(), **names}
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
@@ -114,6 +132,26 @@ class Answers:
         x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
         version = MapVersion(self._writer.store_id, merged, fact)
         return HistoryAnswer(x_m, y_m, tuple(self._span(moment, names) for moment in moments), version, now_ns)
+
+    def tiles(self, query: TilesQuery) -> TilesAnswer:
+        """Tiles of the map as it is, or of all of it as of a time."""
+        if query.as_of_ns is None:
+            return self._tiles.answer(query)
+        bounds, version = self._writer.run(lambda store: (store.grid.bounds(), store.version))
+        if bounds is None:
+            return TilesAnswer(version, query.as_of_ns, self._site.cell_m, whole=True, tiles=())
+        west, south, east, north = bounds
+        view = self._view(CellWindow(west, south, east - west, north - south), query.as_of_ns)
+        return tiles_of(view, MapVersion(version.store, view.merged, view.fact), self._site.cell_m, self._config)
+
+    def why(self, query: WhyQuery) -> CellReasons:
+        """Everything that is known of the cell that a position lies in."""
+        window = self._cell(query.x_m, query.y_m)
+        view = self._view(window, query.as_of_ns)
+        excluded = self._follower.excluded()
+        names = self._writer.run(lambda store: [name for name in store.machines() if name not in excluded])
+        version = MapVersion(self._writer.store_id, view.merged, view.fact)
+        return reasons(view, version, (window.column, window.row), names, self._site.cell_m, self._config)
 
     def trust(self, command: TrustCommand) -> dict[str, Any]:
         """What is known of the machine once the command counts, and the version of the map that it counts in."""
@@ -172,11 +210,6 @@ class Answers:
     def _span(self, moment: SpanEvidence, names: tuple[str, ...]) -> HistorySpan:
         values = cell_layers.read(moment.evidence, names, self._config.read, moment.last_ns)
         return HistorySpan(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
-
-
-def reads_past(query: MapQuery) -> bool:
-    """Whether a query folds the journal, which takes a while."""
-    return isinstance(query, HistoryQuery) or (isinstance(query, PointQuery | RegionQuery) and query.when != NOW)
 
 
 def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -179,6 +179,16 @@ def decode_info(data: bytes) -> answers.MapInfo:
     return _record(answers.MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
 
 
+def encode_why(reasons: answers.CellReasons | Mapping[str, Any]) -> bytes:
+    """Answer of `why`."""
+    return pack({"why": _table(reasons)})
+
+
+def decode_why(data: bytes) -> answers.CellReasons:
+    """Undo `encode_why`."""
+    return _record(answers.CellReasons, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "why")
+
+
 def encode_machines(machines: Iterable[answers.MachineState | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
     """Answer of `machines`."""
     return pack({"machines": [_table(machine) for machine in machines], **_version(version)})

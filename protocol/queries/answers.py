@@ -129,12 +129,16 @@ class SiteInfo:
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """What one machine sent: spools, samples accepted, samples declared lost, and its newest stamp."""
+    """What one machine sent: spools, samples accepted, samples that it declared lost, and its newest stamp.
+
+    missing: samples that were acknowledged, are gone, and that it has neither sent again nor declared lost since.
+    """
 
     spools: int
     samples: int
     lost: int
     newest_ns: int
+    missing: int
 
 
 @dataclass(frozen=True)
@@ -151,8 +155,10 @@ class MapInfo:
 
     store: its id; descends: ids of the stores that it was folded from; accepted: ids of those whose place a person let
     it take; fact: see MapVersion. journalled, merged, snapshot: journal rows. bounds: first column, first row, end
-    column and end row of the blocks with evidence; None without any. wall_ns: the server's clock. distrusted: machines
-    whose samples are excluded.
+    column and end row of the blocks with evidence; None without any. first_ns, stamp_ns: the map's oldest stamp, and
+    the site's now; 0 without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    boundaries: of the classes of resistance. shortfalls: what the journal lacked of what was acknowledged, one line for
+    each start that noticed.
     """
 
     site: SiteInfo
@@ -167,14 +173,17 @@ class MapInfo:
     samples_too_unsure: int
     cells: int
     bounds: tuple[int, int, int, int] | None
+    first_ns: int
     stamp_ns: int
     wall_ns: int
     version: str
     server: ServerProcess
     machines: Mapping[str, SampleCounts]
     distrusted: tuple[str, ...]
+    shortfalls: tuple[str, ...]
     counters: Mapping[str, int]
     layers: tuple[str, ...]
+    boundaries: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -211,6 +220,7 @@ class MachineState:
     samples: int
     lost: int
     newest_ns: int
+    missing: int
 
 
 @dataclass(frozen=True)
@@ -255,3 +265,41 @@ class ChangesAnswer(_OfVersion):
 
     changes: tuple[GroundChange, ...]
     version: MapVersion
+
+
+@dataclass(frozen=True)
+class Votes:
+    """A histogram of one cell. centres of the bins; votes: metres driven, in each; before: those before a change."""
+
+    centres: tuple[float, ...]
+    votes: tuple[float, ...]
+    before: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class CellReasons:
+    """Why a cell has its value.
+
+    store, merged, fact: the version of the map. x_m, y_m: centre of the cell. values: its layers; before: those of the
+    evidence before its last change; None is unknown. metres: of evidence that holds. newest_ns: stamp of its newest
+    sample, changed_ns: of its last change; 0 for none. sectors: metres driven by heading, from east, counter-clockwise.
+    machines: who was here; with more than a few machines on the site, another one may be named too.
+    """
+
+    store: str
+    merged: int
+    fact: int
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    cell_m: float
+    values: Mapping[str, float | None]
+    before: Mapping[str, float | None]
+    metres: float
+    newest_ns: int
+    changed_ns: int
+    resistance: Votes
+    grade_east: Votes
+    grade_north: Votes
+    sectors: tuple[float, ...]
+    machines: tuple[str, ...]

@@ -122,6 +122,11 @@ class Projection:
         x, y = self._proj(lon_deg, lat_deg)
         return float(x), float(y), height_m - self._height_m
 
+    def to_map_many(self, lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
+        """Positions in `map` [m], x and y, of places of one shape (...); infinite where that is impossible."""
+        x, y = self._proj(lon_deg.ravel(), lat_deg.ravel())
+        return np.asarray(x).reshape(lat_deg.shape), np.asarray(y).reshape(lat_deg.shape)
+
     def to_geodetic(self, x_m: float, y_m: float, z_m: float = 0.0) -> tuple[float, float, float]:
         """Latitude and longitude [deg] and height [m]."""
         lon, lat = self._proj(x_m, y_m, inverse=True)

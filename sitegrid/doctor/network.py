@@ -133,6 +133,20 @@ def check_server(site: str, info: MapInfo | None, *, is_there: bool, role: str =
     return Finding(Level.FAIL, "server", f"site {site}: the router knows of no map server", advice)
 
 
+def check_losses(info: MapInfo) -> Finding:
+    """What was recorded or acknowledged once and is not in the map server's store, by machine and number."""
+    parts = {
+        "declared lost": {name: counts.lost for name, counts in info.machines.items() if counts.lost},
+        "acknowledged and gone": {name: counts.missing for name, counts in info.machines.items() if counts.missing},
+    }
+    texts = [f"{what}: " + ", ".join(f"{n} of {name}" for name, n in by.items()) for what, by in parts.items() if by]
+    texts += info.shortfalls[-1:]
+    if not texts:
+        return Finding(Level.PASS, "losses", "no machine has lost samples, and the store none")
+    advice = "look at the disks of machines and server, and at their logs; a backup may have what the store lacks"
+    return Finding(Level.WARN, "losses", "; ".join(texts), advice)
+
+
 def check_site(site: SiteConfig, info: MapInfo) -> Finding:
     """Whether a site file means the same ground as the server."""
     if (site.name, site.frame) == (info.site.name, info.site.frame):

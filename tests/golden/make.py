@@ -5,6 +5,7 @@ Only after a deliberate change of the wire, with docs/protocol.md. The tests com
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu,
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
+from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.wire import codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -116,6 +118,7 @@ MACHINE = records.MachineState(
     samples=1200,
     lost=3,
     newest_ns=T0 + 1,
+    missing=5,
 )
 TRUST = records.TrustAnswer(**vars(MACHINE), store=STORE, merged=17, fact=3)
 CHANGE = records.GroundChange(
@@ -128,6 +131,29 @@ CHANGE = records.GroundChange(
     resistance_after=0.0078125,
     grade_before=0.0,
     grade_after=None,
+)
+TILES = TilesAnswer(
+    VERSION, T0, 0.5, whole=True, tiles=(MapTile(-1, 2, 17, 3, T0, zlib.compress(bytes(range(256)) * 96, 6)),)
+)
+VOTES = records.Votes((0.01, 0.1), (1.5, 0.0), (0.0, 2.25))
+WHY = records.CellReasons(
+    store=STORE,
+    merged=17,
+    fact=3,
+    stamp_ns=T0 + 9,
+    x_m=0.5,
+    y_m=1.5,
+    cell_m=1.0,
+    values={"resistance": 0.015625, "grade": None},
+    before={"resistance": 0.25, "grade": None},
+    metres=1.5,
+    newest_ns=T0,
+    changed_ns=T0 - 5,
+    resistance=VOTES,
+    grade_east=VOTES,
+    grade_north=VOTES,
+    sectors=(1.0, 0.5),
+    machines=("loader-1", "loader-2"),
 )
 ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 OVERLOADED = QueryError(Refusal.OVERLOADED, "the server has too many queries to answer", 2.5)
@@ -147,6 +173,8 @@ GOLDEN: dict[str, Golden] = {
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
+    "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
+    "why.bin": Golden(WHY, answers.encode_why, answers.decode_why),
     "tile.bin": Golden(tile(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
     "machines.bin": Golden(

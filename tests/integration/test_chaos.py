@@ -71,6 +71,13 @@ def test_power_cuts_find_a_file_that_is_not_synced_at_every_commit(tmp_path, lib
 
 
 @pytest.mark.processes
+def test_power_cuts_find_a_mark_that_is_written_before_its_commit(tmp_path, library):
+    operations = disk_faults.trace(library, tmp_path / "run", "store", 3, "hasty")
+    outcome = disk_faults.cut(operations, "store", 60, random.Random(1))
+    assert any("false alarm" in problem for problem in outcome.problems)
+
+
+@pytest.mark.processes
 def test_writes_that_fail_one_after_the_other_lose_nothing(tmp_path, library):
     outcome = disk_faults.writes(scenario(tmp_path / "run", scale=0.05))
     assert (outcome.lost, outcome.double, outcome.problems) == (0, 0, [])

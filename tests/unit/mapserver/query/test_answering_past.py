@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mapserver.layers.cell_layers import LAYERS
-from mapserver.query.answering import Answers, reads_past
+from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.commands import TrustCommand, encode_command
-from protocol.queries.requests import MAX_SPANS, Freshness, HistoryQuery, PointQuery, RegionQuery, When
+from protocol.queries.requests import MAX_SPANS, Freshness, HistoryQuery, PointQuery, RegionQuery, When, reads_past
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, samples, send
 from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
