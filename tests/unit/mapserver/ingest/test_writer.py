@@ -15,6 +15,7 @@ import pytest
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
 from mapserver.ingest import backlog, snapshot_times
+from mapserver.ingest import writer as writer_module
 from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, MOST_RETRY_S, size_of
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
@@ -110,6 +111,21 @@ def test_what_waits_is_committed_in_groups(start, monkeypatch, waiting, commits)
     assert len(events) == commits
 
 
+def test_batches_that_follow_closely_are_committed_together_and_keep_no_work_waiting(start, monkeypatch):
+    monkeypatch.setattr(writer_module, "COMMIT_EVERY_S", 0.3)
+    events = spied(monkeypatch, "commit")
+    writer, replies = start(clock=Clock()), Replies()
+    assert isinstance(send(writer, [incoming(samples(1))])[0], Ack)  # at once: nothing was committed before
+    for i in (1, 2, 3):
+        writer.submit(incoming(samples(1), i + 1), replies[i])
+    assert writer.run(lambda store: store.journalled) == 1
+    assert [answer.watermark for answer in replies.wait(3)] == [2, 3, 4]
+    assert len(events) == 2
+    writer.submit(incoming(samples(1), 5), replies[5])
+    writer.close()
+    assert replies.wait(4)[-1].watermark == 5
+
+
 def test_a_failed_commit_refuses_all_and_later_batches_work(start, monkeypatch):
     writer, replies = start(), Replies()
     journal = writer.run(lambda store: store.journal)
@@ -168,7 +184,7 @@ def test_the_backlog_of_one_machine_keeps_no_other_out(start, monkeypatch):
 
 
 def test_a_fleet_with_backlogs_is_served_to_the_end_through_little_room(start, monkeypatch):
-    """As after a server was away: all machines at once, for a few of which there is room, refused ones at once again."""
+    """As after a server was away: all machines at once, and room for a few; refused ones come again at once."""
     machines, batches_each = [f"m-{i}" for i in range(12)], 5
     parts = {name: [incoming(samples(40), 1 + 40 * i, name) for i in range(batches_each)] for name in machines}
     room = 4 * size_of(parts[machines[0]][0].payload)
