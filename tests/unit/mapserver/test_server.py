@@ -273,6 +273,15 @@ def test_events_and_queries_below_the_map_do_not_meet(served):
     subscriber.undeclare()
 
 
+def test_no_batch_is_taken_while_another_server_may_be_the_writer(served):
+    server, client = served
+    server._claim.held = False
+    refused = deliver(client, batch(samples(5)))
+    assert refused.reason == Refusal.NOT_WRITER
+    server._claim.held = True
+    assert deliver(client, batch(samples(5))).watermark == 5
+
+
 def test_a_command_reaches_the_follower_with_its_reason(served):
     _, client = served
     deliver(client, batch(samples(5)))

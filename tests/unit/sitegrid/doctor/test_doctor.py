@@ -134,6 +134,9 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (permission(None, is_there=False), FAIL, "start `sitegrid server`"),
         (permission(None, has_keys=True), FAIL, "under the name of its keys alone"),
         (permission(None), FAIL, "denies it, or the server hangs"),
+        (network.check_writers([INFO]), PASS, f"pid 7 on host office, store {INFO.store}"),
+        (network.check_writers([INFO, INFO]), FAIL, "2 map servers take samples of this site: pid 7 on host office"),
+        (network.check_writers([]), SKIP, "no map server"),
         (network.check_time(INFO), PASS, "no stamp is ahead"),
         (network.check_time(replace(INFO, stamp_ns=NOW_NS, wall_ns=NOW_NS + 10**18)), PASS, "no stamp is ahead"),
         (
@@ -193,6 +196,8 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (disk.check_health("loader-1", {"spool": 7, "uplink": "no"}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {"spool": [], "spool_problem": None}), PASS, "? samples wait"),
         (store(), PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
+        (store(None, checkpoints=3, checkpoint_bytes=2 * 10**8), PASS, "ago; 3 checkpoints of the past, 0.2 GB"),
+        (store(None, damaged_checkpoints=1), PASS, "; 1 damaged, the server makes them again"),
         (store(None, snapshot_row=0, snapshot_age_s=math.inf), PASS, "no snapshot"),
         (store(None, last_row=30_000), WARN, "a restart folds 26000 rows"),
         (store(shortfall="3 journal rows after row 5 are gone"), FAIL, "rows after row 5 are gone; restore a backup"),
@@ -324,6 +329,15 @@ def filled_store(folder: Path) -> None:
         store.save_snapshot()
         payload = encode_batch(SampleBatch("loader-1", 5, 5, samples(4), SITE.frame))
         store.commit([Incoming("loader-1", payload)])
+
+
+def test_checkpoints_of_a_store_are_counted(tmp_path: Path):
+    filled_store(tmp_path)
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    (folder / "2026-01-01T10.checkpoint").write_bytes(b"half of one")
+    state = disk.read_store(tmp_path, time.time())
+    assert (state.checkpoints, state.damaged_checkpoints, state.checkpoint_bytes) == (0, 1, 11)
 
 
 def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
@@ -512,7 +526,7 @@ def test_a_running_agent_is_heard(site: Site, capsys):
 def test_people_read_one_line_each(capsys):
     assert main(["doctor", "--endpoint", free_endpoint()]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"--------"]
+    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"-" * 9]
     assert lines[1].startswith("FAIL  router        nothing listens at tcp/127.0.0.1:")
 
 
