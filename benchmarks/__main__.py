@@ -8,8 +8,8 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import filter as filters
 from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, query, sim
+from benchmarks.agents import filter as filters
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 
