@@ -11,6 +11,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from protocol.errors import ConfigError
+from protocol.files import sealed
 from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, IDENTITY_FILE, KEY_FILE, SIGNING_FILE
 from sitegrid.security.certificates import KeyPair, expires_at, issue, make_authority
 from sitegrid.security.register import ROUTER, Register, RegisterEntry, common_name, save_register, write_private
@@ -43,7 +44,7 @@ def certify(folder: Path, register: Register, name: str, role: str, expires: dat
     if signing_key:
         files[SIGNING_FILE] = signing_key
     _private_folder(folder / name)
-    for file, data in {**files, IDENTITY_FILE: identity.encode()}.items():
+    for file, data in {**files, IDENTITY_FILE: sealed(identity).encode()}.items():
         write_private(folder / name / file, data)
     register = register.with_entry(name, entry)
     save_register(folder, register)
