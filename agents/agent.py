@@ -19,12 +19,13 @@ from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
-from agents.presence import Owner, Presence
+from agents.presence import Presence
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
+from protocol.wire.owners import Owner
 
 log = logging.getLogger("agents.agent")
 

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import zenoh
 
+from mapserver.claim import WriterClaim
 from mapserver.config import ServerConfig
 from mapserver.evidence import grid
 from mapserver.follower.follower import Follower
 from mapserver.ingest import batches
-from mapserver.ingest.store import Incoming, Store, Verify
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store, Verify
+from mapserver.ingest.store_folder import store_id
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records
 from mapserver.query.answer_pool import AnswerPool
@@ -49,12 +52,21 @@ class Server:
         config: ServerConfig,
         now_ns: Callable[[], int],
         verify: Verify | None = None,
+        *,
+        take_over: bool = False,
     ) -> None:
         """ingest: for batches alone, since an answer that nobody takes holds up its whole link. readers: for all else.
 
-        verify: of signed batches, see Store; without it signatures are not asked for.
+        verify: of signed batches, see Store; without it signatures are not asked for. take_over: have another server of
+        the site end, where there is one; otherwise a LinkError says so.
         """
-        self._writer = Writer(Store(folder, site, config, now_ns, verify))
+        with ExitStack() as opened:
+            self._claim = WriterClaim(ingest, site.name, store_id(folder / JOURNAL_FILE))
+            opened.callback(self._claim.close)
+            self._claim.acquire(take_over=take_over)
+            self._writer = Writer(Store(folder, site, config, now_ns, verify))
+            self._claim.store = self._writer.store_id
+            opened.pop_all()
         self._changed = readers.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
@@ -75,6 +87,11 @@ class Server:
         """Whether the writer's thread has died; the process should end."""
         return self._writer.failed
 
+    @property
+    def ended(self) -> str:
+        """Why another server is the site's writer now, empty while none is; the process should end."""
+        return self._claim.ended
+
     def close(self) -> None:
         """Stop listening, finish what has come in, commit, snapshot."""
         for queryable in self._queryables:
@@ -84,6 +101,7 @@ class Server:
         self._follower.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()
+        self._claim.close()  # the last: another server may use the store now
 
     def _on_batch(self, query: zenoh.Query) -> None:
         payload = query.payload.to_bytes() if query.payload else b""
@@ -99,6 +117,9 @@ class Server:
                 except zenoh.ZError as error:  # the asker is gone; it will ask again
                     log.info("reply failed machine=%s error=%r", machine, str(error))
 
+        if not self._claim.held:
+            reply(Refused(Refusal.NOT_WRITER, "it is not certain that no other map server writes; send this one again"))
+            return
         signature = query.attachment.to_bytes() if query.attachment else b""
         self._writer.submit(Incoming(machine, payload, signature), reply)
 

@@ -11,6 +11,7 @@ from protocol.queries.answers import (
     PointAnswer,
     Region,
     SampleCounts,
+    ServerAlive,
     SiteInfo,
     TrustAnswer,
     Votes,
@@ -26,5 +27,5 @@ __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
 __all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
 __all__ += ["CellReasons", "MapTile", "MapVersion", "TilesAnswer", "Votes"]
-__all__ += ["Bounds", "KnownGround", "SampleCounts", "SiteInfo"]
+__all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __version__ = package_version()

@@ -19,6 +19,7 @@ from protocol.queries.answers import (
     MapVersion,
     PointAnswer,
     Region,
+    ServerAlive,
     TrustAnswer,
 )
 from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command
@@ -123,6 +124,10 @@ class Client:
     def why(self, x_m: float, y_m: float, *, as_of_ns: int | None = None) -> CellReasons:
         """Everything that is known of the cell at a position in `map`: votes, passes, machines, changes."""
         return answer_codec.decode_why(self._ask(requests.WhyQuery(float(x_m), float(y_m), as_of_ns)))
+
+    def alive(self) -> ServerAlive:
+        """Whether the server takes batches: for probes, since it waits for nothing."""
+        return answer_codec.decode_alive(self._ask(requests.AliveQuery()))
 
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""

@@ -263,6 +263,9 @@ class Uplink:
         self.counters[f"refused_{refused.reason}"] += 1
         self.problem = refused.problem
         self.stuck = refused.problem if refused.reason in BLOCKING else ""
+        if refused.reason in PASSING and refused.retry_after_s > 0:
+            pause_s = min(refused.retry_after_s, self._pacing.max_backoff_s)
+            return Wait(float(pause_s * self._rng.uniform(1.0, 1.5)))  # no sooner, and not all machines at once
         if refused.reason in PASSING or refused.reason in BLOCKING or head is None or not len(head.rows):
             return self._back_off()
         if refused.reason == Refusal.GAP:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import fold, scratch_block
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
-from mapserver.evidence.pages import CompactPages, PackedPages, Page
+from mapserver.evidence.grid_state import GridCounts, GridState
+from mapserver.evidence.pages import PackedPages
 from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
 from mapserver.evidence.workers import ALONE, Workers
 from protocol.arrays import AnyArray, Table
@@ -26,40 +26,6 @@ PIECE = 4096  # samples whose weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
 
 
-@dataclass(frozen=True)
-class PlacedPage:
-    """A page, and where it belongs: the block's column and row, the tier of its timeline and the index there."""
-
-    x: int
-    y: int
-    tier: int
-    index: int
-    page: Page
-
-
-@dataclass(frozen=True)
-class GridState:
-    """Everything that a snapshot keeps; equal grids have equal states.
-
-    blocks: column, row and pages of each block, in the order of places. newest_ns, oldest_ns: of all samples, or 0.
-    """
-
-    blocks: tuple[tuple[int, int, CompactPages], ...]
-    folded: int
-    skipped: int
-    newest_ns: int
-    oldest_ns: int
-
-    @property
-    def pages(self) -> list[PlacedPage]:
-        """All pages, one by one."""
-        return [
-            PlacedPage(x, y, tier, index, page)
-            for x, y, pages in self.blocks
-            for tier, index, page in pages.expanded().items()
-        ]
-
-
 class Grid:
     """Evidence of one site. newest_ns, oldest_ns: the newest and the oldest stamp of all samples, 0 for none."""
 
@@ -68,7 +34,8 @@ class Grid:
         self.cell_m = cell_m
         self.config = config
         self.newest_ns = self.oldest_ns = 0
-        self._folded = self._skipped = 0
+        self._folded = self._skipped = self._cells = 0
+        self._blocks: tuple[int, int, int, int] | None = None  # bounds of all blocks: west, south, east, north
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
@@ -113,8 +80,9 @@ class Grid:
         self._drain()
         other._drain()
         self._turn += 1
+        self._extend(other._timelines)
         for block, timeline in other._timelines.items():
-            self._timeline(block).add(timeline.settled().expanded())
+            self._cells += self._timeline(block).add(timeline.settled().expanded())
             self._touched.add(block)
             self._turns[block] = self._turn
         self._folded += other._folded
@@ -171,16 +139,22 @@ class Grid:
     def bounds(self) -> tuple[int, int, int, int] | None:
         """First column, first row, end column, end row of all blocks with evidence."""
         self._drain()
-        if not self._timelines:
-            return None
-        xs, ys = zip(*self._timelines, strict=True)
-        n = BLOCK_CELLS
-        return min(xs) * n, min(ys) * n, (max(xs) + 1) * n, (max(ys) + 1) * n
+        return self.counts().bounds
 
     def known_cells(self) -> int:
         """How many cells have any evidence."""
         self._drain()
-        return sum(timeline.known_cells for timeline in self._timelines.values())
+        return self._cells
+
+    def counts(self) -> GridCounts:
+        """What is there, from counters: nothing is folded or looked through for it."""
+        waiting = is_foldable(self._rows[: self._waiting].view(SAMPLE_DTYPE), self.config)
+        voting, n = int(np.count_nonzero(waiting)), BLOCK_CELLS
+        bounds = None
+        if self._blocks:
+            west, south, east, north = self._blocks
+            bounds = west * n, south * n, (east + 1) * n, (north + 1) * n
+        return GridCounts(self._folded + voting, self._skipped + len(waiting) - voting, self._cells, bounds)
 
     def state(self) -> GridState:
         """Everything, in the order of places, so that equal grids have equal states."""
@@ -192,8 +166,11 @@ class Grid:
     def from_state(cls, cell_m: float, config: FoldConfig, state: GridState) -> Grid:
         """Undo `state`."""
         grid = cls(cell_m, config)
+        grid._extend((x, y) for x, y, _ in state.blocks)
         for x, y, pages in state.blocks:
-            grid._timelines[x, y], grid._turns[x, y] = Timeline(grid._tiers, grid._spaces[0], pages), 0
+            timeline = grid._timelines[x, y] = Timeline(grid._tiers, grid._spaces[0], pages)
+            grid._turns[x, y] = 0
+            grid._cells += timeline.known_cells
         grid._folded, grid._skipped = state.folded, state.skipped
         grid.newest_ns, grid.oldest_ns = state.newest_ns, state.oldest_ns
         return grid
@@ -225,6 +202,7 @@ class Grid:
         rows, names = self._rows[: self._waiting].view(SAMPLE_DTYPE), self._names[: self._waiting]
         count = self._workers.count
         pages: list[list[tuple[Block, PackedPages]]] = [[] for _ in range(count)]  # of each worker's blocks
+        cells = [0] * count
 
         def fold_share(worker: int) -> None:
             """Fold a stretch of the samples."""
@@ -237,13 +215,15 @@ class Grid:
             for block, packed in pages[worker]:
                 timeline = self._timeline(block)
                 timeline.space = self._spaces[worker]
-                timeline.add(packed)
+                cells[worker] += timeline.add(packed)
                 self._touched.add(block)
                 self._turns[block] = self._turn
 
         self._turn += 1
         self._workers.each(fold_share)
         self._workers.each(add_share)
+        self._cells += sum(cells)
+        self._extend({block for share in pages for block, _ in share})
         voting = int(is_foldable(rows, self.config).sum())
         self._folded += voting
         self._skipped += len(rows) - voting
@@ -254,6 +234,12 @@ class Grid:
         if timeline is None:
             timeline = self._timelines[block] = Timeline(self._tiers, self._spaces[0])
         return timeline
+
+    def _extend(self, blocks: Iterable[Block]) -> None:
+        """Keep the bounds of all blocks."""
+        for x, y in blocks:
+            west, south, east, north = self._blocks or (x, y, x, y)
+            self._blocks = min(west, x), min(south, y), max(east, x), max(north, y)
 
     def _settle(self, worker: int) -> None:
         """Settle a worker's own blocks."""

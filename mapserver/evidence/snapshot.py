@@ -17,7 +17,8 @@ import numpy as np
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
-from mapserver.evidence.grid import Grid, GridState
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.grid_state import GridState
 from mapserver.evidence.pages import EMPTY, CompactPages
 from protocol.arrays import AnyArray
 from protocol.files import PRIVATE, whole_file

@@ -131,14 +131,16 @@ class Timeline:
         self._known[settled.marks[:, 0]] = True
         self.known_cells = int(np.count_nonzero(self._known))
 
-    def add(self, pages: PackedPages) -> None:
-        """Add evidence of any tiers and spans, also of those that are there."""
+    def add(self, pages: PackedPages) -> int:
+        """Add evidence of any tiers and spans, also of those that are there; returns how many cells are new."""
+        known_before = self.known_cells
         self._fresh.append(pages)
         self._known[pages.cells["cell"]] = True
         self.known_cells = int(np.count_nonzero(self._known))
         self._waiting += len(pages.table)
         if self._waiting >= PATIENCE:
             self.settled()
+        return self.known_cells - known_before
 
     def settled(self) -> CompactPages:
         """All pages, in the order of tier and index, each cell's newest spans apart."""

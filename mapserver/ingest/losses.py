@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 
 from mapserver.journal.journal import Journal
-from mapserver.journal.rows import Watermark
-from mapserver.journal.shortfall import KIND, Shortfall, SpoolKey, beyond, missing
+from mapserver.journal.rows import MachineTotals
+from mapserver.journal.shortfall import KIND, Shortfall, beyond, missing
 
 log = logging.getLogger("mapserver.ingest.losses")
 
@@ -26,15 +27,9 @@ def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shor
     return [Shortfall.from_event(event) for event in journal.events(KIND)]
 
 
-def by_machine(watermarks: Mapping[SpoolKey, Watermark], shortfalls: Sequence[Shortfall]) -> dict[str, dict[str, int]]:
+def by_machine(journal: Journal, shortfalls: Sequence[Shortfall]) -> dict[str, dict[str, int]]:
     """What each machine sent: spools, samples, samples that it declared lost, newest stamp, and what is missing."""
-    gone = missing(shortfalls, watermarks)
-    names = dict.fromkeys([*(machine for machine, _ in watermarks), *gone])
-    machines = {name: {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0, "missing": gone[name]} for name in names}
-    for (machine, _), mark in watermarks.items():
-        entry = machines[machine]
-        entry["spools"] += 1
-        entry["samples"] += mark.seq - mark.lost
-        entry["lost"] += mark.lost
-        entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
-    return machines
+    gone = missing(shortfalls, journal.watermarks()) if shortfalls else Counter()
+    sent = journal.machines()
+    names = dict.fromkeys([*sent, *gone])
+    return {name: {**vars(sent.get(name, MachineTotals())), "missing": gone[name]} for name in names}

@@ -22,8 +22,8 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
-from mapserver.ingest.lock import hold
 from mapserver.ingest.losses import by_machine, name_shortfalls
+from mapserver.ingest.store_folder import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
@@ -87,9 +87,12 @@ class Store:
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
+            in_snapshot = self.grid.counts()
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
             release_memory()
-            self.merged = last_row
+            self.merged, counts = last_row, self.grid.counts()
+            tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
+            self._snapshot_samples = self.journal.samples - tail
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
             self.fact = self._last_fact()
@@ -99,6 +102,11 @@ class Store:
     def journalled(self) -> int:
         """The last row on disk."""
         return self.journal.last_row
+
+    @property
+    def samples_behind(self) -> int:
+        """How many samples the newest snapshot lacks: a start would have to fold them."""
+        return self.journal.samples - self._snapshot_samples
 
     @property
     def newest_ns(self) -> int:
@@ -140,13 +148,13 @@ class Store:
         """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
         if self.merged <= self.snapshot_row:
             return None
-        row, grid, excluded = self.merged, self.grid, self.excluded
+        row, grid, excluded, samples = self.merged, self.grid, self.excluded, self.journal.samples
         state = grid.state()
 
         def write() -> None:
             snapshot.save(self.folder, row, state, self.site.cell_m, self.config.fold, excluded)
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
-                self.snapshot_row = row
+                self.snapshot_row, self._snapshot_samples = row, samples
 
         return write
 
@@ -160,7 +168,7 @@ class Store:
             grid.fold_all(rows.samples, rows.names())
         self.grid, self.excluded = grid, excluded
         self.fact = self._last_fact()
-        self.snapshot_row = 0  # what is on disk has other machines in it
+        self.snapshot_row = self._snapshot_samples = 0  # what is on disk has other machines in it
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
@@ -179,7 +187,8 @@ class Store:
         self._opened.close()
 
     def info(self) -> dict[str, Any]:
-        """State of the store in plain values."""
+        """State of the store in plain values, from counters."""
+        counts = self.grid.counts()
         return {
             "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
             "store": self.identity.id,
@@ -189,10 +198,10 @@ class Store:
             "journalled": self.journalled,
             "merged": self.merged,
             "snapshot": self.snapshot_row,
-            "samples_merged": self.grid.folded,
-            "samples_too_unsure": self.grid.skipped,
-            "cells": self.grid.known_cells(),
-            "bounds": self.grid.bounds(),
+            "samples_merged": counts.folded,
+            "samples_too_unsure": counts.skipped,
+            "cells": counts.cells,
+            "bounds": counts.bounds,
             "first_ns": self.grid.oldest_ns,
             "stamp_ns": self.newest_ns,
             "wall_ns": self.now_ns(),
@@ -206,7 +215,7 @@ class Store:
 
     def machines(self) -> dict[str, dict[str, int]]:
         """What each machine sent and lost; see `by_machine`."""
-        return by_machine(self.journal.watermarks(), self.shortfalls)
+        return by_machine(self.journal, self.shortfalls)
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
         """What each batch holds, or why it is refused; one that is not signed is not looked at."""

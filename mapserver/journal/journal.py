@@ -16,9 +16,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mapserver.journal.progress import Progress
 from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
 from mapserver.journal.records import extent_of, record
-from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, extent_checksum
+from mapserver.journal.rows import Admission, JournalRow, MachineTotals, Watermark, checksum, extent_checksum
 from mapserver.journal.shortfall import EVENT, ROW, Shortfall, compare, marked, spool_name
 from mapserver.journal.shortfall import KIND as SHORTFALL
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
@@ -67,11 +68,20 @@ class Journal(JournalQueries):
 
     def watermark(self, machine: str, spool_id: int) -> Watermark:
         """Progress of a spool."""
-        return self._watermarks.get((machine, spool_id), Watermark())
+        return self._progress.watermark(machine, spool_id)
 
     def watermarks(self) -> dict[tuple[str, int], Watermark]:
         """Progress of all spools."""
-        return dict(self._watermarks)
+        return self._progress.watermarks()
+
+    def machines(self) -> dict[str, MachineTotals]:
+        """What each machine sent."""
+        return self._progress.machines()
+
+    @property
+    def samples(self) -> int:
+        """How many samples all machines sent."""
+        return self._progress.samples
 
     def begin(self) -> None:
         """Open a transaction; rows appended from here on are one group commit."""
@@ -102,7 +112,7 @@ class Journal(JournalQueries):
         """Write a watermark into the open transaction."""
         values = (machine, _spool_bytes(spool_id), watermark.seq, watermark.lost, watermark.newest_ns)
         self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", (*values, checksum(*values)))
-        self._watermarks[machine, spool_id] = watermark
+        self._progress.put(machine, spool_id, watermark)
         self._changed[spool_name(machine, spool_id)] = watermark.seq
 
     def commit(self) -> None:
@@ -131,7 +141,7 @@ class Journal(JournalQueries):
     def note_shortfall(self, shortfall: Shortfall) -> None:
         """Keep what is missing as an event; no file that proves it is needed from then on."""
         self.shortfall = shortfall
-        newest_ns = max((mark.newest_ns for mark in self._watermarks.values()), default=0)
+        newest_ns = max((mark.newest_ns for mark in self.watermarks().values()), default=0)
         self.append_event(SHORTFALL, newest_ns, shortfall.body())
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
@@ -192,14 +202,14 @@ class Journal(JournalQueries):
 
     def _compare(self, traces: Traces) -> None:
         """Compare what there is with the mark and the log beside it, and name what is missing."""
-        present = marked(self.last_row, self._number(_LAST_EVENT), self._watermarks)
+        present = marked(self.last_row, self._number(_LAST_EVENT), self.watermarks())
         if shortfall := compare(traces, present):
             with suppress(OSError):  # a full disk: the shortfall is named all the same
                 traces.keep_log(self.last_row)
             self._require_agreement()
             self.note_shortfall(shortfall)
         with suppress(OSError):  # it stays behind, which is no alarm, or is compared again
-            self._mark.replace(marked(self.last_row, self._number(_LAST_EVENT), self._watermarks))
+            self._mark.replace(marked(self.last_row, self._number(_LAST_EVENT), self.watermarks()))
 
     def _require_agreement(self) -> None:
         """StoreError where pages of different times are in the file, as a damaged log may leave them.
@@ -215,7 +225,7 @@ class Journal(JournalQueries):
         return self.watermark(row.machine, row.spool_id).seq
 
     def _return_to_disk(self) -> None:
-        self._watermarks = self._load_watermarks()
+        self._progress = Progress(self._load_watermarks())
         self.last_row = self._last_row()
         self._changed.clear()
 

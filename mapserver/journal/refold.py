@@ -15,7 +15,7 @@ from mapserver.journal.reader import LAST
 from mapserver.journal.rows import ALL, Selection
 
 # The kernels run beside each other, what is Python between them does not.
-THREADS = min(2, len(os.sched_getaffinity(0)))
+THREADS = min(2, os.cpu_count() or 1)
 
 
 class _StoppedError(Exception):

@@ -18,6 +18,7 @@ from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
 
+SpoolKey = tuple[str, int]  # machine, spool_id
 _EXTENT = struct.Struct("<3q4d")
 
 
@@ -149,6 +150,16 @@ class StoreIdentity:
 
     id: str
     descends: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MachineTotals:
+    """What one machine sent: spools, samples, samples that it declared lost, newest stamp."""
+
+    spools: int = 0
+    samples: int = 0
+    lost: int = 0
+    newest_ns: int = 0
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mapserver.journal.rows import Event, Watermark
+from mapserver.journal.rows import Event, SpoolKey, Watermark
 from protocol.disk.traces import Traces
 
 KIND = "shortfall"
 ROW, EVENT = "row", "event"  # names of a mark; the others are those of spools
-SpoolKey = tuple[str, int]  # machine, spool_id
 
 
 @dataclass(frozen=True)

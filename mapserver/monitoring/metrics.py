@@ -137,6 +137,7 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _gauge("sitegrid_map_ahead_seconds", "How far that is ahead of the server's clock.", _ahead_s(info)),
         _gauge("sitegrid_shortfalls", "Times that acknowledged samples were gone.", len(info["shortfalls"])),
         _gauge("sitegrid_waiting_batches", "Batches that wait to be taken.", writer["waiting"]),
+        _gauge("sitegrid_waiting_bytes", "What these batches take in memory.", writer["waiting_bytes"]),
         _counter("sitegrid_commits_total", "Commits of the journal.", writer["commits"]),
         _counter("sitegrid_commit_seconds_total", "Time spent on commits.", writer["commit_s"]),
     ]

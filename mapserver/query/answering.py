@@ -84,6 +84,8 @@ class Answers:
                 return codec.encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
+            case requests.AliveQuery():
+                return codec.encode_alive(self._writer.alive())
             case requests.MachinesQuery():
                 return codec.encode_machines(self._follower.machines(), self._version())
             case requests.ChangesQuery():

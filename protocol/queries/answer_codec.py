@@ -157,6 +157,18 @@ def _take_tables(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
 # --- records ---------------------------------------------------------------------------------------------------------
 
 
+def encode_alive(alive: answers.ServerAlive) -> bytes:
+    """Answer of `alive`."""
+    return pack(asdict(alive))
+
+
+def decode_alive(data: bytes) -> answers.ServerAlive:
+    """Undo `encode_alive`."""
+    table = unpack(data, MAX_SMALL_BYTES)
+    journalled, merged = (take(table, name, int) for name in ("journalled", "merged"))
+    return answers.ServerAlive(take_store(table), journalled, merged, take(table, "busy_s", float))
+
+
 def encode_info(info: answers.MapInfo | Mapping[str, Any]) -> bytes:
     """Answer of `info`; here and below, a record or a table of its fields."""
     return pack({"info": _table(info)})

@@ -187,6 +187,19 @@ class MapInfo:
 
 
 @dataclass(frozen=True)
+class ServerAlive:
+    """A map server that takes batches. journalled, merged: journal rows.
+
+    busy_s: how long it has been at the work that it does now, 0 for none.
+    """
+
+    store: str
+    journalled: int
+    merged: int
+    busy_s: float
+
+
+@dataclass(frozen=True)
 class MachineState:
     """What the map server knows of one machine.
 

@@ -1,6 +1,7 @@
 """Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers: `answers.py`.
 
-The server parses a query once, into a frozen type; an unknown parameter is refused by name.
+The server parses a query once, into a frozen type; an unknown parameter is refused by name. It is one module because
+both directions of a parameter have to agree.
 """
 
 from collections.abc import Callable, Mapping
@@ -100,6 +101,15 @@ class InfoQuery:
 
 
 @dataclass(frozen=True)
+class AliveQuery:
+    """Whether the server takes batches: for probes, since it waits for nothing."""
+
+    fresh = Freshness()
+
+    name = "alive"
+
+
+@dataclass(frozen=True)
 class MachinesQuery:
     """What the server knows of each machine."""
 
@@ -142,7 +152,7 @@ class WhyQuery:
 
 
 CellQuery = PointQuery | RegionQuery | TileQuery | HistoryQuery | WhyQuery
-MapQuery = CellQuery | TilesQuery | InfoQuery | MachinesQuery | ChangesQuery
+MapQuery = CellQuery | TilesQuery | InfoQuery | AliveQuery | MachinesQuery | ChangesQuery
 
 
 def check_size(columns: int, rows: int) -> None:
@@ -157,6 +167,8 @@ def check_size(columns: int, rows: int) -> None:
 def encode_query(query: MapQuery) -> dict[str, str]:
     """Selector parameters."""
     match query:
+        case AliveQuery():
+            return {}
         case ChangesQuery():
             return {"after": str(query.after)} if query.after else {}
         case TileQuery():
@@ -260,6 +272,7 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
     "tiles": (("store", "row", "fact", "as_of"), _parse_tiles),
     "why": (("x", "y", "as_of"), _parse_why),
+    "alive": ((), lambda _: AliveQuery()),
     "info": (_FRESH, lambda parameters: InfoQuery(_freshness(parameters))),
 }
 

@@ -26,7 +26,7 @@ from sitegrid.security.join import join, signer
 if TYPE_CHECKING:
     from agents.config import AgentConfig
     from agents.drivers import Driver
-    from agents.presence import Owner
+    from protocol.wire.owners import Owner
 
 HELP = "run the localisation agent of one machine"
 EXTRA = "agent"
@@ -83,7 +83,8 @@ def _open(settings: SessionConfig) -> zenoh.Session:
 
 def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) -> Owner:
     """Refuse to start while another agent of the same name runs."""
-    from agents.presence import find_namesake, this_process
+    from agents.presence import find_namesake
+    from protocol.wire.owners import this_process
 
     if other := find_namesake(session, site, machine):
         problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"

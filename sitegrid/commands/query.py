@@ -55,6 +55,7 @@ def add_options(parser: ArgumentParser) -> None:
     changes = _add_query(queries, _changes, "list of ground changes: place and time")
     changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
     _add_query(queries, _info, "state of the map and its server")
+    _add_query(queries, _alive, "whether the map server takes batches: for probes")
 
 
 def _add_query(queries: Subparsers, ask: Ask, summary: str) -> ArgumentParser:
@@ -215,6 +216,11 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
         ),
         *(f"  {name}: {count}" for name, count in sorted(info.counters.items())),
     ]
+
+
+def _alive(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:
+    alive = client.alive()
+    return alive, [f"batches are taken: journal row {alive.journalled}, merged {alive.merged}"]
 
 
 def _stamps(client: Client, **times: SiteTime | None) -> dict[str, Any]:

@@ -158,8 +158,8 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     """The state of a store, also while a server uses it; StoreError where it cannot be used."""
     # imported here: needs the `server` extra, which a machine's host does not have
     from mapserver.evidence import snapshot
-    from mapserver.ingest.lock import is_in_use
     from mapserver.ingest.store import JOURNAL_FILE
+    from mapserver.ingest.store_folder import is_in_use
     from mapserver.journal import shortfall as short
     from mapserver.journal.reader import SCHEMA, JournalReader
 

@@ -9,6 +9,7 @@ import math
 import secrets
 import socket
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,6 +111,27 @@ def ask_info(session: zenoh.Session, site: str) -> tuple[MapInfo | None, tuple[i
     data = _ask(session, keys.map_query(site, "info"), b"")
     asked_ns = (before_ns, time.time_ns())
     return (decode_info(data) if data else None), asked_ns
+
+
+def ask_writers(session: zenoh.Session, site: str) -> list[MapInfo]:
+    """The `info` of every map server of a site; without those whose answers cannot be read."""
+    every: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+    servers = []
+    for reply in session.get(keys.map_query(site, "info"), timeout=ANSWER_S, **every):
+        with suppress(MessageError):
+            servers += [decode_info(reply.ok.payload.to_bytes())] if reply.ok is not None else []
+    return servers
+
+
+def check_writers(servers: list[MapInfo]) -> Finding:
+    """Whether one map server alone takes the samples of the site."""
+    names = [f"pid {info.server.pid} on host {info.server.host}, store {info.store}" for info in servers]
+    if len(servers) == 1:
+        return Finding(Level.PASS, "writer", names[0])
+    if not servers:
+        return skipped("writer", "no map server has answered a second time")
+    problem = f"{len(servers)} map servers take samples of this site: {'; '.join(names)}"
+    return Finding(Level.FAIL, "writer", problem, "stop all but one: each lacks what the others have")
 
 
 def offset_of(info: MapInfo, asked_ns: tuple[int, int]) -> tuple[float, float]:

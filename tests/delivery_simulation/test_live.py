@@ -20,7 +20,7 @@ from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import Uplink, UplinkConfig, Wait
 from agents.delivery.uplink_thread import UplinkThread
 from agents.localisation.filters.belief import PoseBelief
-from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
+from agents.presence import PATIENCE, Presence, find_namesake
 from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol.errors import LinkError
@@ -28,6 +28,7 @@ from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_pose
+from protocol.wire.owners import ANSWER_S
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.commands.agent import _claim_name, _open
 from sitegrid.process.children import wait_until

@@ -1,5 +1,6 @@
 """Samples, batches and stores for the tests of the map server."""
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,7 +14,8 @@ import zenoh
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
-from mapserver.evidence.grid import LIVE_ROWS, Grid, GridState, PlacedPage
+from mapserver.evidence.grid import LIVE_ROWS, Grid
+from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import CompactPages, Page
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
@@ -167,8 +169,10 @@ def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = S
     return Store(folder, site, config, now_ns)
 
 
-def open_writer(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Writer:
-    return Writer(open_store(folder, config, site))
+def open_writer(
+    folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE, clock: Callable[[], float] = time.monotonic
+) -> Writer:
+    return Writer(open_store(folder, config, site), clock)
 
 
 class Replies:

@@ -216,6 +216,21 @@ def test_batch_is_never_less_than_one_sample() -> None:
     assert len(d.batch().rows) == 1
 
 
+@pytest.mark.parametrize(("asked_s", "least_s"), [(0.3, 0.3), (4.0, 4.0), (3000.0, 5.0)])
+def test_a_machine_comes_again_when_the_server_has_room_and_not_all_at_once(asked_s: float, least_s: float) -> None:
+    """As often as it is asked to, and never much later than by itself."""
+    d = met(5, max_backoff_s=5.0)
+    pauses = []
+    for _ in range(50):
+        d.payload()
+        pauses.append(d.reply(Refused(Refusal.OVERLOADED, "", retry_after_s=asked_s)))
+    assert least_s <= min(pauses) < 1.1 * least_s
+    assert 1.4 * least_s < max(pauses) <= 1.5 * least_s
+    d.payload()
+    assert d.reply(None) <= 0.2  # which has nothing to do with failures
+    assert d.counter("depth") == 5
+
+
 @pytest.mark.parametrize("reply", [None, Refused(Refusal.OVERLOADED, "")])
 def test_pause_doubles_up_to_its_bound_and_starts_anew_after_success(reply: Refused | None) -> None:
     d = met(5, backoff_s=0.2, max_backoff_s=1.5)

@@ -46,7 +46,7 @@ INFO: dict[str, Any] = {
     "distrusted": ["loader-2"],
     "shortfalls": ["5 acknowledged samples of loader-1 are gone"],
     "counters": {"batches": 12, "samples_trimmed": 7, "refused_gap": 2, "refused_query_unknown_layer": 1},
-    "writer": {"waiting": 3, "commits": 20, "commit_s": 0.5},
+    "writer": {"waiting": 3, "waiting_bytes": 4096, "commits": 20, "commit_s": 0.5},
 }
 HEALTH = {
     "spool": {"depth": 40, "unsaved": 1, "recorded": 90, "dropped": 2, "put_aside": 1, "gone": 6},
@@ -96,6 +96,7 @@ def test_the_state_of_the_server_is_exposed(tmp_path: Path):
         "map_newest_timestamp_seconds": NOW_NS / 1e9,
         "map_ahead_seconds": 3,
         "waiting_batches": 3,
+        "waiting_bytes": 4096,
         "commits_total": 20,
         "commit_seconds_total": 0.5,
         "store_bytes": 0,

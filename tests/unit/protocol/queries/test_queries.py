@@ -13,6 +13,7 @@ from protocol.queries import answers
 from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
 from protocol.queries.requests import (
+    AliveQuery,
     ChangesQuery,
     Freshness,
     HistoryQuery,
@@ -60,6 +61,7 @@ def histories(draw):
     | st.builds(MachinesQuery, freshness)
     | st.builds(ChangesQuery, st.integers(0, 10**15))
     | st.builds(InfoQuery, freshness)
+    | st.builds(AliveQuery)
 )
 def test_query_round_trip(query):
     assert parse_query(query.name, split_selector(selector_of(encode_query(query)))) == query

@@ -134,6 +134,9 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (permission(None, is_there=False), FAIL, "start `sitegrid server`"),
         (permission(None, has_keys=True), FAIL, "under the name of its keys alone"),
         (permission(None), FAIL, "denies it, or the server hangs"),
+        (network.check_writers([INFO]), PASS, f"pid 7 on host office, store {INFO.store}"),
+        (network.check_writers([INFO, INFO]), FAIL, "2 map servers take samples of this site: pid 7 on host office"),
+        (network.check_writers([]), SKIP, "no map server"),
         (network.check_time(INFO), PASS, "no stamp is ahead"),
         (network.check_time(replace(INFO, stamp_ns=NOW_NS, wall_ns=NOW_NS + 10**18)), PASS, "no stamp is ahead"),
         (
@@ -512,7 +515,7 @@ def test_a_running_agent_is_heard(site: Site, capsys):
 def test_people_read_one_line_each(capsys):
     assert main(["doctor", "--endpoint", free_endpoint()]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"--------"]
+    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"-" * 9]
     assert lines[1].startswith("FAIL  router        nothing listens at tcp/127.0.0.1:")
 
 

@@ -1,4 +1,4 @@
-"""The lock of a store's folder: one server on this host has it open."""
+"""A store's folder before the store is opened: its lock, as one server on this host has it open, and the id."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mapserver.journal.reader import JournalReader
 from protocol.errors import StoreError
 from protocol.files import make_private
 
@@ -37,3 +38,11 @@ def hold(folder: Path) -> Iterator[None]:
             problem = "another server is using this store; stop it, or choose another --store"
             raise StoreError(folder, problem) from None
         yield
+
+
+def store_id(journal: Path) -> str:
+    """Id of the store of a journal; empty where there is none yet. StoreError where it cannot be read."""
+    if not journal.exists():
+        return ""
+    with JournalReader(journal) as reader:
+        return reader.identity().id
