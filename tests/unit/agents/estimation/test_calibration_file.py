@@ -53,6 +53,7 @@ def test_senseless_numbers_are_refused(tmp_path: Path, wrong: dict[str, Any]) ->
         load(path, "loader-1")
 
 
+@pytest.mark.slow
 def test_no_flipped_bit_is_used(tmp_path: Path) -> None:
     """Each bit of the file: the calibration is the one that was saved, or an error that names the file."""
     path = tmp_path / "c.json"

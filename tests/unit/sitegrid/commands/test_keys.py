@@ -251,6 +251,7 @@ def change(path: Path, old: str, new: str) -> None:
     path.write_text(sealed(text.replace(old, new)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["register.toml", "server/identity.toml"])
 def test_no_flipped_bit_lets_anybody_in(folder: Path, place: str):
     """Each bit of what `sitegrid keys` writes as text: it is refused, with the file's name."""
