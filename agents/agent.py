@@ -14,7 +14,7 @@ from agents.config import AgentConfig
 from agents.delivery.audit import AuditLog
 from agents.delivery.spool import Spool
 from agents.delivery.uplink import Uplink
-from agents.delivery.uplink_thread import Sign, UplinkThread, linger
+from agents.delivery.uplink_thread import Check, Sign, UplinkThread, linger
 from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
@@ -56,6 +56,7 @@ class Agent:
         withhold: bool = False,
         owner: Owner | None = None,
         sign: Sign | None = None,
+        check: Check | None = None,
     ) -> None:
         self._config = config
         self._calibration_file = CalibrationFile(places.calibration, machine.name)
@@ -68,7 +69,7 @@ class Agent:
             log.error("recorded samples are gone spool=%s problem=%r", places.spool, self._spool.damage)
         self._presence = Presence(session, site.name, machine.name, owner)
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
-        self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign)
+        self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
         self._unsaved, self._given_up, self._spool_problem = empty(), 0, ""
         self._readings = 0
         self._samples = 0

@@ -28,6 +28,7 @@ BLOCKING = {
     Refusal.WALL_CLOCK,
     Refusal.SERVER_CLOCK,
     Refusal.OTHER_STORE,
+    Refusal.UNSIGNED,
     Refusal.NOT_MSGPACK,
     Refusal.MISSING_FIELD,
     Refusal.WRONG_TYPE,
@@ -163,9 +164,7 @@ class Uplink:
         self.machine = machine
         self.timeout_s = timeout_s
         self.counters: Counter[str] = Counter()
-        self.problem = ""
-        self.stuck = ""
-        self.held = ""
+        self.problem = self.stuck = self.held = ""
         self.ack_s_max = 0.0
         self._frame = frame
         self._pacing = pacing or Pacing()

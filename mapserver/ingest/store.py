@@ -29,8 +29,9 @@ from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
 from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
+from mapserver.past import checkpoints
 from mapserver.trust.decisions import KIND as TRUST
-from mapserver.trust.decisions import TrustDecision, TrustDecisions
+from mapserver.trust.decisions import TrustDecision, TrustDecisions, last_counted
 from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
@@ -85,6 +86,7 @@ class Store:
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
             self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
+            checkpoints.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
             in_snapshot = self.grid.counts()
@@ -95,7 +97,7 @@ class Store:
             self._snapshot_samples = self.journal.samples - tail
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
-            self.fact = self._last_fact()
+            self.fact = last_counted(self.journal.events(TRUST), self.excluded)
             self._opened = opened.pop_all()
 
     @property
@@ -167,13 +169,13 @@ class Store:
         for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
             grid.fold_all(rows.samples, rows.names())
         self.grid, self.excluded = grid, excluded
-        self.fact = self._last_fact()
+        self.fact = last_counted(self.journal.events(TRUST), self.excluded)
         self.snapshot_row = self._snapshot_samples = 0  # what is on disk has other machines in it
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
         self.journal.append_event(TRUST, decision.stamp_ns, asdict(decision))
-        self.fact = self._last_fact()
+        self.fact = last_counted(self.journal.events(TRUST), self.excluded)
 
     def accept(self, store: str, reason: str) -> None:
         """Take the place of another store for good, since a person says so: its runs are taken on here."""
@@ -266,15 +268,6 @@ class Store:
         """The server's clock when the last row came in, 0 where none is in the journal."""
         is_there = last_row > self.journal.archived_row
         return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
-
-    def _last_fact(self) -> int:
-        """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""
-        decisions, fact = TrustDecisions(()), 0
-        for event in self.journal.events(TRUST):
-            decisions.add(TrustDecision(**event.body))
-            if decisions.distrusted == self.excluded:
-                fact = event.id
-        return fact
 
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count what became of a batch, once it is certain."""

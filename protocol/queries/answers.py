@@ -1,7 +1,7 @@
 """Answers to map queries as values (docs/protocol.md, "Map queries"); their bytes: `answer_codec.py`.
 
 Stamps are UTC in nanoseconds. `version` is the version of the map that an answer is true for, `merged` its journal row;
-`stamp_ns` is the site's now, or the time that the map is as of.
+`stamp_ns` is the site's now, or the time that the map is as of. It is one module because they are read side by side.
 """
 
 from collections.abc import Mapping
@@ -142,6 +142,20 @@ class SampleCounts:
 
 
 @dataclass(frozen=True)
+class CheckpointCounts:
+    """Checkpoints of the evidence, from which maps of the past are made.
+
+    count: of those that can be used. bytes: of all. newest_ns: when the newest one that can be used is closed, 0 for
+    none. passed_over: how many were damaged since the start.
+    """
+
+    count: int
+    bytes: int
+    newest_ns: int
+    passed_over: int
+
+
+@dataclass(frozen=True)
 class ServerProcess:
     """Where a map server runs."""
 
@@ -178,6 +192,7 @@ class MapInfo:
     wall_ns: int
     version: str
     server: ServerProcess
+    checkpoints: CheckpointCounts
     machines: Mapping[str, SampleCounts]
     distrusted: tuple[str, ...]
     shortfalls: tuple[str, ...]

@@ -21,7 +21,7 @@ from sitegrid.options.groups import add_network
 from sitegrid.options.outputs import OutputFile
 from sitegrid.options.values import not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
-from sitegrid.security.join import join, signer
+from sitegrid.security.join import join, reply_check, signer
 
 if TYPE_CHECKING:
     from agents.config import AgentConfig
@@ -64,8 +64,9 @@ def run(arguments: Namespace) -> int:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
         places = Places(arguments.spool, arguments.audit, _calibration(arguments))
-        sign, withhold = signer(arguments.keys), arguments.withhold
-        agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign)
+        key, check, withhold = signer(arguments.keys), reply_check(arguments.keys), arguments.withhold
+        sign = key.sign if key else None
+        agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign, check=check)
         opened.callback(agent.close)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
         report = agent.run(_driver(arguments, log, session, site.name, machine.name), stop.is_set, wait=stop.wait)

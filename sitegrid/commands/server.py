@@ -20,7 +20,7 @@ from sitegrid.options.groups import add_network
 from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import address
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
-from sitegrid.security.join import join
+from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
 
 if TYPE_CHECKING:
@@ -64,7 +64,11 @@ def run(arguments: Namespace) -> int:
         for session in (ingest, readers):
             opened.callback(session.close)
         check, take_over = _verifier(arguments.signed), arguments.take_over
-        server = Server(ingest, readers, arguments.store, site, config, time.time_ns, check, take_over=take_over)
+        key = signer(arguments.keys)
+        sign = key.sign_reply if key else None
+        server = Server(
+            ingest, readers, arguments.store, site, config, time.time_ns, check, sign=sign, take_over=take_over
+        )
         opened.callback(server.close)
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:

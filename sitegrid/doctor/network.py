@@ -229,7 +229,7 @@ def ask_permission(
     key = keys.ingest(site, machine)
     batch = encode_batch(SampleBatch(machine, secrets.randbits(64) or 1, 1, empty(), frame))
     try:
-        data = _ask(session, key, batch, sign(key, batch) if (sign := signer(folder)) else None)
+        data = _ask(session, key, batch, signing.sign(key, batch) if (signing := signer(folder)) else None)
         return decode_reply(data) if data else None
     except MessageError as error:
         return Refused(error.reason, f"its answer cannot be read: {error}")

@@ -32,6 +32,7 @@ from sitegrid import connect
 from sitegrid.cli import main
 from sitegrid.process.children import Child, Children, wait_until
 from sitegrid.security.access import SPARE_BYTES
+from sitegrid.security.join import reply_check
 from sitegrid.security.signing import Signer
 
 certificates = pytest.importorskip("sitegrid.security.certificates", reason="cryptography is not installed")
@@ -168,6 +169,9 @@ def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_
             assert decode_reply(reply).reason == "wrong_machine", site.still_works()
         (reply,) = answers(session, key, batch, attachment=mine)
         assert isinstance(decode_reply(reply), Ack)
+        (signed,) = session.get(key, payload=batch, attachment=mine, timeout=READY_S)
+        signature = signed.ok.attachment.to_bytes()
+        assert reply_check(site.keys / "loader-1")(key, batch, signed.ok.payload.to_bytes(), signature)
     agent, _ = site.drive(tmp_path / "spool.db", 10)
     report = agent.expect("ended", READY_S)["ended"]
     assert report["delivered"], f"agent pid {agent.pid}, server pid {site.server.pid}"

@@ -35,6 +35,7 @@ from tests.unit.mapserver.data import (
     held,
     incoming,
     open_writer,
+    past_of,
     random_samples,
     same,
     samples,
@@ -515,14 +516,16 @@ QUERIES = [
 
 @pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
 def test_a_refused_query_says_why(start, reason, name, parameters):
+    writer = start()
     with pytest.raises(QueryError) as caught:
-        answered(Answers(start(), FakeFollower()), name, parameters)
+        answered(Answers(writer, FakeFollower(), past_of(writer)), name, parameters)
     assert caught.value.reason == reason
 
 
 def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
     elsewhere |= {Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}  # in the tests of admission, and of the claim
+    elsewhere |= {Refusal.UNSIGNED}  # which a sender says, and no server
     elsewhere |= {Refusal.UNKNOWN_MACHINE, Refusal.EXPIRED}  # commands and tiles, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 
