@@ -91,7 +91,7 @@ def _asked(past: Past, reader: JournalReader, now_ns: int, runs: int) -> Iterato
 
 
 def history(runs: int) -> list[Took]:
-    """What it takes to have the history of a point that all of HISTORY_ROWS journal rows are about, in each of so many runs."""
+    """What the history of a point takes that all of HISTORY_ROWS journal rows are about, in each of so many runs."""
     draw = np.random.default_rng(1)
     with tempfile.TemporaryDirectory() as folder:
         journal = Journal(Path(folder) / JOURNAL_FILE, SITE.name, SITE.frame)
