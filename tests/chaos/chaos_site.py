@@ -26,7 +26,7 @@ from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings
 
 READY_S = 40.0
 RESUME_S = 60.0
-ROUTER, SERVER = "router", "server"
+ROUTER, SERVER, SECOND = "router", "server", "second"  # the last: a map server with a store of its own
 COMMAND = ("-m", "sitegrid.cli")
 HOUR_S = 3600
 # Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
@@ -57,7 +57,7 @@ class ChaosSite:
             (folder / name).mkdir(parents=True)
         self.folder, self.console = folder, console
         self.machines = recordings.machines
-        self.endpoints = dict.fromkeys((ROUTER, SERVER, *self.machines), free_endpoint())
+        self.endpoints = dict.fromkeys((ROUTER, SERVER, SECOND, *self.machines), free_endpoint())
         self.prefix: dict[str, tuple[str, ...]] = {}
         self.env: dict[str, dict[str, str]] = {}
         self.options: dict[str, tuple[str, ...]] = {}
@@ -128,7 +128,12 @@ class ChaosSite:
 
     def expect_end(self, role: str) -> tuple[int | None, str]:
         """Start what cannot run; returns its exit code, None if it does run, and its last words."""
-        process = self.start(role)
+        self.start(role)
+        return self.wait_end(role)
+
+    def wait_end(self, role: str) -> tuple[int | None, str]:
+        """Wait for a process to end by itself; returns its exit code, None if it runs on, and its last words."""
+        process = self._running[role]
         self._wait(lambda: process.code is not None, READY_S, f"{role} runs on")
         return self._running.pop(role).code, process.last_words()
 
@@ -251,9 +256,10 @@ class ChaosSite:
         where, site = ("--endpoint", self.endpoints[role]), ("--site-file", str(self.folder / "site.toml"))
         if role == ROUTER:
             return ["router", "--listen", self.endpoints[role], *self.options.get(role, ())]
-        if role == SERVER:
-            store = ("--store", str(self.folder / "store"), "--config", str(self.folder / "server.toml"))
-            return ["server", *where, *site, *store]
+        if role in (SERVER, SECOND):
+            folder = self.folder / ("store" if role == SERVER else SECOND)
+            store = ("--store", str(folder), "--config", str(self.folder / "server.toml"))
+            return ["server", *where, *site, *store, *self.options.get(role, ())]
         first_ns = self._first_ns + self._starts * SECONDS * 10**9
         manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, first_ns, idle=idle)
         replay = ("--driver", "replay", "--log", manifest, "--data", self._recordings.data(role), "--speed", SPEED)
