@@ -21,6 +21,7 @@ from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store, Verify
 from mapserver.ingest.store_folder import store_id
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records
+from mapserver.past.past import Past
 from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.answering import Answers
 from protocol.errors import ConfigError, QueryError, Refusal
@@ -74,8 +75,9 @@ class Server:
         self._changed = readers.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
-        self._follower = Follower(self._writer, self._publish)
-        self.answers = Answers(self._writer, self._follower)
+        past = Past.of_store(folder, site.cell_m, config.fold)
+        self._follower = Follower(self._writer, self._publish, past)
+        self.answers = Answers(self._writer, self._follower, past)
         self._now = AnswerPool("query", config.query_threads, ANSWER_BYTES)
         # Others: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
         self._past = AnswerPool("past", 1, MOST_PAST)

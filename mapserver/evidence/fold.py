@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
-from mapserver.evidence.fold_kernels import fold_sorted
+from mapserver.evidence.fold_kernels import BUCKET_BITS, fold_sorted
 from mapserver.evidence.pages import CELL, PackedPages, frozen
 from mapserver.evidence.sample_kernels import locate, split, weigh
 from protocol.arrays import AnyArray, Bools, Ints, Table
@@ -31,12 +31,18 @@ def scratch_block() -> Scratch:
 
 
 def fold(
-    rows: Table, names: NDArray[np.uint64], cell_m: float, config: FoldConfig, scratch: Scratch
+    rows: Table,
+    names: NDArray[np.uint64],
+    cell_m: float,
+    config: FoldConfig,
+    scratch: Scratch,
+    spans: Ints | None = None,
 ) -> Iterator[tuple[int, int, PackedPages]]:
     """Fold samples; yields block column, block row and pages of buckets (tier 0), a block maybe more than once.
 
     names (n,): hashes of the rows' machines. The weight of all samples together stays within COUNT_MAX. Samples that
-    do not know their place well enough have no vote.
+    do not know their place well enough have no vote. spans (n,): numbers below 2**BUCKET_BITS of the pages that the
+    rows count in, in place of their buckets.
     """
     limits = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2)
     n = len(rows)
@@ -44,8 +50,12 @@ def fold(
     keys, touching, area = locate(rows, limits, config.bucket_ns, places, stencils)
     if area > MOST_SHARES and n > 1:  # tiny cells under unsure positions
         for part in (slice(n // 2), slice(n // 2, None)):
-            yield from fold(rows[part], names[part], cell_m, config, scratch)
+            yield from fold(
+                rows[part], names[part], cell_m, config, scratch, spans[part] if spans is not None else None
+            )
         return
+    if spans is not None:
+        keys = keys >> BUCKET_BITS << BUCKET_BITS | spans[touching]
     starts, shares = np.empty(n, np.int64), np.empty(area, np.uint32)
     weigh(rows, places, stencils, starts, shares)
     bins, bin_shares = np.empty((n, 4), np.int64), np.empty((n, 3), np.uint32)

@@ -40,7 +40,7 @@ def save(
     for part in folder.glob(".snapshot-*.part"):  # of a process that was killed: one alone writes to a store
         part.unlink(missing_ok=True)
     totals = {name: getattr(state, name) for name in _TOTALS}
-    header = {**_parameters(cell_m, config, excluded), "row": row, **totals}
+    header = {**parameters(cell_m, config, excluded), "row": row, **totals}
     with whole_file(path, PRIVATE) as file:
         np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.blocks))  # type: ignore[arg-type]
     for old in rows_on_disk(folder)[KEEP:]:
@@ -70,7 +70,7 @@ def load(path: Path, cell_m: float, config: FoldConfig, excluded: Collection[str
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
-            expected = _parameters(cell_m, config, excluded)
+            expected = parameters(cell_m, config, excluded)
             if {key: header.get(key) for key in expected} != expected:
                 return None
             state = GridState(_blocks(file), *(header[name] for name in _TOTALS))
@@ -92,8 +92,11 @@ def load_newest(
     return 0, Grid(cell_m, config)
 
 
-def _parameters(cell_m: float, config: FoldConfig, excluded: Collection[str]) -> dict[str, object]:
-    """What the evidence depends on."""
+def parameters(cell_m: float, config: FoldConfig, excluded: Collection[str]) -> dict[str, object]:
+    """What the evidence depends on beside the samples: its form, the fold, and the facts about machines.
+
+    A snapshot or a checkpoint made with others is not used. excluded: machines whose rows are not folded.
+    """
     fold = {**asdict(config), "std_floor_m": STD_FLOOR_M}
     bins = [ev.RESISTANCE_BINS, ev.GRADE_BINS, ev.SECTORS]
     return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": bins, "excluded": sorted(excluded), **fold}

@@ -173,7 +173,7 @@ class Exclusion:
         replaced.clear()  # here: to let go of a grid takes time that the writer's thread does not have
         release_memory()
         values = (",".join(sorted(excluded)), rounds, time.monotonic() - began_s)
-        log.info("map folded again without=%s rounds=%d seconds=%.1f", *values)
+        log.warning("map folded again without=%s rounds=%d seconds=%.1f", *values)
         return True
 
     def _superseded(self, excluded: frozenset[str]) -> bool:

@@ -1,4 +1,4 @@
-"""The follower: a thread beside the writer that runs three jobs in turn, and one that folds the map again."""
+"""The follower: a thread beside the writer that runs four jobs in turn, and one that folds the map again."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import logging
 import threading
 from typing import Any
 
+from mapserver.follower.checkpointing import Checkpointing
 from mapserver.follower.exclusion import Exclusion
 from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Publish
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.reader import JournalReader
+from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
 from protocol.queries.answers import GroundChange
@@ -25,14 +27,15 @@ class Follower:
     publish: is given each change when it is new or grows.
     """
 
-    def __init__(self, writer: Writer, publish: Publish) -> None:
+    def __init__(self, writer: Writer, publish: Publish, past: Past) -> None:
         self._writer = writer
         self._reader = reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ending = threading.Event()
         self._exclusion = Exclusion(writer)
         self._audit = Audit(writer, reader, self._exclusion.judge, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
-        self._jobs = (self._audit, self._changes, Archiving(writer, reader, self._ending))
+        self._checkpointing = Checkpointing(writer, reader, past, self._ending)
+        self._jobs = (self._audit, self._changes, Archiving(writer, reader, self._ending), self._checkpointing)
         self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
         self._thread.start()
 
@@ -68,6 +71,7 @@ class Follower:
         self._ending.set()
         self._exclusion.close()
         self._thread.join()
+        self._checkpointing.close()
         self._reader.close()
 
     def _machine(self, name: str, sent: dict[str, int]) -> dict[str, Any]:

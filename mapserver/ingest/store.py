@@ -29,6 +29,7 @@ from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
 from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
+from mapserver.past import checkpoints
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions, last_counted
 from protocol.errors import MessageError, Refusal
@@ -40,6 +41,7 @@ from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
+
 JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
@@ -80,9 +82,11 @@ class Store:
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
-            self.excluded, last_row = TrustDecisions(self.journal.events(TRUST)).distrusted, self.journal.last_row
+            last_row = self.journal.last_row
+            self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
             self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
+            checkpoints.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
             in_snapshot = self.grid.counts()

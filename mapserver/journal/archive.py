@@ -68,6 +68,11 @@ class Archive:
             problem = f"the file with row {reached + 1} is missing; restore it from a backup"
             raise StoreError(self.folder, problem)
 
+    def next_stamp(self, from_ns: int) -> int | None:
+        """The least stamp from `from_ns` on of all files; None for none."""
+        stamps = (self.open(path).next_stamp(from_ns) for path in self.paths())
+        return min((stamp for stamp in stamps if stamp is not None), default=None)
+
 
 def archive(
     folder: Path,

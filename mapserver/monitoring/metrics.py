@@ -121,7 +121,7 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
     counters, writer = info["counters"], info["writer"]
     queries = _without(counters, _REFUSED_QUERY)
     batches = {k: v for k, v in _without(counters, _REFUSED).items() if not k.startswith("query_")}
-    trimmed = counters.get("samples_trimmed", 0)
+    trimmed, past = counters.get("samples_trimmed", 0), info["checkpoints"]
     return [
         _counter("sitegrid_batches_total", "Batches with new samples that were taken.", counters.get("batches", 0)),
         _counter("sitegrid_batches_refused_total", "Batches that were refused.", batches, "reason"),
@@ -130,6 +130,10 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _gauge("sitegrid_journal_rows", "The last row of the journal on disk.", info["journalled"]),
         _gauge("sitegrid_merged_rows", "The last row of the journal that is in the map.", info["merged"]),
         _gauge("sitegrid_snapshot_rows", "The row that the newest snapshot is true for.", info["snapshot"]),
+        _gauge("sitegrid_checkpoints", "Checkpoints that maps of the past can begin with.", past["count"]),
+        _gauge("sitegrid_checkpoint_bytes", "Size of all checkpoints.", past["bytes"]),
+        _gauge("sitegrid_checkpoint_newest_timestamp_seconds", "Until when the newest goes.", past["newest_ns"] / 1e9),
+        _counter("sitegrid_checkpoints_passed_over_total", "Damaged ones; they are made again.", past["passed_over"]),
         _gauge("sitegrid_map_samples", "Samples that are in the map.", info["samples_merged"]),
         _gauge("sitegrid_map_samples_too_unsure", "Samples whose place is too unsure.", info["samples_too_unsure"]),
         _gauge("sitegrid_map_cells", "Cells that are known.", info["cells"]),

@@ -12,10 +12,11 @@ from mapserver.change.detection import reach_blocks
 from mapserver.follower.follower import Follower
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
-from mapserver.journal.history import SpanEvidence
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
+from mapserver.past.cell_history import CellHistory
+from mapserver.past.past import Past
 from mapserver.query.map_tiles import Tiles, tiles_of
 from mapserver.query.tiles import TILE_BYTES, OpenRegions, Reading, TileGrid
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
@@ -23,10 +24,9 @@ from mapserver.query.why import reasons
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
-from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
+from protocol.queries.answers import CellReasons, HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
 from protocol.queries.commands import AcceptCommand, TrustCommand, parse_command
 from protocol.queries.map_tiles import TilesAnswer, encode_tiles
-from protocol.queries.reasons import CellReasons, encode_why
 from protocol.queries.requests import (
     MAX_SPANS,
     HistoryQuery,
@@ -46,12 +46,12 @@ WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 class Answers:
     """Answers the queries of one map, from any thread."""
 
-    def __init__(self, writer: Writer, follower: Follower) -> None:
+    def __init__(self, writer: Writer, follower: Follower, past: Past) -> None:
         self._writer, self._follower = writer, follower
         self._site, self._config = writer.site, writer.config
         self._open = OpenRegions()
         self._tiles = Tiles(writer)
-        self._past = PastMaps(writer.folder / JOURNAL_FILE, self._site.cell_m, self._config)
+        self._past = PastMaps(writer.folder / JOURNAL_FILE, past, self._config)
 
     def size(self, query: MapQuery) -> int:
         """About how many bytes the answer has."""
@@ -82,7 +82,7 @@ class Answers:
             case requests.TilesQuery():
                 return encode_tiles(self.tiles(query))
             case requests.WhyQuery():
-                return encode_why(self.why(query))
+                return codec.encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
             case requests.AliveQuery():
@@ -97,7 +97,7 @@ class Answers:
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
         names = {"layers": [*cell_layers.LAYERS, *AREA_LAYERS], "boundaries": list(self._config.read.boundaries)}
-        return {**self._writer.info(), **names}
+        return {**self._writer.info(), "checkpoints": self._past.past.checkpoints.state, **names}
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
@@ -129,10 +129,10 @@ class Answers:
         from_ns, to_ns = _time_of(query, now_ns, span_s)
         cell = self._cell(query.x_m, query.y_m)
         selection = Selection(from_ns, to_ns, without=self._follower.excluded())
-        moments, merged = self._past.moments((cell.column, cell.row), selection, span_s)
+        past, merged = self._past.history((cell.column, cell.row), selection, round(span_s * 1e9))
         x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
         version = MapVersion(self._writer.store_id, merged, fact)
-        return HistoryAnswer(x_m, y_m, tuple(self._span(moment, names) for moment in moments), version, now_ns)
+        return HistoryAnswer(x_m, y_m, self._spans(past, names), version, now_ns)
 
     def tiles(self, query: TilesQuery) -> TilesAnswer:
         """Tiles of the map as it is, or of all of it as of a time."""
@@ -208,9 +208,13 @@ class Answers:
         fact = self._writer.run(lambda store: store.fact)
         return replace(self._past.view(window, as_of_ns, self._follower.excluded()), fact=fact)
 
-    def _span(self, moment: SpanEvidence, names: tuple[str, ...]) -> HistorySpan:
-        values = cell_layers.read(moment.evidence, names, self._config.read, moment.last_ns)
-        return HistorySpan(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
+    def _spans(self, past: CellHistory, names: tuple[str, ...]) -> tuple[HistorySpan, ...]:
+        values = cell_layers.read(past.evidence, names, self._config.read, past.last_ns[:, None])
+        columns = (past.first_ns.tolist(), past.last_ns.tolist(), *(values[name][:, 0].tolist() for name in names))
+        return tuple(
+            HistorySpan(first_ns, last_ns, dict(zip(names, of_span, strict=True)))
+            for first_ns, last_ns, *of_span in zip(*columns, strict=True)
+        )
 
 
 def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -142,6 +142,20 @@ class SampleCounts:
 
 
 @dataclass(frozen=True)
+class CheckpointCounts:
+    """Checkpoints of the evidence, from which maps of the past are made.
+
+    count: of those that can be used. bytes: of all. newest_ns: when the newest one that can be used is closed, 0 for
+    none. passed_over: how many were damaged since the start.
+    """
+
+    count: int
+    bytes: int
+    newest_ns: int
+    passed_over: int
+
+
+@dataclass(frozen=True)
 class ServerProcess:
     """Where a map server runs."""
 
@@ -178,6 +192,7 @@ class MapInfo:
     wall_ns: int
     version: str
     server: ServerProcess
+    checkpoints: CheckpointCounts
     machines: Mapping[str, SampleCounts]
     distrusted: tuple[str, ...]
     shortfalls: tuple[str, ...]
@@ -265,3 +280,41 @@ class ChangesAnswer(_OfVersion):
 
     changes: tuple[GroundChange, ...]
     version: MapVersion
+
+
+@dataclass(frozen=True)
+class Votes:
+    """A histogram of one cell. centres of the bins; votes: metres driven, in each; before: those before a change."""
+
+    centres: tuple[float, ...]
+    votes: tuple[float, ...]
+    before: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class CellReasons:
+    """Why a cell has its value.
+
+    store, merged, fact: the version of the map. x_m, y_m: centre of the cell. values: its layers; before: those of the
+    evidence before its last change; None is unknown. metres: of evidence that holds. newest_ns: stamp of its newest
+    sample, changed_ns: of its last change; 0 for none. sectors: metres driven by heading, from east, counter-clockwise.
+    machines: who was here; with more than a few machines on the site, another one may be named too.
+    """
+
+    store: str
+    merged: int
+    fact: int
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    cell_m: float
+    values: Mapping[str, float | None]
+    before: Mapping[str, float | None]
+    metres: float
+    newest_ns: int
+    changed_ns: int
+    resistance: Votes
+    grade_east: Votes
+    grade_north: Votes
+    sectors: tuple[float, ...]
+    machines: tuple[str, ...]

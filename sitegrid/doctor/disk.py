@@ -140,6 +140,7 @@ class StoreState:
 
     shortfall: what its files lack now of what was acknowledged, one line, empty where nothing is missing. missing: what
     earlier starts found so, by machine.
+    checkpoints, damaged_checkpoints: how many; checkpoint_bytes: of all.
     """
 
     site: str
@@ -152,6 +153,9 @@ class StoreState:
     snapshot_age_s: float
     shortfall: str = ""
     missing: Mapping[str, int] = field(default_factory=dict)
+    checkpoints: int = 0
+    checkpoint_bytes: int = 0
+    damaged_checkpoints: int = 0
 
 
 def read_store(folder: Path, now_s: float) -> StoreState:
@@ -162,6 +166,7 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     from mapserver.ingest.store_folder import is_in_use
     from mapserver.journal import shortfall as short
     from mapserver.journal.reader import SCHEMA, JournalReader
+    from mapserver.past.checkpoints import Checkpoints
 
     if not (folder / JOURNAL_FILE).is_file():
         raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")
@@ -182,7 +187,10 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     if newest > last_row:
         lacks = lacks or short.beyond(last_row, newest)
     text = str(lacks) if lacks else ""
-    return StoreState(site, frame, SCHEMA, last_row, archived, len(machines), newest, age_s, text, missing)
+    past = Checkpoints(folder).entries({}, last_row)
+    sizes, damaged = sum(entry.bytes for entry in past), sum(entry.header is None for entry in past)
+    rows = (SCHEMA, last_row, archived, len(machines), newest, age_s)
+    return StoreState(site, frame, *rows, text, missing, len(past) - damaged, sizes, damaged)
 
 
 def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
@@ -190,7 +198,10 @@ def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
     rows = f"{state.last_row} rows of {state.machines} machines, {state.archived_row} archived"
     tail = state.last_row - state.snapshot_row
     snapshot = f"snapshot of row {state.snapshot_row}, {_ago(state.snapshot_age_s)}" if state.snapshot_row else ""
-    message = f"site {state.site}, schema {state.schema}: {rows}; {snapshot or 'no snapshot'}"
+    checkpoints = f"{state.checkpoints} checkpoints of the past, {state.checkpoint_bytes / 1e9:.1f} GB"
+    if state.damaged_checkpoints:
+        checkpoints += f"; {state.damaged_checkpoints} damaged, the server makes them again"
+    message = f"site {state.site}, schema {state.schema}: {rows}; {snapshot or 'no snapshot'}; {checkpoints}"
     if site and (site.name, site.frame) != (state.site, state.frame):
         problem = f"it is of site {state.site} with frame {state.frame}, the site file {site.name} with {site.frame}"
         return Finding(Level.FAIL, "store", problem, "choose another --store, or the site file that belongs to it")

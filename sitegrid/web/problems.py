@@ -31,7 +31,7 @@ class Problem(SitegridError):  # noqa: N818 - the word of RFC 9457
 
 def bad(reason: Refusal, detail: str) -> Problem:
     """A request that says something wrong."""
-    return Problem(HTTPStatus.BAD_REQUEST, reason, detail)
+    return Problem(STATUS.get(reason, HTTPStatus.BAD_REQUEST), reason, detail)
 
 
 def problem_of(error: Exception) -> Problem:

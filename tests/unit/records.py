@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from protocol.queries.answers import MachineState, MapInfo, MapVersion, SampleCounts, ServerProcess, SiteInfo
+from protocol.queries.answers import (
+    CheckpointCounts,
+    MachineState,
+    MapInfo,
+    MapVersion,
+    SampleCounts,
+    ServerProcess,
+    SiteInfo,
+)
 from protocol.site.site_config import SiteConfig
 
 STORE = "0123456789abcdef"
@@ -20,6 +28,7 @@ def map_info(site: SiteConfig, **values: Any) -> MapInfo:
     defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
     defaults |= {"site": SiteInfo(**vars(site), frame=site.frame, crs=site.crs), "version": "1.0", "bounds": None}
     defaults |= {"store": STORE, "descends": (), "accepted": (), "server": ServerProcess("office", 7)}
+    defaults |= {"checkpoints": CheckpointCounts(0, 0, 0, 0)}
     defaults |= {"machines": {}, "distrusted": (), "shortfalls": (), "counters": {}, "layers": (), "boundaries": ()}
     return MapInfo(**(defaults | values))
 

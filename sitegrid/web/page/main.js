@@ -213,7 +213,11 @@ function closePanel() {
 }
 
 const cellAt = (left, top) => view.toSite(left, top).map((v) => Math.floor(v / page.map.cell_m));
-function explain(left, top) { page.cell = cellAt(left, top); openPanel("why", page.cell); }
+function explain(left, top) {
+  page.cell = cellAt(left, top);
+  if (innerWidth <= 720) { view.shift(view.width / 2 - left, view.height * 0.28 - top); page.redraw(); } // above the panel
+  openPanel("why", page.cell);
+}
 
 function rest(left, top) {
   clearTimeout(restTimer);
@@ -341,6 +345,7 @@ const on = {
     page.changes = site.changes;
     page.boundaries = site.boundaries;
     for (const [name, trusted] of Object.entries(site.trusted)) if (page.machines.has(name)) page.machines.get(name).trusted = trusted;
+    if (page.map.store) page.map.stamp_ns = Math.max(page.map.stamp_ns, site.stamp_ns); // time goes on where nobody drives
     page.time.span(site.first_ns, site.stamp_ns);
     page.redraw();
   },

@@ -22,19 +22,21 @@ export const facts = (rows) =>
 
 // A chart: a canvas of the given height that `draw(context, width)` fills; its figures also stand in `label`.
 export function chart(height, label, draw) {
-  const canvas = element("canvas", { role: "img", ariaLabel: label });
+  const canvas = element("canvas");
   canvas.setAttribute("role", "img");
   canvas.setAttribute("aria-label", label);
-  requestAnimationFrame(() => {
-    const ratio = Math.min(2, devicePixelRatio || 1), width = canvas.clientWidth || 300;
+  canvas.style.height = `${height}px`;
+  const watch = new ResizeObserver(() => { // also when it is first on the page: only then it has a width
+    const ratio = Math.min(2, devicePixelRatio || 1), width = canvas.clientWidth;
+    if (!width) return;
     canvas.width = width * ratio;
     canvas.height = height * ratio;
-    canvas.style.height = `${height}px`;
     const context = canvas.getContext("2d");
     context.scale(ratio, ratio);
     context.font = `11px ${getComputedStyle(document.body).fontFamily}`;
     draw(context, width);
   });
+  watch.observe(canvas);
   return canvas;
 }
 
@@ -60,8 +62,8 @@ export function voteChart(why, boundaries, palette, ink) {
     context.textAlign = "center";
     KINDS.forEach((kind, i) => {
       const at = Math.min(width - 18, Math.max(18, x(kind.value)));
-      context.fillText(`${(100 * kind.value).toFixed(kind.value < 0.01 ? 1 : 0)} %`, at, floor + 12);
-      if (i !== 2 || width > 340) context.fillText(kind.name.split(" ").at(-1), at, floor + 24);
+      context.fillText(`${(100 * kind.value).toFixed(kind.value < 0.01 ? 1 : 0)}${i === 2 ? "" : " %"}`, at, floor + 12);
+      if (i !== 2) context.fillText(kind.name.split(" ").at(i === 3 ? 0 : -1), at, floor + 24);
     });
   });
 }
@@ -115,5 +117,5 @@ export function timeChart(spans, changed_ns, ink) {
   });
 }
 
-export const clock = (ns) => new Date(ns / 1e6).toISOString().slice(11, 16);
+export const clock = (ns, seconds = false) => new Date(ns / 1e6).toISOString().slice(11, seconds ? 19 : 16);
 export const day = (ns) => new Date(ns / 1e6).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric", timeZone: "UTC" });

@@ -90,7 +90,7 @@ export class TimeBar {
 
   show() {
     const [time, date] = byId("clock").children, ns = this.at ?? this.last_ns;
-    time.textContent = ns ? clock(ns) : "--:--";
+    time.textContent = ns ? clock(ns, true) : "--:--";
     date.textContent = ns ? `${day(ns)}${this.at === null ? ", now" : ""}` : "";
     this.slider.value = this.stepOf(this.at);
     this.slider.setAttribute("aria-valuetext", ns ? `${day(ns)} ${clock(ns)} UTC` : "no time known");
@@ -122,7 +122,8 @@ export class TimeBar {
     context.fillStyle = ink.soft;
     context.textAlign = "center";
     const ticks = Math.max(2, Math.floor(width / 130));
-    for (let i = 1; i < ticks; i++) context.fillText(clock(this.first_ns + i * (this.last_ns - this.first_ns) / ticks), i * width / ticks, height - 1);
+    const short = this.last_ns - this.first_ns < 3600e9;
+    for (let i = 1; i < ticks; i++) context.fillText(clock(this.first_ns + i * (this.last_ns - this.first_ns) / ticks, short), i * width / ticks, height - 1);
     context.fillStyle = ink.alarm;
     for (const change of this.page.changes) {
       const at = x(change.first_ns);

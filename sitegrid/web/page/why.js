@@ -17,7 +17,10 @@ export async function build(page, [column, row]) {
 
 function head(page, why, where) {
   const { resistance: value, resistance_std: std } = why.values;
-  if (value === null) return element("section", { className: "part" }, element("p", { className: "say" }, "Machines drove here, but none could measure the resistance."), element("p", { className: "note" }, where));
+  if (value === null) {
+    const text = why.values.visits === null ? "Machines only touched this cell: there is too little evidence for a value." : "Machines drove here, but none could measure the resistance.";
+    return element("section", { className: "part" }, element("p", { className: "say" }, text), element("p", { className: "note" }, where));
+  }
   const kind = KINDS[Math.min(KINDS.length - 1, kindOf(value, page.boundaries))], colour = page.palette === "kinds" ? kind.rgb : ordered(place(value));
   const swatch = element("i");
   swatch.style.background = css(colour);
@@ -44,14 +47,14 @@ function votes(page, why) {
 function counts(page, why) {
   const { visits, grade, grade_std: std, grade_east: east, grade_north: north } = why.values;
   const slope = grade === null ? "unknown" : grade < 0.01 ? "level" : `${percent(grade)} up to ${compass(Math.atan2(north, east))}`;
-  const rows = facts([["Passes", `${Math.round(visits)}`], ["Newest", ago(Math.max(0, (why.stamp_ns - why.newest_ns) / 1e9))], ["Slope", slope], std === null || grade === null ? null : ["", `± ${percent(std)}`], ["Evidence", `${why.metres.toFixed(1)} m driven`]]);
+  const rows = facts([["Passes", visits === null ? "not one" : `${Math.round(visits)}`], ["Newest", ago(Math.max(0, (why.stamp_ns - why.newest_ns) / 1e9))], ["Slope", slope], std === null || grade === null ? null : ["", `± ${percent(std)}`], ["Evidence", `${why.metres.toFixed(why.metres < 1 ? 2 : 1)} m driven`]]);
   return element("section", { className: "part two" }, rows, roseChart(why.sectors, page.ink));
 }
 
 const compass = (angle) => ["E", "NE", "N", "NW", "W", "SW", "S", "SE"][Math.round(((angle + 2 * Math.PI) % (2 * Math.PI)) / (Math.PI / 4)) % 8];
 
 function machines(why) {
-  return part("Machines", `${why.machines.length || Math.round(why.values.machines)}`, element("p", { className: "say" }, why.machines.length ? why.machines.join(", ") : "Not known by name."));
+  return part("Machines", `${why.machines.length || Math.round(why.values.machines ?? 0)}`, element("p", { className: "say" }, why.machines.length ? why.machines.join(", ") : "Not known by name."));
 }
 
 async function overTime(page, at, why) {

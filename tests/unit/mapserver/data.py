@@ -19,6 +19,7 @@ from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import CompactPages, Page
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
+from mapserver.past.past import Past
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from protocol.site.geometry import CellWindow
@@ -173,6 +174,10 @@ def open_writer(
     folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE, clock: Callable[[], float] = time.monotonic
 ) -> Writer:
     return Writer(open_store(folder, config, site), clock)
+
+
+def past_of(writer: Writer) -> Past:
+    return Past.of_store(writer.folder, writer.site.cell_m, writer.config.fold)
 
 
 class Replies:

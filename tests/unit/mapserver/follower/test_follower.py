@@ -30,6 +30,7 @@ from tests.unit.mapserver.data import (
     incoming,
     open_store,
     open_writer,
+    past_of,
     random_samples,
     same,
     samples,
@@ -48,7 +49,7 @@ class Site:
         self.published: list[GroundChange] = []
         self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0), trust=TrustConfig(judge_s, exclude))
         self.writer = open_writer(folder, self.config)
-        self.follower = Follower(self.writer, self.published.append)
+        self.follower = Follower(self.writer, self.published.append, past_of(self.writer))
 
     @property
     def grid(self) -> Grid:

@@ -35,6 +35,7 @@ from tests.unit.mapserver.data import (
     held,
     incoming,
     open_writer,
+    past_of,
     random_samples,
     same,
     samples,
@@ -515,8 +516,9 @@ QUERIES = [
 
 @pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
 def test_a_refused_query_says_why(start, reason, name, parameters):
+    writer = start()
     with pytest.raises(QueryError) as caught:
-        answered(Answers(start(), FakeFollower()), name, parameters)
+        answered(Answers(writer, FakeFollower(), past_of(writer)), name, parameters)
     assert caught.value.reason == reason
 
 

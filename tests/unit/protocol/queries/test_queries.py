@@ -330,6 +330,7 @@ INFO = answers.MapInfo(
     wall_ns=10,
     version="1.0",
     server=answers.ServerProcess("office", 7),
+    checkpoints=answers.CheckpointCounts(12, 900_000_000, 1_767_225_600_000_000_000, 1),
     machines={"a": answers.SampleCounts(1, 42, 0, 9, 0)},
     distrusted=("b",),
     shortfalls=("3 journal rows after row 5 are gone",),

@@ -196,6 +196,8 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (disk.check_health("loader-1", {"spool": 7, "uplink": "no"}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {"spool": [], "spool_problem": None}), PASS, "? samples wait"),
         (store(), PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
+        (store(None, checkpoints=3, checkpoint_bytes=2 * 10**8), PASS, "ago; 3 checkpoints of the past, 0.2 GB"),
+        (store(None, damaged_checkpoints=1), PASS, "; 1 damaged, the server makes them again"),
         (store(None, snapshot_row=0, snapshot_age_s=math.inf), PASS, "no snapshot"),
         (store(None, last_row=30_000), WARN, "a restart folds 26000 rows"),
         (store(shortfall="3 journal rows after row 5 are gone"), FAIL, "rows after row 5 are gone; restore a backup"),
@@ -327,6 +329,15 @@ def filled_store(folder: Path) -> None:
         store.save_snapshot()
         payload = encode_batch(SampleBatch("loader-1", 5, 5, samples(4), SITE.frame))
         store.commit([Incoming("loader-1", payload)])
+
+
+def test_checkpoints_of_a_store_are_counted(tmp_path: Path):
+    filled_store(tmp_path)
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    (folder / "2026-01-01T10.checkpoint").write_bytes(b"half of one")
+    state = disk.read_store(tmp_path, time.time())
+    assert (state.checkpoints, state.damaged_checkpoints, state.checkpoint_bytes) == (0, 1, 11)
 
 
 def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
