@@ -5,7 +5,8 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Watermark
 from protocol.errors import StoreError
 from protocol.machine.log_folder import open_log
 from protocol.site.site_config import site_toml
@@ -69,7 +71,7 @@ class ChaosSite:
         self._ack_ms: list[int] = []
         self._recordings, self._first_ns = recordings, first_ns
         self._running: dict[str, Process] = {}
-        self._starts = 0
+        self._starts, self._starts_of = 0, Counter[str]()
         site = replace(open_log(recordings.data(self.machines[0])).site, clock=clock)
         (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
         (folder / "server.toml").write_text(SERVER_TOML, encoding="utf-8")
@@ -98,6 +100,7 @@ class ChaosSite:
     def start(self, role: str, *, idle: bool = False) -> Process:
         """Start a router, a server, or a machine's agent; idle: one that only delivers what is left."""
         self._starts += 1
+        self._starts_of[role] += 1
         words = self._words(role, idle)
         env = {"PYTHONUNBUFFERED": "1", **self.env.get(role, {})}
         log = self.folder / "log" / f"{self._starts:04d}-{role}"
@@ -139,6 +142,16 @@ class ChaosSite:
 
     def wait_ready(self, role: str) -> None:
         self._wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
+
+    def wait_runs(self) -> None:
+        """Wait until there are samples of every start of every agent in the journal."""
+
+        def are_there() -> bool:
+            self.tend()
+            runs = Counter(machine for machine, _ in self._marks())
+            return all(runs[machine] >= self._starts_of[machine] for machine in self.machines)
+
+        self._wait(are_there, READY_S, "some runs have no samples")
 
     def tend(self) -> None:
         """Start again what has ended by itself; only the end of a drive, or one with an excuse, is no problem."""
@@ -197,14 +210,18 @@ class ChaosSite:
 
     def progress(self) -> dict[str, int]:
         """How many samples of each machine are in the journal."""
-        counts: dict[str, int] = {}
+        counts: Counter[str] = Counter()
+        for (machine, _), mark in self._marks().items():
+            counts[machine] += mark.seq
+        return counts
+
+    def _marks(self) -> Mapping[tuple[str, int], Watermark]:
+        """Progress of every run in the journal; nothing while it is being made, or recovered."""
         try:
             with JournalReader(self.folder / "store" / JOURNAL_FILE) as reader:
-                for (machine, _), mark in reader.watermarks().items():
-                    counts[machine] = counts.get(machine, 0) + mark.seq
-        except StoreError:  # being made, or recovered
+                return reader.watermarks()
+        except StoreError:
             return {}
-        return counts
 
     def _note_report(self, process: Process) -> None:
         """Take what an agent reported when it ended."""

@@ -30,7 +30,7 @@ def second_server(scenario: FaultRun) -> FaultOutcome:
     with scenario.site() as site, Proxy(int(site.endpoints[ROUTER].rpartition(":")[2])) as of_server:
         site.endpoints[SERVER] = of_server.endpoint
         site.start_all()
-        site.linger(2.0)  # every run that is being recorded is acknowledged by the first store
+        _bind(site)
         with site.fault():
             _is_refused(site)
             of_server.set(Weather(cut=True))
@@ -41,7 +41,7 @@ def second_server(scenario: FaultRun) -> FaultOutcome:
             _has_ended(site, SERVER, OTHER_WRITES)
             site.stop(SECOND)
             _start_again(site)
-        site.linger(2.0)
+        _bind(site)
         with site.fault():
             site.options[SECOND] = ("--take-over",)
             site.start(SECOND)
@@ -56,6 +56,12 @@ def second_server(scenario: FaultRun) -> FaultOutcome:
             if taken := reader.last_row:
                 site.problem(f"the second store took {taken} batches of runs that are bound to the first")
         return site.finish(scenario.fault, 3)
+
+
+def _bind(site: ChaosSite) -> None:
+    """Wait until the first store has acknowledged samples of every run that is being recorded."""
+    site.wait_runs()
+    site.console.wait(1.0)  # for the acknowledgements; a drive that ends now is not followed by another one
 
 
 def _is_refused(site: ChaosSite) -> None:
