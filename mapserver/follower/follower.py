@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from typing import Any
 
 from mapserver.follower.checkpointing import Checkpointing
@@ -17,7 +18,10 @@ from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
 from protocol.queries.answers import GroundChange
 
-TURN_S = 1.0  # between two turns: how late a change of the ground is published
+# Between two turns, which is how late a change of the ground is published: where a large fleet drives everywhere at
+# once, each turn looks at all of the map again, and no more than a share of one core should go into that.
+TURN_S, LATEST_S = 1.0, 5.0
+SHARE = 0.2
 log = logging.getLogger("mapserver.follower.follower")
 
 
@@ -98,6 +102,7 @@ class Follower:
 
     def _run(self) -> None:
         while not self._ending.is_set():
+            began_s = time.thread_time()
             for job in self._jobs:
                 if self._ending.is_set():
                     break
@@ -107,4 +112,9 @@ class Follower:
                     log.error("follower failed job=%s error=%r", job.name, str(error))
                 except Exception:  # a bug here must not end the server, nor pass unseen
                     log.exception("follower failed job=%s", job.name)
-            self._ending.wait(TURN_S)
+            self._ending.wait(pause_s(time.thread_time() - began_s))
+
+
+def pause_s(worked_s: float) -> float:
+    """How long to wait after a turn that took so much processor time."""
+    return min(max(TURN_S, worked_s * (1 / SHARE - 1)), LATEST_S)

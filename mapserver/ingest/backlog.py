@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 QUEUE_BYTES = 64 * 2**20  # that wait at most: half a minute of the fullest queue's work is not worth more memory
 BATCH_BYTES = 1024  # of a batch beside its payload: the query that waits for its answer
-GROUP_BATCHES = 64  # committed together at most: one sync to disk for all of them
+GROUP_BATCHES = 256  # committed together at most: one sync to disk for all of them
 GROUP_BYTES = 4 * 2**20  # likewise, but never less than one batch; the others wait 0.1 s for so many samples
 FIRST_BYTES_PER_S = 4 * 2**20  # assumed until some were worked off
 PACE_WEIGHT = 0.1  # of the last group in the mean

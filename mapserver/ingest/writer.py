@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import Counter, deque
@@ -24,6 +25,7 @@ Reply = Callable[[Ack | Refused], None]
 _Batch = tuple[Incoming, Reply]
 log = logging.getLogger("mapserver.ingest.writer")
 
+COMMIT_EVERY_S = 0.01  # at most: a commit costs a sync, some pages and 0.5 ms, however few batches are in it
 HANGS_S = 30.0  # at one piece of work: a group or a look takes less than a second, a disk that hangs for ever
 
 
@@ -56,6 +58,7 @@ class Writer:
         self._is_closing = False
         self._ended = ""  # why nothing is taken any more
         self._busy_since_s: float | None = None
+        self._committed_s = -math.inf  # when the last commit began
         self.waits = MergeWaits(store.merged)
         self.failed = False
         self._times = SnapshotTimes(self.config.store.snapshot_s, clock())
@@ -164,13 +167,20 @@ class Writer:
             if not (self._backlog or self._works or self._is_closing):
                 wait_s = self._times.due_s(self._store.samples_behind) - self._clock()
                 self._turn.wait(min(max(0.0, wait_s), threading.TIMEOUT_MAX))
-            self._group = self._backlog.take()
+            is_early = self._backlog and self._gather()
+            self._group = [] if is_early else self._backlog.take()
             if self._is_closing and not (self._group or self._works):
                 self._ended = "the server is ending"
             return not self._ended
 
+    def _gather(self) -> bool:
+        """Let more batches come for the next commit, where the last one is not long ago; True if work comes first."""
+        wait_s = self._committed_s + COMMIT_EVERY_S - self._clock()
+        came = wait_s > 0 and self._turn.wait_for(lambda: self._works or self._is_closing, wait_s)
+        return bool(came) and not self._is_closing
+
     def _commit(self) -> None:
-        began_s = self._clock()
+        began_s = self._committed_s = self._clock()
         answers = self._store.commit([incoming for incoming, _ in self._group])
         self._pace.worked(sum(size_of(incoming.payload) for incoming, _ in self._group), self._clock() - began_s)
         self.waits.advance(self._store.merged)

@@ -182,7 +182,4 @@ def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float) -> int:
 
 def checksum(*values: object) -> int:
     """CRC-32 of plain values, bytes among them."""
-    crc32 = 0
-    for value in values:
-        crc32 = zlib.crc32(value if isinstance(value, bytes) else repr(value).encode(), crc32)
-    return crc32
+    return zlib.crc32(repr(values).encode())

@@ -87,7 +87,7 @@ class SiteConfig:
             "+k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
         )
 
-    @property
+    @cached_property
     def frame(self) -> str:
         """Eight hex digits that tell site frames apart; batches carry them, so that frames never mix in one map."""
         return hashlib.sha256(f"{self.crs} {float(self.origin_height_m)!r}".encode()).hexdigest()[:8]

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from benchmarks.measure import memory_mb
 from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE
@@ -73,6 +74,7 @@ class ChaosSite:
         self._running: dict[str, Process] = {}
         self._starts, self._starts_of = 0, Counter[str]()
         site = replace(open_log(recordings.data(self.machines[0])).site, clock=clock)
+        self.name = site.name
         (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
         (folder / "server.toml").write_text(SERVER_TOML, encoding="utf-8")
 
@@ -113,10 +115,40 @@ class ChaosSite:
     def send(self, role: str, number: signal.Signals) -> None:
         self._running[role].send(number)
 
+    def peak_mb(self, role: str) -> float:
+        """The most memory that a process had since its start, or since that was forgotten."""
+        return memory_mb("VmHWM", self._running[role].pid)
+
+    def forget_peak_mb(self, role: str) -> float:
+        """Have the peak counted from now on; returns what the process has now."""
+        Path(f"/proc/{self._running[role].pid}/clear_refs").write_text("5", encoding="ascii")
+        return memory_mb("VmRSS", self._running[role].pid)
+
     def kill(self, role: str) -> None:
         with self.fault():
             self._running[role].end(signal.SIGKILL)
             self.start(role)
+
+    def put_down(self, role: str) -> None:
+        """End a process with SIGKILL, and leave it so."""
+        self._running.pop(role).end(signal.SIGKILL)
+
+    def words_of_refusal(self, role: str) -> str | None:
+        """Wait until a process that was started works, None, or has refused to: its last words."""
+        process = self._running[role]
+        self._wait(lambda: process.said("ready") or process.code is not None, READY_S, f"{role} is not ready")
+        return process.last_words() if process.code is not None and not process.said("ready") else None
+
+    def deliver_rest(self, machine: str) -> None:
+        """Have a machine that is not running deliver what its spool has, and nothing new."""
+        process = self.start(machine, idle=True)
+        self._wait(lambda: process.code is not None, RESUME_S, "left-over samples are not delivered")
+        self._running.pop(machine).end()
+
+    def log_of(self, role: str) -> str:
+        """What all processes of a role have logged."""
+        paths = sorted((self.folder / "log").glob(f"*-{role}.err"))
+        return "".join(path.read_text(encoding="utf-8", errors="replace") for path in paths)
 
     def stop(self, role: str) -> None:
         """End a process with SIGTERM; it is to obey within a few seconds."""

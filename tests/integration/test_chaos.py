@@ -19,7 +19,15 @@ from agents.delivery.spool import Spool, SpoolConfig
 from protocol.machine.samples import empty
 from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
-from tests.chaos import bit_flips, disk_faults, site_faults, stepped_clock, store_faults
+from tests.chaos import (
+    bit_flips,
+    damage_faults,
+    disk_faults,
+    reader_faults,
+    site_faults,
+    stepped_clock,
+    store_faults,
+)
 from tests.chaos.__main__ import ChaosFault, run_suite, totals
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
@@ -80,6 +88,38 @@ def test_the_year_2099_shifts_no_clock_and_blocks_no_spool(tmp_path):
 def test_the_archive_goes_on_after_a_wrong_clock(tmp_path):
     outcome = harmless(tmp_path, store_faults.archive_clock)
     assert (outcome.declared, outcome.notes["archived"] > 0) == (0, True)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("fault", [damage_faults.wal_flip, damage_faults.restored_store])
+def test_what_damage_takes_is_declared_and_named(tmp_path, fault):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=40)
+    outcome = fault(scenario(tmp_path / "run", recordings=recordings, seconds=3.0))
+    assert (outcome.lost, outcome.double, outcome.silent, outcome.problems) == (0, 0, 0, [])
+    assert outcome.declared > 0
+    assert outcome.recorded == outcome.merged + outcome.declared
+
+
+@pytest.mark.processes
+def test_agents_name_a_damaged_calibration_and_go_on(tmp_path):
+    recordings = make(tmp_path / "recordings", machines=1, seed=3, seconds=40)
+    outcome = damage_faults.calibration_flip(scenario(tmp_path / "run", recordings=recordings, seconds=1.0))
+    assert (outcome.lost, outcome.silent, outcome.problems) == (0, 0, [])
+    assert outcome.count > 1000
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_readers_that_sleep_cost_machines_nothing(tmp_path):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=60)
+    outcome = reader_faults.sleeping_reader(scenario(tmp_path / "run", recordings=recordings, seconds=1.0))
+    assert outcome.problems == [], "among others: a slow acknowledgement, a server that took more memory"
+    assert outcome.is_good
+    assert outcome.count == sum(readers for _, readers in reader_faults.SLEEPING)
+    assert outcome.recorded == outcome.merged > 30
+    assert 0 < outcome.ack_ms_max <= reader_faults.LONGEST_ACK_MS
+    assert 0.9 < outcome.memory_ratio <= reader_faults.MOST_MEMORY
+    assert outcome.answer_s_max > 0
 
 
 @pytest.mark.processes

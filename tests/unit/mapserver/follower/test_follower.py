@@ -120,6 +120,11 @@ def fold_of(sent: dict[str, list[Any]], config: ServerConfig, without: str = "")
     return grid
 
 
+@pytest.mark.parametrize(("worked_s", "pause_s"), [(0.0, 1.0), (0.2, 1.0), (0.5, 2.0), (1.0, 4.0), (60.0, 5.0)])
+def test_turns_of_a_large_fleet_leave_most_of_the_time_to_others(worked_s, pause_s):
+    assert follower.pause_s(worked_s) == pytest.approx(pause_s)
+
+
 def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
     sent = fleet({}, size=16)
     with opened() as site:

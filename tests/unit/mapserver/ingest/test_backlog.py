@@ -22,11 +22,11 @@ def test_machines_are_taken_in_turn_and_each_ones_batches_in_order():
 
 
 def test_who_has_had_a_turn_comes_after_those_who_wait():
-    backlog = filled("a" * 200 + "b")
+    backlog = filled("a" * 2 * GROUP_BATCHES + "b")
     first = backlog.take()
     assert (len(first), first[:3]) == (GROUP_BATCHES, ["a1", "b1", "a2"])
     backlog.add("c", 10, "c1")
-    assert backlog.take()[:2] == ["a64", "c1"]
+    assert backlog.take()[:2] == [f"a{GROUP_BATCHES}", "c1"]
 
 
 def test_a_group_is_bounded_in_bytes_and_never_empty():

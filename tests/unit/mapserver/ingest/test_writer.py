@@ -1,7 +1,9 @@
 import math
+import queue
 import sqlite3
 import threading
 import time
+from collections import Counter
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -13,7 +15,8 @@ import pytest
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
 from mapserver.ingest import backlog, snapshot_times
-from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, MOST_RETRY_S
+from mapserver.ingest import writer as writer_module
+from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, MOST_RETRY_S, size_of
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
@@ -109,6 +112,21 @@ def test_what_waits_is_committed_in_groups(start, monkeypatch, waiting, commits)
     assert len(events) == commits
 
 
+def test_batches_that_follow_closely_are_committed_together_and_keep_no_work_waiting(start, monkeypatch):
+    monkeypatch.setattr(writer_module, "COMMIT_EVERY_S", 0.3)
+    events = spied(monkeypatch, "commit")
+    writer, replies = start(clock=Clock()), Replies()
+    assert isinstance(send(writer, [incoming(samples(1))])[0], Ack)  # at once: nothing was committed before
+    for i in (1, 2, 3):
+        writer.submit(incoming(samples(1), i + 1), replies[i])
+    assert writer.run(lambda store: store.journalled) == 1
+    assert [answer.watermark for answer in replies.wait(3)] == [2, 3, 4]
+    assert len(events) == 2
+    writer.submit(incoming(samples(1), 5), replies[5])
+    writer.close()
+    assert replies.wait(4)[-1].watermark == 5
+
+
 def test_a_failed_commit_refuses_all_and_later_batches_work(start, monkeypatch):
     writer, replies = start(), Replies()
     journal = writer.run(lambda store: store.journal)
@@ -164,6 +182,32 @@ def test_the_backlog_of_one_machine_keeps_no_other_out(start, monkeypatch):
     assert all(isinstance(answer, Ack) for answer in live.wait(20))
     answers = dict(late.all) if late.wait(8) else {}
     assert [answers[key].watermark for key in range(8 - len(gone))] == [100 * (i + 1) for i in range(8 - len(gone))]
+
+
+def test_a_fleet_with_backlogs_is_served_to_the_end_through_little_room(start, monkeypatch):
+    """As after a server was away: all machines at once, and room for a few; refused ones come again at once."""
+    machines, batches_each = [f"m-{i}" for i in range(12)], 5
+    parts = {name: [incoming(samples(40), 1 + 40 * i, name) for i in range(batches_each)] for name in machines}
+    room = 4 * size_of(parts[machines[0]][0].payload)
+    monkeypatch.setattr(backlog.Backlog.__init__, "__defaults__", (room,))
+    writer, answers = start(), queue.SimpleQueue()
+    reached, refused = Counter(), 0
+    with held(writer):
+        for name in machines:
+            writer.submit(parts[name][0], lambda answer, name=name: answers.put((name, answer)))
+    while sum(reached.values()) < len(machines) * batches_each:
+        name, answer = answers.get(timeout=WAIT_S)
+        if isinstance(answer, Ack):
+            reached[name] += 1
+            assert answer.watermark == 40 * reached[name]
+            if reached[name] == batches_each:
+                continue
+        else:
+            assert answer.reason == Refusal.OVERLOADED
+            refused += 1
+        writer.submit(parts[name][reached[name]], lambda answer, name=name: answers.put((name, answer)))
+    assert writer.info()["samples_merged"] == 40 * batches_each * len(machines)
+    assert refused > 0
 
 
 def test_closing_finishes_what_is_waiting(start, tmp_path):
