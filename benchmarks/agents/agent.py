@@ -1,7 +1,6 @@
 """What a whole agent costs: CPU share of a core and memory, of the pure core fed as a machine feeds it.
 
-It is measured in a process of its own, `python -m benchmarks.agents.agent SECONDS`, which imports nothing but an
-agent's core.
+It is measured in a process of its own, `python -m benchmarks.agents.agent SECONDS`, which imports an agent alone.
 """
 
 from __future__ import annotations

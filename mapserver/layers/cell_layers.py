@@ -239,15 +239,19 @@ def derive_area(
 ) -> dict[str, Floats32]:
     """Make these layers, of cells or areas, from the `required` layers of cells, all (rows, columns)."""
     done: dict[str, Floats] = {name: values.astype(np.float64) for name, values in cells.items()}
+    return {name: _derived(name, done, cell_m, config).astype(np.float32) for name in names}
 
-    def derive(name: str) -> Floats:
-        if name not in done:
-            for need in AREA_LAYERS[name].needs:
-                derive(need)
-            done[name] = AREA_LAYERS[name].derive(Area(done, cell_m, config.fill_reach_m, config.boundaries))
-        return done[name]
 
-    return {name: derive(name).astype(np.float32) for name in names}
+def _derived(name: str, done: dict[str, Floats], cell_m: float, config: ReadConfig) -> Floats:
+    """One layer, with those that it needs added to `done`.
+
+    No closure: one that calls itself is a cycle, and keeps the arrays of a query until the next collection.
+    """
+    if name not in done:
+        for need in AREA_LAYERS[name].needs:
+            _derived(need, done, cell_m, config)
+        done[name] = AREA_LAYERS[name].derive(Area(done, cell_m, config.fill_reach_m, config.boundaries))
+    return done[name]
 
 
 # --- shared by layers -------------------------------------------------------------------------------------------------

@@ -60,9 +60,8 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
-        ingest, readers = open_session(joined), open_session(joined)
-        for session in (ingest, readers):
-            opened.callback(session.close)
+        ingest = opened.enter_context(closing(open_session(joined)))
+        readers = opened.enter_context(closing(open_session(joined)))
         check, take_over = _verifier(arguments.signed), arguments.take_over
         key = signer(arguments.keys)
         sign = key.sign_reply if key else None

@@ -18,9 +18,9 @@ from protocol.errors import ConfigError
 from protocol.wire.credentials import CERTIFICATE_FILE, KEY_FILE
 from sitegrid.client import connect
 from sitegrid.process.lifetime import say
+from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
 from sitegrid.web.site import SiteFeed
-from sitegrid.web.tokens import TokenFile
 
 FIRST_S = 10.0  # until a new connection has sent its first request; a slow one holds a place that others need
 CONNECTIONS = 500

@@ -18,7 +18,7 @@ from agents.delivery.spool import Spool, SpoolConfig
 from protocol.machine.samples import empty
 from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
-from tests.chaos import bit_flips, disk_faults, site_faults, stepped_clock
+from tests.chaos import bit_flips, disk_faults, reader_faults, site_faults, stepped_clock
 from tests.chaos.__main__ import ChaosFault, run_suite, totals
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
@@ -53,6 +53,20 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
     assert 0 < outcome.ack_ms_max < 60_000
     assert len(set(outcome.pids)) >= 4 + 4 + 2, "a process of its own for every start"
     assert not any(Path(f"/proc/{pid}").exists() for pid in outcome.pids)
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_readers_that_sleep_cost_machines_nothing(tmp_path):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=60)
+    outcome = reader_faults.sleeping_reader(scenario(tmp_path / "run", recordings=recordings, seconds=1.0))
+    assert outcome.problems == [], "among others: a slow acknowledgement, a server that took more memory"
+    assert outcome.is_good
+    assert outcome.count == sum(readers for _, readers in reader_faults.SLEEPING)
+    assert outcome.recorded == outcome.merged > 30
+    assert 0 < outcome.ack_ms_max <= reader_faults.LONGEST_ACK_MS
+    assert 0.9 < outcome.memory_ratio <= reader_faults.MOST_MEMORY
+    assert outcome.answer_s_max > 0
 
 
 @pytest.mark.processes

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -429,6 +430,17 @@ def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
             put_until(received, b"last", lambda: loader.put(keys.pose(SITE, "loader-1"), b"last"))
             most = 50 * (time.monotonic() - began) + 5
         assert received.count(b"flood") <= most, guarded.still_works()
+
+
+def test_connections_that_say_nothing_delay_no_link(guarded: Guarded):
+    place = tuple(guarded.endpoint.removeprefix("tls/").rsplit(":", 1))
+    with contextlib.ExitStack() as opened:
+        for _ in range(150):
+            opened.enter_context(socket.create_connection(place, READY_S))
+        began = time.monotonic()
+        with guarded.session("guest"):
+            took_s = time.monotonic() - began
+        assert took_s < 2.0, guarded.still_works()
 
 
 # --- revoked ---------------------------------------------------------------------------------------------------------
