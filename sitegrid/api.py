@@ -2,7 +2,6 @@
 
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
 from protocol.queries.answers import (
-    CellReasons,
     GroundChange,
     HistorySpan,
     MachineState,
@@ -14,9 +13,9 @@ from protocol.queries.answers import (
     ServerAlive,
     SiteInfo,
     TrustAnswer,
-    Votes,
 )
 from protocol.queries.map_tiles import MapTile, TilesAnswer
+from protocol.queries.reasons import CellReasons, Votes
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
 from protocol.version import package_version

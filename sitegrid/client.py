@@ -11,7 +11,6 @@ import zenoh
 from protocol.errors import LinkError, QueryError, Refusal
 from protocol.queries import answer_codec, requests
 from protocol.queries.answers import (
-    CellReasons,
     GroundChange,
     HistorySpan,
     MachineState,
@@ -25,6 +24,7 @@ from protocol.queries.answers import (
 from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command
 from protocol.queries.map_tiles import TilesAnswer, decode_tiles
 from protocol.queries.parameters import selector_of
+from protocol.queries.reasons import CellReasons, decode_why
 from protocol.queries.tiles import Progress, joined
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
@@ -123,7 +123,7 @@ class Client:
 
     def why(self, x_m: float, y_m: float, *, as_of_ns: int | None = None) -> CellReasons:
         """Everything that is known of the cell at a position in `map`: votes, passes, machines, changes."""
-        return answer_codec.decode_why(self._ask(requests.WhyQuery(float(x_m), float(y_m), as_of_ns)))
+        return decode_why(self._ask(requests.WhyQuery(float(x_m), float(y_m), as_of_ns)))
 
     def alive(self) -> ServerAlive:
         """Whether the server takes batches: for probes, since it waits for nothing."""

@@ -41,7 +41,6 @@ from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
-
 JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
@@ -82,8 +81,7 @@ class Store:
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
-            last_row = self.journal.last_row
-            self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
+            self.excluded, last_row = TrustDecisions(self.journal.events(TRUST)).distrusted, self.journal.last_row
             self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             checkpoints.remove_beyond(folder, last_row)

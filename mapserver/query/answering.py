@@ -24,9 +24,10 @@ from mapserver.query.why import reasons
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
-from protocol.queries.answers import CellReasons, HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
+from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
 from protocol.queries.commands import AcceptCommand, TrustCommand, parse_command
 from protocol.queries.map_tiles import TilesAnswer, encode_tiles
+from protocol.queries.reasons import CellReasons, encode_why
 from protocol.queries.requests import (
     MAX_SPANS,
     HistoryQuery,
@@ -82,7 +83,7 @@ class Answers:
             case requests.TilesQuery():
                 return encode_tiles(self.tiles(query))
             case requests.WhyQuery():
-                return codec.encode_why(self.why(query))
+                return encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
             case requests.AliveQuery():

@@ -16,7 +16,8 @@ from mapserver.evidence.timeline import evidence
 from mapserver.layers import cell_layers
 from mapserver.query.views import View
 from protocol.arrays import AnyArray
-from protocol.queries.answers import CellReasons, MapVersion, Votes
+from protocol.queries.answers import MapVersion
+from protocol.queries.reasons import CellReasons, Votes
 from protocol.site.geometry import BLOCK_CELLS
 
 LAYERS = tuple(

@@ -126,6 +126,27 @@ class ChaosSite:
             self._running[role].end(signal.SIGKILL)
             self.start(role)
 
+    def put_down(self, role: str) -> None:
+        """End a process with SIGKILL, and leave it so."""
+        self._running.pop(role).end(signal.SIGKILL)
+
+    def words_of_refusal(self, role: str) -> str | None:
+        """Wait until a process that was started works, None, or has refused to: its last words."""
+        process = self._running[role]
+        self._wait(lambda: process.said("ready") or process.code is not None, READY_S, f"{role} is not ready")
+        return process.last_words() if process.code is not None and not process.said("ready") else None
+
+    def deliver_rest(self, machine: str) -> None:
+        """Have a machine that is not running deliver what its spool has, and nothing new."""
+        process = self.start(machine, idle=True)
+        self._wait(lambda: process.code is not None, RESUME_S, "left-over samples are not delivered")
+        self._running.pop(machine).end()
+
+    def log_of(self, role: str) -> str:
+        """What all processes of a role have logged."""
+        paths = sorted((self.folder / "log").glob(f"*-{role}.err"))
+        return "".join(path.read_text(encoding="utf-8", errors="replace") for path in paths)
+
     def stop(self, role: str) -> None:
         """End a process with SIGTERM; it is to obey within a few seconds."""
         process, began_s = self._running.pop(role), time.monotonic()

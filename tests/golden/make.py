@@ -20,6 +20,7 @@ from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
+from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
 from protocol.wire import codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -135,8 +136,8 @@ CHANGE = records.GroundChange(
 TILES = TilesAnswer(
     VERSION, T0, 0.5, whole=True, tiles=(MapTile(-1, 2, 17, 3, T0, zlib.compress(bytes(range(256)) * 96, 6)),)
 )
-VOTES = records.Votes((0.01, 0.1), (1.5, 0.0), (0.0, 2.25))
-WHY = records.CellReasons(
+VOTES = Votes((0.01, 0.1), (1.5, 0.0), (0.0, 2.25))
+WHY = CellReasons(
     store=STORE,
     merged=17,
     fact=3,
@@ -174,7 +175,7 @@ GOLDEN: dict[str, Golden] = {
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
-    "why.bin": Golden(WHY, answers.encode_why, answers.decode_why),
+    "why.bin": Golden(WHY, encode_why, decode_why),
     "tile.bin": Golden(tile(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
     "machines.bin": Golden(

@@ -18,7 +18,7 @@ from agents.delivery.spool import Spool, SpoolConfig
 from protocol.machine.samples import empty
 from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
-from tests.chaos import bit_flips, disk_faults, reader_faults, site_faults, stepped_clock
+from tests.chaos import bit_flips, damage_faults, disk_faults, reader_faults, site_faults, stepped_clock
 from tests.chaos.__main__ import ChaosFault, run_suite, totals
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
@@ -53,6 +53,24 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
     assert 0 < outcome.ack_ms_max < 60_000
     assert len(set(outcome.pids)) >= 4 + 4 + 2, "a process of its own for every start"
     assert not any(Path(f"/proc/{pid}").exists() for pid in outcome.pids)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("fault", [damage_faults.wal_flip, damage_faults.restored_store])
+def test_what_damage_takes_is_declared_and_named(tmp_path, fault):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=40)
+    outcome = fault(scenario(tmp_path / "run", recordings=recordings, seconds=3.0))
+    assert (outcome.lost, outcome.double, outcome.silent, outcome.problems) == (0, 0, 0, [])
+    assert outcome.declared > 0
+    assert outcome.recorded == outcome.merged + outcome.declared
+
+
+@pytest.mark.processes
+def test_agents_name_a_damaged_calibration_and_go_on(tmp_path):
+    recordings = make(tmp_path / "recordings", machines=1, seed=3, seconds=40)
+    outcome = damage_faults.calibration_flip(scenario(tmp_path / "run", recordings=recordings, seconds=1.0))
+    assert (outcome.lost, outcome.silent, outcome.problems) == (0, 0, [])
+    assert outcome.count > 1000
 
 
 @pytest.mark.processes

@@ -79,10 +79,10 @@ def test_a_region_is_the_clients_as_text_and_as_arrays(web: WebSite):
 
 def test_why_history_machines_changes_are_the_clients(web: WebSite):
     x_m, y_m = driven_place(web)
-    why, told = web.client.why(x_m, y_m), web.get("why", {"x": x_m, "y": y_m}).json
-    assert told["resistance"]["votes"] == pytest.approx(list(why.resistance.votes))
-    assert told["machines"] == list(why.machines)
-    assert told["newest_time"].startswith("2026-01-01T00:0")
+    why, answer = web.client.why(x_m, y_m), web.get("why", {"x": x_m, "y": y_m}).json
+    assert answer["resistance"]["votes"] == pytest.approx(list(why.resistance.votes))
+    assert answer["machines"] == list(why.machines)
+    assert answer["newest_time"].startswith("2026-01-01T00:0")
     spans = web.get("history", {"x": x_m, "y": y_m, "layers": "resistance"}).json["spans"]
     ours = web.client.history(x_m, y_m, ["resistance"])
     assert [span["first_ns"] for span in spans] == [span.first_ns for span in ours]
