@@ -72,7 +72,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = vars(_parser().parse_args(words))
     run, as_json = arguments.pop("run"), arguments.pop("json")
     result: Report = run(**arguments)
-    tables = [result[name] for name in ("rows", "decisions", "agent") if name in result]
+    tables = [result[name] for name in ("rows", "decisions", "past", "agent") if name in result]
     print(json.dumps(result) if as_json else "\n\n".join(map(table, tables)))
     for variant, remedy in result.get("missing", {}).items():
         print(f"not measured: {variant}; {remedy}", file=sys.stderr)

@@ -80,14 +80,14 @@ def _messages() -> Iterator[Decoder]:
     batches = ("batch.bin", "batch_lost.bin", "batch_empty.bin", NEWER)
     golden = {name: ((FOLDER / f"{name}.bin").read_bytes(),) for name in _SINGLE}
     several = {"batch": tuple((FOLDER / name).read_bytes() for name in batches)}
-    several["reply"] = tuple((FOLDER / name).read_bytes() for name in ("ack.bin", "refused.bin"))
+    several["reply"] = tuple((FOLDER / name).read_bytes() for name in ("ack.bin", "refused.bin", "refused_later.bin"))
     for name, seeds in {**golden, **several}.items():
         file = {"batch": "batch.bin", "reply": "ack.bin"}.get(name, f"{name}.bin")
         encode, decode = GOLDEN[file].encode, GOLDEN[file].decode
         yield Decoder(name, seeds, partial(_again, name, encode, decode), (MessageError,), messages)
 
 
-_SINGLE = ("bundle", "pose", "health", "point", "region", "history", "tiles", "why", *PLAIN[1:], "error")
+_SINGLE = ("bundle", "pose", "health", "point", "region", "history", "tiles", "why", "alive", *PLAIN[1:], "error")
 
 
 def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], Any], data: bytes) -> None:
@@ -116,11 +116,12 @@ def _selectors() -> Iterator[Decoder]:
         requests.RegionQuery(Bounds(0.0, 0.0, 200.0, 150.0), ("resistance",), fresh, when),
         requests.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
         requests.TilesQuery(MapVersion("0123456789abcdef", 17, 3)),
-        requests.TilesQuery(as_of_ns=T0),
+        requests.TilesQuery(as_of_ns=T0, place=(-3, 12)),
         requests.WhyQuery(12.0, 40.5, T0),
         requests.MachinesQuery(fresh),
         requests.ChangesQuery(3),
         requests.InfoQuery(fresh),
+        requests.AliveQuery(),
     )
     seeds = tuple(f"{query.name}?{selector_of(requests.encode_query(query))}".encode() for query in asked)
     yield Decoder("query", seeds, _query, (QueryError,), texts)
