@@ -1,4 +1,4 @@
-"""Runs of real agents that go on in another store: one that was folded from the first, and one that a person accepts."""
+"""Runs of real agents that go on in another store: one folded from the first, and one that a person accepts."""
 
 from __future__ import annotations
 
