@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.fold_kernels import fold_sorted
-from mapserver.evidence.pages import CELL, PackedPages, frozen
+from mapserver.evidence.pages import CELL, RAW_CELL, PackedPages
 from mapserver.evidence.sample_kernels import locate, split, weigh
 from protocol.arrays import AnyArray, Bools, Ints, Table
 
@@ -74,18 +74,15 @@ def _by_block(pages: Ints, votes: NDArray[np.uint64], cells: Table) -> Iterator[
     """Cut pages into those of each block; copies, which keep nothing else alive."""
     if not len(pages):
         return
-    dtype: type[np.unsignedinteger[Any]] = np.uint32 if int(votes.max()) < 2**32 else np.uint64
     begins: Bools = np.ones(len(pages), np.bool_)
     begins[1:] = (pages[1:, :2] != pages[:-1, :2]).any(axis=1)
     firsts = np.flatnonzero(begins)
-    ends = [*firsts[1:].tolist(), len(pages)]
+    ends = np.append(firsts[1:], len(pages))
     tables = np.zeros((len(pages), 6), np.int64)
     tables[:, 1:] = pages[:, 2:]
-    at = np.repeat(firsts, np.diff(firsts, append=len(pages)))
-    tables[:, 2:4] -= pages[at, 3, None]
-    tables[:, 4:6] -= pages[at, 5, None]
-    for first, end in zip(firsts.tolist(), ends, strict=True):
-        x, y, _, first_vote, _, first_cell, _ = pages[first].tolist()
-        _, _, _, _, end_vote, _, end_cell = pages[end - 1].tolist()
-        few = votes[first_vote:end_vote].astype(dtype)
-        yield x, y, PackedPages(tables[first:end].copy(), few, frozen(cells[first_cell:end_cell]))
+    tables[:, 2:] -= np.repeat(pages[firsts][:, [3, 3, 5, 5]], ends - firsts, axis=0)
+    few: NDArray[np.unsignedinteger[Any]] = votes.astype(np.uint32) if int(votes.max()) < 2**32 else votes
+    raw = cells.view(RAW_CELL)
+    places = np.column_stack([pages[firsts][:, [0, 1, 3, 5]], pages[ends - 1][:, [4, 6]], firsts, ends])
+    for x, y, vote, cell, end_vote, end_cell, first, end in places.tolist():
+        yield x, y, PackedPages(tables[first:end].copy(), few[vote:end_vote].copy(), raw[cell:end_cell].copy())

@@ -13,7 +13,8 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import fold, scratch_block
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.pages import CompactPages, PackedPages, Page
-from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
+from mapserver.evidence.settling import Space, Tiers
+from mapserver.evidence.timeline import PATIENCE, Block, TimedPage, Timeline, evidence, settle_all
 from mapserver.evidence.workers import ALONE, Workers
 from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -144,7 +145,9 @@ class Grid:
     def pages(self, blocks: Iterable[Block]) -> list[Sequence[TimedPage]]:
         """Pages of each of these blocks in the order of time, none for a block without evidence."""
         self._drain()
-        return [self._timelines[block].timed() if block in self._timelines else () for block in blocks]
+        timelines = [self._timelines.get(block) for block in blocks]
+        settle_all(timeline for timeline in timelines if timeline)
+        return [timeline.timed() if timeline else () for timeline in timelines]
 
     def touch_all(self) -> None:
         """Count all blocks as touched."""
@@ -177,6 +180,7 @@ class Grid:
     def state(self) -> GridState:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()
+        settle_all(self._timelines.values())
         blocks = ((x, y, self._timelines[x, y].settled()) for x, y in sorted(self._timelines))
         return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns)
 
@@ -225,6 +229,7 @@ class Grid:
                 timeline.space = self._spaces[worker]
                 timeline.add(packed)
                 self._touched.add(block)
+            settle_all({self._timelines[block] for block, _ in pages[worker]}, PATIENCE)
 
         self._workers.each(fold_share)
         self._workers.each(add_share)
@@ -241,10 +246,10 @@ class Grid:
 
     def _settle(self, worker: int) -> None:
         """Settle a worker's own blocks."""
-        for block, timeline in self._timelines.items():
-            if _worker_of(block, self._workers.count) == worker:
-                timeline.space = self._spaces[worker]
-                timeline.settled()
+        own = [line for block, line in self._timelines.items() if _worker_of(block, self._workers.count) == worker]
+        for timeline in own:
+            timeline.space = self._spaces[worker]
+        settle_all(own)
 
     def _engage(self, workers: Workers, waiting_rows: int) -> None:
         """Go on with other workers, each with space of its own."""

@@ -62,11 +62,12 @@ def expand_votes(table: Any, runs: Any, cells: Any, counts: Any, high: Any, out:
 
 
 @numba.njit(cache=True, nogil=True)
-def compact_cells(table: Any, cells: Any, out: Any, words: Any) -> int:
+def compact_cells(table: Any, cells: Any, out: Any, words: Any, ends: Any) -> None:
     """Replace bitmaps and stamps of cells by numbers of words: each page has its own, all different, in one list.
 
     Fills out (k, 4): cell, and numbers of its visits, its machines and its stamp among the page's words; words (m,)
-    uint64: for each page how many of the three there are, packed in 9 bits each, then the words. Returns how many.
+    uint64: for each page how many of the three there are, packed in 9 bits each, then the words; ends (n,) of the words
+    of each page.
     """
     used = 0
     for p in range(len(table)):
@@ -95,7 +96,7 @@ def compact_cells(table: Any, cells: Any, out: Any, words: Any) -> int:
         words[header] = sizes
         for j in range(first, end):
             out[j, 0] = cells[j].cell
-    return used
+        ends[p] = used
 
 
 @numba.njit(cache=True, nogil=True)
