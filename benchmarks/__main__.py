@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from benchmarks import filter as filters
-from benchmarks import ingest, live, merge, merge_memory, merge_restart, query, sim
+from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, query, sim
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 
@@ -43,6 +43,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
     ),
     "memory": (merge_memory.run, "memory that a day of work on 1 km2 takes of the map server", {"hours": HOURS}),
     "restart": (merge_restart.run, "time to open a store with a long journal", {"samples": 20_000_000}),
+    "fold": (
+        fold.run,
+        "journals that are folded again, and a decision about a machine",
+        {"hours": HOURS, "samples": 20_000_000, "runs": 1},
+    ),
     "live": (
         live.run,
         "processor time of a server at work, by thread",
@@ -60,7 +65,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = vars(_parser().parse_args(words))
     run, as_json = arguments.pop("run"), arguments.pop("json")
     result: Report = run(**arguments)
-    tables = [result[name] for name in ("rows", "agent") if name in result]
+    tables = [result[name] for name in ("rows", "decisions", "agent") if name in result]
     print(json.dumps(result) if as_json else "\n\n".join(map(table, tables)))
     for variant, remedy in result.get("missing", {}).items():
         print(f"not measured: {variant}; {remedy}", file=sys.stderr)

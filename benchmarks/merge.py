@@ -87,7 +87,7 @@ def _sums(make: Callable[[int], Sums], install: str = "") -> Variant:
 
 SIDE = int(SIDE_M)
 MOST_TOUCHED = 9  # blocks by one sample
-BENCH = "pip install 'sitegrid[bench]'"
+BENCH = "pip install '.[bench]'"
 VARIANTS = {
     "soft_votes": _soft_votes("refold", REFOLD_ROWS),
     "soft_votes, live": _soft_votes("live", LIVE_ROWS),

@@ -7,26 +7,33 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import zenoh
 
 from mapserver.config import ServerConfig
+from mapserver.evidence import grid
 from mapserver.follower.follower import Follower
+from mapserver.ingest import batches
 from mapserver.ingest.store import Incoming, Store, Verify
 from mapserver.ingest.writer import Writer
+from mapserver.journal import records
+from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.answering import Answers, reads_past
-from protocol.errors import ConfigError, QueryError
+from protocol.errors import ConfigError, QueryError, Refusal
 from protocol.queries.answer_codec import encode_change, encode_error
 from protocol.queries.answers import GroundChange
 from protocol.queries.parameters import split_selector
+from protocol.queries.requests import parse_query
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import encode_reply
 from protocol.wire.messages import Ack, Refused
 
 COMMAND_THREADS = 8  # a command waits for its map; those given meanwhile are kept at once, and folded together
+ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 tiles, or 2000 points
+MOST_PAST, MOST_COMMANDS = 16, 16  # that wait or are in work
+MAX_QUESTION = 4096  # bytes of a query's parameters
 log = logging.getLogger("mapserver")
 
 
@@ -53,10 +60,10 @@ class Server:
         )
         self._follower = Follower(self._writer, self._publish)
         self.answers = Answers(self._writer, self._follower)
-        self._threads = ThreadPoolExecutor(config.query_threads, thread_name_prefix="query")
+        self._now = AnswerPool("query", config.query_threads, ANSWER_BYTES)
         # Others: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
-        self._past_thread = ThreadPoolExecutor(1, thread_name_prefix="past")
-        self._command_threads = ThreadPoolExecutor(COMMAND_THREADS, thread_name_prefix="command")
+        self._past = AnswerPool("past", 1, MOST_PAST)
+        self._commands = AnswerPool("command", COMMAND_THREADS, MOST_COMMANDS)
         self._queryables = [
             ingest.declare_queryable(keys.ingest_all(site.name), self._on_batch),
             readers.declare_queryable(keys.map_queries_all(site.name), self._on_query),
@@ -72,8 +79,8 @@ class Server:
         """Stop listening, finish what has come in, commit, snapshot."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
-        for threads in (self._threads, self._past_thread, self._command_threads):
-            threads.shutdown(wait=False, cancel_futures=True)  # nobody waits for an answer longer than for the end
+        for pool in (self._now, self._past, self._commands):
+            pool.close()
         self._follower.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()
@@ -95,31 +102,79 @@ class Server:
         signature = query.attachment.to_bytes() if query.attachment else b""
         self._writer.submit(Incoming(machine, payload, signature), reply)
 
-    def _on_query(self, query: zenoh.Query) -> None:
-        name, parameters = _asked(query)
-        threads = self._past_thread if reads_past(name, parameters) else self._threads
-        threads.submit(self._reply, query, lambda: self.answers.answer(name, parameters))
+    def _on_query(self, asked: zenoh.Query) -> None:
+        """Parse a query and let it wait, without a thread, for the journal row that it asks for; then for a thread."""
+        try:
+            name, parameters = _asked(asked)
+            query = parse_query(name, parameters)
+            pool, size = (self._past, 1) if reads_past(query) else (self._now, self.answers.size(query))
+        except QueryError as error:
+            self._refuse(asked, error)
+            return
 
-    def _on_command(self, query: zenoh.Query) -> None:
-        name, parameters = _asked(query)
-        self._command_threads.submit(self._reply, query, lambda: self.answers.obey(name, parameters))
+        def enter(error: QueryError | None) -> None:
+            if error:
+                self._refuse(asked, error)
+            else:
+                self._submit(pool, size, asked, lambda: self.answers.answer(query))
 
-    def _reply(self, query: zenoh.Query, answer: Callable[[], bytes]) -> None:
-        with query:
-            try:
-                query.reply(query.key_expr, answer())
-            except QueryError as error:
-                self._writer.count_refusal(error.reason)
-                query.reply_err(encode_error(error))
-            except zenoh.ZError as error:
-                log.info("reply failed query=%s error=%r", query.key_expr, str(error))
-            except Exception as error:  # a bug must not leave the asker waiting, nor end the thread silently
-                log.exception("query failed query=%s", query.key_expr)
-                query.reply_err(encode_error(QueryError("internal", f"the server failed: {error}")))
+        try:
+            self._writer.waits.add(query.fresh.after, query.fresh.wait_s, enter)
+        except QueryError as error:
+            self._refuse(asked, error)
+
+    def _on_command(self, asked: zenoh.Query) -> None:
+        try:
+            name, parameters = _asked(asked)
+        except QueryError as error:
+            self._refuse(asked, error)
+        else:
+            self._submit(self._commands, 1, asked, lambda: self.answers.obey(name, parameters))
+
+    def _submit(self, pool: AnswerPool, size: int, asked: zenoh.Query, answer: Callable[[], bytes]) -> None:
+        try:
+            pool.submit(size, lambda: self._reply(asked, answer))
+        except QueryError as error:
+            self._refuse(asked, error)
+
+    def _reply(self, asked: zenoh.Query, answer: Callable[[], bytes]) -> None:
+        try:
+            data = answer()
+        except QueryError as error:
+            self._refuse(asked, error)
+        except Exception as error:  # a bug must not leave the asker waiting
+            log.exception("query failed query=%s", asked.key_expr)
+            self._refuse(asked, QueryError("internal", f"the server failed: {error}"))
+        else:
+            with asked:
+                _send(asked, lambda: asked.reply(asked.key_expr, data))
+
+    def _refuse(self, asked: zenoh.Query, error: QueryError) -> None:
+        self._writer.count_refusal(error.reason)
+        with asked:
+            _send(asked, lambda: asked.reply_err(encode_error(error)))
 
     def _publish(self, change: GroundChange) -> None:
         self._changed.put(encode_change(change))
 
 
+def warm_up(config: ServerConfig) -> None:
+    """Have all kernels that ingest needs, before the first batch."""
+    grid.warm_up(config.fold)
+    batches.warm_up()
+    records.warm_up()
+
+
 def _asked(query: zenoh.Query) -> tuple[str, dict[str, str]]:
-    return keys.query_of(str(query.key_expr)), split_selector(str(query.parameters))
+    """Name and parameters. QueryError for what no client sends: what waits is kept in memory."""
+    parameters = str(query.parameters)
+    if len(parameters) > MAX_QUESTION or query.payload:
+        raise QueryError(Refusal.TOO_LARGE, f"a query has at most {MAX_QUESTION} bytes of parameters, and no payload")
+    return keys.query_of(str(query.key_expr)), split_selector(parameters)
+
+
+def _send(asked: zenoh.Query, send: Callable[[], object]) -> None:
+    try:
+        send()
+    except zenoh.ZError as error:  # the asker is gone
+        log.info("reply failed query=%s error=%r", asked.key_expr, str(error))

@@ -32,6 +32,7 @@ class Refusal(StrEnum):
     UNKNOWN_QUERY = "unknown_query"
     UNKNOWN_MACHINE = "unknown_machine"
     AFTER_TIMEOUT = "after_timeout"
+    EXPIRED = "expired"
 
 
 MAX_LINE = 500  # characters
@@ -86,11 +87,12 @@ class MessageError(SitegridError):
 
 
 class QueryError(SitegridError):
-    """A map query is malformed, or the server refused it."""
+    """A map query is malformed, or the server refused it. retry_after_s: ask again then, 0 where that is no use."""
 
-    def __init__(self, reason: Refusal | str, problem: str) -> None:
+    def __init__(self, reason: Refusal | str, problem: str, retry_after_s: float = 0.0) -> None:
         super().__init__(problem)
         self.reason = str(reason)
+        self.retry_after_s = retry_after_s
 
 
 class LinkError(_PlaceError):

@@ -76,7 +76,7 @@ def resolve(config: SimConfig) -> Scenario:
 
 
 def write_configs(config: SimConfig, folder: Path) -> list[Path]:
-    """Write `site.toml` and `<machine>.toml` for the agents: nominal values, nothing of the truth."""
+    """Write `site.toml` and `<machine>.toml` for the agents, nothing of the truth; returns the files of the agents."""
     scenario = resolve(config)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "site.toml").write_text(site_toml(scenario.site), encoding="utf-8")

@@ -4,26 +4,18 @@ with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
     ground = site.region((0, 0, 200, 150), ["resistance"])
 """
 
-from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
-from protocol.queries.answers import (
-    GroundChange,
-    HistorySpan,
-    MachineState,
-    MapInfo,
-    PointAnswer,
-    Region,
-    SampleCounts,
-    SiteInfo,
-    TrustAnswer,
-)
-from protocol.site.geometry import Bounds
-from protocol.site.site_config import KnownGround
-from protocol.version import package_version
-from sitegrid.client import Client, connect
-from sitegrid.listener import Listener
+TYPE_CHECKING = False  # as that of `typing`, which this need not import
+if TYPE_CHECKING:
+    from sitegrid.api import *  # noqa: F403 - it has __all__
+    from sitegrid.api import __version__ as __version__
 
-__all__ = ["Client", "Listener", "connect"]
-__all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
-__all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
-__all__ += ["Bounds", "KnownGround", "SampleCounts", "SiteInfo"]
-__version__ = package_version()
+
+def __getattr__(name: str) -> object:
+    """Import what a program uses when it does: the command begins here too, and hears Ctrl-C before numpy is loaded."""
+    from importlib import import_module
+
+    return getattr(import_module("sitegrid.api"), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__getattr__("__all__")]  # type: ignore[misc]

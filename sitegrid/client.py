@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import zenoh
 
-from protocol.errors import LinkError
+from protocol.errors import LinkError, QueryError, Refusal
 from protocol.queries import answer_codec, requests
 from protocol.queries.answers import GroundChange, HistorySpan, MachineState, MapInfo, PointAnswer, Region, TrustAnswer
-from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
+from protocol.queries.tiles import Progress, joined
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
@@ -22,6 +23,7 @@ from sitegrid.security.join import join
 # Nobody answers, at once: the server starts again, or has just connected (Zenoh issue 2767). It may answer in a moment.
 AGAIN_S = 0.1
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
+REGION_ATTEMPTS = 3
 TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 
 
@@ -66,11 +68,22 @@ class Client:
         minus_ns: int | None = None,
         after: int = 0,
         wait_s: float = 10.0,
+        progress: Progress | None = None,
     ) -> Region:
-        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates."""
+        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates.
+
+        A large region comes in tiles, all of one version of the map; progress is called with each, as (here, of all).
+        """
         box = bounds if isinstance(bounds, Bounds) else Bounds(*(float(v) for v in bounds))
         when, fresh = requests.When(as_of_ns, minus_ns), requests.Freshness(after, wait_s)
-        return answer_codec.decode_region(self._ask(requests.RegionQuery(box, tuple(layers), fresh, when)))
+        query = requests.RegionQuery(box, tuple(layers), fresh, when)
+        for _ in range(REGION_ATTEMPTS - 1):
+            try:
+                return joined(self._tiles(query), progress)
+            except QueryError as error:
+                if error.reason != Refusal.EXPIRED:  # else that version of the map is not kept any more: begin again
+                    raise
+        return joined(self._tiles(query), progress)
 
     def history(
         self,
@@ -103,7 +116,10 @@ class Client:
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with an id beyond `after`: when, where, how many cells, from what to what."""
-        return list(answer_codec.decode_changes(self._ask(requests.ChangesQuery(after))).changes)
+        changes = list(answer_codec.decode_changes(self._ask(requests.ChangesQuery(after))).changes)
+        if len(changes) < answer_codec.MAX_CHANGES:
+            return changes
+        return changes + self.changes(changes[-1].id)
 
     def on_change(self, callback: Callable[[GroundChange], object]) -> Listener[GroundChange]:
         """Call `callback`, on a thread of its own, with each change that is found or grows, until the handle is closed.
@@ -129,6 +145,11 @@ class Client:
         """Leave it to the server again whether a machine's samples are used."""
         return self._command(TrustCommand(machine, None, "", wait_s))
 
+    def accept(self, store: str, reason: str) -> MapInfo:
+        """Let the map server's store take the place of another one, which is gone: machines go on with it."""
+        command = AcceptCommand(store, reason)
+        return answer_codec.decode_info(self._get(keys.admin(self.site, command.name), encode_command(command), 0.0))
+
     def close(self) -> None:
         """Close the session and its listeners."""
         for listener in self._listeners:
@@ -149,6 +170,13 @@ class Client:
             wait_s += PAST_S
         return self._get(keys.map_query(self.site, query.name), requests.encode_query(query), wait_s)
 
+    def _tiles(self, query: requests.RegionQuery) -> Iterator[Region]:
+        """The region, or tile after tile of it."""
+        yield (first := answer_codec.decode_region(self._ask(query)))
+        if first.tile:
+            for number in range(1, first.tile.count):
+                yield answer_codec.decode_region(self._ask(requests.TileQuery(first.tile.cursor, number)))
+
     def _command(self, command: TrustCommand) -> TrustAnswer:
         key = keys.admin(self.site, command.name)
         return answer_codec.decode_machine(self._get(key, encode_command(command), command.wait_s))
@@ -162,7 +190,10 @@ class Client:
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
                 if reply.err is not None and (text := reply.err.payload.to_bytes()) != TIMED_OUT:
-                    raise answer_codec.decode_error(text)
+                    error, held_s = answer_codec.decode_error(text), time.monotonic()
+                    if not 0 < error.retry_after_s < end_s - held_s - AGAIN_S:
+                        raise error
+                    time.sleep(error.retry_after_s)
             if time.monotonic() > asked_s + AGAIN_S:
                 held_s = time.monotonic()
             time.sleep(AGAIN_S)

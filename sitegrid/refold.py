@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.config import ServerConfig
-from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.store import ACCEPTED, JOURNAL_FILE, Store
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.copier import Copier, SpoolKey, merged
@@ -30,7 +30,7 @@ from protocol.files import load_toml
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.site_config import SiteConfig, site_toml
 from protocol.site.site_file import load_site
-from sitegrid.process.lifetime import say
+from sitegrid.process.lifetime import raise_interrupts, say, tell
 from sitegrid.process.progress import Display
 
 SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
@@ -39,7 +39,10 @@ COMMIT_ROWS = 500
 
 @dataclass(frozen=True)
 class SampleSource:
-    """Rows of a file or a store. site: where it is known; first_ns: when its first row was received."""
+    """Rows of a file or a store. site: where it is known; first_ns: when its first row was received.
+
+    stores: ids of the stores whose samples these are, or whose place that store took.
+    """
 
     path: Path
     name: str
@@ -49,11 +52,13 @@ class SampleSource:
     samples: int
     first_ns: int
     rows: Iterator[JournalRow]
+    stores: tuple[str, ...]
     watermarks: Mapping[SpoolKey, Watermark] = field(default_factory=dict)
 
 
 def run(arguments: Namespace) -> int:
     """Fold once and print what became of the samples."""
+    raise_interrupts()  # a store that is not complete is removed
     selection = Selection(
         from_ns=arguments.from_ns or 0,
         to_ns=MAX_STAMP_NS if arguments.until_ns is None else arguments.until_ns - 1,
@@ -71,7 +76,7 @@ def run(arguments: Namespace) -> int:
             problem = f"{unknown[0]!r} is no machine of these archives; they are: {', '.join(sorted(known))}"
             raise ConfigError("--without", problem)
         summary = _build(arguments, sources, site, selection)
-    say(summary) if arguments.json else print("\n".join(_lines(summary)))
+    say(summary) if arguments.json else tell(*_lines(summary))
     return 0
 
 
@@ -98,6 +103,8 @@ def _build(arguments: Namespace, sources: list[SampleSource], site: SiteConfig, 
         machines[machine] += samples
     return {
         "store": str(arguments.out),
+        "id": info["store"],
+        "descends": info["descends"],
         "archives": len(sources),
         "rows": info["journalled"],
         "samples": machines.total(),
@@ -122,7 +129,7 @@ def _sources(path: Path, selection: Selection, opened: ExitStack) -> Iterator[Sa
         raise ConfigError(path, f"holds neither Parquet files nor a {JOURNAL_FILE}")
     for file in map(ArchiveFile, files):
         header, site, rows = file.header, file.header.site, file.read(selection=in_time)
-        contents = (frozenset(header.machines), file.samples, file.first_received_ns, rows)
+        contents = (frozenset(header.machines), file.samples, file.first_received_ns, rows, (header.store,))
         yield SampleSource(file.path, site.name, header.frame, site, *contents)
 
 
@@ -135,7 +142,9 @@ def _store(path: Path, selection: Selection, opened: ExitStack) -> SampleSource:
     first_ns = first.received_ns if first else 0
     rows = history_rows(history, selection=selection)
     site = _site_of(path)
-    return SampleSource(path, journal.site, journal.frame, site, machines, samples, first_ns, rows, watermarks)
+    identity, accepted = journal.identity(), (event.body["store"] for event in journal.events(ACCEPTED))
+    stores = (identity.id, *identity.descends, *accepted)
+    return SampleSource(path, journal.site, journal.frame, site, machines, samples, first_ns, rows, stores, watermarks)
 
 
 def _site_of(store: Path) -> SiteConfig | None:
@@ -177,7 +186,8 @@ def _config(arguments: Namespace) -> tuple[ServerConfig, str]:
 
 def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: Selection, *, headless: bool) -> Copier:
     """Write the journal of the new store."""
-    journal = Journal(part / JOURNAL_FILE, site.name, site.frame)
+    stores = dict.fromkeys(store for source in sources for store in source.stores)
+    journal = Journal(part / JOURNAL_FILE, site.name, site.frame, stores)
     copier = Copier(journal, site.frame, selection)
     total, done = sum(source.samples for source in sources), 0
     sources = sorted(sources, key=lambda source: (source.first_ns, sorted(source.machines), source.path))

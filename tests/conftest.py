@@ -6,12 +6,14 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy starts them: small matrices, and tests side by side
 
-from collections.abc import Generator
+import signal
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from sitegrid.process.lifetime import SIGNALS
 from tests.paths import ROOT, SHARED_DATA
 
 # Repeatable on every machine, and no complaint about a slow one.
@@ -38,6 +40,15 @@ def husky_data() -> Path:
 def _at_root(monkeypatch: pytest.MonkeyPatch) -> None:
     """Child processes find the packages from wherever pytest was started."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+
+
+@pytest.fixture(autouse=True)
+def _signals_are_put_back() -> Iterator[None]:
+    """Commands that run inside the test's process set signal handlers."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 # `make quick` leaves out what takes longer than about half a second of processor time, quietly run. Three times that

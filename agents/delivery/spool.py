@@ -44,13 +44,15 @@ class SpoolConfig:
 class SpoolRun:
     """What one opening recorded. base: number of the last sample before it; acknowledged: a seq.
 
-    closed: the server has once accounted for all of it.
+    closed: the server has once accounted for all of it. store: id of the store that it is bound to: that which has
+    acknowledged samples of it, empty before one has.
     """
 
     base: int
     spool_id: int
     acknowledged: int = 0
     closed: bool = False
+    store: str = ""
 
 
 @dataclass(frozen=True)
@@ -161,20 +163,22 @@ class Spool:
                 self._move_to_quarantine(run, damaged, "damaged on the machine's disk")
             newest = None if self._sending < len(self._runs) - 1 else end
             if not oldest:
-                return Head(run.spool_id, end + 1, empty(), end) if newest is None else None
+                return Head(run.spool_id, end + 1, empty(), end, store=run.store) if newest is None else None
             first = oldest[0][0]
             n = next((i for i, (number, _, final, _) in enumerate(oldest) if final == 0 or number != first + i), None)
             seq, rows = first - run.base, _table(row for _, row, _, _ in oldest[:n])
-            return Head(run.spool_id, seq, rows, seq - 1 - run.acknowledged, newest) if len(rows) else None
+            lost = seq - 1 - run.acknowledged
+            return Head(run.spool_id, seq, rows, lost, newest, run.store) if len(rows) else None
 
-    def acknowledge(self, spool_id: int, watermark: int) -> None:
-        """Delete what the server has on disk, of one run."""
+    def acknowledge(self, spool_id: int, watermark: int, store: str = "") -> None:
+        """Delete what the server has on disk, of one run, which is bound to that store from then on."""
         with self._access():
             at = self._index(spool_id)
             run, end = self._runs[at], self._end(at)
             upto = max(run.acknowledged, min(watermark, end))
             is_earlier = at < len(self._runs) - 1
-            new = replace(run, acknowledged=upto, closed=run.closed or (is_earlier and watermark >= end))
+            closed = run.closed or (is_earlier and watermark >= end)
+            new = replace(run, acknowledged=upto, closed=closed, store=(upto and store) or run.store)
             with transaction(self._db):
                 numbers = (run.base, run.base + upto)
                 deleted = self._db.execute("DELETE FROM sample WHERE number > ? AND number <= ?", numbers).rowcount
@@ -332,8 +336,8 @@ class Spool:
         self._db.executemany("REPLACE INTO meta VALUES (?, ?)", values)
 
     def _save_run(self, run: SpoolRun) -> None:
-        values = (run.base, f"{run.spool_id:016x}", run.acknowledged, int(run.closed))
-        self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?, ?)", (*values, checksum_of(*values)))
+        values = (run.base, f"{run.spool_id:016x}", run.acknowledged, int(run.closed), run.store)
+        self._db.execute("REPLACE INTO run VALUES (?, ?, ?, ?, ?, ?)", (*values, checksum_of(*values)))
 
 
 def _damaged(rows: list[_SampleRow]) -> list[tuple[int, bytes]]:
@@ -345,11 +349,11 @@ def _is_sound(number: int, row: object, crc32: int) -> bool:
     return isinstance(row, bytes) and len(row) == SAMPLE_DTYPE.itemsize and crc32 == checksum(number, row)
 
 
-def _run_from(base: int, spool_id: str, acknowledged: int, closed: int, crc32: int) -> SpoolRun:
+def _run_from(base: int, spool_id: str, acknowledged: int, closed: int, store: str, crc32: int) -> SpoolRun:
     """A run as the file has it; ValueError where that is not what was written."""
-    if crc32 != checksum_of(base, spool_id, acknowledged, closed):
+    if crc32 != checksum_of(base, spool_id, acknowledged, closed, store):
         raise ValueError(f"what it knows of samples from {base} on is damaged; move the file away")
-    return SpoolRun(base, int(spool_id, 16), acknowledged, bool(closed))
+    return SpoolRun(base, int(spool_id, 16), acknowledged, bool(closed), store)
 
 
 def _table(rows: Iterable[bytes]) -> Table:

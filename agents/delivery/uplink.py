@@ -26,12 +26,14 @@ BLOCKING = {
     Refusal.WRONG_MACHINE,
     Refusal.VERSION,
     Refusal.WALL_CLOCK,
+    Refusal.SERVER_CLOCK,
+    Refusal.OTHER_STORE,
     Refusal.NOT_MSGPACK,
     Refusal.MISSING_FIELD,
     Refusal.WRONG_TYPE,
     Refusal.COLUMN_LENGTH,
 }
-PASSING = {Refusal.OVERLOADED, Refusal.STORE}  # the server will accept the same batch later
+PASSING = {Refusal.OVERLOADED, Refusal.STORE, Refusal.NOT_WRITER}  # the server will accept the same batch later
 SHARE = 1 / 3  # of the time-out that an exchange should take: a link that gets twice as slow still answers in time
 IDLE_S = 0.5  # longest pause without samples
 
@@ -69,7 +71,8 @@ class Head:
     """What the spool hands over: its oldest final samples, of one run; none where an earlier run is to be closed.
 
     lost_before: how many directly before them will never be sent. newest: the last sequence number given out, of the
-    run that is being recorded; None for an earlier run.
+    run that is being recorded; None for an earlier run. store: id of the store that the run is bound to, empty before
+    one has acknowledged a sample of it.
     """
 
     spool_id: int
@@ -77,6 +80,7 @@ class Head:
     rows: Table
     lost_before: int
     newest: int | None = None
+    store: str = ""
 
     @property
     def acknowledged(self) -> int:
@@ -100,10 +104,11 @@ class Send:
 
 @dataclass(frozen=True)
 class Delete:
-    """Delete the samples of a run up to a sequence number: the server has them on disk."""
+    """Delete the samples of a run up to a sequence number: the server has them on disk, in this store."""
 
     spool_id: int
     watermark: int
+    store: str = ""
 
 
 @dataclass(frozen=True)
@@ -142,8 +147,9 @@ Action = ReadHead | Send | SpoolAction | Wait
 class Uplink:
     """Delivery of one machine's samples.
 
-    held: why nothing is sent although it could be, empty if it is. problem: what keeps samples from the server now.
-    ack_s_max: the longest time from the first sending of a batch until samples of it were acknowledged.
+    held: why nothing is sent although it could be, empty if it is. problem: what keeps samples from the server now;
+    stuck: the same, where only a person can mend it. ack_s_max: the longest time from the first sending of a batch
+    until samples of it were acknowledged.
     """
 
     def __init__(
@@ -158,6 +164,7 @@ class Uplink:
         self.timeout_s = timeout_s
         self.counters: Counter[str] = Counter()
         self.problem = ""
+        self.stuck = ""
         self.held = ""
         self.ack_s_max = 0.0
         self._frame = frame
@@ -183,8 +190,8 @@ class Uplink:
         if head is None and self._has_met_server:
             return Wait(IDLE_S, for_samples=True)
         head = head or Head(spool_id, 1, empty(), 0)
-        batch = SampleBatch(self.machine, head.spool_id, head.first_seq, head.rows, self._frame, head.lost_before)
-        return Send(encode_batch(batch))
+        sent = (head.spool_id, head.first_seq, head.rows, self._frame, head.lost_before, head.store)
+        return Send(encode_batch(SampleBatch(self.machine, *sent)))
 
     def on_reply(self, reply: Ack | Refused | None, took_s: float) -> SpoolAction | Wait:
         """Act on the reply to the last batch, None for none. took_s: how long the exchange took."""
@@ -233,8 +240,13 @@ class Uplink:
         head, waited_s, self._unacknowledged_s = self._head, self._unacknowledged_s, 0.0
         if head is None:
             return self._succeed(0.0)
+        if head.store and head.store not in (ack.store, ack.replaces):  # what it deleted on that one's word is not here
+            self.counters["other_store"] += 1
+            self.problem = f"store {ack.store} acknowledges samples whose predecessors are in store {head.store}"
+            self.stuck = self.problem
+            return self._back_off()
         if not len(head.rows):  # an earlier run is closed, even if the server is older than the run
-            return Delete(head.spool_id, max(ack.watermark, head.first_seq - 1))
+            return Delete(head.spool_id, max(ack.watermark, head.first_seq - 1), ack.store)
         if head.newest is not None and ack.watermark > head.newest:
             # Only a machine that was copied or set back while it ran, memory and all, gives a number twice.
             self.counters["new_spool_ids"] += 1
@@ -244,12 +256,13 @@ class Uplink:
             return self._back_off()
         self.counters["batches"] += 1
         self.ack_s_max = max(self.ack_s_max, waited_s)
-        return Delete(head.spool_id, ack.watermark)
+        return Delete(head.spool_id, ack.watermark, ack.store)
 
     def _on_refused(self, refused: Refused) -> SpoolAction | Wait:
         head = self._head
         self.counters[f"refused_{refused.reason}"] += 1
         self.problem = refused.problem
+        self.stuck = refused.problem if refused.reason in BLOCKING else ""
         if refused.reason in PASSING or refused.reason in BLOCKING or head is None or not len(head.rows):
             return self._back_off()
         if refused.reason == Refusal.GAP:
@@ -261,7 +274,7 @@ class Uplink:
         return Quarantine(head, refused.problem)
 
     def _succeed(self, pause_s: float) -> Wait:
-        self.problem, self._failures, self._has_met_server = "", 0, True
+        self.problem, self.stuck, self._failures, self._has_met_server = "", "", 0, True
         return Wait(pause_s)
 
     def _adapt(self, n: int) -> None:

@@ -30,8 +30,8 @@ def perform(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
                 return uplink.on_head(spool.head(limit), spool.spool_id)
             case Send(payload):
                 return uplink.on_reply(*ask(payload))
-            case Delete(spool_id, watermark):
-                spool.acknowledge(spool_id, watermark)
+            case Delete(spool_id, watermark, store):
+                spool.acknowledge(spool_id, watermark, store)
             case LowerWatermark(spool_id, watermark):
                 spool.lower_watermark(spool_id, watermark)
             case StartNewRun():
@@ -57,6 +57,7 @@ class UplinkThread:
         self._spool = spool
         self._sign = sign
         self._new_samples = threading.Event()
+        self._logged = ""
         self._stop = threading.Event()
         self._cancel = zenoh.CancellationToken()
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
@@ -80,9 +81,16 @@ class UplinkThread:
                 if isinstance(action, Wait):
                     self._pause(action)
                 action = perform(action, self._uplink, self._spool, self._ask)
+                self._tell()
             except Exception as error:  # a bug must not end the thread, and with it all delivery, without a word
                 log.exception("uplink failed")
                 action = self._uplink.on_bug(error)
+
+    def _tell(self) -> None:
+        """Log what a person has to mend, once: it does not pass by itself, as a link that is down does."""
+        if (stuck := self._uplink.stuck) and stuck != self._logged:
+            log.error("samples wait problem=%r", stuck)
+        self._logged = stuck
 
     def _pause(self, pause: Wait) -> None:
         if pause.for_samples:

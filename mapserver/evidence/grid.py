@@ -17,7 +17,7 @@ from mapserver.evidence.settling import Space, Tiers
 from mapserver.evidence.timeline import PATIENCE, Block, TimedPage, Timeline, evidence, settle_all
 from mapserver.evidence.workers import ALONE, Workers
 from protocol.arrays import AnyArray, Table
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 # Samples that wait to be folded together: the more, the fewer pages. While machines drive, the map is read every second
@@ -25,7 +25,6 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 LIVE_ROWS, REFOLD_ROWS = 8192, 131_072
 PIECE = 4096  # samples whose weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
-_RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records field by field, and these at once
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class Grid:
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
         self._workers, self._scratch, self._spaces = ALONE, [scratch_block()], [Space()]
-        self._rows: AnyArray = np.empty(waiting_rows, _RAW_SAMPLE)
+        self._rows: AnyArray = np.empty(waiting_rows, RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
         self._waiting, self._weight = 0, 0
 
@@ -202,7 +201,7 @@ class Grid:
         while len(rows):
             part = rows[: len(self._rows) - self._waiting]
             end = self._waiting + len(part)
-            self._rows[self._waiting : end] = part.view(_RAW_SAMPLE)
+            self._rows[self._waiting : end] = part.view(RAW_SAMPLE)
             self._names[self._waiting : end] = names[: len(part)]
             self._waiting, rows, names = end, rows[len(part) :], names[len(part) :]
             if end == len(self._rows):
@@ -255,7 +254,7 @@ class Grid:
         """Go on with other workers, each with space of its own."""
         self._drain()
         self._workers = workers
-        self._rows, self._names = np.empty(waiting_rows, _RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
+        self._rows, self._names = np.empty(waiting_rows, RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
         self._scratch = [*self._scratch, *(scratch_block() for _ in range(workers.count))][: workers.count]
         self._spaces = [*self._spaces, *(Space() for _ in range(workers.count))][: workers.count]
         for timeline in self._timelines.values():

@@ -17,7 +17,7 @@ from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.history import History
 from mapserver.journal.reader import JournalReader
-from mapserver.journal.refold import fold_history
+from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Selection
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import KIND, TrustDecision, TrustDecisions
@@ -139,7 +139,15 @@ class Exclusion:
             if not fold_history(grid, history, row, last, selection, lambda: self._superseded(excluded)):
                 return False
             row, rounds = last, rounds + 1
-        self._writer.run(lambda store: store.adopt(grid, row, excluded))
+        replaced: list[Grid] = []
+
+        def adopt(store: Store) -> None:
+            replaced.append(store.grid)
+            store.adopt(grid, row, excluded)
+
+        self._writer.run(adopt)
+        replaced.clear()  # here: to let go of a grid takes time that the writer's thread does not have
+        release_memory()
         values = (",".join(sorted(excluded)), rounds, time.monotonic() - began_s)
         log.info("map folded again without=%s rounds=%d seconds=%.1f", *values)
         return True

@@ -120,8 +120,9 @@ class Archiving:
         if not after_h or time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + LOOK_S
-        before_ns = self._writer.now_ns() - round(after_h * 3600e9)
-        hours = archive(self._writer.folder / FOLDER, self._reader, self._writer.site, before_ns, self._forget)
+        now_ns, folder = self._writer.now_ns(), self._writer.folder / FOLDER
+        before_ns = now_ns - round(after_h * 3600e9)
+        hours = archive(folder, self._reader, self._writer.site, before_ns, self._forget, now_ns)
         if path := next(hours, None):
             self._writer.run(lambda store: store.journal.shrink())
             log.info("archived file=%s", path.name)

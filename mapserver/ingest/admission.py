@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
 
-from mapserver.journal.rows import Admission
+from mapserver.journal.rows import Admission, StoreIdentity
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
-from protocol.wire.codec import decode_batch
 from protocol.wire.messages import SampleBatch
+
+DAY_NS = 86_400_000_000_000
+FUTURE_NS = DAY_NS  # clocks that nobody set to the right zone or day are less wrong than that
+FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01: a server's clock before this program was written is wrong
 
 
 class GapError(MessageError):
@@ -21,22 +24,81 @@ class GapError(MessageError):
         self.expected = expected
 
 
-def parse(payload: bytes, machine: str, site: SiteConfig, now_ns: Callable[[], int]) -> SampleBatch:
-    """Decode and judge a batch that came in under the key of `machine`; MessageError says what is wrong with it."""
-    batch = decode_batch(payload, site.extent_m)
+@dataclass(frozen=True)
+class SeenTime:
+    """What a store has seen of time, beside the server's clock.
+
+    others_ns, newest_ns: newest stamp of the trusted machines but the sender, and of all. received_ns: the server's
+    clock when the last row came in. 0 for none.
+    """
+
+    others_ns: int = 0
+    newest_ns: int = 0
+    received_ns: int = 0
+
+
+def nothing_seen(_: str) -> SeenTime:
+    """What a new store has seen."""
+    return SeenTime()
+
+
+def judge(
+    batch: SampleBatch,
+    machine: str,
+    site: SiteConfig,
+    now_ns: Callable[[], int],
+    seen: Callable[[str], SeenTime] = nothing_seen,
+) -> None:
+    """Judge a decoded batch that came in under the key of `machine`; MessageError says what is wrong with it.
+
+    seen: of a sender; it is asked for batches from the future alone.
+    """
     if batch.machine != machine:
         problem = f"{batch.machine!r} sends under the key of {machine!r}"
         raise MessageError(Refusal.WRONG_MACHINE, problem, field="machine")
     if batch.frame != site.frame:
         problem = f"{batch.frame[:16]!r}: the frame of site {site.name} is {site.frame!r}; compare the site files"
         raise MessageError(Refusal.WRONG_FRAME, problem, field="frame")
-    if site.clock == "wall" and len(batch.rows):
-        row = int(batch.rows["stamp_ns"].argmax())
-        ahead_s = (int(batch.rows["stamp_ns"][row]) - now_ns()) * 1e-9
-        if ahead_s > site.clock_tolerance_s:
-            problem = f"{ahead_s:.1f} s ahead of the server's clock; set the machine's clock"
-            raise MessageError(Refusal.WALL_CLOCK, problem, field="stamp_ns", row=row)
-    return batch
+    if len(batch.rows):
+        _check_newest(batch, site, now_ns(), seen)
+
+
+def _check_newest(batch: SampleBatch, site: SiteConfig, now_ns: int, seen: Callable[[str], SeenTime]) -> None:
+    """Refuse stamps that shift the site's now: one sample of the year 2099 would make all others old."""
+    row = int(batch.rows["stamp_ns"].argmax())
+    stamp_ns = int(batch.rows["stamp_ns"][row])
+    ahead_ns = stamp_ns - now_ns
+    if ahead_ns > FUTURE_NS and stamp_ns - (time := seen(batch.machine)).others_ns > FUTURE_NS:
+        behind_ns = max(FIRST_NS, time.received_ns, time.newest_ns - FUTURE_NS) - now_ns
+        if behind_ns > 0:  # nothing can be said of a sample by such a clock
+            problem = (
+                f"the server's clock is {_days(ahead_ns)} behind this sample, and {_days(behind_ns)} behind what its"
+            )
+            problem += " store has seen; set the server's clock"
+            raise MessageError(Refusal.SERVER_CLOCK, problem, field="stamp_ns", row=row)
+        problem = f"{_days(ahead_ns)} ahead of the server's clock and of all other machines; set the machine's clock"
+        raise MessageError(Refusal.FAR_FUTURE, problem, field="stamp_ns", row=row)
+    if site.clock == "wall" and ahead_ns * 1e-9 > site.clock_tolerance_s:
+        problem = f"{ahead_ns * 1e-9:.1f} s ahead of the server's clock; set the machine's clock"
+        raise MessageError(Refusal.WALL_CLOCK, problem, field="stamp_ns", row=row)
+
+
+def _days(span_ns: int) -> str:
+    return f"{span_ns / DAY_NS:.1f} days"
+
+
+def check_store(batch: SampleBatch, identity: StoreIdentity, accepted: Collection[str]) -> str:
+    """The store that this one replaces for a batch, empty where it need not; MessageError where it may not.
+
+    accepted: ids of the stores whose place a person has let this one take.
+    """
+    if batch.store in ("", identity.id):
+        return ""
+    if batch.store in identity.descends or batch.store in accepted:
+        return batch.store
+    problem = f"earlier samples of this run are in store {batch.store}, and this is store {identity.id}: start the"
+    problem += f" server with that one, or `sitegrid accept {batch.store}` if it is gone"
+    raise MessageError(Refusal.OTHER_STORE, problem, field="store")
 
 
 def admit(batch: SampleBatch, watermark: int) -> Admission:

@@ -2,38 +2,46 @@
 
 from __future__ import annotations
 
-import fcntl
+import logging
 import os
 import socket
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
+from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, admit, parse
+from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
+from mapserver.ingest.batches import decode_batches
+from mapserver.ingest.lock import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
-from mapserver.journal.refold import fold_history
+from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
 from mapserver.trust.decisions import KIND as TRUST
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
-from protocol.errors import MessageError, Refusal, StoreError
+from protocol.errors import MessageError, Refusal
+from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
+log = logging.getLogger("mapserver.ingest.store")
+
 JOURNAL_FILE = "journal.db"
-LOCK_FILE = "lock"
+ACCEPTED = "accepted_store"  # kind of an event
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
 
@@ -49,8 +57,8 @@ class Incoming:
 class Store:
     """Journal, grid, watermarks and counters of one site.
 
-    identity: which store this is. excluded: machines whose rows are not in the grid. merged: the last journal row that
-    is; fact: the last decision that counts in it. newest_ns: the site's now.
+    identity: which store this is; accepted: ids of those whose place it takes. excluded: machines whose rows are not in
+    the grid. merged: the last journal row that is; fact: the last decision in it. newest_ns: the site's now.
     """
 
     def __init__(
@@ -66,20 +74,22 @@ class Store:
         self._verify = verify
         self.counters: Counter[str] = Counter()
         self.commits, self.commit_s = 0, 0.0
-        self.newest_ns = 0
         with ExitStack() as opened:
-            opened.enter_context(_hold(folder))
+            opened.enter_context(hold(folder))
             self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
+            self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
             last_row = self.journal.last_row
             self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
             snapshot.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
+            release_memory()
             self.merged = last_row
-            self.newest_ns = self.journal.newest_ns()
+            self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
+            self._received_ns = self._last_received(last_row)
             self.fact = self._last_fact()
             self._opened = opened.pop_all()
 
@@ -87,6 +97,11 @@ class Store:
     def journalled(self) -> int:
         """The last row on disk."""
         return self.journal.last_row
+
+    @property
+    def newest_ns(self) -> int:
+        """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
+        return self._newest_but("")
 
     @property
     def version(self) -> MapVersion:
@@ -98,9 +113,10 @@ class Store:
 
         Nothing is acknowledged before its commit; where the commit fails, every batch of the group is refused.
         """
+        batches = self._decode(group)
         try:
             self.journal.begin()
-            answers = [self._admit(incoming) for incoming in group]
+            answers = [self._admit(incoming, batch) for incoming, batch in zip(group, batches, strict=True)]
             began_s = time.monotonic()
             self.journal.commit()
             self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
@@ -110,8 +126,7 @@ class Store:
             return [Refused(Refusal.STORE, f"the server cannot write: {error}") for _ in group]
         for answer, admission in answers:
             self._count(answer, admission)
-            if isinstance(answer, Ack) and admission and len(admission.batch.rows):
-                self._fold(answer.row, admission.batch)
+        self._fold([admission.batch for _, admission in answers if admission and len(admission.batch.rows)])
         return [answer for answer, _ in answers]
 
     def save_snapshot(self) -> None:
@@ -133,24 +148,29 @@ class Store:
 
         return write
 
-    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> Grid:
+    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
         """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines.
 
-        The rows beyond it are folded here, while batches wait: let them be few. Returns the grid that was used so far,
-        so that another thread may spend the time to let go of it.
+        The rows beyond it are folded here, while batches wait: let them be few.
         """
         grid.touch_all()
         for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
             grid.fold_all(rows.samples, rows.names())
-        before, self.grid, self.excluded = self.grid, grid, excluded
+        self.grid, self.excluded = grid, excluded
         self.fact = self._last_fact()
         self.snapshot_row = 0  # what is on disk has other machines in it
-        return before
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
         self.journal.append_event(TRUST, decision.stamp_ns, asdict(decision))
         self.fact = self._last_fact()
+
+    def accept(self, store: str, reason: str) -> None:
+        """Take the place of another store for good, since a person says so: its runs are taken on here."""
+        if store != self.identity.id and store not in self.accepted:
+            self.journal.append_event(ACCEPTED, self.newest_ns, {"store": store, "reason": reason})
+            self.accepted |= {store}
+            log.warning("accepted store=%s reason=%r", store, reason)
 
     def close(self) -> None:
         """Close the journal and let go of the folder."""
@@ -162,6 +182,7 @@ class Store:
             "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
             "store": self.identity.id,
             "descends": list(self.identity.descends),
+            "accepted": sorted(self.accepted),
             "fact": self.fact,
             "journalled": self.journalled,
             "merged": self.merged,
@@ -190,20 +211,55 @@ class Store:
             entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
         return machines
 
-    def _admit(self, incoming: Incoming) -> tuple[Ack | Refused, Admission | None]:
+    def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
+        """What each batch holds, or why it is refused; one that is not signed is not looked at."""
+        refused = [self._signature_problem(incoming) for incoming in group]
+        signed = (incoming.payload for incoming, error in zip(group, refused, strict=True) if error is None)
+        decoded = iter(decode_batches(list(signed), self.site.extent_m))
+        return [error or next(decoded) for error in refused]
+
+    def _signature_problem(self, incoming: Incoming) -> MessageError | None:
+        if not self._verify:
+            return None
+        if not incoming.machine:
+            return MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
+        key = keys.ingest(self.site.name, incoming.machine)
         try:
-            if self._verify:
-                self._check_signature(self._verify, incoming)
-            batch = parse(incoming.payload, incoming.machine, self.site, self.now_ns)
+            self._verify(incoming.machine, key, incoming.payload, incoming.signature)
+        except MessageError as error:
+            return error
+        return None
+
+    def _admit(self, incoming: Incoming, batch: SampleBatch | MessageError) -> tuple[Ack | Refused, Admission | None]:
+        try:
+            if isinstance(batch, MessageError):
+                raise batch
+            judge(batch, incoming.machine, self.site, self.now_ns, self._seen)
+            replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
         new = len(admission.batch.rows) > 0
-        row = self.journal.append(admission, self.now_ns()) if new else self.journalled
+        if new:
+            self._received_ns = self.now_ns()
+        row = self.journal.append(admission, self._received_ns) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
-        return Ack(admission.watermark, row, admission.trimmed, self.identity.id), admission
+        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces), admission
+
+    def _newest_but(self, machine: str) -> int:
+        """The newest stamp of the machines in the map but one."""
+        hidden = self.excluded | {machine}
+        return max((newest_ns for name, newest_ns in self._newest.items() if name not in hidden), default=0)
+
+    def _seen(self, machine: str) -> SeenTime:
+        return SeenTime(self._newest_but(machine), self.newest_ns, self._received_ns)
+
+    def _last_received(self, last_row: int) -> int:
+        """The server's clock when the last row came in, 0 where none is in the journal."""
+        is_there = last_row > self.journal.archived_row
+        return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
 
     def _last_fact(self) -> int:
         """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""
@@ -214,12 +270,6 @@ class Store:
                 fact = event.id
         return fact
 
-    def _check_signature(self, verify: Verify, incoming: Incoming) -> None:
-        if not incoming.machine:
-            raise MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
-        key = keys.ingest(self.site.name, incoming.machine)
-        verify(incoming.machine, key, incoming.payload, incoming.signature)
-
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count what became of a batch, once it is certain."""
         if isinstance(answer, Refused):
@@ -229,24 +279,16 @@ class Store:
             self.counters["samples_trimmed"] += admission.trimmed
             self.counters["samples_lost"] += admission.lost
 
-    def _fold(self, row: int, batch: SampleBatch) -> None:
-        if batch.machine not in self.excluded:
-            self.grid.fold(batch.rows, batch.machine)
-        self.newest_ns = max(self.newest_ns, int(batch.rows["stamp_ns"].max()))
-        self.merged = row
+    def _fold(self, batches: list[SampleBatch]) -> None:
+        """Fold what was committed: all of it that there is, up to the last journal row."""
+        folded = [batch for batch in batches if batch.machine not in self.excluded]
+        names = np.array([name_hash(batch.machine) for batch in folded], np.uint64)
+        rows = joined([batch.rows for batch in folded])
+        self.grid.fold_all(rows, np.repeat(names, [len(batch.rows) for batch in folded]))
+        for batch in batches:
+            newest_ns = int(batch.rows["stamp_ns"].max())
+            self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)
+        self.merged = self.journalled
 
     def _history(self) -> History:
         return History(self.journal, Archive(self.folder / FOLDER))
-
-
-@contextmanager
-def _hold(folder: Path) -> Iterator[None]:
-    """Keep a second server off the folder: each would take the samples that the other has. A crash releases it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK_FILE).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            problem = "another server is using this store; stop it, or choose another --store"
-            raise StoreError(folder, problem) from None
-        yield

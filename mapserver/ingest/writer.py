@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.ingest.store import Incoming, Store
 from protocol.errors import QueryError, Refusal
 from protocol.wire.messages import Ack, Refused
@@ -36,6 +37,7 @@ class Writer:
     """Owns a Store on a thread of its own, from here on; site, config, folder, now_ns, store_id: of the store.
 
     `submit` and `run` may be called from any thread; both return at once or wait for the owner, never touch the store.
+    waits: who waits for a row to be merged.
     """
 
     def __init__(self, store: Store) -> None:
@@ -46,7 +48,7 @@ class Writer:
         self._batches: queue.Queue[tuple[Incoming, Reply] | _Work | None] = queue.Queue()
         self._waiting = threading.Semaphore(QUEUE_BATCHES)
         self._overloaded = 0
-        self._merged = threading.Condition()
+        self.waits = MergeWaits(store.merged)
         self.failed = False
         self._snapshots = ThreadPoolExecutor(1, thread_name_prefix="snapshot")
         self._snapshot: Future[None] = Future()
@@ -68,16 +70,9 @@ class Writer:
         self._batches.put(_Work(work, result))
         return result.result(timeout_s)
 
-    def wait_merged(self, row: int, wait_s: float) -> None:
-        """Wait until a journal row is merged; QueryError if that takes longer than wait_s."""
-        with self._merged:
-            if not self._merged.wait_for(lambda: self._store.merged >= row, wait_s):
-                problem = f"journal row {row} is not merged after {wait_s:g} s; merged is {self._store.merged}"
-                raise QueryError(Refusal.AFTER_TIMEOUT, problem)
-
     def count_refusal(self, reason: str) -> None:
-        """Count a refused query."""
-        self.run(lambda store: store.counters.update({f"refused_query_{reason}": 1}))
+        """Count a refused query, soon: nobody waits for that."""
+        self._batches.put(_Work(lambda store: store.counters.update({f"refused_query_{reason}": 1}), Future()))
 
     def info(self) -> dict[str, Any]:
         """State of the store."""
@@ -90,6 +85,7 @@ class Writer:
 
     def close(self) -> None:
         """Finish what is waiting, snapshot, close; once more does nothing."""
+        self.waits.close()
         self._batches.put(None)
         self._thread.join()
 
@@ -154,8 +150,7 @@ class Writer:
         if ending:
             self._batches.put(None)
         answers = self._store.commit([incoming for incoming, _ in group])
-        with self._merged:
-            self._merged.notify_all()
+        self.waits.advance(self._store.merged)
         for (incoming, reply), answer in zip(group, answers, strict=True):
             self._waiting.release()
             if isinstance(answer, Refused):

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mapserver.journal.archive_file import KEY, NAME, ArchiveFile, ArchiveHeader, arrow, row_range, seal
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.reader import LAST, JournalReader
 from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
 from protocol.errors import StoreError
 from protocol.files import sync_folder, whole_file
@@ -30,6 +30,7 @@ FILE_SAMPLES = 2_000_000  # about; an hour with more is cut into several files
 GROUP_SAMPLES = 50_000  # of a row group, about: a batch is never cut
 HOUR_NS = 3_600_000_000_000
 TEMPORARY = "next.parquet.tmp"
+ReceivedRow = tuple[JournalRow, int]  # and when it came in [ns]
 
 
 class Archive:
@@ -68,21 +69,29 @@ class Archive:
 
 
 def archive(
-    folder: Path, journal: JournalReader, site: SiteConfig, before_ns: int, forget: Callable[[int], int]
+    folder: Path,
+    journal: JournalReader,
+    site: SiteConfig,
+    before_ns: int,
+    forget: Callable[[int], int],
+    now_ns: int = LAST,
 ) -> Iterator[Path]:
     """Move hours of reception that ended before `before_ns` from the journal into files, one at each step.
 
     Runs on any thread with a reader of its own. forget: is handed a row and has the journal's owner call
-    `Journal.forget` with it once, in between other work; returns what that returned.
+    `Journal.forget` with it once, in between other work; returns what that returned. now_ns: the clock; a row that was
+    received later than that is as old as the next one that was not.
     """
-    while path := next_file(folder, journal, site, before_ns):
+    while path := next_file(folder, journal, site, before_ns, now_ns):
         _, last = row_range(path)
         while forget(last) < last:
             pass
         yield path
 
 
-def next_file(folder: Path, journal: JournalReader, site: SiteConfig, before_ns: int) -> Path | None:
+def next_file(
+    folder: Path, journal: JournalReader, site: SiteConfig, before_ns: int, now_ns: int = LAST
+) -> Path | None:
     """Make the next file, or take the one that a crash left; the journal, compared with it, may forget its rows.
 
     None where no further hour is old enough.
@@ -91,20 +100,44 @@ def next_file(folder: Path, journal: JournalReader, site: SiteConfig, before_ns:
         unfinished.unlink(missing_ok=True)
     archived = journal.archived_row
     left = [path for path in Archive(folder).paths() if row_range(path)[1] > archived]
-    path = left[0] if left else write_file(folder, site, _hour(journal.read(archived), before_ns))
+    rows = _hour(_received(journal, archived, now_ns), before_ns)
+    path = left[0] if left else write_file(folder, journal.identity().id, site, rows)
     if path:
         _compare(path, journal, archived)
     return path
 
 
-def _hour(rows: Iterator[JournalRow], before_ns: int) -> Iterator[JournalRow]:
+def _received(journal: JournalReader, after: int, now_ns: int) -> Iterator[ReceivedRow]:
+    """Rows and when they came in: where the server's clock was ahead of now then, when the next row did.
+
+    Otherwise one row that was received "next year" would keep all that follow from the archive until then.
+    """
+    until, known_ns = 0, 0
+    for row in journal.read(after):
+        if row.received_ns <= now_ns:
+            yield row, row.received_ns
+            continue
+        if row.row > until:
+            until, known_ns = _next_received(journal, row.row, now_ns)
+        yield row, known_ns
+
+
+def _next_received(journal: JournalReader, after: int, now_ns: int) -> tuple[int, int]:
+    """The next row that was received by now, and when; where there is none, LAST and now."""
+    for rows in journal.read_many(after):
+        if len(there := np.flatnonzero(rows.received_ns <= now_ns)):
+            return int(rows.numbers[there[0]]), int(rows.received_ns[there[0]])
+    return LAST, now_ns
+
+
+def _hour(rows: Iterator[ReceivedRow], before_ns: int) -> Iterator[ReceivedRow]:
     """Rows that were received in the same hour as the first one, if that ended before `before_ns`."""
     hour, samples = None, 0
-    for row in rows:
-        hour = row.received_ns // HOUR_NS if hour is None else hour
-        if row.received_ns // HOUR_NS != hour or (hour + 1) * HOUR_NS > before_ns or samples >= FILE_SAMPLES:
+    for row, received_ns in rows:
+        hour = received_ns // HOUR_NS if hour is None else hour
+        if received_ns // HOUR_NS != hour or (hour + 1) * HOUR_NS > before_ns or samples >= FILE_SAMPLES:
             return
-        yield row
+        yield row, received_ns
         samples += len(row.rows)
 
 
@@ -122,21 +155,22 @@ def _plain(row: JournalRow) -> tuple[object, ...]:
     return tuple((values | {"rows": row.rows.tobytes()}).values())
 
 
-def write_file(folder: Path, site: SiteConfig, rows: Iterator[JournalRow]) -> Path | None:
-    """Write rows to a new file that survives a power cut once it has its name; None where there are none.
+def write_file(folder: Path, store: str, site: SiteConfig, rows: Iterator[ReceivedRow]) -> Path | None:
+    """Write rows of a store to a new file that survives a power cut once it has its name; None where there are none.
 
     The file is complete under a temporary name first: its own name has its last row, which is not known before.
     """
-    first = next(rows, None)
-    if first is None:
+    begin = next(rows, None)
+    if begin is None:
         return None
+    first, received_ns = begin
     temporary = folder / TEMPORARY
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with whole_file(temporary) as file:
-            last_row = write_parquet(file, site, chain([first], rows))
+            last_row = write_parquet(file, store, site, chain([first], (row for row, _ in rows)))
             seal(file)
-        hour = datetime.fromtimestamp(first.received_ns // HOUR_NS * 3600, UTC).strftime("%Y-%m-%dT%H")
+        hour = datetime.fromtimestamp(received_ns // HOUR_NS * 3600, UTC).strftime("%Y-%m-%dT%H")
         path = folder / f"{hour}_{first.row:06d}-{last_row:06d}.parquet"
         temporary.rename(path)
         sync_folder(folder)
@@ -147,7 +181,7 @@ def write_file(folder: Path, site: SiteConfig, rows: Iterator[JournalRow]) -> Pa
     return path
 
 
-def write_parquet(file: BinaryIO, site: SiteConfig, rows: Iterator[JournalRow]) -> int:
+def write_parquet(file: BinaryIO, store: str, site: SiteConfig, rows: Iterator[JournalRow]) -> int:
     """Write rows, row group by row group; returns the last one's number."""
     delta = dict.fromkeys(("seq", "row", "stamp_ns"), "DELTA_BINARY_PACKED")
     options = {
@@ -163,7 +197,7 @@ def write_parquet(file: BinaryIO, site: SiteConfig, rows: Iterator[JournalRow]) 
         for group in _groups(rows):
             writer.write_table(_table(group))
             machines |= {row.machine for row in group}
-        header = ArchiveHeader(site, site.frame, site.crs, tuple(sorted(machines)))
+        header = ArchiveHeader(store, site, site.frame, site.crs, tuple(sorted(machines)))
         writer.add_key_value_metadata({KEY: json.dumps(asdict(header))})
     return group[-1].row
 

@@ -28,7 +28,7 @@ from protocol.errors import ConfigError, StoreError
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 
-SCHEMA = 1
+SCHEMA = 2
 KEY = b"sitegrid"  # of our own metadata
 NAME = re.compile(r"\d{4}-\d\d-\d\dT\d\d_(\d+)-(\d+)\.parquet")
 _SEAL = b"SGRD"
@@ -37,8 +37,9 @@ _SEAL_BYTES = 12
 
 @dataclass(frozen=True)
 class ArchiveHeader:
-    """What a file states about itself beside Parquet's own metadata."""
+    """What a file states about itself beside Parquet's own metadata. store: id of the store that it is of."""
 
+    store: str
     site: SiteConfig
     frame: str
     crs: str
@@ -197,4 +198,4 @@ def arrow(module: str = "") -> Any:
     try:
         return import_module(f"pyarrow.{module}" if module else "pyarrow")
     except ModuleNotFoundError:
-        raise ConfigError("archive", "pyarrow is not installed: pip install 'sitegrid[archive]'") from None
+        raise ConfigError("archive", "pyarrow is not installed: pip install '.[archive]'") from None

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
-from mapserver.journal.records import record
+from mapserver.journal.records import extent_of, record
 from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, extent_checksum
 from protocol.errors import StoreError
 
@@ -64,16 +64,13 @@ class Journal(JournalQueries):
     def append(self, admission: Admission, received_ns: int) -> int:
         """Write one row and its watermark into the open transaction; returns the row's number."""
         batch = admission.batch
-        x_m, y_m, stamps = (batch.rows[name] for name in ("x_m", "y_m", "stamp_ns"))
-        first_ns, last_ns = int(stamps.min()), int(stamps.max())
         row = self.last_row + 1
         written = JournalRow(row, batch.machine, batch.spool_id, batch.first_seq, batch.rows, received_ns)
         self._db.execute("INSERT INTO journal VALUES (?, ?)", (row, record(written)))
-        box = (float(x_m.min()), float(y_m.min()), float(x_m.max()), float(y_m.max()))
-        extent = (row, first_ns, last_ns, *box)
+        extent = (row, *extent_of(batch.rows))
         self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, extent_checksum(*extent)))
         before = self.watermark(batch.machine, batch.spool_id)
-        watermark = Watermark(admission.watermark, before.lost + admission.lost, max(before.newest_ns, last_ns))
+        watermark = Watermark(admission.watermark, before.lost + admission.lost, max(before.newest_ns, extent[2]))
         self.put_watermark(batch.machine, batch.spool_id, watermark)
         self.last_row = row
         return row

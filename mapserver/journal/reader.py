@@ -123,10 +123,6 @@ class JournalQueries:
             if is_end:
                 return
 
-    def newest_ns(self) -> int:
-        """The newest stamp of all samples, archived or not: the site's now."""
-        return self._number("SELECT COALESCE(MAX(newest_ns), 0) FROM watermark")
-
     def identity(self) -> StoreIdentity:
         """Which store this is; StoreError where that is damaged."""
         words = self._meta().get("store", "").split()

@@ -1,4 +1,4 @@
-"""Journal rows as bytes: one record each, checked and taken apart many at a time.
+"""Journal rows as bytes: one record each, checked and taken apart many at a time; where their samples lie.
 
 A record is little-endian: HEAD, the machine's name, the samples as SAMPLE_DTYPE, and the CRC-32 of all that. The CRC-32
 of a whole record is then the same number for all, SOUND: a record is checked before anything in it is believed.
@@ -30,6 +30,26 @@ def record(row: JournalRow) -> bytes:
     head = np.array((row.row, row.received_ns, row.spool_id, row.first_seq, len(name)), HEAD)
     body = head.tobytes() + name + row.rows.tobytes()
     return body + zlib.crc32(body).to_bytes(_CRC_BYTES, "little")
+
+
+def warm_up() -> None:
+    """Compile the kernels, or read them from their cache, before a batch waits for them."""
+    row = JournalRow(1, "", 1, 1, np.zeros(1, SAMPLE_DTYPE))
+    decoded([1], [record(row)])
+    extent_of(row.rows)
+
+
+@numba.njit(cache=True, nogil=True)
+def extent_of(samples: Table) -> tuple[int, int, float, float, float, float]:
+    """When and where samples lie: first and last stamp, west, south, east, north."""
+    first = samples[0]
+    first_ns = last_ns = first.stamp_ns
+    west_m, south_m, east_m, north_m = first.x_m, first.y_m, first.x_m, first.y_m
+    for sample in samples:
+        first_ns, last_ns = min(first_ns, sample.stamp_ns), max(last_ns, sample.stamp_ns)
+        west_m, east_m = min(west_m, sample.x_m), max(east_m, sample.x_m)
+        south_m, north_m = min(south_m, sample.y_m), max(north_m, sample.y_m)
+    return first_ns, last_ns, west_m, south_m, east_m, north_m
 
 
 def decoded(numbers: Sequence[int], records: Sequence[Any]) -> JournalRows:

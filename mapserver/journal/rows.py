@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from mapserver.evidence.fold_config import name_hash
 from protocol.arrays import Bools, Ints, Table
 from protocol.machine.readings import MAX_STAMP_NS
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
 
-_RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records field by field, and these at once
 _EXTENT = struct.Struct("<3q4d")
 
 
@@ -85,7 +84,7 @@ class JournalRows:
         if rows.all():
             return self
         columns = ("lengths", "machine", "numbers", "spool_ids", "first_seqs", "received_ns")
-        samples = self.samples.view(_RAW_SAMPLE)[np.repeat(rows, self.lengths)].view(SAMPLE_DTYPE)
+        samples = self.samples.view(RAW_SAMPLE)[np.repeat(rows, self.lengths)].view(SAMPLE_DTYPE)
         return replace(self, samples=samples, **{name: getattr(self, name)[rows] for name in columns})
 
     def first(self, n: int) -> JournalRows:
@@ -102,7 +101,7 @@ class JournalRows:
         chosen = selection.includes(self.samples)
         if chosen.all():
             return self.samples, self.names()
-        return self.samples.view(_RAW_SAMPLE)[chosen].view(SAMPLE_DTYPE), self.names()[chosen]
+        return self.samples.view(RAW_SAMPLE)[chosen].view(SAMPLE_DTYPE), self.names()[chosen]
 
 
 @dataclass(frozen=True)

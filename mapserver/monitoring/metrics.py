@@ -133,11 +133,17 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _gauge("sitegrid_map_samples", "Samples that are in the map.", info["samples_merged"]),
         _gauge("sitegrid_map_samples_too_unsure", "Samples whose place is too unsure.", info["samples_too_unsure"]),
         _gauge("sitegrid_map_cells", "Cells that are known.", info["cells"]),
-        _gauge("sitegrid_map_newest_timestamp_seconds", "Newest stamp of all samples.", info["stamp_ns"] / 1e9),
+        _gauge("sitegrid_map_newest_timestamp_seconds", "Newest stamp of trusted machines.", info["stamp_ns"] / 1e9),
+        _gauge("sitegrid_map_ahead_seconds", "How far that is ahead of the server's clock.", _ahead_s(info)),
         _gauge("sitegrid_waiting_batches", "Batches that wait to be taken.", writer["waiting"]),
         _counter("sitegrid_commits_total", "Commits of the journal.", writer["commits"]),
         _counter("sitegrid_commit_seconds_total", "Time spent on commits.", writer["commit_s"]),
     ]
+
+
+def _ahead_s(info: Mapping[str, Any]) -> float:
+    """Negative where a site is idle, or replays a log; 0 before there is a sample."""
+    return (info["stamp_ns"] - info["wall_ns"]) / 1e9 if info["stamp_ns"] else 0.0
 
 
 def _machines(info: Mapping[str, Any]) -> Iterable[Metric]:

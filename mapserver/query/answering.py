@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mapserver.change.detection import reach_blocks
 from mapserver.follower.follower import Follower
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
@@ -15,15 +16,17 @@ from mapserver.journal.history import SpanEvidence
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
+from mapserver.query.tiles import TILE_BYTES, OpenRegions, Reading, TileGrid
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
 from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
-from protocol.queries.commands import TrustCommand, parse_command
-from protocol.queries.requests import MAX_SPANS, HistoryQuery, MapQuery, PointQuery, RegionQuery, When
+from protocol.queries.commands import AcceptCommand, TrustCommand, parse_command
+from protocol.queries.requests import MAX_SPANS, NOW, HistoryQuery, MapQuery, PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds, CellWindow
 
+SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 
 
@@ -33,30 +36,42 @@ class Answers:
     def __init__(self, writer: Writer, follower: Follower) -> None:
         self._writer, self._follower = writer, follower
         self._site, self._config = writer.site, writer.config
+        self._open = OpenRegions()
         self._past = PastMaps(writer.folder / JOURNAL_FILE, self._site.cell_m, self._config)
 
-    def answer(self, name: str, parameters: Mapping[str, str]) -> bytes:
-        """Parse and answer one query; QueryError says what is wrong with it."""
-        query = requests.parse_query(name, parameters)
-        self._writer.wait_merged(query.fresh.after, query.fresh.wait_s)
-        return self._encode(query)
+    def size(self, query: MapQuery) -> int:
+        """About how many bytes the answer has."""
+        if isinstance(query, requests.TileQuery):
+            return TILE_BYTES
+        if not isinstance(query, RegionQuery):
+            return SMALL_BYTES
+        window = self._site.geometry.window(query.bounds)
+        return min(TILE_BYTES, 4 * window.columns * window.rows * len(query.layers or cell_layers.LAYERS) + SMALL_BYTES)
 
     def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and carry out one command; QueryError says what is wrong with it."""
-        return codec.encode_machine(self.trust(parse_command(name, parameters)))
+        command = parse_command(name, parameters)
+        if isinstance(command, AcceptCommand):
+            self._writer.run(lambda store: store.accept(command.store, command.reason))
+            return codec.encode_info(self.info())
+        return codec.encode_machine(self.trust(command))
 
-    def _encode(self, query: MapQuery) -> bytes:
+    def answer(self, query: MapQuery) -> bytes:
+        """Answer one query; QueryError says what is wrong with it."""
         match query:
             case PointQuery():
                 return codec.encode_point(self.point(query))
             case RegionQuery():
                 return codec.encode_region(self.region(query))
+            case requests.TileQuery():
+                return codec.encode_region(self.tile(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
             case requests.MachinesQuery():
                 return codec.encode_machines(self._follower.machines(), self._version())
             case requests.ChangesQuery():
-                return codec.encode_changes(self._follower.changes(query.after), self._version())
+                changes = self._follower.changes(query.after)[: codec.MAX_CHANGES]
+                return codec.encode_changes(changes, self._version())
         return codec.encode_info(self.info())
 
     def info(self) -> dict[str, Any]:
@@ -65,13 +80,25 @@ class Answers:
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
-        region = self._read(self._cell(query.x_m, query.y_m), query.layers, query.when)
+        cell = self._cell(query.x_m, query.y_m)
+        region = self._read(self._reading(cell, _names(query), query.when), cell)
         values = {name: float(layer[0, 0]) for name, layer in region.layers.items()}
         return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.version, region.stamp_ns)
 
     def region(self, query: RegionQuery) -> Region:
-        """Layers of all cells that a rectangle touches."""
-        return self._read(self._site.geometry.window(query.bounds), query.layers, query.when)
+        """Layers of all cells that a rectangle touches, or of the first tile of them: `tile` has the others."""
+        window, names = self._site.geometry.window(query.bounds), _names(query)
+        requests.check_size(window.columns, window.rows)
+        tiles = TileGrid.of_layers(window, len(names))
+        if tiles.count == 1:
+            return self._read(self._reading(window, names, query.when), window)
+        self._open.make_room()
+        reading = self._reading(window, names, query.when)
+        return self._tile(reading, tiles, 0, self._open.open(reading))
+
+    def tile(self, query: requests.TileQuery) -> Region:
+        """One more tile of a region that is open."""
+        return self._tile(*self._open.reading(query.cursor, query.number), query.number, query.cursor)
 
     def history(self, query: HistoryQuery) -> HistoryAnswer:
         """Layers of the cell that a position lies in, span by span."""
@@ -99,19 +126,29 @@ class Answers:
         window = self._site.geometry.window(Bounds(x_m, y_m, np.nextafter(x_m, np.inf), np.nextafter(y_m, np.inf)))
         return CellWindow(window.column, window.row, 1, 1)
 
-    def _read(self, window: CellWindow, names: tuple[str, ...], when: When) -> Region:
-        requests.check_size(window.columns, window.rows)
-        if when.minus_ns is None:
-            return self._map(window, cell_layers.select(names), when.as_of_ns)
-        names = _with_difference(names)
-        newer, older = (self._map(window, names, as_of_ns) for as_of_ns in (when.as_of_ns, when.minus_ns))
-        differences = {name: newer[name] - older[name] for name in names}
+    def _reading(self, window: CellWindow, names: tuple[str, ...], when: When) -> Reading:
+        wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
+        times = [when.as_of_ns] if when.minus_ns is None else [when.as_of_ns, when.minus_ns]
+        return Reading(window, names, tuple(self._view(wide, as_of_ns) for as_of_ns in times))
+
+    def _tile(self, reading: Reading, tiles: TileGrid, number: int, cursor: int) -> Region:
+        return replace(self._read(reading, tiles.tile(number)), tile=tiles.place(number, cursor))
+
+    def _read(self, reading: Reading, window: CellWindow) -> Region:
+        """Layers of a window in that of the reading."""
+        newer, *others = (self._map(view, reading, window) for view in reading.views)
+        if not others:
+            return newer
+        (older,) = others
+        differences = {name: newer[name] - older[name] for name in reading.layers}
         version = replace(newer.version, row=min(newer.merged, older.merged))
         return replace(newer, layers=differences, version=version)
 
-    def _map(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None) -> Region:
+    def _map(self, view: View, reading: Reading, window: CellWindow) -> Region:
+        names = reading.layers
         wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
-        view = self._view(wide, as_of_ns)
+        if window != reading.window:
+            view = view.around(wide, reach_blocks(self._site.cell_m, self._config.change))
         values = read_cells(view, wide, cell_layers.required(names), self._site.cell_m, self._config)
         areas = cell_layers.derive_area(names, values, self._site.cell_m, self._config.read)
         geometry = self._site.geometry
@@ -135,9 +172,9 @@ class Answers:
         return HistorySpan(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
 
 
-def reads_past(name: str, parameters: Mapping[str, str]) -> bool:
+def reads_past(query: MapQuery) -> bool:
     """Whether a query folds the journal, which takes a while."""
-    return name == HistoryQuery.name or not {"as_of", "minus"}.isdisjoint(parameters)
+    return isinstance(query, HistoryQuery) or (isinstance(query, PointQuery | RegionQuery) and query.when != NOW)
 
 
 def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -148,8 +185,11 @@ def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-def _with_difference(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Check layers to be subtracted; none means all of which there is a difference."""
+def _names(query: PointQuery | RegionQuery) -> tuple[str, ...]:
+    """The layers of a query, checked; none means all, or all of which there is a difference."""
+    names = query.layers
+    if query.when.minus_ns is None:
+        return cell_layers.select(names)
     if refused := [name for name in names if name in WITHOUT_DIFFERENCE]:
         problem = f"layer `{refused[0]}` has no difference; ask for it without `minus`, as of each time"
         raise QueryError(Refusal.OUT_OF_RANGE, problem)

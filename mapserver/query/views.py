@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,16 @@ class View:
     merged: int
     stamp_ns: int
     fact: int = 0
+
+    def around(self, window: CellWindow, reach: int) -> View:
+        """Only what a part of the window is read from."""
+        wide = _surroundings(window, reach)
+        (left, right), (bottom, top) = (
+            (first // BLOCK_CELLS, (first + count) // BLOCK_CELLS)
+            for first, count in ((wide.column, wide.columns), (wide.row, wide.rows))
+        )
+        blocks = ((x, y) for x in range(left, right) for y in range(bottom, top))
+        return replace(self, pages={block: self.pages[block] for block in blocks if block in self.pages})
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Samples: geotagged resistance and gradient, as structured rows; the same bytes on machine, wire and server."""
 
 import hashlib
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -28,6 +29,7 @@ SAMPLE_DTYPE = np.dtype(
     ]
 )
 COLUMNS: tuple[str, ...] = SAMPLE_DTYPE.names or ()
+RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records field by field, and these at once
 
 RESISTANCE = ("c_rr", "c_rr_var")  # may both be NaN
 GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
@@ -53,6 +55,11 @@ LIMITS: dict[str, tuple[float, float]] = {
 def empty(n: int = 0) -> Table:
     """Return `n` zeroed samples."""
     return np.zeros(n, SAMPLE_DTYPE)
+
+
+def joined(tables: Sequence[Table]) -> Table:
+    """Samples of several tables in one."""
+    return np.concatenate([np.empty(0, RAW_SAMPLE), *(table.view(RAW_SAMPLE) for table in tables)]).view(SAMPLE_DTYPE)
 
 
 def content_hash(row: Table) -> str:

@@ -18,7 +18,8 @@ from protocol.queries import answers
 from protocol.site.geometry import MAX_CELLS
 from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_store, unpack
 
-MAX_REPLY_BYTES = 2**30
+MAX_REPLY_BYTES = 2**23  # a tile has 0.8 MB, a history of 2000 spans 1 MB
+MAX_CHANGES = 1000  # of one answer
 MAX_CELL_M = 1e4
 MAX_PLACE_M = 1e7  # from the origin
 MAX_ITEMS = 100_000  # of one list
@@ -43,7 +44,7 @@ def decode_point(data: bytes) -> answers.PointAnswer:
 
 
 def encode_region(region: answers.Region) -> bytes:
-    """Answer of `region`: layers as float32 little-endian, row by row from the south."""
+    """Answer of `region` and `tile`: layers as float32 little-endian, row by row from the south."""
     layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in region.layers.items()}
     return pack(
         {
@@ -55,6 +56,7 @@ def encode_region(region: answers.Region) -> bytes:
             "layers": layers,
             **_version(region.version),
             "stamp_ns": region.stamp_ns,
+            **({"tile": asdict(region.tile)} if region.tile else {}),
         }
     )
 
@@ -76,7 +78,19 @@ def decode_region(data: bytes) -> answers.Region:
         layers=layers,
         version=_take_version(table),
         stamp_ns=take(table, "stamp_ns", int),
+        tile=_take_tile(table, columns, rows),
     )
+
+
+def _take_tile(table: dict[str, Any], columns: int, rows: int) -> answers.Tile | None:
+    """Where a tile of columns x rows cells lies, if that is said; it has to lie within its region."""
+    if table.get("tile") is None:
+        return None
+    tile = _record(answers.Tile, table, "tile")
+    inside = 0 <= tile.column <= tile.columns - columns and 0 <= tile.row <= tile.rows - rows
+    if not (inside and 0 <= tile.number < tile.count and tile.columns * tile.rows <= MAX_CELLS):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{tile} of {columns} x {rows} cells", field="tile")
+    return tile
 
 
 def _take_place(table: dict[str, Any], name: str) -> float:
@@ -258,10 +272,11 @@ def _tuple(hints: tuple[Any, ...], values: list[Any], field: str) -> tuple[Any, 
 
 def encode_error(error: QueryError) -> bytes:
     """Answer to a query or a command that is refused."""
-    return pack({"reason": error.reason, "problem": str(error)})
+    again = {"retry_after_s": error.retry_after_s} if error.retry_after_s else {}
+    return pack({"reason": error.reason, "problem": str(error), **again})
 
 
 def decode_error(data: bytes) -> QueryError:
     """Undo `encode_error`."""
     table = unpack(data, MAX_SMALL_BYTES)
-    return QueryError(take(table, "reason", str), take(table, "problem", str))
+    return QueryError(take(table, "reason", str), take(table, "problem", str), take(table, "retry_after_s", float, 0.0))

@@ -48,11 +48,28 @@ class PointAnswer(_OfVersion):
 
 
 @dataclass(frozen=True)
+class Tile:
+    """Where a tile lies in the region that was asked for.
+
+    cursor: names the version of the map that the region is read from. number: of this tile, 0 to count - 1. column,
+    row: its south-western cell in the region, which has columns x rows cells.
+    """
+
+    cursor: int
+    number: int
+    count: int
+    column: int
+    row: int
+    columns: int
+    rows: int
+
+
+@dataclass(frozen=True)
 class Region(_OfVersion):
     """A rectangle of cells.
 
     x_m (columns,), y_m (rows,): cell centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
-    NaN where unknown; row 0 is the southernmost.
+    NaN where unknown; row 0 is the southernmost. tile: where this is a tile of a larger region; None for all of it.
     """
 
     x_m: Floats
@@ -61,6 +78,7 @@ class Region(_OfVersion):
     layers: Mapping[str, Floats32]
     version: MapVersion
     stamp_ns: int
+    tile: Tile | None = None
 
     def __getitem__(self, layer: str) -> Floats32:
         return self.layers[layer]
@@ -131,14 +149,16 @@ class ServerProcess:
 class MapInfo:
     """State of the map and its server.
 
-    store: its id; descends: ids of the stores that it was folded from; fact: see MapVersion. journalled, merged,
-    snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks with evidence; None
-    without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    store: its id; descends: ids of the stores that it was folded from; accepted: ids of those whose place a person let
+    it take; fact: see MapVersion. journalled, merged, snapshot: journal rows. bounds: first column, first row, end
+    column and end row of the blocks with evidence; None without any. wall_ns: the server's clock. distrusted: machines
+    whose samples are excluded.
     """
 
     site: SiteInfo
     store: str
     descends: tuple[str, ...]
+    accepted: tuple[str, ...]
     fact: int
     journalled: int
     merged: int

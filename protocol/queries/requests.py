@@ -60,6 +60,17 @@ class RegionQuery:
 
 
 @dataclass(frozen=True)
+class TileQuery:
+    """One more tile of a region that is answered in tiles; cursor: from its first tile. number: from 0 on."""
+
+    cursor: int
+    number: int
+    fresh = Freshness()
+
+    name = "tile"
+
+
+@dataclass(frozen=True)
 class HistoryQuery:
     """The cell at a position in `map` [m] over time, span by span.
 
@@ -106,11 +117,11 @@ class ChangesQuery:
     name = "changes"
 
 
-MapQuery = PointQuery | RegionQuery | HistoryQuery | InfoQuery | MachinesQuery | ChangesQuery
+MapQuery = PointQuery | RegionQuery | TileQuery | HistoryQuery | InfoQuery | MachinesQuery | ChangesQuery
 
 
 def check_size(columns: int, rows: int) -> None:
-    """Refuse a region with more cells than one reply may hold."""
+    """Refuse a region with too many cells."""
     if columns * rows > MAX_CELLS:
         raise QueryError(Refusal.TOO_LARGE, f"region of {columns} x {rows} cells; at most {MAX_CELLS} are answered")
 
@@ -122,6 +133,8 @@ def encode_query(query: MapQuery) -> dict[str, str]:
     """Selector parameters."""
     if isinstance(query, ChangesQuery):
         return {"after": str(query.after)} if query.after else {}
+    if isinstance(query, TileQuery):
+        return {"cursor": str(query.cursor), "number": str(query.number)}
     parameters: dict[str, str] = {}
     if isinstance(query, PointQuery | HistoryQuery):
         parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
@@ -164,6 +177,10 @@ def _parse_region(parameters: ps.Parameters) -> RegionQuery:
     return RegionQuery(_bounds(parameters), _layers(parameters), _freshness(parameters), _when(parameters))
 
 
+def _parse_tile(parameters: ps.Parameters) -> TileQuery:
+    return TileQuery(*(ps.count({name: ps.required(parameters, name)}, name) for name in ("cursor", "number")))
+
+
 def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
     from_ns, to_ns = ps.stamp(parameters, "from"), ps.stamp(parameters, "to")
     if from_ns and to_ns and from_ns > to_ns:
@@ -180,6 +197,7 @@ _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
     "point": (("x", "y", "layers", "as_of", "minus", *_FRESH), _parse_point),
     "region": (("bounds", "layers", "as_of", "minus", *_FRESH), _parse_region),
+    "tile": (("cursor", "number"), _parse_tile),
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),

@@ -3,17 +3,17 @@
 import math
 import re
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import msgpack
 import numpy as np
 
-from protocol.arrays import Table
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
-from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples
+from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples, empty
 from protocol.site.site_config import NAME
-from protocol.wire.messages import VERSION, Ack, Health, Pose, Refused, SampleBatch, SensorBundle
+from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
 
 MAX_BATCH_BYTES = 4 * 2**20
 MAX_BATCH_SAMPLES = 20_000
@@ -23,6 +23,8 @@ MAX_ITEMS = 1000  # of one list, except in answers: the decoder reserves memory 
 MAX_DEPTH = 16  # of plain values
 MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
+_WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
+_NO_ROWS = empty()
 STORE_ID = re.compile(r"[0-9a-f]{16}")
 
 
@@ -135,33 +137,41 @@ def decode_batch(data: bytes, extent_m: float) -> SampleBatch:
 
     extent_m: how far from the origin a position may lie. Unknown columns and fields are ignored.
     """
+    packed = unpack_batch(data)
+    rows = np.empty(packed.n, SAMPLE_DTYPE)
+    for name, column in zip(COLUMNS, packed.columns, strict=True):
+        rows[name] = np.frombuffer(column, SAMPLE_DTYPE[name])
+    check_samples(rows, extent_m)
+    return replace(packed.batch, rows=rows)
+
+
+def unpack_batch(data: bytes) -> PackedBatch:
+    """Check all of a batch but its samples."""
     table = unpack(data, MAX_BATCH_BYTES)
     n = _take_int(table, "n", 0, MAX_BATCH_SAMPLES, Refusal.TOO_LARGE)
     first_seq = _take_int(table, "first_seq", 1, MAX_SEQ, Refusal.FIRST_SEQ)
     lost_before = _take_int({"lost_before": 0, **table}, "lost_before", 0, first_seq - 1)
-    rows = _decode_rows(take(table, "cols", dict), n)
-    check_samples(rows, extent_m)
-    return SampleBatch(
+    batch = SampleBatch(
         machine=_take_name(table),
         spool_id=_take_int(table, "spool_id", 1, MAX_U64),
         first_seq=first_seq,
-        rows=rows,
+        rows=_NO_ROWS,
         frame=take(table, "frame", str),
         lost_before=lost_before,
         store=take_store(table, optional=True),
     )
+    return PackedBatch(batch, n, _columns(take(table, "cols", dict), n))
 
 
-def _decode_rows(cols: dict[str, Any], n: int) -> Table:
-    rows = np.zeros(n, SAMPLE_DTYPE)
-    for name in COLUMNS:
-        dtype = SAMPLE_DTYPE[name]
-        data: bytes = take(cols, name, bytes)
-        if len(data) != n * dtype.itemsize:
-            problem = f"{len(data)} bytes, {n} samples take {n * dtype.itemsize}"
+def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
+    columns: tuple[Any, ...] = tuple(map(cols.get, COLUMNS))
+    for name, width, data in zip(COLUMNS, _WIDTHS, columns, strict=True):
+        if type(data) is not bytes:
+            take(cols, name, bytes)
+        elif len(data) != n * width:
+            problem = f"{len(data)} bytes, {n} samples take {n * width}"
             raise MessageError(Refusal.COLUMN_LENGTH, problem, field=f"cols.{name}")
-        rows[name] = np.frombuffer(data, dtype)
-    return rows
+    return columns
 
 
 def encode_reply(reply: Ack | Refused) -> bytes:

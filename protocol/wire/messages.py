@@ -35,6 +35,15 @@ class SampleBatch:
 
 
 @dataclass(frozen=True)
+class PackedBatch:
+    """A batch as it came in. batch: without its samples; n: how many; columns: theirs, in the order of COLUMNS."""
+
+    batch: SampleBatch
+    n: int
+    columns: tuple[bytes, ...]
+
+
+@dataclass(frozen=True)
 class Ack:
     """Everything up to `watermark` is on the server's disk.
 

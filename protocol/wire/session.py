@@ -1,6 +1,8 @@
 """Zenoh sessions as this project uses them: no scouting, and no shared memory, which can drop queries."""
 
 import json
+import os
+import re
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,6 +14,21 @@ from protocol.wire.credentials import Credentials
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_TLS_ENDPOINT = "tls/127.0.0.1:7447"
+_SYSTEM_ERROR = re.compile(r"([^:\[\]()]+) \(os error \d+\)")
+# What keeps a router from stopping for one link:
+ROUTER = {
+    # What waits for a link that does not read [batches of 64 kB]: a whole tile of a region, so that it stops no other.
+    "transport/link/tx/queue/size/data": 16,
+    # Beyond that, everything else that comes from the same sender stands still, until the link is closed [us]. Zenoh's
+    # 5 s are longer than an agent waits for its acknowledgement.
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
+    # Links that open and say nothing: with Zenoh's 100 at a time and 10 s for each, 100 keep all others out for 10 s.
+    "transport/unicast/accept_pending": 500,  # of 1024 files that a process usually may open
+    "transport/unicast/accept_timeout": 3000,  # [ms]; four small messages, also over a link of 64 kbit/s
+}
+# Closing a link that takes no more bytes blocks its thread in the kernel for 10 s (Zenoh sets SO_LINGER), and with
+# Zenoh's two threads two such links stop all others.
+THREADS = "(rx: (worker_threads: 64), net: (worker_threads: 8))"
 
 
 @dataclass(frozen=True)
@@ -50,13 +67,22 @@ def open_session(config: SessionConfig) -> zenoh.Session:
             settings.insert_json5(key, json.dumps(value))
         return zenoh.open(settings)
     except zenoh.ZError as error:
-        raise LinkError(config.endpoint, f"cannot {_aim(config)} ({str(error).splitlines()[0][:120]})") from None
+        raise LinkError(config.endpoint, f"cannot {_aim(config)} ({reason_of(error)})") from None
+
+
+def reason_of(error: zenoh.ZError) -> str:
+    """What Zenoh says, without the places in its sources and the errors around the cause."""
+    text = str(error).partition("\n")[0]
+    if of_system := _SYSTEM_ERROR.search(text):
+        return of_system[1].strip().lower()
+    text = text.partition(" at /")[0]
+    return "no answer in time" if text.endswith("Timeout!") else text[:120]
 
 
 def _aim(config: SessionConfig) -> str:
     """What failed, and the likely reasons: a link that is refused looks like one that is not there."""
     if config.mode == "router":
-        return "listen here"
+        return "listen here: end the router that does, or choose another --listen"
     if config.credentials:
         return (
             "reach a router here: start one with `sitegrid router --keys`, or it and these keys do not know each other"
@@ -74,7 +100,7 @@ def _settings(config: SessionConfig) -> dict[str, object]:
     if config.credentials:
         settings["transport/link/tls"] = config.credentials.tls(listens=config.mode == "router")
     if config.mode == "router":
-        return {**settings, "listen/endpoints": [config.endpoint], **config.guard}
+        return {**settings, **ROUTER, "listen/endpoints": [config.endpoint], **config.guard}
     # A client's open blocks until the router is there; a peer that listens nowhere connects in the background.
     in_background = config.wait_s < 0
     wait_ms = -1 if in_background else int(config.wait_s * 1000)
@@ -86,6 +112,11 @@ def _settings(config: SessionConfig) -> dict[str, object]:
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
         "listen/endpoints": [],
     }
+
+
+def use_many_threads() -> None:
+    """Let links of this process not wait for each other; before its first session."""
+    os.environ.setdefault("ZENOH_RUNTIME", THREADS)
 
 
 def free_endpoint() -> str:

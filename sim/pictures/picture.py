@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from mapserver.pictures.frame import INK, Image, text
 from mapserver.pictures.plotter import write_image
-from protocol.errors import ConfigError
 from sim.config import SimConfig
 from sim.machines.model import MachineModel
 from sim.pictures.plan import draw_plan
@@ -25,8 +22,7 @@ CLOSEUPS = 2
 
 
 def draw(config: SimConfig, path: Path) -> list[Path]:
-    """Draw a scenario into one file (format by the suffix); returns what was written, a ConfigError says why not."""
-    _check(path)
+    """Draw a scenario into one file (format by the suffix); returns what was written, raises OSError."""
     simulator = Simulator(config)
     try:
         plan = draw_plan(simulator.scenario, simulator.models, simulator.state)
@@ -35,21 +31,8 @@ def draw(config: SimConfig, path: Path) -> list[Path]:
         views = _views(simulator, max(plan.shape[1], LEAST_PX) - 2 * GAP_PX)
     finally:
         simulator.close()
-    try:
-        write_image(path, _below(plan, views))
-    except OSError as error:
-        raise ConfigError(path, f"cannot be written: {error.strerror}") from None
+    write_image(path, _below(plan, views))
     return [path]
-
-
-def _check(path: Path) -> None:
-    """Refuse before the work what could not be written after it."""
-    if not path.suffix or not cv2.haveImageWriter(path.name):
-        raise ConfigError(path, "is no picture: name a .png or .jpg file")
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise ConfigError(path, f"cannot be written: {path.parent} is no folder to write into")
-    if path.is_dir():
-        raise ConfigError(path, "cannot be written: it is a folder")
 
 
 def _views(simulator: Simulator, width: int) -> Image:

@@ -18,6 +18,7 @@ from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.options.groups import add_network
+from sitegrid.options.outputs import OutputFile
 from sitegrid.options.values import not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
 from sitegrid.security.join import join, signer
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from agents.presence import Owner
 
 HELP = "run the localisation agent of one machine"
+EXTRA = "agent"
+KEPT = OutputFile(makes_folder=True)
 LINK_S = 1.0  # how long to wait for the router before starting without it
 
 
@@ -38,9 +41,9 @@ def add_options(parser: ArgumentParser) -> None:
     add("--config", type=Path, help="file with machine, sensors and options (config/agent.toml)")
     add("--site-file", type=Path, help="site file (config/site.toml); not needed with --log")
     add("--name", help="name of the machine (overrides the config file)")
-    add("--spool", type=Path, required=True, help="file of the spool")
-    add("--audit", type=Path, help="file that lists every recorded sample, to prove that none is lost")
-    add("--calibration", type=Path, help="calibration file (default: beside the spool)")
+    add("--spool", type=KEPT, required=True, help="file of the spool")
+    add("--audit", type=KEPT, help="file that lists every recorded sample, to prove that none is lost")
+    add("--calibration", type=KEPT, help="calibration file (default: beside the spool)")
     add("--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)")
     add("--log", type=Path, help="replay: manifest of the log")
     add("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")

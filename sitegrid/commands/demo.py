@@ -5,9 +5,11 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import positive
 
 HELP = "run the whole system in simulation and draw the maps"
+EXTRA = "agent,server,sim"
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -19,7 +21,7 @@ def add_options(parser: ArgumentParser) -> None:
     add("--world", choices=("pybullet", "fast"), help="physics of the machines (overrides the scenario)")
     add("--machines", type=int, help="number of machines in the scenario's first fleet (overrides the scenario)")
     add("--seed", type=int, help="random seed (overrides the scenario)")
-    add("--out", type=Path, default=Path("demo-output"), help="folder for pictures and stores (default %(default)s)")
+    add("--out", type=FOLDER, default="demo-output", help="folder for pictures and stores (default %(default)s)")
     add("--headless", action="store_true", help="no live display; print plain lines")
     add("--log", type=Path, help="manifest of a real log, which another agent replays")
     add("--data", type=Path, help="folder with the CSV files of that log")

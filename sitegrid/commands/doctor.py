@@ -8,9 +8,10 @@ from pathlib import Path
 
 from sitegrid.doctor import Level
 from sitegrid.options.groups import add_network
-from sitegrid.process.lifetime import say
+from sitegrid.process.lifetime import say, tell
 
 HELP = "check the set-up of this host and say how to repair it"
+EXTRA = "server"  # for --store alone
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -30,5 +31,5 @@ def run(arguments: Namespace) -> int:
     findings = examine(arguments)
     ok = all(finding.level != Level.FAIL for finding in findings)
     table = {"ok": ok, "findings": [asdict(finding) for finding in findings]}
-    say(table) if arguments.json else print(*findings, sep="\n")
+    say(table) if arguments.json else tell(*findings)
     return 0 if ok else 1

@@ -10,14 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sitegrid.options.groups import add_action
+from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import count, positive, seed, withhold
-from sitegrid.process.lifetime import note, plain, say
+from sitegrid.process.lifetime import note, plain, raise_interrupts, say, tell
 from sitegrid.process.progress import Display
 
 if TYPE_CHECKING:
     from evaluation.campaign.experiment import Runner
 
 HELP = "run the accuracy experiments"
+EXTRA = "eval"
 Report = dict[str, Any]  # plain values by name; lists of rows are tables
 MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side
 SHOWN = (list, dict)  # values of a row that a table for people has no room for
@@ -43,9 +45,9 @@ def add_options(parser: ArgumentParser) -> None:
         (ground, "estimates along the track, errors by place"),
         (merge, "the maps of the first seed and the table"),
     ):
-        action.add_argument("--out", type=Path, default=Path("eval-output"), help=out)
+        action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
-        action.add_argument("--plots", type=Path, help=f"folder to draw {drawn} into")
+        action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
     for action, seconds in ((table, 1200.0), (ground, 600.0)):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
@@ -79,7 +81,7 @@ def run(arguments: Namespace) -> int:
     if arguments.json:
         say(plain(report))
     else:
-        print("\n\n".join(_lines(report)))
+        tell("\n\n".join(_lines(report)))
     return 0
 
 
@@ -119,9 +121,12 @@ def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple
     from evaluation.campaign.experiment import Runner
     from evaluation.campaign.workers import cores
 
+    raise_interrupts()  # the bar hides the cursor of the terminal
     with Display(title, headless=arguments.json) as display:
         runner = Runner(arguments.out, arguments.processes or cores(), display.show)
         report, outcomes = work(runner)
+    if not arguments.json:
+        note(f"recordings and results are in {arguments.out}")
     if arguments.plots:
         pictures = import_module(plots)  # imported here: only pictures need matplotlib
         report = {**report, "plots": list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))}

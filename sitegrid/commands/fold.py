@@ -5,17 +5,19 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from sitegrid.options.outputs import FOLDER
 from sitegrid.options.times import STAMP_HELP, parse_stamp
 from sitegrid.options.values import positive
 
 HELP = "build a new store from archives, with other parameters"
+EXTRA = "server"
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add = parser.add_argument
     add("archives", type=Path, nargs="+", metavar="ARCHIVE", help="a Parquet file, a folder of them, or a store")
-    add("--out", type=Path, required=True, metavar="STORE", help="folder of the new store")
+    add("--out", type=FOLDER, required=True, metavar="STORE", help="folder of the new store")
     add("--site-file", type=Path, help="site file, if the archives hold no site (site.toml)")
     add("--cell", type=positive, metavar="M", help="edge of a cell in metres (default: that of the site)")
     add("--config", type=Path, help="file with options (config/server.toml)")

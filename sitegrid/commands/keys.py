@@ -12,12 +12,14 @@ from typing import Any
 from protocol.errors import ConfigError
 from protocol.wire.keys import check_name
 from sitegrid.options.groups import add_action
+from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import days
-from sitegrid.process.lifetime import say
+from sitegrid.process.lifetime import say, tell
 from sitegrid.security import register as registers
 from sitegrid.security.register import REGISTER_FILE, ROLES, ROUTER, Register, RegisterEntry
 
 HELP = "make, list and revoke the certificates of a site"
+EXTRA = "security"
 THIS_HOST = ("localhost", "127.0.0.1")
 HOST_LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
 
@@ -41,7 +43,7 @@ def add_options(parser: ArgumentParser) -> None:
         action.add_argument("name", metavar="MACHINE")
     for action, act in ((init, _init), (add, _add), (revoke, _revoke), (show, _list)):
         folder = "folder with all keys of the site (default %(default)s)"
-        action.add_argument("--dir", type=Path, default=Path("keys"), help=folder)
+        action.add_argument("--dir", type=FOLDER if action is init else Path, default="keys", help=folder)
         action.set_defaults(act=act)
 
 
@@ -119,7 +121,7 @@ def _list(arguments: Namespace, now: datetime) -> None:
         say({"site": register.site, "hosts": register.hosts, "names": rows})
         return
     for row in rows:
-        print(f"{row['name']:24} {row['role']:8} {row['expires'][:10]}  {row['state']}")
+        tell(f"{row['name']:24} {row['role']:8} {row['expires'][:10]}  {row['state']}")
 
 
 def _row(name: str, entry: RegisterEntry, now: datetime) -> dict[str, Any]:
@@ -134,4 +136,4 @@ def _row(name: str, entry: RegisterEntry, now: datetime) -> dict[str, Any]:
 
 
 def _tell(arguments: Namespace, line: str, **values: Any) -> None:
-    say(values) if arguments.json else print(line)
+    say(values) if arguments.json else tell(line)

@@ -6,9 +6,11 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from sitegrid.options.groups import add_network, add_site
+from sitegrid.options.outputs import PICTURE
 from sitegrid.options.values import positive
 
 HELP = "draw the map, once or live"
+EXTRA = "server"
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -16,7 +18,7 @@ def add_options(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add_network(parser)
     add_site(parser)
-    add("--out", type=Path, default=Path("map.png"), help="picture to write (default %(default)s)")
+    add("--out", type=PICTURE, default="map.png", help="picture to write (default %(default)s)")
     sides = "west, south, east, north in metres (default: the whole map)"
     add("--bounds", type=float, nargs=4, metavar=("W", "S", "E", "N"), help=sides)
     add("--truth", type=Path, help="true map of a simulation (truth_map.npz): also draw the difference")

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
+from protocol.files import whole_file
 from protocol.queries.answers import GroundChange, MachineState, PointAnswer, Region
+from protocol.queries.tiles import Progress
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
+from sitegrid.options.outputs import OutputFile
 from sitegrid.options.times import HELP as TIME_HELP
 from sitegrid.options.times import SiteTime, parse_time, utc_text
 from sitegrid.options.values import positive
-from sitegrid.process.lifetime import plain, say, stop_flag, wait
+from sitegrid.process import streams
+from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
+from sitegrid.process.progress import EVERY_S
 
 HELP = "ask the map"
 Answer = tuple[Any, Iterable[str]]  # a table for programs, None where all is printed already; lines for people
@@ -40,7 +45,7 @@ def add_options(parser: ArgumentParser) -> None:
     _add_when(point)
     region = _add_query(queries, _region, "a rectangle of cells, in metres")
     _add_numbers(region, "west_m", "south_m", "east_m", "north_m")
-    region.add_argument("--out", type=Path, help="write coordinates and layers into this .npz file")
+    region.add_argument("--out", type=OutputFile((".npz",)), help="write coordinates and layers into this .npz file")
     _add_when(region)
     history = _add_query(queries, _history, "the cell at a position over time")
     _add_numbers(history, "x_m", "y_m")
@@ -82,7 +87,7 @@ def run(arguments: Namespace) -> int:
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         table, lines = arguments.ask(client, arguments, layers)
     if table is not None:
-        say(plain(table)) if arguments.json else print(*lines, sep="\n")
+        say(plain(table)) if arguments.json else tell(*lines)
     return 0
 
 
@@ -98,12 +103,13 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     sides = (arguments.west_m, arguments.south_m, arguments.east_m, arguments.north_m)
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
     try:
-        region = client.region(sides, layers, **when, after=arguments.after)
+        region = client.region(sides, layers, **when, after=arguments.after, progress=_tiles_shown())
     except ValueError as error:
         raise ConfigError("sitegrid query region", str(error)) from None
     if arguments.out:
         arrays: dict[str, Any] = {"x_m": region.x_m, "y_m": region.y_m, **region.layers}
-        np.savez_compressed(arguments.out, **arrays)
+        with whole_file(arguments.out) as file:
+            np.savez_compressed(file, **arrays)
     summary = {name: _statistics(values) for name, values in region.layers.items()}
     size = {"columns": len(region.x_m), "rows": len(region.y_m)}
     b = region.bounds
@@ -112,12 +118,29 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     for name, row in summary.items():
         span = f"min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
         lines.append(f"  {name:18} {row['known']:7d} known   {span}")
-    return {**size, **_version(region), "layers": summary}, lines
+    table = {**size, **_version(region), "layers": summary}
+    if arguments.out:
+        table["file"] = str(arguments.out)
+        lines.append(f"written to {arguments.out}")
+    return table, lines
 
 
 def _version(answer: PointAnswer | Region) -> dict[str, Any]:
     version = answer.version
     return {"store": version.store, "merged": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
+
+
+def _tiles_shown() -> Progress:
+    """What shows on standard error, now and then, how much of a large region is here."""
+    next_s = time.monotonic() + EVERY_S
+
+    def show(here: int, count: int) -> None:
+        nonlocal next_s
+        if time.monotonic() >= next_s:
+            next_s = time.monotonic() + EVERY_S
+            note(f"{here} of {count} tiles")
+
+    return show
 
 
 def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
@@ -158,7 +181,9 @@ def _follow_changes(client: Client, arguments: Namespace) -> None:
     stop = stop_flag()
 
     def show(change: GroundChange) -> None:
-        say(plain(change)) if arguments.json else print(_change_line(change), flush=True)
+        say(plain(change)) if arguments.json else tell(_change_line(change))
+        if not streams.is_open():
+            stop.set()
 
     listener = client.on_change(show)
     for change in client.changes(arguments.after):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from protocol.errors import ConfigError
 from protocol.wire.credentials import check_valid, load_credentials
-from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, open_session
+from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, open_session, use_many_threads
 from sitegrid.process.lifetime import say, stop_flag, wait
 from sitegrid.security.access import router_settings
 from sitegrid.security.join import is_loopback, with_keys
@@ -32,6 +32,7 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Route until stopped."""
     stop = stop_flag()
+    use_many_threads()
     if arguments.keys:
         _route_guarded(arguments.keys, with_keys(arguments.listen), stop)
     else:

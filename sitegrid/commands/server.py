@@ -14,8 +14,9 @@ from protocol.config import from_table
 from protocol.files import load_toml
 from protocol.site.site_file import load_site
 from protocol.version import package_version
-from protocol.wire.session import open_session
+from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
+from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import address
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
 from sitegrid.security.join import join
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from mapserver.server import Server
 
 HELP = "run the map server of a site"
+EXTRA = "server"
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -33,7 +35,7 @@ def add_options(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add_network(parser)
     add("--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)")
-    add("--store", type=Path, required=True, help="folder with journal, archive and snapshots")
+    add("--store", type=FOLDER, required=True, help="folder with journal, archive and snapshots")
     add("--config", type=Path, help="file with options (config/server.toml)")
     add("--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register")
     usual = ("127.0.0.1", 9464)
@@ -44,16 +46,16 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Serve until stopped; then finish what has come in, commit, snapshot."""
     from mapserver.config import ServerConfig
-    from mapserver.evidence.grid import warm_up
-    from mapserver.server import Server
+    from mapserver.server import Server, warm_up
 
     stop = stop_flag()
+    use_many_threads()
     return_large_blocks()
     site = load_site(arguments.site_file)
     table = load_toml(arguments.config) if arguments.config else {}
     config = from_table(ServerConfig, table, str(arguments.config))
     with ExitStack() as opened:
-        warm_up(config.fold)
+        warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
         ingest, readers = open_session(joined), open_session(joined)
         for session in (ingest, readers):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from protocol.errors import ConfigError
 from sitegrid.options.groups import add_network
+from sitegrid.options.outputs import FOLDER, PICTURE
 from sitegrid.process.lifetime import END_S, note, say, stop_flag
 from sitegrid.process.progress import Display
 from sitegrid.security.join import join
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from sim.config import SimConfig
 
 HELP = "run the simulator: machines drive and publish sensor readings"
+EXTRA = "sim"
 OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site")
 ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
@@ -39,11 +41,12 @@ def add_options(parser: ArgumentParser) -> None:
     ):
         add(f"--{name}", type=kind, help=f"{what} (overrides the config file)")
     add("--site", help="name of the site in keys (overrides the config file)")
-    add("--truth", type=Path, help="folder for the true map and the true tracks")
-    add("--record", type=Path, help="folder for log folders, one per machine; nothing is published then")
+    add("--truth", type=FOLDER, help="folder for the true map and the true tracks")
+    add("--record", type=FOLDER, help="folder for log folders, one per machine; nothing is published then")
     add("--all-sensors", action="store_true", help="use every GPS receiver and IMU of the machines")
-    add("--picture", type=Path, help="draw the site into this file (plan and perspective), then exit")
-    add("--write-configs", type=Path, help="write site.toml and one agent file per machine into this folder, then exit")
+    add("--picture", type=PICTURE, help="draw the site into this file (plan and perspective), then exit")
+    configs = "write site.toml and one agent file per machine into this folder, then exit"
+    add("--write-configs", type=FOLDER, help=configs)
 
 
 def run(arguments: Namespace) -> int:
@@ -56,7 +59,9 @@ def run(arguments: Namespace) -> int:
     if arguments.write_configs:
         from sim.config import write_configs
 
-        write_configs(config, arguments.write_configs)
+        agents = write_configs(config, arguments.write_configs)
+        written = [str(arguments.write_configs / "site.toml"), *map(str, agents)]
+        say({"configs": written}) if arguments.json else note("\n".join(written))
     if arguments.picture:
         _draw(config, arguments)
     if arguments.record:
@@ -66,7 +71,8 @@ def run(arguments: Namespace) -> int:
     settings = join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name)
     tell = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
     report = publish(config, settings, stop, on_progress=tell, truth_dir=arguments.truth)
-    line = f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings"
+    true = f"; the truth is in {arguments.truth}" if arguments.truth else ""
+    line = f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings{true}"
     say({"ended": dataclasses.asdict(report)}) if arguments.json else note(line)
     return 0
 
@@ -79,7 +85,8 @@ def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> i
     with Display("machines drive", headless=arguments.json) as display:
         show = partial(display.show, total_s=seconds, what="recording")
         simulator = record(config, arguments.record, arguments.truth, on_progress=show, stop=stop)
-    say({"recorded": str(arguments.record), "machines": len(simulator.machines), "seconds": simulator.simulated_s})
+    table = {"recorded": str(arguments.record), "machines": len(simulator.machines), "seconds": simulator.simulated_s}
+    say(table | ({"truth": str(arguments.truth)} if arguments.truth else {}))
     return 0
 
 

@@ -9,7 +9,7 @@ from protocol.queries.answers import TrustAnswer
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import add_network, add_site
 from sitegrid.options.values import not_negative
-from sitegrid.process.lifetime import plain, say
+from sitegrid.process.lifetime import plain, say, tell
 
 HELP = "use a machine's samples, even if they contradict other machines"
 
@@ -43,5 +43,5 @@ def decide(arguments: Namespace, command: Callable[[Client], TrustAnswer]) -> in
         machine = command(client)
     state = "is trusted" if machine.trusted else "is left out of the map"
     line = f"{machine.name} {state}, as of journal row {machine.merged}"
-    say(plain(machine)) if arguments.json else print(line)
+    say(plain(machine)) if arguments.json else tell(line)
     return 0

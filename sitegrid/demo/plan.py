@@ -62,16 +62,25 @@ def make_plan(arguments: Namespace) -> DemoPlan:
     except ValueError as error:
         raise ConfigError("sitegrid demo", str(error)) from None
     scenario = resolve(config)
-    work = arguments.out / "work"
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
     manifest, data = _log_of(arguments)
     log = open_log(manifest, data) if manifest else None
+    work = _emptied(arguments.out / "work")
     return DemoPlan(arguments.out, work, free_endpoint(), config, scenario, write_configs(config, work), log, manifest)
+
+
+def _emptied(work: Path) -> Path:
+    """The folder of an earlier run without its contents; ConfigError where it is something else's."""
+    if work.exists() and any(work.iterdir()) and not (work / "site.toml").exists():
+        raise ConfigError(work, "is not of an earlier demo, and would be emptied; choose another --out")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    return work
 
 
 def _log_of(arguments: Namespace) -> tuple[Path | None, Path | None]:
     """The log to replay: as asked for, or the default one where its data lies."""
+    if arguments.data and not arguments.log:
+        raise ConfigError("--data", "is the folder of a log; name the log with --log")
     if arguments.log and not arguments.no_log:
         return arguments.log, arguments.data
     default = not arguments.no_log and DEFAULT_MANIFEST.exists() and DEFAULT_DATA.exists()

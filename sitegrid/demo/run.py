@@ -23,7 +23,7 @@ from sitegrid.client import Client, connect
 from sitegrid.demo.plan import READY_S, DemoPlan, LogReplay, make_plan, start_agent, start_server, start_sim
 from sitegrid.pictures.draw import TrackRecorder, draw, draw_both, draw_differences, truth_layers
 from sitegrid.process.children import Child, Children
-from sitegrid.process.lifetime import note, plain, say, stop_flag
+from sitegrid.process.lifetime import note, plain, say, stop_flag, tell
 from sitegrid.process.progress import Display
 
 
@@ -159,7 +159,7 @@ def _print(result: dict[str, Any]) -> None:
     """The report for people."""
     r, driven = result, result["driven"]
     rmse = ", ".join(f"{name} {value} m" for name, value in r["position_rmse_m"].items())
-    print(
+    tell(
         f"{r['machines']} machines drove {r['seconds']:g} s, recorded {r['samples_recorded']} samples;\n"
         f"  merged {r['samples_merged']}, lost {r['lost']}, double {r['double']}\n"
         f"  {r['cells']} cells are known: resistance class wrong in {r['wrong_resistance_pct']} %, "
@@ -170,5 +170,5 @@ def _print(result: dict[str, Any]) -> None:
     )
     if log := result["log"]:
         withheld = f"{log['withheld_rms_m']} m rms against {log['withheld_fixes']} withheld fixes"
-        print(f"real log {log['name']}: {log['recorded']} samples, lost {log['lost']}, {withheld}")
-    print("pictures:", *result["pictures"], sep="\n  ")
+        tell(f"real log {log['name']}: {log['recorded']} samples, lost {log['lost']}, {withheld}")
+    tell("pictures:", *(f"  {picture}" for picture in result["pictures"]))

@@ -23,7 +23,7 @@ from sitegrid.security.join import join
 
 ANYBODY = "doctor"  # where there are no keys, every name is as good
 ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
-OF_SERVER = ("server", "clock", "version", "permission")  # checks that need the map server
+OF_SERVER = ("server", "clock", "time", "version", "permission")  # checks that need the map server
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def _keys(arguments: Namespace) -> tuple[list[Finding], Subject | None]:
     except ConfigError as error:
         return [Finding(Level.FAIL, "certificate", str(error))], None
     except ModuleNotFoundError:
-        return [skipped("certificate", "pip install 'sitegrid[security]'")], subject
+        return [skipped("certificate", "pip install '.[security]' in the folder of this project")], subject
     site = arguments.site or (subject.site_file.name if subject.site_file else "")
     findings = check_certificate(certificate, datetime.now(UTC), site, arguments.machine or "")
     return findings, subject if findings[0].level != Level.FAIL else None
@@ -100,6 +100,7 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
         findings += [
             network.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
             network.check_clock(*network.offset_of(info, asked_ns), site),
+            network.check_time(info),
             network.check_version(package_version(), info.version),
         ]
     return [*findings, _permission(subject, session, info)]

@@ -15,7 +15,7 @@ from typing import Any
 
 import zenoh
 
-from protocol.errors import LinkError, MessageError
+from protocol.errors import LinkError, MessageError, Refusal
 from protocol.machine.samples import empty
 from protocol.queries.answer_codec import decode_info
 from protocol.queries.answers import MapInfo
@@ -32,6 +32,7 @@ ANSWER_S = 5.0
 LINK_S = 3.0
 KNOWN_S = 1.0  # for the router's news of who answers
 HEALTH_S = 3.0  # an agent reports its health every second
+AHEAD_S = 60.0  # of the newest stamp and the server's clock: more than clocks set by hand are off
 OFFSET_S = 1.0  # of two clocks, beyond which the ages on the map are off
 
 
@@ -151,6 +152,23 @@ def check_clock(offset_s: float, error_s: float, site: SiteConfig | None) -> Fin
     if abs(offset_s) - error_s > OFFSET_S:
         return Finding(Level.WARN, "clock", message, advice)
     return Finding(Level.PASS, "clock", message)
+
+
+def check_time(info: MapInfo) -> Finding:
+    """Whether the stamps of machines and the server's clock fit each other."""
+    ahead_s = (info.stamp_ns - info.wall_ns) * 1e-9
+    if count := info.counters.get(f"refused_{Refusal.SERVER_CLOCK}"):
+        problem = f"the map server refused {count} batches since its own clock is behind what it has seen"
+        return Finding(Level.WARN, "time", problem, "set the server's clock; machines wait, and keep their samples")
+    if count := info.counters.get(f"refused_{Refusal.FAR_FUTURE}"):
+        problem = f"{count} batches were refused for stamps more than a day ahead; these samples are quarantined"
+        return Finding(Level.WARN, "time", problem, "the server's log names the machine: set its clock")
+    if ahead_s > AHEAD_S:
+        trusted = {name: counts for name, counts in info.machines.items() if name not in info.distrusted}
+        newest = max(trusted, key=lambda name: trusted[name].newest_ns, default="?")
+        problem = f"the site's now is {ahead_s / 3600:.1f} h ahead of the server's clock, by {newest}"
+        return Finding(Level.WARN, "time", problem, f"set the clock that is wrong; or `sitegrid distrust {newest}`")
+    return Finding(Level.PASS, "time", "no stamp is ahead of the map server's clock")
 
 
 def check_version(own: str, other: str) -> Finding:

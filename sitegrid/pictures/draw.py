@@ -38,7 +38,11 @@ def run(arguments: Namespace) -> int:
                 break
             stop.wait(arguments.every)
         tracks.close()
-    say({"picture": str(arguments.out), "drawn": drawn}) if arguments.json else note(f"{arguments.out}")
+    table = {"picture": str(arguments.out), "drawn": drawn}
+    if drawn and arguments.truth:
+        table["difference"] = str(beside(arguments.out))
+    files = [str(value) for name, value in table.items() if name != "drawn"] if drawn else []
+    say(table) if arguments.json else note("\n".join(files) or "nothing was drawn")
     return 0
 
 
@@ -63,8 +67,13 @@ def draw(
     difference = side_by_side(draw_differences(region, truth)) if truth else None
     write_image(out, image)
     if difference is not None:
-        write_image(out.with_stem(f"{out.stem}-difference"), difference)
+        write_image(beside(out), difference)
     return region
+
+
+def beside(out: Path) -> Path:
+    """The file of the difference from a true map."""
+    return out.with_stem(f"{out.stem}-difference")
 
 
 def draw_both(region: Region, tracks: list[Track]) -> list[Image]:

@@ -8,39 +8,56 @@ import logging
 import os
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, is_dataclass
 from typing import Any
 
+from sitegrid.process import streams
+
 END_S = 2.5  # from the signal to the end of the process
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LARGE_BYTES = 2**20  # a block of memory that is worth a system call
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of malloc.h
 log = logging.getLogger("sitegrid.process.lifetime")
 
 
 def stop_flag(end_s: float | None = END_S) -> threading.Event:
-    """Return an event that SIGINT and SIGTERM set. Wait on it with a time-out only: Python may lose SIGTERM otherwise.
+    """Return an event that SIGNALS set. Wait on it with a time-out only: Python may lose SIGTERM otherwise.
 
     The process ends end_s after the signal, whatever it is doing then; None lets it take its time. No sample is lost at
-    any moment: samples are acknowledged after their commit, and deleted after their acknowledgement.
+    any moment: samples are acknowledged after their commit, and deleted after their acknowledgement. SIGHUP, a terminal
+    that was closed, stays ignored where `nohup` has it ignored.
     """
     stop = threading.Event()
 
     def on_signal(*_: object) -> None:
-        stop.set()
+        """Nothing: the thread that watches receives the signal, too."""
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    if end_s is not None:
-        _end_in_time(stop, on_signal, end_s)
+    _handle(on_signal)
+    _watch_signals(stop, on_signal, end_s)
     return stop
 
 
-def _end_in_time(stop: threading.Event, handler: Callable[..., None], end_s: float) -> None:
-    """End the process in time, from a thread that receives signals by itself.
+def raise_interrupts() -> None:
+    """Have the first of SIGNALS raise KeyboardInterrupt, for a command that tidies up then; the second ends it."""
+
+    def on_signal(*_: object) -> None:
+        _handle(signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    _handle(on_signal)
+
+
+def _handle(handler: Callable[..., None] | signal.Handlers) -> None:
+    for number in SIGNALS:
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
+
+
+def _watch_signals(stop: threading.Event, handler: Callable[..., None], end_s: float | None) -> None:
+    """Log a signal, set the event and end the process in time, from a thread that receives signals by itself.
 
     Python runs signal handlers on the main thread, and not while that waits inside Zenoh: for a router, for a reply or
     for a slow subscriber, up to 30 s. The wake-up descriptor is written to at once (signal.set_wakeup_fd).
@@ -51,22 +68,28 @@ def _end_in_time(stop: threading.Event, handler: Callable[..., None], end_s: flo
 
     def watch(_: socket.socket) -> None:  # holds the other end open for as long as the process runs
         while True:
-            if signals.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
+            if (number := signals.recv(1)[0]) not in SIGNALS:
                 continue
+            if number == signal.SIGHUP:  # what nobody asked for: a supervisor sends SIGTERM
+                _log_or_not(log.warning, "ending: the terminal was closed (nohup keeps it) signal=%s", "SIGHUP")
+            else:
+                _log_or_not(log.info, "ending signal=%s", signal.Signals(number).name)
             stop.set()
+            if end_s is None:
+                continue
             time.sleep(end_s)
             if signal.getsignal(signal.SIGTERM) is handler:  # not where a test goes on
-                _end_now(end_s)
+                _log_or_not(log.warning, "ended in mid-work seconds=%g", end_s)
+                os._exit(0)
 
     threading.Thread(target=watch, args=(woken,), name="signals", daemon=True).start()
 
 
-def _end_now(after_s: float) -> None:
-    """End the process; a thread logs it, since standard error may be a pipe that nobody empties."""
-    warning = threading.Thread(target=log.warning, args=("ended in mid-work seconds=%g", after_s), daemon=True)
-    warning.start()
-    warning.join(0.2)
-    os._exit(0)
+def _log_or_not(write: Callable[..., None], *event: object) -> None:
+    """Log from a thread that is not waited for: standard error may be a pipe that nobody empties."""
+    thread = threading.Thread(target=write, args=event, daemon=True)
+    thread.start()
+    thread.join(0.2)
 
 
 def return_large_blocks() -> bool:
@@ -87,12 +110,17 @@ def wait(stop: threading.Event) -> None:
 
 def say(table: Mapping[str, Any]) -> None:
     """Print one JSON object as a line, at once: other processes read it."""
-    print(json.dumps(table, allow_nan=False), flush=True)
+    streams.write_out(json.dumps(table, allow_nan=False))
+
+
+def tell(*lines: object) -> None:
+    """Print lines for people on standard output, at once."""
+    streams.write_out("\n".join(map(str, lines)))
 
 
 def note(line: str) -> None:
     """Print a line for people on standard error, so that standard output stays for results."""
-    print(line, file=sys.stderr, flush=True)
+    streams.write_error(line)
 
 
 def plain(value: Any) -> Any:

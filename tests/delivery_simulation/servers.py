@@ -10,16 +10,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mapserver.config import ServerConfig
-from mapserver.ingest.admission import GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, check_store, judge
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.journal.journal import Journal
-from mapserver.journal.rows import Admission
+from mapserver.journal.rows import Admission, StoreIdentity
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
+from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused
 from tests.delivery_simulation.faults import Fault, FaultPlan, FaultyConnection, Killed
 
 RunKey = tuple[str, int]  # machine, spool_id
+STORE = StoreIdentity("0123456789abcdef")
 
 
 class JournalledSample(NamedTuple):
@@ -91,7 +93,9 @@ class ModelServer:
 
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
         try:
-            batch = parse(incoming.payload, incoming.machine, self._site, self._now_ns)
+            batch = decode_batch(incoming.payload, self._site.extent_m)
+            judge(batch, incoming.machine, self._site, self._now_ns)
+            check_store(batch, STORE, ())
             seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
             admission = admit(batch, seq)
         except MessageError as error:
@@ -101,7 +105,7 @@ class ModelServer:
             disk.rows.append(admission)
         if len(admission.batch.rows) or admission.lost:
             disk.marks[batch.machine, batch.spool_id] = (admission.watermark, lost + admission.lost)
-        return Ack(admission.watermark, len(disk.rows), admission.trimmed)
+        return Ack(admission.watermark, len(disk.rows), admission.trimmed, STORE.id)
 
 
 class RealServer:

@@ -35,7 +35,7 @@ from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu
 from protocol.queries import requests
-from protocol.queries.commands import TrustCommand, encode_command, parse_command
+from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
@@ -119,7 +119,11 @@ def _selectors() -> Iterator[Decoder]:
     )
     seeds = tuple(f"{query.name}?{selector_of(requests.encode_query(query))}".encode() for query in asked)
     yield Decoder("query", seeds, _query, (QueryError,), texts)
-    commands = (TrustCommand("loader-2", False, "moved; x = 3", 60.0), TrustCommand("loader-2", None))
+    commands = (
+        TrustCommand("loader-2", False, "moved; x = 3", 60.0),
+        TrustCommand("loader-2", None),
+        AcceptCommand("0123456789abcdef", "disk died"),
+    )
     seeds = tuple(f"{command.name}?{selector_of(encode_command(command))}".encode() for command in commands)
     yield Decoder("command", seeds, _command, (QueryError,), texts)
 

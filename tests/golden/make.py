@@ -6,7 +6,7 @@ Only after a deliberate change of the wire, with docs/protocol.md. The tests com
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +77,11 @@ def region() -> records.Region:
     )
 
 
+def tile() -> records.Region:
+    """The region as the second of two tiles, two columns to the east."""
+    return replace(region(), tile=records.Tile(123_456_789, 1, 2, 2, 0, 5, 2))
+
+
 def decode_batch(data: bytes) -> SampleBatch:
     """Decode with the extent of the golden site."""
     return codec.decode_batch(data, EXTENT_M)
@@ -125,6 +130,7 @@ CHANGE = records.GroundChange(
     grade_after=None,
 )
 ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
+OVERLOADED = QueryError(Refusal.OVERLOADED, "the server has too many queries to answer", 2.5)
 
 GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
@@ -138,6 +144,7 @@ GOLDEN: dict[str, Golden] = {
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
+    "tile.bin": Golden(tile(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
     "machines.bin": Golden(
         records.MachinesAnswer((MACHINE,), VERSION),
@@ -153,6 +160,7 @@ GOLDEN: dict[str, Golden] = {
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
     "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, answers.encode_info, decode_info_table),
     "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),
+    "overloaded.bin": Golden(OVERLOADED, answers.encode_error, answers.decode_error),
 }
 NEWER = "batch_newer.bin"  # of a later version of the software: an unknown field and an unknown column
 

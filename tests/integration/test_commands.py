@@ -60,9 +60,10 @@ def test_query_and_plot_answer_people_and_machines(mapped: SiteRun, tmp_path: Pa
     assert cells["layers"]["resistance"]["known"] == int(np.isfinite(region["resistance"]).sum())
     picture, truth = tmp_path / "map.png", mapped.folder / "truth" / "truth_map.npz"
     drawn = sitegrid("plot", *where, "--out", picture, "--truth", truth, "--bounds", 0, 0, 200, 150, "--json")
-    assert last_json(drawn.stdout) == {"picture": str(picture), "drawn": 1}
+    difference = str(tmp_path / "map-difference.png")
+    assert last_json(drawn.stdout) == {"picture": str(picture), "drawn": 1, "difference": difference}
     assert cv2.imread(str(picture)) is not None
-    assert cv2.imread(str(tmp_path / "map-difference.png")) is not None
+    assert cv2.imread(difference) is not None
     late = sitegrid("query", *where, "--after", 10**6, "info", timeout_s=60)
     assert (late.returncode, late.stdout) == (1, "")
     assert "is not merged after" in late.stderr

@@ -19,7 +19,7 @@ def map_info(site: SiteConfig, **values: Any) -> MapInfo:
     zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "stamp_ns", "wall_ns")
     defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
     defaults |= {"site": SiteInfo(**vars(site), frame=site.frame, crs=site.crs), "version": "1.0", "bounds": None}
-    defaults |= {"store": STORE, "descends": (), "server": ServerProcess("office", 7)}
+    defaults |= {"store": STORE, "descends": (), "accepted": (), "server": ServerProcess("office", 7)}
     defaults |= {"machines": {}, "distrusted": (), "counters": {}, "layers": ()}
     return MapInfo(**(defaults | values))
 

@@ -49,9 +49,9 @@ def test_dockerfile_is_clean():
 
 
 def test_every_command_is_one_that_the_parser_takes():
-    import sitegrid.cli
+    import sitegrid.door
 
-    parser = sitegrid.cli.build_parser()
+    parser = sitegrid.door.build_parser()
     words = commands()
     assert len(words) == len(services()) + 1
     for line in words:

@@ -1,22 +1,35 @@
 import threading
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import zenoh
 
+from mapserver import server as server_module
+from mapserver.query import tiles
+from mapserver.query.answering import SMALL_BYTES
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
-from protocol.queries.requests import Freshness, HistoryQuery, InfoQuery, PointQuery, RegionQuery, encode_query
+from protocol.queries.requests import (
+    Freshness,
+    HistoryQuery,
+    InfoQuery,
+    PointQuery,
+    RegionQuery,
+    TileQuery,
+    encode_query,
+)
+from protocol.queries.tiles import joined
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, WAIT_S, batch, now_ns, routed, samples
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, WAIT_S, batch, now_ns, routed, samples, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +160,76 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     assert ack == Ack(5, 1, store=ack.store)
     assert server.answers.info()["samples_merged"] == 5
     server.close()
+
+
+# --- readers that ask for much ----------------------------------------------------------------------------------------
+
+
+def begun(client: zenoh.Session, key: str, parameters: dict[str, str], n: int) -> list[zenoh.Handler]:
+    """Queries whose answers nobody waits for yet."""
+    return [client.get(f"{key}?{selector_of(parameters)}", timeout=WAIT_S) for _ in range(n)]
+
+
+def test_waiting_queries_keep_no_other_from_an_answer_and_get_theirs(served):
+    server, client = served
+    waiting = begun(client, keys.map_query("pit", "info"), {"after": "1", "wait": "60"}, 50)
+    wait_for(lambda: len(server._writer.waits._waiting) == 50)
+    ask(client, InfoQuery())
+    deliver(client, batch(samples(5)))
+    for replies in waiting:
+        assert codec.decode_info(next(iter(replies)).ok.payload.to_bytes()).merged == 1
+
+
+@pytest.mark.parametrize(
+    ("limit", "key", "parameters", "held"),
+    [
+        ("ANSWER_BYTES", keys.map_query("pit", "info"), {}, "info"),
+        ("MOST_PAST", keys.map_query("pit", "point"), {"x": "0", "y": "0", "as_of": "1"}, "point"),
+        ("MOST_COMMANDS", keys.admin("pit", "trust"), {"machine": "a", "trusted": "yes"}, "trust"),
+    ],
+)
+def test_queries_beyond_a_budget_have_to_come_again(sessions, tmp_path, monkeypatch, limit, key, parameters, held):
+    router, client = sessions
+    monkeypatch.setattr(server_module, limit, 2 if limit != "ANSWER_BYTES" else 2 * SMALL_BYTES)
+    with closing(Server(router, router, tmp_path, SITE, CONFIG, now_ns)) as server:
+        release = threading.Event()
+
+        def hold(*_):
+            assert release.wait(WAIT_S)
+            raise QueryError(Refusal.STORE, "held")
+
+        monkeypatch.setattr(server.answers, held, hold)
+        first = begun(client, key, parameters, 2)
+        refused = codec.decode_error(get(client, key, parameters).err.payload.to_bytes())
+        assert refused.reason == Refusal.OVERLOADED
+        assert refused.retry_after_s > 0
+        assert deliver(client, batch(samples(1))) == Ack(1, 1, store=server._writer.store_id)
+        release.set()
+        reasons = {codec.decode_error(next(iter(replies)).err.payload.to_bytes()).reason for replies in first}
+        assert reasons == {Refusal.STORE}
+
+
+@pytest.mark.parametrize("asked", [{"payload": b"x"}, {"parameters": {"layers": "a" * 5000}}])
+def test_a_query_that_would_fill_memory_while_it_waits_is_refused(served, asked):
+    _, client = served
+    reply = get(client, keys.map_query("pit", "info"), **asked)
+    assert codec.decode_error(reply.err.payload.to_bytes()).reason == Refusal.TOO_LARGE
+
+
+def test_a_large_region_comes_in_tiles_and_is_forgotten_after_a_while(served, monkeypatch):
+    _, client = served
+    deliver(client, batch(samples(5, c_rr=0.25)))
+    first = codec.decode_region(ask(client, RegionQuery(Bounds(0, 0, 600, 400), ("resistance",))))
+    count = first.tile.count
+    parts = [codec.decode_region(ask(client, TileQuery(first.tile.cursor, n))) for n in range(count)]
+    region = joined(parts)
+    assert count > 1
+    assert region["resistance"].shape == (400, 600)
+    assert region["resistance"][8, 8] == pytest.approx(0.25, rel=1e-3)
+    assert np.isfinite(region["resistance"]).sum() == 1
+    monkeypatch.setattr(tiles, "IDLE_S", -1.0)
+    tile = {"cursor": str(first.tile.cursor), "number": "0"}
+    assert refusal(client, "tile", tile).reason == Refusal.EXPIRED
 
 
 # --- changes, commands, the past --------------------------------------------------------------------------------------

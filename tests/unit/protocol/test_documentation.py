@@ -60,8 +60,9 @@ def test_every_parameter_of_a_query_is_documented():
 
 
 def test_every_parameter_and_limit_of_a_command_is_documented():
-    [row] = re.findall(r"\n\| `trust` \| (.*?) \|", WIRE)
-    assert re.findall(r"`(.*?)`", row) == [*commands._NAMES]
+    for command, (names, _) in commands._COMMANDS.items():
+        [row] = re.findall(rf"\n\| `{command}` \| (.*?) \|", WIRE)
+        assert re.findall(r"`(.*?)`", row) == [*names]
     assert undocumented(commands._WORDS, WIRE) == []
     assert f"at most {parameters.MAX_TEXT} characters" in WIRE
     assert f"More than {requests.MAX_SPANS} spans" in WIRE

@@ -15,7 +15,21 @@ from sitegrid import cli
 from sitegrid.process.lifetime import plain
 
 COMMANDS = (
-    *("agent", "demo", "distrust", "doctor", "eval", "fold", "keys", "plot", "query", "router", "server", "sim"),
+    *(
+        "accept",
+        "agent",
+        "demo",
+        "distrust",
+        "doctor",
+        "eval",
+        "fold",
+        "keys",
+        "plot",
+        "query",
+        "router",
+        "server",
+        "sim",
+    ),
     "trust",
 )
 
@@ -38,10 +52,11 @@ def test_each_command_has_help_and_a_module(command: str, capsys):
 
 
 def test_help_imports_only_the_base_install():
-    code = "import sys; import sitegrid.cli as c; c.build_parser(); print(*sorted(sys.modules))"
+    code = "import sys; import sitegrid.door as d; d.build_parser(); print(*sorted(sys.modules))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     packages = {name.partition(".")[0] for name in output.split()}
-    assert not packages & {*cli.EXTRAS, "agents", "mapserver", "sim", "evaluation", "benchmarks", "pyarrow"}
+    extras = {"cryptography", "cv2", "filterpy", "matplotlib", "numba", "pyarrow", "pybullet", "pyproj", "rich"}
+    assert not packages & {*extras, *("scipy", "agents", "mapserver", "sim", "evaluation", "benchmarks")}
     assert {"sitegrid", "zenoh"} <= packages
 
 
@@ -56,22 +71,35 @@ def test_errors_are_one_line_or_json(monkeypatch, capsys):
     assert json.loads(capsys.readouterr().err) == {"error": "site.toml: broken"}
 
 
-def test_a_missing_extra_is_named(monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("command", "words", "missing", "extras"),
+    [
+        ("agent", ["--spool", "x.db"], "scipy.linalg", "agent"),
+        ("demo", ["--out", "x"], "pybullet", "agent,server,sim"),
+        ("eval", ["physics"], "pybullet", "eval"),
+        ("keys", ["list"], "cryptography", "security"),
+        ("query", ["info"], "cryptography", "security"),
+        ("server", ["--site-file", "x", "--store", "x"], "cryptography", "server,security"),
+        ("sim", [], "numba", "sim"),
+    ],
+)
+def test_a_missing_extra_is_that_of_the_command(command, words, missing, extras, monkeypatch, capsys):
     def fail(_: object) -> int:
-        raise ModuleNotFoundError("No module named 'numba'", name="numba")
+        raise ModuleNotFoundError(f"No module named {missing!r}", name=missing)
 
-    monkeypatch.setattr("sitegrid.commands.router.run", fail)
-    assert cli.main(["router"]) == 1
-    assert "pip install 'sitegrid[server]'" in capsys.readouterr().err
+    monkeypatch.setattr(f"sitegrid.commands.{command}.run", fail)
+    assert cli.main([command, *words]) == 1
+    assert f"pip install '.[{extras}]'" in capsys.readouterr().err
 
 
-def test_a_bug_is_not_hidden(monkeypatch):
+@pytest.mark.parametrize("missing", ["sim.nothing", "sitegrid.nothing", "sqlite3"])
+def test_a_bug_is_not_hidden(monkeypatch, missing: str):
     def fail(_: object) -> int:
-        raise ModuleNotFoundError("No module named 'ours'", name="ours")
+        raise ModuleNotFoundError(f"No module named {missing!r}", name=missing)
 
-    monkeypatch.setattr("sitegrid.commands.router.run", fail)
+    monkeypatch.setattr("sitegrid.commands.sim.run", fail)
     with pytest.raises(ModuleNotFoundError):
-        cli.main(["router"])
+        cli.main(["sim"])
 
 
 def test_verbose_raises_the_log_level(monkeypatch):

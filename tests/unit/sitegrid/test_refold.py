@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,8 +127,24 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
     with JournalReader(store / JOURNAL_FILE) as reader:
         assert again.journal.watermarks() == reader.watermarks()
+        old = reader.identity()
     assert (again.site, again.newest_ns) == (SITE, T0 + 1190 * S)
+    assert again.identity.id != old.id
+    assert again.identity.descends == (old.id,)
     again.close()
+
+
+def test_a_store_lists_all_that_it_descends_from(store: Path, tmp_path: Path):
+    gone = "0123456789abcdef"
+    shutil.copytree(store, tmp_path / "copy")
+    with closing(Store(tmp_path / "copy", SITE, ServerConfig(), time.time_ns)) as first:
+        first.accept(gone, "its disk died")
+        old = first.identity.id
+    assert run(store / "archive", "--out", tmp_path / "files") == 0  # files alone say which store they are of
+    assert run(tmp_path / "files", tmp_path / "copy", "--out", tmp_path / "new") == 0
+    with closing(opened(tmp_path / "files")) as files, closing(opened(tmp_path / "new")) as new:
+        assert files.identity.descends == (old,)
+        assert new.identity.descends == (files.identity.id, old, gone)
 
 
 def test_the_machines_go_on_sending_to_the_new_store(store: Path, tmp_path: Path):
@@ -271,8 +289,8 @@ def refused(capsys, *words: object) -> str:
 def test_a_place_that_is_taken_is_refused(store: Path, tmp_path: Path, capsys):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "something").touch()
-    for out in (tmp_path / "full", tmp_path / "full" / "something"):
-        assert "exists and is not empty; choose another --out" in refused(capsys, store, "--out", out)
+    assert "exists and is not empty; choose another --out" in refused(capsys, store, "--out", tmp_path / "full")
+    assert "something is no folder" in refused(capsys, store, "--out", tmp_path / "full" / "something")
     (tmp_path / "empty").mkdir()
     assert run(store, "--out", tmp_path / "empty") == 0
     (tmp_path / "new.part").mkdir()

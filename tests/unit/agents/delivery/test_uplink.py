@@ -2,6 +2,7 @@ import itertools
 import math
 import random
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from agents.delivery.uplink import (
     Wait,
 )
 from agents.delivery.uplink_thread import linger, perform
-from mapserver.ingest.admission import GapError, admit, parse
+from mapserver.ingest.admission import GapError, admit, judge
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.machine.samples import content_hash
 from protocol.wire.codec import decode_batch, decode_reply, encode_reply
@@ -37,6 +38,7 @@ from tests.unit.agents.drives import SITE, made_up_samples
 ROWS = made_up_samples(500)
 QUICK_S = 0.01  # an exchange over a good link
 TIMEOUT_S = UplinkConfig().timeout_s
+LAST_NS = int(ROWS["stamp_ns"].max())
 MEMORY = Path(":memory:")  # the spool's files have tests of their own
 
 
@@ -50,7 +52,8 @@ class Server:
 
     def answer(self, payload: bytes) -> Ack | Refused:
         try:
-            batch = parse(payload, "loader-1", SITE, lambda: 0)
+            batch = decode_batch(payload, SITE.extent_m)
+            judge(batch, "loader-1", SITE, lambda: LAST_NS)
             admission = admit(batch, self.watermarks[batch.spool_id])
         except GapError as error:
             return Refused(error.reason, str(error), error.expected)
@@ -61,7 +64,7 @@ class Server:
             self.accepted[new.spool_id, new.first_seq + i, content_hash(row)] += 1
         self.lost += admission.lost
         self.watermarks[batch.spool_id] = max(self.watermarks[batch.spool_id], admission.watermark)
-        return Ack(self.watermarks[batch.spool_id], 1, admission.trimmed)
+        return Ack(self.watermarks[batch.spool_id], 1, admission.trimmed, FIRST)
 
 
 class Delivery:
@@ -568,3 +571,68 @@ def test_the_longest_acknowledgement_counts_from_the_first_sending():
     assert uplink.ack_s_max == pytest.approx(TIMEOUT_S + pause.seconds + 0.1), "with the pause, and both exchanges"
     exchange(Ack(10, 3, 0), 0.3)
     assert uplink.ack_s_max > TIMEOUT_S, "it keeps the longest"
+
+
+# --- stores ----------------------------------------------------------------------------------------------------------
+
+FIRST, SECOND = "a" * 16, "b" * 16
+
+
+def bound_to_first(n: int = 8) -> Delivery:
+    """An uplink of whose run the store FIRST has acknowledged five samples, of n."""
+    d = met(n, first_batch=5)
+    assert d.batch().store == ""  # nothing was acknowledged yet: any store may
+    d.reply(Ack(5, 1, store=FIRST))
+    return d
+
+
+def test_a_run_is_bound_to_the_first_store_that_acknowledges_it():
+    d = bound_to_first()
+    assert d.batch().store == FIRST
+    assert d.reply(Ack(8, 2, store=FIRST)) > 0
+    assert d.counter("depth") == 0
+
+
+@pytest.mark.parametrize("store", [SECOND, ""])
+def test_nothing_is_deleted_on_the_word_of_another_store(store: str):
+    d = bound_to_first()
+    d.batch()
+    assert d.reply(Ack(8, 1, store=store)) > 0
+    assert d.counter("depth") == 3
+    assert FIRST in d.uplink.problem
+    assert d.uplink.counters["other_store"] == 1
+    assert d.batch().first_seq == 6  # it sends the same again, until a server with the right store answers
+    d.reply(Ack(8, 2, store=FIRST))
+    assert (d.counter("depth"), d.uplink.problem) == (0, "")
+
+
+def test_another_store_that_refuses_keeps_the_samples_waiting():
+    d = bound_to_first()
+    d.batch()
+    assert d.reply(Refused(Refusal.OTHER_STORE, "store a... is not this one")) > 0
+    assert (d.counter("depth"), d.counter("put_aside")) == (3, 0)
+    assert d.uplink.problem == "store a... is not this one"
+
+
+def test_a_store_that_replaces_another_learns_what_it_lacks():
+    d = bound_to_first()
+    d.batch()
+    d.reply(Refused(Refusal.GAP, "", expected=1))  # it is accepted, and has nothing of the run
+    sent = d.batch()
+    assert (sent.first_seq, sent.lost_before, sent.store) == (6, 5, FIRST)
+    d.reply(Ack(8, 1, store=SECOND, replaces=FIRST))
+    assert d.counter("depth") == 0
+    d.spool.record(ROWS[8:9])
+    assert d.batch().store == SECOND
+
+
+def test_a_run_remembers_its_store_when_the_spool_is_opened_again(tmp_path: Path):
+    with closing(Spool(tmp_path / "s.db", SpoolConfig())) as spool:
+        spool.record(ROWS[:3])
+        spool.acknowledge(spool.spool_id, 2, FIRST)
+    with closing(Spool(tmp_path / "s.db", SpoolConfig())) as spool:
+        head = spool.head(10)
+        assert (head.store, head.first_seq, head.newest) == (FIRST, 3, None)
+        spool.acknowledge(head.spool_id, 3, FIRST)
+        spool.record(ROWS[3:4])
+        assert spool.head(10).store == ""  # the new run is bound to none

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mapserver.evidence import grid as grid_module
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import LIVE_ROWS, Grid
-from mapserver.journal.refold import threads
+from mapserver.journal.refold import lent
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from tests.reference.grid import by_definition, of_grid, plain
@@ -86,7 +86,7 @@ def test_reading_meanwhile_does_not_matter(seed: int, days: float) -> None:
 def test_how_many_threads_fold_does_not_matter(seed: int, days: float, count: int, rows: int) -> None:
     parts = batches(seed, days=days, spread_m=30.0)
     grid = grid_of(parts[:2])
-    with pytest.MonkeyPatch.context() as patch, threads(count) as workers:
+    with pytest.MonkeyPatch.context() as patch, lent(count) as workers:
         patch.setattr(grid_module, "REFOLD_ROWS", rows)
         with grid.bulk(workers):
             for machine, part in parts[2:]:
@@ -102,7 +102,7 @@ def test_an_error_in_a_thread_reaches_the_caller() -> None:
     def fails(_: int) -> None:
         raise MemoryError
 
-    with threads(2) as workers, pytest.raises(MemoryError):
+    with lent(2) as workers, pytest.raises(MemoryError):
         workers.each(fails)
 
 

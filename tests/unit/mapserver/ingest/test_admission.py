@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapserver.ingest.admission import GapError, admit, parse
+from mapserver.ingest.admission import GapError, SeenTime, admit, judge
 from protocol.errors import MessageError, Refusal
-from protocol.wire.codec import encode_batch
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, now_ns, samples
 
 
@@ -102,49 +101,80 @@ def test_declared_losses_and_samples_add_up(steps):
 # --- judging ---------------------------------------------------------------------------------------------------------
 
 
-def judge(sent, machine="a", site=SITE):
-    return parse(encode_batch(sent), machine, site, now_ns)
+def judged(sent, machine="a", site=SITE):
+    judge(sent, machine, site, now_ns)
 
 
-def test_a_good_batch_comes_through_whole():
-    sent = batch(samples(3), 5, lost_before=2)
-    got = judge(sent)
-    assert (got.machine, got.spool_id, got.first_seq, got.lost_before) == ("a", 7, 5, 2)
-    assert got.rows.tobytes() == sent.rows.tobytes()
+def test_a_good_batch_passes():
+    judged(batch(samples(3), 5, lost_before=2))
 
 
 def test_a_batch_under_the_key_of_another_machine_is_refused():
     with pytest.raises(MessageError, match="'a' sends under the key of 'b'") as caught:
-        judge(batch(samples()), machine="b")
+        judged(batch(samples()), machine="b")
     assert caught.value.reason == Refusal.WRONG_MACHINE
 
 
 def test_a_batch_of_another_site_frame_is_refused():
     with pytest.raises(MessageError, match="compare the site files") as caught:
-        judge(batch(samples(), frame="deadbeef"))
+        judged(batch(samples(), frame="deadbeef"))
     assert caught.value.reason == Refusal.WRONG_FRAME
-
-
-def test_a_position_beyond_the_extent_of_this_site_is_refused():
-    near = replace(SITE, extent_m=10.0)
-    judge(batch(samples(x_m=9.0)), site=near)
-    with pytest.raises(MessageError) as caught:
-        judge(batch(samples(2, x_m=[9.0, 11.0])), site=near)
-    assert (caught.value.reason, caught.value.field, caught.value.row) == (Refusal.OUTSIDE_SITE, "x_m", 1)
 
 
 def test_a_stamp_ahead_of_the_wall_clock_is_refused_where_the_site_says_so():
     wall = replace(SITE, clock="wall", clock_tolerance_s=2.0)
     at_limit, beyond = (samples(3, stamp_ns=[NOW_NS - 10**12, NOW_NS + ahead, NOW_NS]) for ahead in (2e9, 2.1e9))
-    judge(batch(at_limit), site=wall)
-    judge(batch(beyond))  # clock = "data"
+    judged(batch(at_limit), site=wall)
+    judged(batch(beyond))  # clock = "data"
     with pytest.raises(MessageError, match=r"2\.1 s ahead") as caught:
-        judge(batch(beyond), site=wall)
+        judged(batch(beyond), site=wall)
     assert (caught.value.reason, caught.value.row) == (Refusal.WALL_CLOCK, 1)
 
 
+DAY = 86_400 * 10**9
+
+
+@pytest.mark.parametrize("clock", ["data", "wall"])
+@pytest.mark.parametrize(
+    ("ahead_ns", "seen", "reason"),
+    [
+        (DAY + 1, SeenTime(), Refusal.FAR_FUTURE),  # a new store
+        (73 * 365 * DAY, SeenTime(NOW_NS, NOW_NS + DAY, NOW_NS), Refusal.FAR_FUTURE),  # the year 2099
+        (3 * DAY, SeenTime(NOW_NS + DAY, NOW_NS + DAY), Refusal.FAR_FUTURE),  # ahead of all others, too
+        (3 * DAY, SeenTime(0, NOW_NS + DAY, NOW_NS), Refusal.FAR_FUTURE),  # its own earlier stamps prove nothing
+        (3 * DAY, SeenTime(0, 0, NOW_NS + 1), Refusal.SERVER_CLOCK),  # the server's clock went back
+        (3 * DAY, SeenTime(0, NOW_NS + DAY + 1), Refusal.SERVER_CLOCK),
+        (400 * DAY, SeenTime(NOW_NS + 300 * DAY, NOW_NS + 300 * DAY), Refusal.SERVER_CLOCK),
+    ],
+)
+def test_a_stamp_a_day_ahead_of_all_that_is_known_is_refused_with_its_row(clock, ahead_ns, seen, reason):
+    sent = batch(samples(3, stamp_ns=[NOW_NS, NOW_NS + ahead_ns, NOW_NS]))
+    with pytest.raises(MessageError) as caught:
+        judge(sent, "a", replace(SITE, clock=clock), now_ns, lambda machine: {"a": seen}[machine])
+    assert (caught.value.reason, caught.value.field, caught.value.row) == (reason, "stamp_ns", 1)
+
+
+@pytest.mark.parametrize(
+    ("ahead_ns", "seen"),
+    [
+        (DAY, SeenTime()),
+        (3 * DAY, SeenTime(NOW_NS + 2 * DAY, NOW_NS + 2 * DAY)),  # as the others say: the server's clock is behind
+        (-(10**18), SeenTime()),  # a log of 1994
+    ],
+)
+def test_a_stamp_that_others_bear_out_passes__a_site_that_goes_by_its_data(ahead_ns, seen):
+    sent = batch(samples(1, stamp_ns=NOW_NS + ahead_ns))
+    judge(sent, "a", SITE, now_ns, lambda _: seen)
+
+
+def test_a_server_whose_clock_was_never_set_makes_machines_wait():
+    with pytest.raises(MessageError, match="set the server's clock") as caught:
+        judge(batch(samples(1)), "a", SITE, lambda: 1)
+    assert caught.value.reason == Refusal.SERVER_CLOCK
+
+
 def test_an_empty_batch_passes_a_wall_clock():
-    assert len(judge(batch(samples(0)), site=replace(SITE, clock="wall")).rows) == 0
+    judged(batch(samples(0)), site=replace(SITE, clock="wall"))
 
 
 @pytest.mark.parametrize(

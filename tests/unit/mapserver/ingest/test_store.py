@@ -4,16 +4,19 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mapserver.evidence import snapshot
+from mapserver.ingest.store import Store
+from mapserver.trust.decisions import TrustDecision
 from protocol.errors import Refusal, StoreError
 from protocol.wire.messages import Ack, Refused
 from tests.unit.mapserver.data import (
+    CONFIG,
     NOW_NS,
     SITE,
     Incoming,
@@ -274,7 +277,7 @@ def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, sa
 @pytest.mark.parametrize("parts", [1, 5, 25])
 def test_a_replay_of_any_part_of_the_journal_after_a_snapshot_gives_the_same_bits(tmp_path, parts):
     rows = random_samples(100, 13, half_m=20.0)
-    rows["stamp_ns"] += np.arange(100) % 9 * 10**9 * 40_000
+    rows["stamp_ns"] += np.arange(100) % 9 * 10**9 * 9_000
     store = open_store(tmp_path / "store")
     for i, part in enumerate(np.split(rows, parts * 4)):
         store.commit([incoming(part, 1 + i * len(part))])
@@ -298,3 +301,101 @@ def test_samples_at_the_end_of_a_spool_are_declared_lost_without_a_row(tmp_path)
     store = open_store(tmp_path)
     assert store.machines()["a"] == {"spools": 1, "samples": 3, "lost": 4, "newest_ns": NOW_NS + 2 * 10**9}
     store.close()
+
+
+# --- which store it is -----------------------------------------------------------------------------------------------
+
+GONE = "0123456789abcdef"
+
+
+def test_a_store_keeps_its_id_and_so_does_a_copy_of_it(tmp_path):
+    with closing(open_store(tmp_path / "a")) as store, closing(open_store(tmp_path / "b")) as other:
+        identity = store.identity
+        assert identity.id != other.identity.id
+        assert identity.descends == ()
+    shutil.copytree(tmp_path / "a", tmp_path / "copy")
+    for name in ("a", "copy"):
+        with closing(open_store(tmp_path / name)) as again:
+            assert again.identity == identity
+
+
+def test_a_damaged_id_is_found_when_the_store_is_opened(tmp_path):
+    open_store(tmp_path).close()
+    with closing(sqlite3.connect(tmp_path / "journal.db")) as db:
+        db.execute("UPDATE meta SET value = replace(value, substr(value, 1, 1), 'x') WHERE key = 'store'")
+        db.commit()
+    with pytest.raises(StoreError, match="the id of the store is damaged"):
+        open_store(tmp_path)
+
+
+def test_a_run_that_is_bound_to_another_store_is_refused_until_a_person_accepts_that_one(tmp_path):
+    with closing(open_store(tmp_path)) as store:
+        bound = incoming(samples(2), 4, lost_before=3, store=GONE)
+        refused = store.commit([bound])[0]
+        assert refused.reason == Refusal.OTHER_STORE
+        assert GONE in refused.problem
+        assert store.identity.id in refused.problem
+        assert (store.journalled, store.machines()) == (0, {})
+        store.accept(GONE, "its disk died")
+        store.accept(GONE, "its disk died")  # once more changes nothing
+        assert len(store.journal.events("accepted_store")) == 1
+    with closing(open_store(tmp_path)) as store:  # it holds after a restart
+        assert store.info()["accepted"] == [GONE]
+        assert store.commit([bound])[0] == Ack(5, 1, 0, store.identity.id, replaces=GONE)
+        assert store.machines()["a"]["lost"] == 3  # what only the other store has is counted
+        assert store.commit([incoming(samples(1), 6, store=store.identity.id)])[0].replaces == ""
+
+
+def test_the_version_of_the_map_names_the_last_decision_that_counts_in_it(tmp_path):
+    with closing(open_store(tmp_path)) as store:
+        store.commit([incoming(samples(2)), incoming(samples(2), machine="b")])
+        assert (store.version.row, store.version.fact) == (2, 0)
+        store.decide(TrustDecision("a", trusted=True, by="person", reason="", stamp_ns=1))
+        assert store.fact == 1  # it changes nothing in the map, so it counts at once
+        store.decide(TrustDecision("b", trusted=False, by="person", reason="moved", stamp_ns=1))
+        assert store.fact == 1
+        store.adopt(folded(samples(2)), 2, frozenset({"b"}))
+        assert store.fact == 2
+    with closing(open_store(tmp_path)) as store:
+        assert (store.version.row, store.version.fact) == (2, 2)
+
+
+# --- time ------------------------------------------------------------------------------------------------------------
+
+DAY = 86_400 * 10**9
+
+
+def test_the_site_s_now_is_that_of_trusted_machines_and_is_taken_back(tmp_path):
+    with closing(open_store(tmp_path)) as store:
+        store.commit([incoming(samples(1)), incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
+        assert store.newest_ns == NOW_NS + DAY
+        store.decide(TrustDecision("b", trusted=False, by="person", reason="its clock", stamp_ns=1))
+        store.adopt(folded(samples(1)), 2, frozenset({"b"}))
+        assert store.newest_ns == store.info()["stamp_ns"] == NOW_NS
+        store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), 2, machine="b")])
+        assert (store.newest_ns, store.machines()["b"]["newest_ns"]) == (NOW_NS, NOW_NS + DAY)
+    with closing(open_store(tmp_path)) as store:
+        assert store.newest_ns == NOW_NS
+
+
+def test_a_machine_from_the_future_bears_out_no_other_once_it_is_distrusted(tmp_path):
+    with closing(open_store(tmp_path)) as store:
+        store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
+        later = incoming(samples(1, stamp_ns=NOW_NS + 2 * DAY), machine="c")
+        store.adopt(folded(samples(0)), 1, frozenset({"b"}))
+        assert store.commit([later])[0].reason == Refusal.FAR_FUTURE
+        store.adopt(folded(samples(1, stamp_ns=NOW_NS + DAY)), 1, frozenset())
+        assert isinstance(store.commit([later])[0], Ack)
+
+
+def test_a_server_whose_clock_went_back_says_so_until_it_is_right_again(tmp_path):
+    clock = [NOW_NS + 400 * DAY]
+    with closing(Store(tmp_path, SITE, CONFIG, lambda: clock[0])) as store:
+        assert isinstance(store.commit([incoming(samples(1, stamp_ns=clock[0]))])[0], Ack)
+        clock[0] -= 300 * DAY
+        monday = incoming(samples(1, stamp_ns=NOW_NS + 403 * DAY), 2)
+        assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
+    with closing(Store(tmp_path, SITE, CONFIG, lambda: clock[0])) as store:  # it is known from the journal, too
+        assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
+        clock[0] += 303 * DAY
+        assert isinstance(store.commit([monday])[0], Ack)

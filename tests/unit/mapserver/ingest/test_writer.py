@@ -1,5 +1,6 @@
 import sqlite3
 import threading
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -35,7 +36,7 @@ from tests.unit.mapserver.data import (
     send,
     wait_for,
 )
-from tests.unit.mapserver.query.fake_follower import FakeFollower
+from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
 
 
 @pytest.fixture
@@ -179,23 +180,24 @@ def test_work_between_batches_is_done_and_sees_those_before(start):
 
 
 def test_waiting_for_a_merged_row_returns_once_it_is(start):
-    writer, done = start(), threading.Event()
-    writer.wait_merged(0, 0.0)
-    waiter = threading.Thread(target=lambda: (writer.wait_merged(2, WAIT_S), done.set()))
-    waiter.start()
+    writer, called = start(), Future()
+    writer.waits.add(2, WAIT_S, called.set_result)
     send(writer, [incoming(samples(1))])
-    assert not done.is_set()
+    assert not called.done()
     send(writer, [incoming(samples(1), 2)])
-    assert done.wait(WAIT_S)
-    waiter.join()
+    assert called.result(WAIT_S) is None
 
 
 def test_waiting_for_a_row_that_does_not_come_times_out(start):
     writer = start()
     send(writer, [incoming(samples(1))])
-    with pytest.raises(QueryError, match=r"row 2 is not merged after 0\.01 s; merged is 1") as caught:
-        writer.wait_merged(2, 0.01)
-    assert caught.value.reason == Refusal.AFTER_TIMEOUT
+    called: Future[QueryError] = Future()
+    writer.waits.add(2, 0.01, called.set_result)
+    error = called.result(WAIT_S)
+    assert (error.reason, str(error)) == (
+        Refusal.AFTER_TIMEOUT,
+        "journal row 2 is not merged after 0.01 s; merged is 1",
+    )
 
 
 # --- snapshots -------------------------------------------------------------------------------------------------------
@@ -373,7 +375,10 @@ BATCHES = [
     (Refusal.GAP, table(first_seq=2)),
     (Refusal.WRONG_FRAME, table(frame="00000000")),
     (Refusal.WRONG_MACHINE, table(machine="b")),
+    (Refusal.OTHER_STORE, table(store="0123456789abcdef")),
+    (Refusal.OUT_OF_RANGE, table(store="0123")),
     (Refusal.WALL_CLOCK, one(stamp_ns=NOW_NS + 10**13)),
+    (Refusal.FAR_FUTURE, one(stamp_ns=NOW_NS + 10**15)),
 ]
 
 
@@ -406,14 +411,14 @@ QUERIES = [
 @pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
 def test_a_refused_query_says_why(start, reason, name, parameters):
     with pytest.raises(QueryError) as caught:
-        Answers(start(), FakeFollower()).answer(name, parameters)
+        answered(Answers(start(), FakeFollower()), name, parameters)
     assert caught.value.reason == reason
 
 
 def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
-    elsewhere |= {Refusal.FAR_FUTURE, Refusal.SERVER_CLOCK, Refusal.OTHER_STORE, Refusal.NOT_WRITER}
-    elsewhere |= {Refusal.UNKNOWN_MACHINE}  # commands, in the tests of the answers
+    elsewhere |= {Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}  # in the tests of admission, and of the claim
+    elsewhere |= {Refusal.UNKNOWN_MACHINE, Refusal.EXPIRED}  # commands and tiles, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 
 

@@ -21,7 +21,7 @@ from mapserver.journal import archive_file
 from mapserver.journal.archive import HOUR_NS, Archive, archive, next_file
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.reader import LAST, JournalReader
 from mapserver.journal.records import record
 from mapserver.journal.rows import ALL, Admission, JournalRow, Selection
 from protocol import files
@@ -52,8 +52,10 @@ class Machines:
         self.journal.commit()
         self._next[machine] = first + n
 
-    def archive(self, before_ns: int = FUTURE, forget: Callable[[int], int] | None = None) -> list[str]:
-        made = archive(self.folder, self.reader, SITE, before_ns, forget or self.journal.forget)
+    def archive(
+        self, before_ns: int = FUTURE, forget: Callable[[int], int] | None = None, now_ns: int = LAST
+    ) -> list[str]:
+        made = archive(self.folder, self.reader, SITE, before_ns, forget or self.journal.forget, now_ns)
         return [path.name for path in made]
 
     def both(self, selection: Selection = ALL) -> list[tuple]:
@@ -330,9 +332,9 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 
 
 def test_a_file_of_another_schema_is_refused(day, monkeypatch):
-    monkeypatch.setattr(ar, "asdict", lambda header: asdict(header) | {"schema": 2})
-    path = ar.write_file(day.folder, SITE, day.reader.read())
-    with pytest.raises(StoreError, match="has schema 2, this version knows 1"):
+    monkeypatch.setattr(ar, "asdict", lambda header: asdict(header) | {"schema": 1})
+    path = ar.write_file(day.folder, "0" * 16, SITE, ((row, row.received_ns) for row in day.reader.read()))
+    with pytest.raises(StoreError, match="has schema 1, this version knows 2"):
         ArchiveFile(path)
 
 
@@ -357,7 +359,8 @@ def test_a_missing_file_is_an_error(day):
 
 def test_two_files_with_the_same_row_are_an_error(day):
     names = day.archive()
-    ar.write_file(day.folder, SITE, iter([row for row in ArchiveFile(day.folder / names[0]).read() if row.row == 3]))
+    twice = [(row, row.received_ns) for row in ArchiveFile(day.folder / names[0]).read() if row.row == 3]
+    ar.write_file(day.folder, "0" * 16, SITE, iter(twice))
     with pytest.raises(StoreError, match="row 3 is also in another file"):
         list(archived(day.folder, 0, 7))
 
@@ -475,6 +478,32 @@ else:
 for _ in archive(folder / "archive", JournalReader(folder / "journal.db"), site, 2**62, forget):
     pass
 """
+
+
+YEAR_NS = 365 * 24 * HOUR_NS
+
+
+def test_rows_that_came_in_next_year_keep_nothing_from_the_archive(tmp_path):
+    """The server's clock was a year ahead for two rows; they count for the hour in which the next right row came in."""
+    with opened(tmp_path) as machines:
+        for hours, off_ns in ((0, 0), (0, YEAR_NS), (1, YEAR_NS), (1, 0), (2, 0), (5, 0)):
+            machines.send(3, NOW_NS + hours * HOUR_NS + off_ns)
+        before, now_ns = machines.both(), NOW_NS + 5 * HOUR_NS
+        names = machines.archive(NOW_NS + 3 * HOUR_NS, now_ns=now_ns)
+        spans = ("00_000001-000001", "01_000002-000004", "02_000005-000005")
+        assert names == [f"2026-01-01T{span}.parquet" for span in spans]
+        assert machines.both() == before  # also when each came in, as the journal has it
+
+
+def test_rows_that_came_in_next_year_wait_for_one_that_did_not(tmp_path):
+    with opened(tmp_path) as machines:
+        machines.send(3, NOW_NS)
+        machines.send(3, NOW_NS + YEAR_NS)
+        later = {"before_ns": NOW_NS + 30 * HOUR_NS, "now_ns": NOW_NS + 54 * HOUR_NS}
+        assert len(machines.archive(**later)) == 1
+        assert machines.archive(**later) == []
+        machines.send(3, NOW_NS + 29 * HOUR_NS - 1)
+        assert machines.archive(**later) == ["2026-01-02T04_000002-000003.parquet"]
 
 
 @pytest.mark.slow

@@ -38,6 +38,7 @@ INFO: dict[str, Any] = {
     "samples_too_unsure": 4,
     "cells": 250,
     "stamp_ns": NOW_NS,
+    "wall_ns": NOW_NS - 3 * 10**9,
     "machines": {
         "loader-1": {"spools": 1, "samples": 200, "lost": 3, "newest_ns": NOW_NS},
         "loader-2": {"spools": 2, "samples": 104, "lost": 0, "newest_ns": NOW_NS - 10**9},
@@ -91,6 +92,7 @@ def test_the_state_of_the_server_is_exposed(tmp_path: Path):
         "map_samples_too_unsure": 4,
         "map_cells": 250,
         "map_newest_timestamp_seconds": NOW_NS / 1e9,
+        "map_ahead_seconds": 3,
         "waiting_batches": 3,
         "commits_total": 20,
         "commit_seconds_total": 0.5,

@@ -1,10 +1,14 @@
-"""A follower with an answer to everything, and no thread."""
+"""A follower with an answer to everything, and no thread; queries answered as the server does."""
 
+from concurrent.futures import Future
 from dataclasses import asdict
 from typing import Any
 
+from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import GroundChange
+from protocol.queries.requests import parse_query
+from tests.unit.mapserver.data import WAIT_S
 from tests.unit.records import machine_state
 
 
@@ -30,3 +34,12 @@ class FakeFollower:
 
     def excluded(self) -> frozenset[str]:
         return self._excluded
+
+
+def answered(answers: Answers, name: str, parameters: dict[str, str]) -> bytes:
+    """Parse a query, wait for the row that it asks for, and answer it."""
+    query, waited = parse_query(name, parameters), Future()
+    answers._writer.waits.add(query.fresh.after, query.fresh.wait_s, waited.set_result)
+    if error := waited.result(WAIT_S):
+        raise error
+    return answers.answer(query)

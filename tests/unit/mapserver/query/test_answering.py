@@ -15,7 +15,7 @@ from protocol.queries.answer_codec import decode_info, decode_point, decode_regi
 from protocol.queries.requests import PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, folded, incoming, open_writer, random_samples, samples, send
-from tests.unit.mapserver.query.fake_follower import FakeFollower
+from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
 
 # One sample in each cell of two diagonals, the value tells the cell.
 STEPS = np.arange(-40, 40)
@@ -120,18 +120,18 @@ def test_least_weight_of_the_read_options_is_obeyed(tmp_path):
 
 
 def test_answers_travel_as_bytes(answers):
-    point = decode_point(answers.answer("point", {"x": "0.5", "y": "-0.5", "layers": "grade_east,visits"}))
+    point = decode_point(answered(answers, "point", {"x": "0.5", "y": "-0.5", "layers": "grade_east,visits"}))
     assert set(point.values) == {"grade_east", "visits"}
-    here = decode_region(answers.answer("region", {"bounds": "0,-2,2,0", "layers": "grade_east"}))
+    here = decode_region(answered(answers, "region", {"bounds": "0,-2,2,0", "layers": "grade_east"}))
     np.testing.assert_allclose(here["grade_east"], [[np.nan, 0.01], [0.0, np.nan]], atol=1e-3)
-    info = decode_info(answers.answer("info", {"after": "1"}))
+    info = decode_info(answered(answers, "info", {"after": "1"}))
     assert info.layers == (*LAYERS, *AREA_LAYERS)
     assert info.samples_merged == 80
 
 
 def test_an_answer_waits_for_the_row_asked_for(answers):
     with pytest.raises(QueryError, match="row 2 is not merged") as caught:
-        answers.answer("point", {"x": "0", "y": "0", "after": "2", "wait": "0.01"})
+        answered(answers, "point", {"x": "0", "y": "0", "after": "2", "wait": "0.01"})
     assert caught.value.reason == Refusal.AFTER_TIMEOUT
 
 
@@ -165,7 +165,7 @@ def answers_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tupl
     def fold(store: Store) -> None:
         for part in rows:
             store.grid.fold(part, "a")
-        store.newest_ns = store.grid.newest_ns
+        store._newest = {"a": store.grid.newest_ns}
 
     writer.run(fold)
     return writer, asked(writer)

@@ -10,10 +10,10 @@ from mapserver.query.answering import Answers, reads_past
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.commands import TrustCommand, encode_command
-from protocol.queries.requests import MAX_SPANS, HistoryQuery, PointQuery, RegionQuery, When
+from protocol.queries.requests import MAX_SPANS, Freshness, HistoryQuery, PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, samples, send
-from tests.unit.mapserver.query.fake_follower import FakeFollower
+from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
 
 S, HOUR_NS = 10**9, 3600 * 10**9
 BOX = Bounds(-40, -40, 40, 40)
@@ -244,29 +244,29 @@ def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
 
 
 def test_questions_about_the_past_are_recognised():
-    assert reads_past("history", {})
-    assert reads_past("point", {"as_of": "1"})
-    assert reads_past("region", {"minus": "1"})
-    assert not reads_past("point", {"x": "1", "after": "3"})
+    assert reads_past(HistoryQuery(0, 0))
+    assert reads_past(PointQuery(0, 0, when=When(as_of_ns=1)))
+    assert reads_past(RegionQuery(BOX, when=When(minus_ns=1)))
+    assert not reads_past(PointQuery(0, 0, fresh=Freshness(3)))
 
 
 def test_answers_about_the_past_travel_as_bytes(answers):
     stamp = str(NOW_NS + 900 * S)
     region = {"bounds": "-2,-2,2,2", "layers": "visits"}
-    then = codec.decode_region(answers.answer("region", {**region, "as_of": stamp}))
-    difference = codec.decode_region(answers.answer("region", {**region, "minus": stamp}))
-    now = codec.decode_region(answers.answer("region", region))
+    then = codec.decode_region(answered(answers, "region", {**region, "as_of": stamp}))
+    difference = codec.decode_region(answered(answers, "region", {**region, "minus": stamp}))
+    now = codec.decode_region(answered(answers, "region", region))
     assert np.array_equal(difference["visits"], now["visits"] - then["visits"], equal_nan=True)
     assert then.stamp_ns == int(stamp)
     place = {"x": "0.5", "y": "0.5", "layers": "visits"}
-    assert codec.decode_point(answers.answer("point", {**place, "as_of": stamp})).stamp_ns == int(stamp)
+    assert codec.decode_point(answered(answers, "point", {**place, "as_of": stamp})).stamp_ns == int(stamp)
     one = ROWS["a"][ROWS["a"]["distance_m"].argmax()]
     there = {"x": str(one["x_m"]), "y": str(one["y_m"]), "layers": "visits"}
     times = {"from": str(one["stamp_ns"]), "to": str(one["stamp_ns"]), "span": "600"}
-    [span] = codec.decode_history(answers.answer("history", {**there, **times})).spans
+    [span] = codec.decode_history(answered(answers, "history", {**there, **times})).spans
     assert span.last_ns - span.first_ns == 600 * S - 1
     with pytest.raises(QueryError, match="row 9 is not merged"):
-        answers.answer("history", {**place, "after": "9", "wait": "0.01"})
+        answered(answers, "history", {**place, "after": "9", "wait": "0.01"})
 
 
 # --- machines, changes, commands -------------------------------------------------------------------------------------
@@ -275,11 +275,10 @@ def test_answers_about_the_past_travel_as_bytes(answers):
 def test_the_follower_is_asked(served):
     follower = FakeFollower()
     answers = served(follower=follower)
-    assert [
-        (machine.name, machine.trusted)
-        for machine in codec.decode_machines(answers.answer("machines", {"after": "1"})).machines
-    ] == [("a", True), ("b", False)]
-    assert [change.id for change in codec.decode_changes(answers.answer("changes", {"after": "41"})).changes] == [42]
+    machines = codec.decode_machines(answered(answers, "machines", {"after": "1"})).machines
+    assert [(machine.name, machine.trusted) for machine in machines] == [("a", True), ("b", False)]
+    changes = codec.decode_changes(answered(answers, "changes", {"after": "41"})).changes
+    assert [change.id for change in changes] == [42]
     row = codec.decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
     assert (row.name, row.trusted, row.merged) == ("b", False, 4)
     answers.obey("trust", {"machine": "b", "trusted": "auto"})
@@ -288,4 +287,4 @@ def test_the_follower_is_asked(served):
         answers.obey("trust", {"machine": "c", "trusted": "yes"})
     assert caught.value.reason == Refusal.UNKNOWN_MACHINE
     with pytest.raises(QueryError, match="row 9 is not merged"):
-        answers.answer("machines", {"after": "9", "wait": "0.01"})
+        answered(answers, "machines", {"after": "9", "wait": "0.01"})

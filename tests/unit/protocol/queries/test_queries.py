@@ -10,7 +10,7 @@ from protocol.errors import MessageError, QueryError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries import answer_codec as codec
 from protocol.queries import answers
-from protocol.queries.commands import TrustCommand, encode_command, parse_command
+from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
 from protocol.queries.requests import (
     ChangesQuery,
@@ -106,8 +106,22 @@ def test_bad_command_is_refused_by_name(parameters, reason, words):
     assert words in str(caught.value)
 
 
+def test_a_store_is_accepted_by_its_id_and_with_a_reason():
+    command = AcceptCommand(STORE, "disk died; 50 % = lost")
+    assert parse_command("accept", split_selector(selector_of(encode_command(command)))) == command
+    for parameters, reason, words in (
+        ({"reason": "died"}, Refusal.MISSING_FIELD, "`store`"),
+        ({"store": STORE}, Refusal.MISSING_FIELD, "`reason`"),
+        ({"store": STORE.upper(), "reason": "died"}, Refusal.OUT_OF_RANGE, "16 hex digits"),
+        ({"store": STORE, "reason": "died", "machine": "a"}, Refusal.UNKNOWN_PARAMETER, "machine"),
+    ):
+        with pytest.raises(QueryError, match=words) as caught:
+            parse_command("accept", parameters)
+        assert caught.value.reason == reason
+
+
 def test_unknown_command_is_refused():
-    with pytest.raises(QueryError, match="command `shutdown` is not known; known: trust") as caught:
+    with pytest.raises(QueryError, match="command `shutdown` is not known; known: trust, accept") as caught:
         parse_command("shutdown", {})
     assert caught.value.reason == Refusal.UNKNOWN_QUERY
 
@@ -300,6 +314,7 @@ INFO = answers.MapInfo(
     site=answers.SiteInfo(**vars(SITE), frame=SITE.frame, crs=SITE.crs),
     store=STORE,
     descends=("f" * 16,),
+    accepted=(),
     fact=2,
     journalled=5,
     merged=5,

@@ -20,7 +20,7 @@ def same(a, b) -> bool:
     if isinstance(a, dict):
         return list(a) == list(b) and all(same(a[k], b[k]) for k in a)
     if isinstance(a, Exception):
-        return type(a) is type(b) and str(a) == str(b) and a.reason == b.reason
+        return type(a) is type(b) and str(a) == str(b) and vars(a) == vars(b)
     return a == b
 
 

@@ -21,8 +21,9 @@ from protocol.wire.session import free_endpoint
 from sim.config import resolve
 from sim.scenario.file import FOLDER, load_scenario
 from sim.truth import TruthMap
-from sitegrid.cli import build_parser, main
+from sitegrid.cli import main
 from sitegrid.commands import agent, plot, server, sim
+from sitegrid.door import build_parser
 from sitegrid.pictures import draw
 from tests.paths import ROOT
 
@@ -215,7 +216,7 @@ def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch):
         failed = True  # so that the command ends at once
 
         def __init__(self, *given: Any) -> None:
-            configs.append(given[3])
+            configs.append(given[4])
 
     monkeypatch.setattr(server, "stop_flag", Stop)
     monkeypatch.setattr("sitegrid.commands.server.open_session", lambda _: Nothing())

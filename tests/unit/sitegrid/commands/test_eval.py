@@ -9,6 +9,7 @@ import pytest
 
 from sitegrid import cli
 from sitegrid.commands import eval as command
+from sitegrid.door import build_parser
 
 MANIFEST = """
 log = { name = "empty", start_ns = 1 }
@@ -23,7 +24,7 @@ columns = { stamp = "t", left_ticks = "l", right_ticks = "r" }
 
 
 def parse(*words: str) -> argparse.Namespace:
-    return cli.build_parser().parse_args(["eval", *words])
+    return build_parser().parse_args(["eval", *words])
 
 
 @pytest.mark.slow

@@ -18,7 +18,8 @@ from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES
 from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
-from sitegrid.cli import build_parser, main
+from sitegrid.cli import main
+from sitegrid.door import build_parser
 from sitegrid.security.access import access_control, router_settings
 from sitegrid.security.join import is_loopback, join
 from sitegrid.security.register import ROLES, Register, RegisterEntry, common_name, load_register, register_toml
@@ -223,7 +224,7 @@ def test_without_cryptography_it_says_what_to_install(tmp_path: Path, monkeypatc
         monkeypatch.delitem(sys.modules, f"sitegrid.security.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     assert act(tmp_path / "keys", "init") == 1
-    assert "pip install 'sitegrid[security]'" in capsys.readouterr().err
+    assert "pip install '.[security]'" in capsys.readouterr().err
 
 
 def test_whoever_only_has_keys_needs_no_cryptography():

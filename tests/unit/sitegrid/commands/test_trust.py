@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 import threading
 from argparse import Namespace
 from collections.abc import Iterator
@@ -20,9 +22,10 @@ from protocol.queries.parameters import split_selector
 from protocol.queries.requests import ChangesQuery, Freshness, MachinesQuery, parse_query
 from protocol.wire import keys
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from sitegrid.cli import build_parser, main
+from sitegrid.cli import main
 from sitegrid.client import Client, connect
 from sitegrid.commands import query
+from sitegrid.door import build_parser
 from sitegrid.process.lifetime import plain
 from tests.unit.records import STORE, machine_state, version
 
@@ -264,13 +267,25 @@ def test_changes_are_followed_until_stopped(server: FakeServer, monkeypatch, cap
             stop.set()
 
     monkeypatch.setattr(query, "say", show)
-    monkeypatch.setattr(query, "print", show, raising=False)
+    monkeypatch.setattr(query, "tell", show)
     watchdog = threading.Timer(WAIT_S, stop.set)
     watchdog.start()
     assert sitegrid(server, "query", "changes", "--follow", *(["--json"] if as_json else [])) == 0
     watchdog.cancel()
     assert ["615" in shown[0], "700" in shown[1], len(shown)] == [True, True, 2]
     assert shown[0].startswith("{") == as_json
+
+
+def test_a_reader_that_leaves_ends_what_is_followed(server: FakeServer, monkeypatch, capsys):
+    stop = threading.Event()
+    monkeypatch.setattr(query, "stop_flag", lambda: stop)
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        assert sitegrid(server, "query", "changes", "--follow") == 0
+        monkeypatch.undo()
+    assert stop.is_set()
 
 
 def test_json_may_stand_before_or_behind_the_query():

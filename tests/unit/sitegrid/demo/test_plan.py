@@ -8,9 +8,9 @@ import pytest
 
 from protocol.errors import ConfigError
 from protocol.site.site_file import load_site
-from sitegrid.cli import build_parser
 from sitegrid.demo import plan as planning
 from sitegrid.demo.plan import DEFAULT_MANIFEST, DemoPlan, make_plan, start_sim
+from sitegrid.door import build_parser
 from tests.paths import ROOT
 
 
@@ -52,11 +52,24 @@ def test_the_plan_writes_a_file_for_the_site_and_each_machine(tmp_path: Path):
 
 
 def test_an_earlier_run_is_cleared_away(tmp_path: Path):
-    (tmp_path / "work").mkdir()
-    old = tmp_path / "work" / "loader-9.db"
+    old = plan_of(tmp_path, "--no-log").work / "loader-9.db"
     old.write_text("old")
     plan_of(tmp_path, "--no-log")
     assert not old.exists()
+
+
+def test_what_is_not_of_an_earlier_run_is_left_alone(tmp_path: Path):
+    (tmp_path / "work").mkdir()
+    mine = tmp_path / "work" / "thesis.tex"
+    mine.write_text("mine")
+    with pytest.raises(ConfigError, match="is not of an earlier demo"):
+        plan_of(tmp_path, "--no-log")
+    assert mine.exists()
+
+
+def test_the_data_of_no_log_are_refused(tmp_path: Path):
+    with pytest.raises(ConfigError, match="--data: is the folder of a log"):
+        plan_of(tmp_path, "--data", str(tmp_path))
 
 
 @pytest.mark.slow

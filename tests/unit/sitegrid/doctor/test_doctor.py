@@ -27,7 +27,7 @@ from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.answer_codec import encode_info
-from protocol.queries.answers import MapInfo
+from protocol.queries.answers import MapInfo, SampleCounts
 from protocol.queries.requests import InfoQuery
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
@@ -68,6 +68,13 @@ GOOD = Certificate(
     signed=True,
     fits=True,
     mode=0o100600,
+)
+COUNTS = {"spools": 1, "samples": 3, "lost": 0}
+AHEAD = replace(
+    INFO,
+    stamp_ns=NOW_NS + 72_000 * 10**9,
+    wall_ns=NOW_NS,
+    machines={f"loader-{i}": SampleCounts(**COUNTS, newest_ns=NOW_NS + 36_000 * 10**9 * i) for i in (1, 2)},
 )
 STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
 HEALTHY = {"spool": {"depth": 3, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
@@ -118,6 +125,20 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (permission(None, is_there=False), FAIL, "start `sitegrid server`"),
         (permission(None, has_keys=True), FAIL, "under the name of its keys alone"),
         (permission(None), FAIL, "denies it, or the server hangs"),
+        (network.check_time(INFO), PASS, "no stamp is ahead"),
+        (network.check_time(replace(INFO, stamp_ns=NOW_NS, wall_ns=NOW_NS + 10**18)), PASS, "no stamp is ahead"),
+        (
+            network.check_time(AHEAD),
+            WARN,
+            "20.0 h ahead of the server's clock, by loader-2; set the clock that is wrong",
+        ),
+        (network.check_time(replace(AHEAD, distrusted=("loader-2",))), WARN, "by loader-1"),
+        (
+            network.check_time(replace(INFO, counters={"refused_far_future": 3})),
+            WARN,
+            "3 batches were refused for stamps",
+        ),
+        (network.check_time(replace(INFO, counters={"refused_server_clock": 3})), WARN, "set the server's clock"),
         (network.check_clock(0.4, 0.01, None), PASS, "0.40 s ahead of"),
         (network.check_clock(-0.4, 0.01, None), PASS, "0.40 s behind"),
         (network.check_clock(1.2, 0.1, None), WARN, "NTP"),
@@ -439,7 +460,7 @@ def test_a_running_agent_is_heard(site: Site, capsys):
 def test_people_read_one_line_each(capsys):
     assert main(["doctor", "--endpoint", free_endpoint()]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["-", "FAIL", "-", "-", "-", "-", "-", "-"]
+    assert [line.split()[0] for line in lines] == ["-", "FAIL", "-", "-", "-", "-", "-", "-", "-"]
     assert lines[1].startswith("FAIL  router        nothing listens at tcp/127.0.0.1:")
 
 

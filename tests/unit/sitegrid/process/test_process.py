@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from sitegrid.cli import build_parser
+from sitegrid.door import build_parser
 
 STUBBORN = """
 import sys, time
@@ -35,6 +35,17 @@ mutex = ctypes.create_string_buffer(256)
 pthread = ctypes.CDLL(None)
 pthread.pthread_mutex_lock(mutex)
 pthread.pthread_mutex_lock(mutex)
+"""
+TIDY = """
+import sys, time
+from sitegrid.process.lifetime import raise_interrupts
+raise_interrupts()
+try:
+    print("ready", flush=True)
+    time.sleep(20)
+except KeyboardInterrupt:
+    print("tidied", flush=True)
+sys.exit(3)
 """
 # Blocks that are freed between others that stay: the second of each size used to lie in the heap.
 GREEDY = """
@@ -76,6 +87,11 @@ def ended(code: str, number: signal.Signals = signal.SIGTERM) -> tuple[int, str,
 def test_who_ends_in_time_ends_as_it_likes(number: signal.Signals):
     code, output, errors, _ = ended(STUBBORN.format(end_s=15, late_s=0), number)
     assert (code, output, errors) == (3, "done\n", "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_who_has_to_tidy_up_may(number: signal.Signals):
+    assert ended(TIDY, number)[:3] == (3, "tidied\n", "")
 
 
 def test_who_does_not_end_is_ended_and_that_is_logged():

@@ -1,0 +1,125 @@
+"""Batches of one commit decoded together: one pass over the samples of all of them.
+
+What is refused, and why, is what `protocol.wire.codec.decode_batch` says of each batch by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain
+from typing import Any
+
+import numba
+import numpy as np
+
+from protocol.arrays import AnyArray, Floats32, Table
+from protocol.errors import MessageError
+from protocol.machine.samples import COLUMNS, GRADE, LIMITS, RESISTANCE, SAMPLE_DTYPE, check_samples, empty
+from protocol.wire.codec import unpack_batch
+from protocol.wire.messages import PackedBatch, SampleBatch
+
+# The rows as 32-bit words: a stamp and two coordinates of two words each, then single-precision numbers.
+_WORD = np.dtype("<u4")
+_WIDTHS = np.array([SAMPLE_DTYPE[name].itemsize // _WORD.itemsize for name in COLUMNS])
+_WORDS = int(_WIDTHS.sum())
+_SINGLE = [name for name in COLUMNS if SAMPLE_DTYPE[name] == np.float32]
+_FIRST_SINGLE = _WORDS - len(_SINGLE)
+_LOW, _HIGH = (np.array([LIMITS[name][end] for name in _SINGLE], np.float32) for end in (0, 1))
+_FIRST_NS, _LAST_NS = LIMITS["stamp_ns"]
+_XX, _XY, _YY = (_FIRST_SINGLE + _SINGLE.index(name) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
+# Bits of the columns that may be NaN, but only together.
+_RESISTANCE, _GRADE = (sum(1 << _SINGLE.index(name) for name in names) for names in (RESISTANCE, GRADE))
+
+
+def decode_batches(payloads: Sequence[bytes], extent_m: float) -> list[SampleBatch | MessageError]:
+    """Decode and check batches; for each what it holds, or what is wrong with it. Their rows lie in one table.
+
+    extent_m: how far from the origin a position may lie.
+    """
+    unpacked = [_unpack(payload) for payload in payloads]
+    packed = [batch for batch in unpacked if isinstance(batch, PackedBatch)]
+    table, plausible = _decode(packed, extent_m)
+    ends = np.cumsum([batch.n for batch in packed]).tolist()
+    decoded = iter(
+        _batch(batch, table[end - batch.n : end], extent_m, is_plausible)
+        for batch, end, is_plausible in zip(packed, ends, plausible, strict=True)
+    )
+    return [next(decoded) if isinstance(batch, PackedBatch) else batch for batch in unpacked]
+
+
+def warm_up() -> None:
+    """Compile the kernels, or read them from their cache, before a batch waits for them."""
+    columns = tuple(bytes(SAMPLE_DTYPE[name].itemsize) for name in COLUMNS)
+    one = PackedBatch(SampleBatch("", 1, 1, empty(), ""), 1, columns)
+    _decode([one], 1.0)
+
+
+def _unpack(payload: bytes) -> PackedBatch | MessageError:
+    try:
+        return unpack_batch(payload)
+    except MessageError as error:
+        return error
+
+
+def _decode(packed: Sequence[PackedBatch], extent_m: float) -> tuple[Table, list[bool]]:
+    """Rows of all batches, and for each batch whether its rows are plausible."""
+    lengths = np.array([batch.n for batch in packed], np.int64)
+    columns = b"".join(chain.from_iterable(batch.columns for batch in packed))
+    words: AnyArray = np.empty((int(lengths.sum()), _WORDS), _WORD)
+    _interleave(np.frombuffer(columns, _WORD), lengths, words)
+    table: Table = words.view(SAMPLE_DTYPE)[:, 0]
+    plausible = np.empty(len(packed), np.bool_)
+    _judge(table, words.view("<f4"), lengths, extent_m, plausible)
+    return table, plausible.tolist()
+
+
+def _batch(batch: PackedBatch, rows: Table, extent_m: float, is_plausible: bool) -> SampleBatch | MessageError:  # noqa: FBT001
+    if not is_plausible:
+        try:
+            check_samples(rows, extent_m)  # which names field and row
+        except MessageError as error:
+            return error
+    return replace(batch.batch, rows=rows)
+
+
+@numba.njit(cache=True, nogil=True)
+def _interleave(columns: Any, lengths: Any, out: Any) -> None:
+    """Make rows (n, words) of the columns of batches, which lie one behind the other."""
+    at, first = 0, 0
+    for n in lengths:
+        word = 0
+        for width in _WIDTHS:
+            for i in range(n):
+                for j in range(width):
+                    out[first + i, word + j] = columns[at]
+                    at += 1
+            word += width
+        first += n
+
+
+@numba.njit(cache=True, nogil=True)
+def _judge(rows: Any, singles: Floats32, lengths: Any, extent_m: float, plausible: Any) -> None:
+    """Whether all rows of each batch pass `check_samples`; singles: the same rows, their words as float32."""
+    k = 0
+    for batch in range(len(lengths)):
+        plausible[batch] = True
+        for _ in range(lengths[batch]):
+            plausible[batch] &= _is_plausible(rows[k], singles[k], extent_m)
+            k += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_plausible(row: Any, singles: Floats32, extent_m: float) -> bool:
+    unknown = 0
+    inside = _FIRST_NS <= row.stamp_ns <= _LAST_NS
+    for value in (row.x_m, row.y_m):
+        inside &= np.isfinite(value) and abs(value) <= extent_m
+    for j in range(len(_LOW)):
+        value = singles[_FIRST_SINGLE + j]
+        unknown |= np.isnan(value) << j
+        inside &= not (value < _LOW[j] or value > _HIGH[j])
+    partly = unknown & _RESISTANCE not in (0, _RESISTANCE) or unknown & _GRADE not in (0, _GRADE)
+    xx, xy, yy = np.float64(singles[_XX]), np.float64(singles[_XY]), np.float64(singles[_YY])
+    semidefinite = xx * yy - xy * xy >= -1e-6 * max(xx * yy, 1e-12)
+    return bool(inside and semidefinite and not partly and not unknown & ~(_RESISTANCE | _GRADE))

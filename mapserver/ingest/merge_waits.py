@@ -1,0 +1,86 @@
+"""Who waits for a journal row to be merged: entries in a list, which hold no thread while they wait."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from protocol.errors import QueryError, Refusal
+
+MOST_WAITING = 1000  # a few kB each
+RETRY_AFTER_S = 2.0
+Then = Callable[[QueryError | None], None]
+
+
+@dataclass(frozen=True)
+class _Wait:
+    row: int
+    wait_s: float
+    deadline_s: float
+    then: Then
+
+
+class MergeWaits:
+    """Calls back once a row is merged, or its wait is over; may be used from any thread."""
+
+    def __init__(self, merged: int) -> None:
+        self._merged = merged
+        self._waiting: list[_Wait] = []
+        self._next_row: float = float("inf")  # the lowest that is waited for
+        self._closed = False
+        self._news = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="waits", daemon=True)
+        self._thread.start()
+
+    def add(self, row: int, wait_s: float, then: Then) -> None:
+        """Have `then` called once the row is merged: here, if it is; with an error if that takes longer than wait_s.
+
+        QueryError if too many are waiting.
+        """
+        with self._news:
+            if is_waiting := row > self._merged:
+                if len(self._waiting) >= MOST_WAITING:
+                    problem = "too many queries wait for journal rows; ask again later"
+                    raise QueryError(Refusal.OVERLOADED, problem, RETRY_AFTER_S)
+                self._waiting.append(_Wait(row, wait_s, time.monotonic() + wait_s, then))
+                self._next_row = min(self._next_row, row)
+                self._news.notify()
+        if not is_waiting:
+            then(None)
+
+    def advance(self, merged: int) -> None:
+        """Say what is merged now. Only wakes the thread that calls back: whoever owns the store has no time for it."""
+        with self._news:
+            self._merged = merged
+            if merged >= self._next_row:
+                self._news.notify()
+
+    def close(self) -> None:
+        """Forget who waits."""
+        with self._news:
+            self._closed = True
+            self._waiting.clear()
+            self._news.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (due := self._next_due()) is not None:
+            for wait in due:
+                problem = f"journal row {wait.row} is not merged after {wait.wait_s:g} s; merged is {self._merged}"
+                wait.then(None if wait.row <= self._merged else QueryError(Refusal.AFTER_TIMEOUT, problem))
+
+    def _next_due(self) -> list[_Wait] | None:
+        """Wait until some wait is over, and take those; None at the end."""
+        with self._news:
+            while not self._closed:
+                now_s = time.monotonic()
+                due = [wait for wait in self._waiting if wait.row <= self._merged or wait.deadline_s <= now_s]
+                if due:
+                    self._waiting = [wait for wait in self._waiting if wait not in due]
+                    self._next_row = min((wait.row for wait in self._waiting), default=float("inf"))
+                    return due
+                deadline_s = min((wait.deadline_s for wait in self._waiting), default=None)
+                self._news.wait(deadline_s and max(0.0, deadline_s - now_s))
+        return None

@@ -1,0 +1,150 @@
+"""Regions in tiles: how they are cut, and the views that are kept while a reader takes tile after tile.
+
+One answer is so small that the router can hold it for a reader that does not read (protocol/wire/session.py): nobody
+else waits for that one. All tiles are of one version of the map, so the pages that they are read from are kept, which
+costs little: pages never change, and the grid shares them.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import threading
+import time
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+from mapserver.query.views import View
+from protocol.errors import QueryError, Refusal
+from protocol.queries.answers import Tile
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
+
+TILE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
+MOST_OPEN = 8  # regions that are answered at the same time
+IDLE_S = 10.0  # a region of which nobody takes a tile for so long makes room
+OPEN_S = 600.0  # ... and one that is open for so long, since its pages leave the grid one by one
+RETRY_AFTER_S = 2.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a region is read from: layers, and the view that they are read from, less another one if there are two."""
+
+    window: CellWindow
+    layers: tuple[str, ...]
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """Tiles of a window, row by row from its south-western corner; edges lie between blocks, where they can.
+
+    width, height: of a tile [cells].
+    """
+
+    window: CellWindow
+    width: int
+    height: int
+
+    @classmethod
+    def of_layers(cls, window: CellWindow, layers: int) -> TileGrid:
+        """Tiles with at most TILE_BYTES each: square, unless the window is narrow."""
+        cells = TILE_BYTES // (4 * layers)
+        if window.columns * window.rows <= cells:
+            return cls(window, window.columns + BLOCK_CELLS, window.rows + BLOCK_CELLS)
+        side = math.isqrt(cells)
+        if window.rows < side:
+            return cls(window, _whole_blocks(cells // window.rows), window.rows + BLOCK_CELLS)
+        if window.columns < side:
+            return cls(window, window.columns + BLOCK_CELLS, _whole_blocks(cells // window.columns))
+        return cls(window, _whole_blocks(side), _whole_blocks(side))
+
+    @property
+    def count(self) -> int:
+        """How many tiles there are."""
+        return len(self._columns) * len(self._rows)
+
+    def tile(self, number: int) -> CellWindow:
+        """One of them."""
+        left, right = self._columns[number % len(self._columns)]
+        bottom, top = self._rows[number // len(self._columns)]
+        return CellWindow(left, bottom, right - left, top - bottom)
+
+    def place(self, number: int, cursor: int) -> Tile:
+        """Where one of them lies."""
+        tile, whole = self.tile(number), self.window
+        corner = (tile.column - whole.column, tile.row - whole.row)
+        return Tile(cursor, number, self.count, *corner, whole.columns, whole.rows)
+
+    @cached_property
+    def _columns(self) -> list[tuple[int, int]]:
+        return _cut(self.window.column, self.window.columns, self.width)
+
+    @cached_property
+    def _rows(self) -> list[tuple[int, int]]:
+        return _cut(self.window.row, self.window.rows, self.height)
+
+
+def _whole_blocks(cells: int) -> int:
+    return max(BLOCK_CELLS, cells // BLOCK_CELLS * BLOCK_CELLS)
+
+
+def _cut(first: int, count: int, length: int) -> list[tuple[int, int]]:
+    """Begin and end of each piece of an axis."""
+    edges = [first, *range(first // BLOCK_CELLS * BLOCK_CELLS + length, first + count, length), first + count]
+    return list(pairwise(edges))
+
+
+@dataclass
+class _Open:
+    reading: Reading
+    opened_s: float
+    used_s: float
+    is_read: bool = False  # to its last tile
+
+
+class OpenRegions:
+    """Regions of which readers take tiles, by cursor."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: dict[int, _Open] = {}
+
+    def make_room(self) -> None:
+        """Forget what is read or left; QueryError while too many regions are being read."""
+        with self._lock:
+            self._forget()
+            read = [cursor for cursor, one in self._open.items() if one.is_read]
+            for cursor in read[: max(0, len(self._open) + 1 - MOST_OPEN)]:
+                del self._open[cursor]
+            if len(self._open) >= MOST_OPEN:
+                problem = f"{MOST_OPEN} large regions are being read; ask again later, or for a smaller one"
+                raise QueryError(Refusal.OVERLOADED, problem, RETRY_AFTER_S)
+
+    def open(self, reading: Reading) -> int:
+        """Keep what a region is read from; returns its cursor. QueryError as `make_room`."""
+        self.make_room()
+        cursor, now_s = 1 + secrets.randbelow(2**48), time.monotonic()
+        with self._lock:
+            self._open[cursor] = _Open(reading, now_s, now_s)
+        return cursor
+
+    def reading(self, cursor: int, number: int) -> tuple[Reading, TileGrid]:
+        """What a tile is read from; QueryError if that is not kept any more, or there is no such tile."""
+        with self._lock:
+            self._forget()
+            one = self._open.get(cursor)
+            if one is None:
+                raise QueryError(Refusal.EXPIRED, f"no region is open under cursor {cursor}: ask for it again")
+            tiles = TileGrid.of_layers(one.reading.window, len(one.reading.layers))
+            if number >= tiles.count:
+                raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `number`: {number} of {tiles.count} tiles, from 0")
+            one.used_s, one.is_read = time.monotonic(), one.is_read or number == tiles.count - 1
+            return one.reading, tiles
+
+    def _forget(self) -> None:
+        now_s = time.monotonic()
+        for cursor, one in list(self._open.items()):
+            if now_s > min(one.used_s + IDLE_S, one.opened_s + OPEN_S):
+                del self._open[cursor]

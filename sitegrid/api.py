@@ -1,0 +1,25 @@
+"""What a program gets as `sitegrid.NAME`: the client, its answers and its errors."""
+
+from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
+from protocol.queries.answers import (
+    GroundChange,
+    HistorySpan,
+    MachineState,
+    MapInfo,
+    PointAnswer,
+    Region,
+    SampleCounts,
+    SiteInfo,
+    TrustAnswer,
+)
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import KnownGround
+from protocol.version import package_version
+from sitegrid.client import Client, connect
+from sitegrid.listener import Listener
+
+__all__ = ["Client", "Listener", "connect"]
+__all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
+__all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
+__all__ += ["Bounds", "KnownGround", "SampleCounts", "SiteInfo"]
+__version__ = package_version()

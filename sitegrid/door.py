@@ -1,0 +1,108 @@
+"""The door of the command: the parser of all commands, and whatever goes wrong behind it as one line and an exit code.
+
+Errors of our own say what to do themselves. Those of the system, of Zenoh, and a library that is not installed are put
+in words here; anything else is a bug and shows where it is.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import pkgutil
+import sys
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from importlib import import_module
+
+import zenoh
+
+from protocol.errors import SitegridError, one_line
+from protocol.wire.session import reason_of
+from sitegrid import commands
+from sitegrid.options.groups import add_command
+from sitegrid.process import streams
+from sitegrid.process.logs import start_logging
+
+INTERRUPTED = 130  # as a shell has it: 128 and the number of SIGINT
+# What needs an extra in some commands only; all else is in the extra of the command (`EXTRA` of its module).
+BESIDE = {"cryptography": "security"}
+OURS = ("protocol", "agents", "mapserver", "sim", "sitegrid", "evaluation", "benchmarks")
+ADVICE = {
+    errno.EACCES: "run this as a user who may, or choose another place",
+    errno.EPERM: "run this as a user who may, or choose another place",
+    errno.EROFS: "choose another place",
+    errno.ENOSPC: "make room, or choose another place",
+    errno.EDQUOT: "make room, or choose another place",
+    errno.EMFILE: "raise the limit of open files (`ulimit -n`)",
+    errno.EADDRINUSE: "end the process that listens there, or choose another port",
+}
+log = logging.getLogger("sitegrid.door")
+
+
+def run(words: Sequence[str]) -> int:
+    """Run a command; returns its exit code. SystemExit as argparse raises it: wrong usage, and help."""
+    streams.complete()
+    try:
+        code = _run(words)
+    finally:
+        streams.flush()
+    if not code and streams.problem():
+        return _fail(f"standard output: {streams.problem()}; not all of the answer was written", words)
+    return code
+
+
+def _run(words: Sequence[str]) -> int:
+    extra = ""
+    try:
+        arguments = build_parser().parse_args(words)
+        extra = arguments.extra
+        start_logging(verbose=arguments.verbose)
+        return int(arguments.run(arguments))
+    except SitegridError as error:
+        return _fail(str(error), words)
+    except zenoh.ZError as error:
+        return _fail(f"network: {reason_of(error)}", words)
+    except ModuleNotFoundError as error:
+        if not (advice := _extra_for(error, extra)):
+            raise
+        return _fail(advice, words)
+    except OSError as error:
+        log.info("failed", exc_info=True)  # with --verbose, where it came from
+        return _fail(_system_problem(error), words)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def build_parser() -> ArgumentParser:
+    """The parser of all commands."""
+    parser = ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
+    nouns = parser.add_subparsers(metavar="COMMAND", required=True)
+    for info in pkgutil.iter_modules(commands.__path__, f"{commands.__name__}."):
+        module = import_module(info.name)
+        noun = add_command(nouns, info.name.rpartition(".")[2], module.HELP)
+        noun.set_defaults(run=module.run, extra=getattr(module, "EXTRA", ""))
+        module.add_options(noun)
+    return parser
+
+
+def _extra_for(error: ModuleNotFoundError, extra: str) -> str:
+    """What to install for a command that misses a module; nothing where the module is ours, or no extra has it."""
+    module = str(error.name).partition(".")[0]
+    extras = ",".join(dict.fromkeys(filter(None, (extra, BESIDE.get(module)))))
+    if not extras or module in OURS or module in sys.stdlib_module_names:
+        return ""
+    return f"{module} is not installed: pip install '.[{extras}]' in the folder of this project"
+
+
+def _system_problem(error: OSError) -> str:
+    """An error of the system: which file, what is wrong, what to do where that helps."""
+    where = f"{error.filename}: " if error.filename is not None else ""
+    what = error.strerror or str(error) or type(error).__name__
+    advice = f"; {ADVICE[error.errno]}" if error.errno in ADVICE else ""
+    return one_line(f"{where}{what}{advice}")
+
+
+def _fail(problem: str, words: Sequence[str]) -> int:
+    streams.write_error(json.dumps({"error": problem}) if "--json" in words else f"sitegrid: {problem}")
+    return 1

@@ -1,0 +1,72 @@
+"""Standard output and standard error: whole lines, written at once.
+
+Neither a reader that has left (`sitegrid query info | head -1`) nor a full disk behind `>` stops the work: what cannot
+be written is dropped, and the door says so at the end. A reader that left has what it wanted: that is no error.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TextIO
+
+_errors: list[OSError] = []  # of standard output
+
+
+def complete() -> None:
+    """Open what the caller closed (`2>&-`), on nothing: else a database became file 1 or 2, where Zenoh may write."""
+    _errors.clear()
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) < 3:
+        pass
+    os.close(descriptor)
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - until the end
+
+
+def write_out(text: str) -> None:
+    """Write lines to standard output."""
+    _write(sys.stdout, f"{text}\n")
+
+
+def write_error(text: str) -> None:
+    """Write lines to standard error."""
+    _write(sys.stderr, f"{text}\n")
+
+
+def flush() -> None:
+    """Write what others, as argparse, have left in the buffers."""
+    for stream in (sys.stdout, sys.stderr):
+        _write(stream, "")
+
+
+def is_open() -> bool:
+    """Whether standard output could be written so far."""
+    return not _errors
+
+
+def problem() -> str:
+    """Why standard output could not be written; nothing if it could, or if its reader has left."""
+    texts = [error.strerror or str(error) for error in _errors if not isinstance(error, BrokenPipeError)]
+    return texts[0] if texts else ""
+
+
+def _write(stream: TextIO, text: str) -> None:
+    try:
+        stream.write(text)
+        stream.flush()
+    except OSError as error:
+        if stream is sys.stdout:
+            _errors.append(error)
+        _mute(stream)
+
+
+def _mute(stream: TextIO) -> None:
+    """Have the stream write to nothing from now on: Python itself flushes it once more, at the end."""
+    try:
+        descriptor = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(descriptor, stream.fileno())
+        os.close(descriptor)
+        stream.flush()
+    except (OSError, ValueError):  # no file, as in a test
+        pass

@@ -1,0 +1,163 @@
+"""Mishaps of real processes: Ctrl-C while they load, a terminal that is closed, readers of their output that leave."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from protocol.wire.session import free_endpoint
+from sim.config import SimConfig
+from sitegrid.door import INTERRUPTED, build_parser
+from sitegrid.process.children import Child, Children, wait_until
+from tests.integration.site_run import READY_S, SiteRun  # beside this file
+
+pytestmark = pytest.mark.processes
+
+NOUNS = tuple(next(a for a in build_parser()._actions if a.choices).choices)  # all commands
+# Ctrl-C as numpy or another library is loaded: before its n-th import. Every line would fail by itself, if it went on.
+IMPORTS = (1, 100, 350)
+LINES = {
+    "agent": ["--spool", "x.db"],
+    "demo": ["--machines", "0"],
+    "distrust": ["m", "--reason", "r", "--endpoint", "none"],
+    "doctor": ["--endpoint", "none"],
+    "eval": ["log", "missing"],
+    "fold": ["missing", "--out", "x"],
+    "keys": ["list", "--dir", "missing"],
+    "plot": ["--endpoint", "none"],
+    "query": ["--endpoint", "none", "info"],
+    "router": ["--listen", "none"],
+    "server": ["--site-file", "missing", "--store", "x"],
+    "sim": ["--endpoint", "none"],
+    "trust": ["m", "--endpoint", "none"],
+}
+# One process for all: it has loaded nothing, and each fork begins as the command does.
+FORKS = """
+import os, signal, sys
+import sitegrid.cli
+
+class CtrlC:
+    def __init__(self, left):
+        self.left = left
+    def find_spec(self, name, path=None, target=None):
+        self.left -= 1
+        if self.left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+
+cases, results = eval(sys.argv[1]), []
+for i, (left, words) in enumerate(cases):
+    if (pid := os.fork()) == 0:
+        errors = os.open(f"{i}.err", os.O_WRONLY | os.O_CREAT)
+        os.dup2(errors, 1), os.dup2(errors, 2)
+        sys.meta_path.insert(0, CtrlC(left))
+        sys.exit(sitegrid.cli.main(words))
+    results.append(os.waitpid(pid, 0)[1])
+print(results)
+"""
+
+
+def sitegrid(*words: object) -> list[str]:
+    return [sys.executable, "-m", "sitegrid.cli", *map(str, words)]
+
+
+@pytest.fixture
+def site(tmp_path: Path, children: Children) -> SiteRun:
+    return SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
+
+
+def test_ctrl_c_while_a_command_loads_ends_it_without_a_word(tmp_path: Path):
+    cases = [(left, [noun, *LINES[noun]]) for noun in NOUNS for left in IMPORTS]  # a new command needs a line
+    words = [sys.executable, "-c", FORKS, repr(cases)]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True)
+    interrupted = dict.fromkeys(NOUNS, 0)
+    for i, ((left, words), status) in enumerate(zip(cases, json.loads(done.stdout), strict=True)):
+        said = (tmp_path / f"{i}.err").read_text()
+        code = os.waitstatus_to_exitcode(status)
+        if code in (-signal.SIGINT, INTERRUPTED):
+            assert said == "", (left, words)
+            interrupted[words[0]] += 1
+        else:  # it needs fewer imports, and has failed meanwhile as it should
+            assert code == 1, (left, words, said)
+            assert "Traceback" not in said
+    assert min(interrupted.values()) >= 2, interrupted
+
+
+def test_a_shell_sees_130(tmp_path: Path):
+    code = "import os, signal, sys; from sitegrid.cli import main; import sitegrid.commands.router as r;"
+    code += "r.run = lambda _: os.kill(os.getpid(), signal.SIGINT) or 0; sys.exit(main(['router']))"
+    shell = subprocess.run(["sh", "-c", f'"{sys.executable}" -c "{code}"; echo $?'], capture_output=True, text=True)
+    assert (shell.stdout, shell.stderr) == ("130\n", "")
+
+
+def test_a_reader_that_leaves_a_pipe_is_no_error(site: SiteRun):
+    site.start_router()
+    site.start_server()
+    where = ("--endpoint", site.endpoint, "--site", site.site)
+    for words, taken in ((["info"], "head -1"), (["--json", "info"], "true")):
+        line = " ".join(map(repr, sitegrid("query", *where, *words)))
+        shell = subprocess.run(
+            ["bash", "-c", f"{line} | {taken}; echo ${{PIPESTATUS[0]}}"], capture_output=True, text=True, check=True
+        )
+        assert shell.stdout.endswith("0\n"), shell.stdout
+        assert shell.stderr == ""
+
+
+@pytest.mark.parametrize("what", ["router", "server", "agent"])
+def test_a_terminal_that_is_closed_ends_a_process_in_order(site: SiteRun, tmp_path: Path, what: str):
+    child = start(site, what)
+    begin_s = time.monotonic()
+    child.send(signal.SIGHUP)
+    assert child.wait(10.0) == 0
+    assert time.monotonic() - begin_s < 3.0
+    assert '"signal": "SIGHUP"' in (tmp_path / f"{child.name}.log").read_text()
+    if what == "server":
+        assert not (site.folder / "store" / "journal.db-wal").exists(), "closed, not cut off"
+
+
+def start(site: SiteRun, what: str) -> Child:
+    router = site.start_router()
+    if what == "router":
+        return router
+    return site.start_server() if what == "server" else site.start_agent(site.configs[0])
+
+
+def test_nohup_keeps_a_process(tmp_path: Path):
+    endpoint = free_endpoint()
+    command = ["nohup", *sitegrid("router", "--listen", endpoint)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path) as router:
+        try:
+            assert b"ready" in router.stdout.readline()  # type: ignore[union-attr]
+            router.send_signal(signal.SIGHUP)
+            again = subprocess.run(sitegrid("router", "--listen", endpoint), capture_output=True, check=False)
+            assert b"already in use" in again.stderr, "the first one goes on"
+            assert router.poll() is None
+            router.send_signal(signal.SIGTERM)
+            assert router.wait(10.0) == 0
+        finally:
+            router.kill()
+
+
+def test_a_demo_whose_terminal_is_closed_leaves_nothing(tmp_path: Path):
+    words = ("demo", "--headless", "--no-log", "--machines", 1, "--world", "fast", "--out", tmp_path / "out")
+    with subprocess.Popen(sitegrid(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo:
+        try:
+            wait_until(lambda: len(children_of(demo.pid)) >= 2, READY_S, "router and server")
+            started = children_of(demo.pid)
+            demo.send_signal(signal.SIGHUP)
+            _, errors = demo.communicate(timeout=40)
+        finally:
+            demo.kill()
+    assert "SIGHUP" in errors
+    assert "Traceback" not in errors
+    assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
+
+
+def children_of(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]

@@ -1,0 +1,179 @@
+"""Decisions about machines in real processes: work goes on meanwhile; kills, ends and full disks at the worst time."""
+
+from __future__ import annotations
+
+import resource
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from itertools import islice, pairwise
+from pathlib import Path
+
+import pytest
+
+from benchmarks import merge_restart
+from benchmarks.merge_work import batches
+from mapserver.config import ServerConfig
+from mapserver.evidence.grid import Grid
+from mapserver.ingest.store import Store
+from protocol.errors import QueryError, Refusal
+from protocol.site.site_file import load_site
+from protocol.wire.session import free_endpoint
+from sim.config import SimConfig
+from sitegrid import Client
+from sitegrid.process.children import Child, Children, wait_until
+from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
+from tests.integration.test_operation import Sender, end, session_of
+from tests.unit.mapserver.data import same
+
+pytestmark = pytest.mark.processes
+
+ROWS = 3000  # of 100 samples: their fold takes a good part of a second
+PATIENCE_S = 2.0  # longest pause of answers and acknowledgements that is no stall, on a machine that has other work
+
+
+@pytest.fixture
+def site(tmp_path: Path, children: Children, monkeypatch: pytest.MonkeyPatch) -> SiteRun:
+    """A site whose store has samples of ten machines, and no snapshot."""
+    run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
+    options = tmp_path / "server.toml"
+    options.write_text("[store]\narchive_after_h = 0.0\n")
+    monkeypatch.setattr(merge_restart, "SITE", load_site(run.site_file))
+    merge_restart.build(tmp_path / "store", ROWS, tail_rows=ROWS)
+    run.start_router()
+    return run
+
+
+def serve(site: SiteRun) -> Child:
+    return site.start_server("--config", str(site.folder / "server.toml"))
+
+
+def store_of(site: SiteRun) -> closing[Store]:
+    return closing(Store(site.folder / "store", load_site(site.site_file), ServerConfig(), time.time_ns))
+
+
+def fold_without(site: SiteRun, machines: set[str]) -> Grid:
+    grid = Grid(load_site(site.site_file).cell_m, ServerConfig().fold)
+    for name, rows in islice(batches(), ROWS):
+        if name not in machines:
+            grid.fold(rows, name)
+    return grid
+
+
+@contextmanager
+def paced(work: Callable[[], object]) -> Iterator[list[float]]:
+    """Repeat work on a thread; gives the times [s] at which it was done."""
+    done_s, ended = [time.monotonic()], threading.Event()
+
+    def repeat() -> None:
+        while not ended.is_set():
+            work()
+            done_s.append(time.monotonic())
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield done_s
+    finally:
+        ended.set()
+        thread.join()
+
+
+def longest_pause_s(done_s: list[float]) -> float:
+    return max(after - before for before, after in pairwise(done_s))
+
+
+def test_batches_and_queries_are_answered_during_a_refold_and_the_map_is_that_of_a_fold_from_the_start(site: SiteRun):
+    server, config = serve(site), load_site(site.site_file)
+    with session_of(site.endpoint) as session, site.connect() as client, site.connect() as other:
+        with closing(Sender(session, config, "loader-11", 50)) as sender, paced(lambda: client.point(100, 0)) as asked:
+            wait_until(lambda: sender.watermark > 0 and len(asked) > 1, READY_S, "traffic")
+            for number in (1, 2):
+                acknowledged, answered, began_s = sender.watermark, len(asked), time.monotonic()
+                row = other.distrust(f"loader-{number}", "a test")
+                assert not row.trusted
+                assert sender.watermark > acknowledged
+                assert len(asked) > answered
+                meanwhile = [began_s, *(at_s for at_s in asked if at_s > began_s)]
+                assert longest_pause_s(meanwhile) < PATIENCE_S
+        assert other.info().distrusted == ("loader-1", "loader-2")
+    end(server)
+    snapshots = list((site.folder / "store").glob("snapshot-*"))
+    with store_of(site) as store:
+        assert store.excluded == {"loader-1", "loader-2"}
+        adopted = store.grid
+        folded = adopted.folded
+        assert folded == fold_without(site, {"loader-1", "loader-2"}).folded + sender.watermark
+    assert snapshots
+    for path in snapshots:
+        path.unlink()
+    with store_of(site) as store:
+        assert same(store.grid, adopted)
+
+
+def given(client: Client, machine: str, wait_s: float = 0.0) -> None:
+    """Give a command; whether the map follows in time or not, it is answered."""
+    try:
+        client.distrust(machine, "a test", wait_s=wait_s)
+    except QueryError as error:
+        assert error.reason == Refusal.AFTER_TIMEOUT  # noqa: PT017 # where there is none it is as good
+
+
+def test_a_server_killed_between_decision_and_map_comes_back_without_the_machine(site: SiteRun):
+    server = serve(site)
+    with site.connect() as client:
+        given(client, "loader-3")
+        kill(server)
+        serve(site)
+        assert list(client.info().distrusted) == ["loader-3"]
+        assert not next(row for row in client.machines() if row.name == "loader-3").trusted
+
+
+def test_decisions_of_several_operators_at_once_all_count(site: SiteRun):
+    serve(site)
+    names = [f"loader-{number}" for number in range(1, 7)]
+    with site.connect() as client:
+        threads = [threading.Thread(target=client.distrust, args=(name, "a test")) for name in names]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(client.info().distrusted) == names
+
+
+def test_a_server_that_folds_again_ends_in_time(site: SiteRun):
+    server = serve(site)
+    with site.connect() as client:
+        given(client, "loader-3")
+        end(server)
+
+
+@contextmanager
+def full_disk(server: Child) -> Iterator[None]:
+    """No file of the process can grow or be begun."""
+    before = resource.prlimit(server.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(server.pid, resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        yield
+    finally:
+        resource.prlimit(server.pid, resource.RLIMIT_FSIZE, before)
+
+
+def test_a_decision_that_a_full_disk_does_not_take_is_refused_and_one_that_was_answered_outlives_a_kill(site: SiteRun):
+    server = serve(site)
+    with site.connect() as client:
+        with full_disk(server):
+            with pytest.raises(QueryError, match="`loader-3` cannot be written, so it does not count") as refused:
+                client.distrust("loader-3", "a test")
+            assert refused.value.reason == Refusal.STORE
+            assert list(client.info().distrusted) == []
+            assert next(row for row in client.machines() if row.name == "loader-3").trusted
+            assert client.info().counters[f"refused_query_{Refusal.STORE}"] == 1
+        kill(server)
+        server = serve(site)
+        assert list(client.info().distrusted) == [], "what was refused is not there"
+        assert not client.distrust("loader-3", "a test").trusted
+        kill(server)
+        serve(site)
+        assert list(client.info().distrusted) == ["loader-3"], "what was answered is"

@@ -1,0 +1,98 @@
+import threading
+from contextlib import closing
+
+import pytest
+
+from mapserver.query.answer_pool import MIN_RETRY_S, AnswerPool
+from protocol.errors import QueryError, Refusal
+from tests.unit.mapserver.data import WAIT_S, wait_for
+
+
+class Held:
+    """Work that tells its name when it is done, and lasts until it is let go."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+        self._go = threading.Semaphore(0)
+        self._begun = threading.Semaphore(0)
+
+    def work(self, name: str):
+        def do() -> None:
+            self._begun.release()
+            assert self._go.acquire(timeout=WAIT_S)
+            self.done.append(name)
+
+        return do
+
+    def begun(self) -> None:
+        assert self._begun.acquire(timeout=WAIT_S)
+
+    def let_go(self, n: int) -> None:
+        self._go.release(n)
+
+
+@pytest.fixture
+def held():
+    return Held()
+
+
+def test_small_answers_pass_large_ones(held):
+    with closing(AnswerPool("test", 1, 1000)) as pool:
+        pool.submit(1, held.work("first"))
+        held.begun()
+        for name, size in (("large", 500), ("small", 1), ("other", 1)):
+            pool.submit(size, held.work(name))
+        held.let_go(4)
+        wait_for(lambda: len(held.done) == 4)
+    assert held.done == ["first", "small", "other", "large"]
+
+
+def test_small_answers_without_end_do_not_keep_a_large_one_waiting():
+    done = threading.Event()
+    with closing(AnswerPool("test", 2, 1000)) as pool:
+
+        def small() -> None:
+            if not done.is_set():
+                pool.submit(1, small)
+
+        for _ in range(4):
+            pool.submit(1, small)
+        pool.submit(500, done.set)
+        assert done.wait(WAIT_S)
+
+
+def test_answers_beyond_the_budget_are_refused_until_some_are_done(held):
+    with closing(AnswerPool("test", 1, 100)) as pool:
+        pool.submit(60, held.work("in work"))
+        held.begun()
+        pool.submit(40, held.work("waits"))
+        with pytest.raises(QueryError, match="too many queries") as caught:
+            pool.submit(1, held.work("refused"))
+        assert (caught.value.reason, caught.value.retry_after_s) == (Refusal.OVERLOADED, MIN_RETRY_S)
+        held.let_go(1)
+        held.begun()
+        pool.submit(60, held.work("again"))
+        held.let_go(2)
+        wait_for(lambda: len(held.done) == 3)
+    assert held.done == ["in work", "waits", "again"]
+
+
+def test_a_bug_in_an_answer_costs_neither_thread_nor_budget(held, caplog):
+    with closing(AnswerPool("test", 1, 1)) as pool:
+        pool.submit(1, lambda: 1 // 0)
+        wait_for(lambda: not pool._size)
+        pool.submit(1, held.work("next"))
+        held.let_go(1)
+        wait_for(lambda: held.done == ["next"])
+    assert "answer failed" in caplog.text
+
+
+def test_what_waits_at_the_end_is_dropped(held):
+    pool = AnswerPool("test", 1, 10)
+    pool.submit(1, held.work("in work"))
+    held.begun()
+    pool.submit(1, held.work("dropped"))
+    held.let_go(2)
+    pool.close()
+    wait_for(lambda: not any(thread.is_alive() for thread in pool._threads))
+    assert held.done[:1] == ["in work"]
