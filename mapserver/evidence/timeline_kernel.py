@@ -13,6 +13,7 @@ import numpy as np
 from mapserver.evidence.cells import CELLS, COUNT_MAX, COUNTS
 
 _INDEX_BITS = 40  # of a span, below its tier
+# Indices of long loops are unsigned: the compiler then need not look for negative ones, which count from the end.
 
 
 @numba.njit(cache=True, nogil=True)
@@ -84,7 +85,8 @@ def _settle(
         else:
             for p in range(len(table)):
                 if held[p, tier] and indices[p, tier] == index:
-                    _add(table[p], tier, tiers, votes, cells, wanted, counts, planes, visits, machines, newest)
+                    every = not spread[p]
+                    _add(table[p], tier, tiers, votes, cells, wanted, counts, planes, visits, machines, newest, every)
             used = _emit_votes(counts, planes, newest, out_votes, used)
             filled = _emit_cells(visits, machines, newest, out_cells, filled)
         row[3], row[5] = used, filled
@@ -95,21 +97,27 @@ def _settle(
 @numba.njit(cache=True, nogil=True)
 def _add(
     page: Any, tier: int, tiers: Any, votes: Any, cells: Any, wanted: Any,
-    counts: Any, planes: Any, visits: Any, machines: Any, newest: Any,
+    counts: Any, planes: Any, visits: Any, machines: Any, newest: Any, all_wanted: Any,
 ) -> None:  # fmt: skip
-    """Add the cells of a page that are on a tier, and their votes."""
-    for j in range(page[4], page[5]):
-        cell = cells[j]
-        wanted[cell.cell] = tiers[j] == tier
+    """Add the cells of a page that are on a tier, and their votes; all_wanted: whether those are all of its cells."""
+    for j in range(np.uint64(page[4]), np.uint64(page[5])):
+        cell = np.uint64(cells[j].cell)
+        wanted[cell] = tiers[j] == tier
         if tiers[j] == tier:
-            visits[cell.cell] |= cell.visits
-            machines[cell.cell] |= cell.machines
-            newest[cell.cell] = max(newest[cell.cell], cell.newest_ns)
-    for j in range(page[2], page[3]):
-        place = votes[j] & np.uint64(0xFFFF)
-        if wanted[place & np.uint64(CELLS - 1)]:
+            visits[cell] |= cells[j].visits
+            machines[cell] |= cells[j].machines
+            newest[cell] = max(newest[cell], cells[j].newest_ns)
+    if all_wanted:
+        for j in range(np.uint64(page[2]), np.uint64(page[3])):
+            place = votes[j] & np.uint64(0xFFFF)
             counts[place] += votes[j] >> np.uint64(16)
             planes[place >> np.uint64(8)] = True
+    else:
+        for j in range(np.uint64(page[2]), np.uint64(page[3])):
+            place = votes[j] & np.uint64(0xFFFF)
+            if wanted[place & np.uint64(CELLS - 1)]:
+                counts[place] += votes[j] >> np.uint64(16)
+                planes[place >> np.uint64(8)] = True
 
 
 @numba.njit(cache=True, nogil=True)
@@ -137,9 +145,9 @@ def _find_tiers(table: Any, indices: Any, cells: Any, keeps: Any, tiers: Any) ->
             index = indices[p, tier]
             if index < 0:
                 break
-            for j in range(table[p, 4], table[p, 5]):
+            for j in range(np.uint64(table[p, 4]), np.uint64(table[p, 5])):
                 if tiers[j] == tier:
-                    cell = cells[j].cell
+                    cell = np.uint64(cells[j].cell)
                     if last[cell] != index:
                         last[cell] = index
                         kept[cell] += 1
@@ -152,8 +160,8 @@ def _held(table: Any, tiers: Any, count: int) -> Any:
     """Whether a page has cells on each tier (n, count)."""
     held = np.zeros((len(table), count), np.bool_)
     for p in range(len(table)):
-        for j in range(table[p, 4], table[p, 5]):
-            held[p, tiers[j]] = True
+        for j in range(np.uint64(table[p, 4]), np.uint64(table[p, 5])):
+            held[p, np.uint8(tiers[j])] = True
     return held
 
 
@@ -171,8 +179,9 @@ def _keys(indices: Any, held: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _copy(source: Any, first: int, end: int, out: Any, used: int) -> int:
-    for i in range(end - first):
-        out[used + i] = source[first + i]
+    source_at, at = np.uint64(first), np.uint64(used)
+    for i in range(np.uint64(end - first)):
+        out[at + i] = source[source_at + i]
     return used + end - first
 
 
@@ -184,15 +193,17 @@ def _emit_votes(counts: Any, planes: Any, newest: Any, out: Any, used: int) -> i
         low += 1
     while not newest[high - 1]:
         high -= 1
+    end = np.uint64(used)
+    most = np.uint64(COUNT_MAX)
     for plane in range(COUNTS):
         if planes[plane]:
             planes[plane] = False
-            for at in range(plane * CELLS + low, plane * CELLS + high):
-                count = min(counts[at], np.uint64(COUNT_MAX))
-                out[used] = (count << np.uint64(16)) | np.uint64(at)
-                used += 1 if count else 0
-                counts[at] = 0
-    return used
+            for at in range(np.uint64(plane * CELLS + low), np.uint64(plane * CELLS + high)):
+                count = min(counts[at], most)
+                out[end] = (count << np.uint64(16)) | at
+                end += np.uint64(count != 0)
+            counts[plane * CELLS + low : plane * CELLS + high] = 0
+    return np.int64(end)
 
 
 @numba.njit(cache=True, nogil=True)
