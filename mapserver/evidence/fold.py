@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
@@ -21,13 +21,24 @@ MOST_PAGES = 1 << 14  # likewise
 _VOTES_OF_CELL = 7  # two bins of each of three values, and one sector
 
 
-Scratch = tuple[AnyArray, ...]
+class Scratch:
+    """Where one thread folds. block: one block unpacked, where kernels sum, zero between folds.
 
+    What a fold needs besides is kept for the next: memory that is new is zeroed by the system first, page by page.
+    """
 
-def scratch_block() -> Scratch:
-    """One block unpacked, where kernels sum (counts, lines, visits, machines, newest stamps); zero between folds."""
-    counts, lines = np.zeros(ev.COUNTS * ev.CELLS, np.uint32), np.zeros(ev.COUNTS, np.int32)
-    return counts, lines, *(np.zeros(ev.CELLS, kind) for kind in (np.uint64, np.uint64, np.int64))
+    def __init__(self) -> None:
+        counts, lines = np.zeros(ev.COUNTS * ev.CELLS, np.uint32), np.zeros(ev.COUNTS, np.int32)
+        bits, newest = (np.zeros(ev.CELLS, np.uint64) for _ in range(2)), np.zeros(ev.CELLS, np.int64)
+        self.block: tuple[AnyArray, ...] = (counts, lines, *bits, newest)
+        self._arrays: dict[str, AnyArray] = {}
+
+    def array(self, name: str, rows: int, dtype: DTypeLike, columns: int = 0) -> AnyArray:
+        """An array (rows,) or (rows, columns) of any content, good until this name is asked for again."""
+        kept = self._arrays.get(name)
+        if kept is None or len(kept) < rows:
+            kept = self._arrays[name] = np.empty((rows, columns) if columns else rows, dtype)
+        return kept[:rows]
 
 
 def fold(
@@ -40,16 +51,17 @@ def fold(
     """
     limits = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2)
     n = len(rows)
-    places, stencils = np.empty((n, 5)), np.empty((n, 3), np.int64)
+    array = scratch.array
+    places, stencils = array("places", n, np.float64, 5), array("stencils", n, np.int64, 3)
     keys, touching, area = locate(rows, limits, config.bucket_ns, places, stencils)
     if area > MOST_SHARES and n > 1:  # tiny cells under unsure positions
         for part in (slice(n // 2), slice(n // 2, None)):
             yield from fold(rows[part], names[part], cell_m, config, scratch)
         return
-    starts, shares = np.empty(n, np.int64), np.empty(area, np.uint32)
+    starts, shares = array("starts", n, np.int64), array("shares", area, np.uint32)
     weigh(rows, places, stencils, starts, shares)
-    bins, bin_shares = np.empty((n, 4), np.int64), np.empty((n, 3), np.uint32)
-    bits, stamps = np.empty((n, 2), np.uint64), np.empty(n, np.int64)
+    bins, bin_shares = array("bins", n, np.int64, 4), array("bin_shares", n, np.uint32, 3)
+    bits, stamps = array("bits", n, np.uint64, 2), array("stamps", n, np.int64)
     split(rows, names, bins, bin_shares, bits, stamps)
     order = np.argsort(keys, kind="stable")
     samples = (stencils, starts, shares, bins, bin_shares, bits, stamps)
@@ -61,12 +73,12 @@ def _pages(
 ) -> Iterator[tuple[int, int, PackedPages]]:
     """Fold sorted pairs, as many at a time as there is space for."""
     block = ev.COUNTS * ev.CELLS
-    pages: Ints = np.empty((min(len(keys), MOST_PAGES), 7), np.int64)
-    votes = np.empty(min(_VOTES_OF_CELL * area, MOST_VOTES) + block, np.uint64)
-    cells: Table = np.empty(min(area, len(pages) * ev.CELLS) + ev.CELLS, CELL)
+    pages = scratch.array("pages", min(len(keys), MOST_PAGES), np.int64, 7)
+    votes = scratch.array("votes", min(_VOTES_OF_CELL * area, MOST_VOTES) + block, np.uint64)
+    cells = scratch.array("cells", min(area, len(pages) * ev.CELLS) + ev.CELLS, CELL)
     done = 0
     while done < len(keys):
-        done, n, used, filled = fold_sorted(done, keys, touching, samples, scratch, pages, votes, cells)
+        done, n, used, filled = fold_sorted(done, keys, touching, samples, scratch.block, pages, votes, cells)
         yield from _by_block(pages[:n], votes[:used], cells[:filled])
 
 

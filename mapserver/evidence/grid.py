@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold import fold, scratch_block
-from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
+from mapserver.evidence.fold import Scratch, fold
+from mapserver.evidence.fold_config import FoldConfig, name_hash
 from mapserver.evidence.pages import CompactPages, PackedPages, Page
+from mapserver.evidence.sample_kernels import count_foldable, extent
 from mapserver.evidence.settling import Space, Tiers
 from mapserver.evidence.timeline import PATIENCE, Block, TimedPage, Timeline, evidence, settle_all
 from mapserver.evidence.workers import ALONE, Workers
@@ -72,7 +73,7 @@ class Grid:
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
-        self._workers, self._scratch, self._spaces = ALONE, [scratch_block()], [Space()]
+        self._workers, self._scratch, self._spaces = ALONE, [Scratch()], [Space()]
         self._rows: AnyArray = np.empty(waiting_rows, RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
         self._waiting, self._weight = 0, 0
@@ -95,9 +96,6 @@ class Grid:
 
     def fold_all(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Fold samples of several machines; names (n,): hash of each one's name."""
-        if not len(rows):
-            return
-        self.newest_ns = max(self.newest_ns, int(rows["stamp_ns"].max()))
         for first in range(0, len(rows), PIECE):
             self._take(np.ascontiguousarray(rows[first : first + PIECE]), names[first : first + PIECE])
 
@@ -194,7 +192,9 @@ class Grid:
 
     def _take(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Let rows wait; what waits is folded before its weight could exceed a count."""
-        weight = int(rows["distance_m"].sum(dtype=np.float64) * ev.WEIGHT_UNITS_PER_M) + len(rows)
+        newest_ns, driven_m = extent(rows)
+        self.newest_ns = max(self.newest_ns, newest_ns)
+        weight = int(driven_m * ev.WEIGHT_UNITS_PER_M) + len(rows)
         if self._weight + weight > ev.COUNT_MAX:
             self._drain()
         self._weight += weight
@@ -232,7 +232,7 @@ class Grid:
 
         self._workers.each(fold_share)
         self._workers.each(add_share)
-        voting = int(is_foldable(rows, self.config).sum())
+        voting = count_foldable(rows, self.config.std_cap_m**2)
         self._folded += voting
         self._skipped += len(rows) - voting
         self._waiting, self._weight = 0, 0
@@ -255,8 +255,8 @@ class Grid:
         self._drain()
         self._workers = workers
         self._rows, self._names = np.empty(waiting_rows, RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
-        self._scratch = [*self._scratch, *(scratch_block() for _ in range(workers.count))][: workers.count]
-        self._spaces = [*self._spaces, *(Space() for _ in range(workers.count))][: workers.count]
+        self._scratch = [Scratch() for _ in range(workers.count)]
+        self._spaces = [Space() for _ in range(workers.count)]
         for timeline in self._timelines.values():
             timeline.space = self._spaces[0]
 

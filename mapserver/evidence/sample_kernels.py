@@ -32,6 +32,34 @@ _TABLE = TABLE.astype(np.uint32)
 
 
 @numba.njit(cache=True, nogil=True)
+def extent(rows: Any) -> tuple[int, float]:
+    """Newest stamp of rows, and how far they were driven [m]."""
+    newest_ns, driven_m = 0, 0.0
+    for k in range(len(rows)):
+        newest_ns = max(newest_ns, rows[k].stamp_ns)
+        driven_m += np.float64(rows[k].distance_m)
+    return newest_ns, driven_m
+
+
+@numba.njit(cache=True, nogil=True)
+def count_foldable(rows: Any, cap_m2: float) -> int:
+    """How many rows `is_foldable` lets vote."""
+    count = 0
+    for k in range(len(rows)):
+        row = rows[k]
+        largest_m2 = _largest(np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2))
+        count += largest_m2 <= cap_m2
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _largest(xx: float, xy: float, yy: float) -> float:
+    """Larger eigenvalue of a covariance."""
+    half = (xx - yy) / 2
+    return (xx + yy) / 2 + np.sqrt(half * half + xy * xy)
+
+
+@numba.njit(cache=True, nogil=True)
 def locate(
     rows: Any, limits: tuple[float, float, float], bucket_ns: int, places: Any, stencils: Any
 ) -> tuple[Any, Any, int]:
@@ -70,8 +98,7 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
     """Position and inverse covariance of one row in cells; returns its reach in cells, -1 where it has no vote."""
     cell_m, floor_m2, cap_m2 = limits
     cov_xx, cov_xy, cov_yy = np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2)
-    half = (cov_xx - cov_yy) / 2
-    if not (cov_xx + cov_yy) / 2 + np.sqrt(half * half + cov_xy * cov_xy) <= cap_m2:
+    if not _largest(cov_xx, cov_xy, cov_yy) <= cap_m2:
         return -1
     per_m2 = 1 / (cell_m * cell_m)
     most = np.sqrt(cov_xx * cov_yy)
@@ -114,15 +141,16 @@ def _weights(place: Any, stencil: Any, shares: Any, used: int) -> int:
     """Fill a stencil with weights from the table; returns their sum."""
     n = stencil[2]
     total = 0
+    first, px, xx = stencil[0] + 0.5, place[0], place[2]
     for dy in range(n):
         y = (stencil[1] + dy + 0.5) - place[1]
         b, c = place[3] * y, place[4] * y * y
-        line = shares[used + dy * n :][:n]
-        for dx in range(n):
-            x = (stencil[0] + dx + 0.5) - place[0]
-            d2 = (place[2] * x + b) * x + c
-            weight = _TABLE[int(min(d2 * TABLE_PER_UNIT, TABLE_LAST))]
-            line[dx] = weight
+        at = np.uint64(used + dy * n)
+        for dx in range(np.uint64(n)):  # unsigned: the compiler need not look for negative indices
+            x = (first + np.float64(dx)) - px
+            d2 = (xx * x + b) * x + c
+            weight = _TABLE[np.uint32(min(d2 * TABLE_PER_UNIT, TABLE_LAST))]
+            shares[at + dx] = weight
             total += int(weight)
     return total
 
