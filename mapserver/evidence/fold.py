@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.buffers import Buffers
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.fold_kernels import fold_sorted
 from mapserver.evidence.pages import CELL, RAW_CELL, PackedPages
@@ -21,24 +22,14 @@ MOST_PAGES = 1 << 14  # likewise
 _VOTES_OF_CELL = 7  # two bins of each of three values, and one sector
 
 
-class Scratch:
-    """Where one thread folds. block: one block unpacked, where kernels sum, zero between folds.
-
-    What a fold needs besides is kept for the next: memory that is new is zeroed by the system first, page by page.
-    """
+class Scratch(Buffers):
+    """Where one thread folds. block: one block unpacked, where kernels sum, zero between folds."""
 
     def __init__(self) -> None:
+        super().__init__()
         counts, lines = np.zeros(ev.COUNTS * ev.CELLS, np.uint32), np.zeros(ev.COUNTS, np.int32)
         bits, newest = (np.zeros(ev.CELLS, np.uint64) for _ in range(2)), np.zeros(ev.CELLS, np.int64)
         self.block: tuple[AnyArray, ...] = (counts, lines, *bits, newest)
-        self._arrays: dict[str, AnyArray] = {}
-
-    def array(self, name: str, rows: int, dtype: DTypeLike, columns: int = 0) -> AnyArray:
-        """An array (rows,) or (rows, columns) of any content, good until this name is asked for again."""
-        kept = self._arrays.get(name)
-        if kept is None or len(kept) < rows:
-            kept = self._arrays[name] = np.empty((rows, columns) if columns else rows, dtype)
-        return kept[:rows]
 
 
 def fold(
@@ -53,7 +44,11 @@ def fold(
     n = len(rows)
     array = scratch.array
     places, stencils = array("places", n, np.float64, 5), array("stencils", n, np.int64, 3)
-    keys, touching, area = locate(rows, limits, config.bucket_ns, places, stencils)
+    keys, touching = array("keys", 3 * n + 16, np.int64), array("touching", 3 * n + 16, np.int32)
+    pairs, area = locate(rows, limits, config.bucket_ns, places, stencils, keys, touching)
+    if pairs > len(keys):
+        keys, touching = array("keys", pairs, np.int64), array("touching", pairs, np.int32)
+        locate(rows, limits, config.bucket_ns, places, stencils, keys, touching)
     if area > MOST_SHARES and n > 1:  # tiny cells under unsure positions
         for part in (slice(n // 2), slice(n // 2, None)):
             yield from fold(rows[part], names[part], cell_m, config, scratch)
@@ -63,9 +58,11 @@ def fold(
     bins, bin_shares = array("bins", n, np.int64, 4), array("bin_shares", n, np.uint32, 3)
     bits, stamps = array("bits", n, np.uint64, 2), array("stamps", n, np.int64)
     split(rows, names, bins, bin_shares, bits, stamps)
-    order = np.argsort(keys, kind="stable")
+    order = np.argsort(keys[:pairs], kind="stable")
+    keys = np.take(keys, order, out=array("sorted keys", pairs, np.int64))
+    touching = np.take(touching, order, out=array("sorted touching", pairs, np.int32))
     samples = (stencils, starts, shares, bins, bin_shares, bits, stamps)
-    yield from _pages(keys[order], touching[order], samples, area, scratch)
+    yield from _pages(keys, touching, samples, area, scratch)
 
 
 def _pages(
@@ -79,10 +76,12 @@ def _pages(
     done = 0
     while done < len(keys):
         done, n, used, filled = fold_sorted(done, keys, touching, samples, scratch.block, pages, votes, cells)
-        yield from _by_block(pages[:n], votes[:used], cells[:filled])
+        yield from _by_block(pages[:n], votes[:used], cells[:filled], scratch)
 
 
-def _by_block(pages: Ints, votes: NDArray[np.uint64], cells: Table) -> Iterator[tuple[int, int, PackedPages]]:
+def _by_block(
+    pages: Ints, votes: NDArray[np.uint64], cells: Table, scratch: Scratch
+) -> Iterator[tuple[int, int, PackedPages]]:
     """Cut pages into those of each block; copies, which keep nothing else alive."""
     if not len(pages):
         return
@@ -93,7 +92,10 @@ def _by_block(pages: Ints, votes: NDArray[np.uint64], cells: Table) -> Iterator[
     tables = np.zeros((len(pages), 6), np.int64)
     tables[:, 1:] = pages[:, 2:]
     tables[:, 2:] -= np.repeat(pages[firsts][:, [3, 3, 5, 5]], ends - firsts, axis=0)
-    few: NDArray[np.unsignedinteger[Any]] = votes.astype(np.uint32) if int(votes.max()) < 2**32 else votes
+    few: AnyArray = votes
+    if int(votes.max()) < 2**32:
+        few = scratch.array("few", len(votes), np.uint32)
+        few[:] = votes
     raw = cells.view(RAW_CELL)
     places = np.column_stack([pages[firsts][:, [0, 1, 3, 5]], pages[ends - 1][:, [4, 6]], firsts, ends])
     for x, y, vote, cell, end_vote, end_cell, first, end in places.tolist():

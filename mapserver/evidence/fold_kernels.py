@@ -146,7 +146,7 @@ def _mark(bits: Any, stamps: Any, last: Any, low: int, high: int, visits: Any, m
 
 
 @numba.njit(cache=True, nogil=True)
-def _pack_votes(counts: Any, lines: Any, low: int, high: int, out: Any, used: int) -> int:
+def _pack_votes(counts: Any, lines: Any, low: int, high: int, out: Any, used: int) -> Any:
     """Move what is not zero in the scratch block to votes; returns where they end."""
     end = np.uint64(used)
     for plane in range(_COUNTS):

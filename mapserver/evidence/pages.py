@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence import page_kernels
+from mapserver.evidence.buffers import Buffers
 from protocol.arrays import Bools, Ints, Table
 
 # place: bin * 256 + cell. Counts of a few passes fit into 16 bits; where one does not, all of a block are wide.
@@ -83,7 +84,7 @@ class CompactPages:
     @classmethod
     def from_packed(cls, table: Ints, votes: NDArray[np.uint64], cells: Table) -> CompactPages:
         """Pages in the order of their rows in the table, whose first end where the next begin."""
-        return compact(np.array([len(table)]), table, votes, cells)[0]
+        return compact(np.array([len(table)]), table, votes, cells, Buffers())[0]
 
     @classmethod
     def joined(cls, parts: Sequence[CompactPages]) -> CompactPages:
@@ -129,15 +130,15 @@ class CompactPages:
         page_kernels.expand_cells(pages.table, self.marks, self.words, pages.cells)
 
 
-def compact(ends: Ints, table: Ints, votes: NDArray[np.uint64], cells: Table) -> list[CompactPages]:
+def compact(ends: Ints, table: Ints, votes: NDArray[np.uint64], cells: Table, buffers: Buffers) -> list[CompactPages]:
     """Pages of several blocks, each whole and by itself.
 
     ends (b,): of the pages of each block. table (n, 6), votes, cells: as of PackedPages, pages end to end.
     """
-    n = len(votes)
-    runs, of_cells, counts = np.empty((n, 2), np.uint8), np.empty(n, np.uint8), np.empty(n, np.uint16)
+    n, array = len(votes), buffers.array
+    runs, of_cells, counts = array("runs", n, np.uint8, 2), array("places", n, np.uint8), array("counts", n, np.uint16)
     high = NO_HIGH if int(votes.max(initial=0)) < 2**32 else np.empty(n, np.uint16)
-    marks, words = np.empty((len(cells), 4), np.uint8), np.empty(len(table) + 3 * len(cells), np.uint64)
+    marks, words = array("marks", len(cells), np.uint8, 4), array("words", len(table) + 3 * len(cells), np.uint64)
     word_ends = np.empty(len(table), np.int64)
     table = table.copy()
     page_kernels.compact_cells(table, cells, marks, words, word_ends)

@@ -56,21 +56,21 @@ def count_foldable(rows: Any, cap_m2: float) -> int:
 def _largest(xx: float, xy: float, yy: float) -> float:
     """Larger eigenvalue of a covariance."""
     half = (xx - yy) / 2
-    return (xx + yy) / 2 + np.sqrt(half * half + xy * xy)
+    largest: float = (xx + yy) / 2 + np.sqrt(half * half + xy * xy)
+    return largest
 
 
 @numba.njit(cache=True, nogil=True)
 def locate(
-    rows: Any, limits: tuple[float, float, float], bucket_ns: int, places: Any, stencils: Any
-) -> tuple[Any, Any, int]:
+    rows: Any, limits: tuple[float, float, float], bucket_ns: int, places: Any, stencils: Any, keys: Any, touching: Any
+) -> tuple[int, int]:
     """Where rows lie, and which blocks their stencils touch.
 
     limits: cell size [m], variance added to every position, largest variance of one that votes [m2]. Fills places
     (n, 5): position in cells, inverse covariance xx, 2 xy, yy; and stencils (n, 3): first column and row, and edge in
-    cells, 0 where a row has no vote. Returns keys and row numbers, one each for every block that a row touches, and the
-    cells of all stencils together.
+    cells, 0 where a row has no vote; keys and touching with keys and row numbers, one each for every block that a row
+    touches, as long as there is room. Returns how many of these, and the cells of all stencils together.
     """
-    keys, touching = np.empty(3 * len(rows) + 16, np.int64), np.empty(3 * len(rows) + 16, np.int32)
     used, area = 0, 0
     for k in range(len(rows)):
         reach = _place(rows[k], limits, places[k])
@@ -84,13 +84,11 @@ def locate(
         bucket = rows[k].stamp_ns // bucket_ns
         for y in range(row >> 4, ((row + n - 1) >> 4) + 1):
             for x in range(column >> 4, ((column + n - 1) >> 4) + 1):
-                if used == len(keys):
-                    keys = np.concatenate((keys, np.empty_like(keys)))
-                    touching = np.concatenate((touching, np.empty_like(touching)))
-                keys[used] = ((x + HALF) << (BLOCK_BITS + BUCKET_BITS)) | ((y + HALF) << BUCKET_BITS) | bucket
-                touching[used] = k
+                if used < len(keys):
+                    keys[used] = ((x + HALF) << (BLOCK_BITS + BUCKET_BITS)) | ((y + HALF) << BUCKET_BITS) | bucket
+                    touching[used] = k
                 used += 1
-    return keys[:used], touching[:used], area
+    return used, area
 
 
 @numba.njit(cache=True, nogil=True)

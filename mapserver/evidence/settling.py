@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.buffers import Buffers
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.pages import CELL, RAW_CELL, CompactPages, PackedPages, compact
 from mapserver.evidence.timeline_kernel import settle_blocks
-from protocol.arrays import AnyArray, Ints
+from protocol.arrays import Ints
 
 HOUR_S, DAY_S = 3600, 86_400
 MOST_VOTES = 1 << 17  # of blocks that are settled together: 1 MB, which stays in the processor's cache
@@ -32,23 +33,12 @@ class Tiers:
         return cls(np.array(spans), np.array((config.keep_buckets, config.keep_hours, config.keep_days, 0)))
 
 
-class Space:
-    """Where a thread settles timelines: the pages that there are, those that come of them, and their sums."""
+class Space(Buffers):
+    """Where one thread settles timelines. counts: of one block, zero in between."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.counts = np.zeros(ev.COUNTS * ev.CELLS, np.uint64)
-        self.votes, self.out_votes = np.empty(0, np.uint64), np.empty(0, np.uint64)
-        self.cells: AnyArray = np.empty(0, RAW_CELL)
-        self.out_cells: AnyArray = np.empty(0, RAW_CELL)
-        self.tiers = np.empty(0, np.int8)
-
-    def grow(self, votes: int, cells: int) -> None:
-        """Have space for so many votes and cells, and one more of each for the kernel, which writes one place ahead."""
-        if votes >= len(self.votes):
-            self.votes, self.out_votes = (np.empty(2 * votes + 1, np.uint64) for _ in range(2))
-        if cells >= len(self.cells):
-            self.cells, self.out_cells = (np.empty(2 * cells + 1, RAW_CELL) for _ in range(2))
-            self.tiers = np.empty(2 * cells + 1, np.int8)
 
 
 def settled(blocks: Sequence[Unsettled], tiers: Tiers, space: Space) -> list[CompactPages]:
@@ -73,11 +63,12 @@ def _settled(blocks: Sequence[Unsettled], tiers: Tiers, space: Space) -> list[Co
     lengths = [(len(one.votes), len(one.cells)) for one in fresh]
     until = np.cumsum([(len(kept.cells), len(kept.marks)), *lengths], axis=0)
     (votes, cells), (all_votes, all_cells) = until[0].tolist(), until[-1].tolist()
-    space.grow(all_votes, all_cells)
+    array = space.array
+    raw_votes, raw_cells = array("votes", all_votes, np.uint64), array("cells", all_cells, RAW_CELL)
     kept_table = kept.table.astype(np.int64)
-    kept.expand_into(PackedPages(kept_table, space.votes[:votes], space.cells[:cells].view(CELL)))
-    np.concatenate([one.votes for one in fresh], out=space.votes[votes:all_votes])
-    np.concatenate([one.cells.view(RAW_CELL) for one in fresh], out=space.cells[cells:all_cells])
+    kept.expand_into(PackedPages(kept_table, raw_votes[:votes], raw_cells[:cells].view(CELL)))
+    np.concatenate([one.votes for one in fresh], out=raw_votes[votes:])
+    np.concatenate([one.cells.view(RAW_CELL) for one in fresh], out=raw_cells[cells:])
     fresh_table = np.concatenate([one.table for one in fresh])
     fresh_pages = [len(one.table) for one in fresh]
     fresh_table[:, 2:] += np.repeat(until[:-1, [0, 0, 1, 1]], fresh_pages, axis=0)
@@ -91,9 +82,10 @@ def _settled(blocks: Sequence[Unsettled], tiers: Tiers, space: Space) -> list[Co
     table = np.concatenate([kept_table, fresh_table])[np.argsort(owners, kind="stable")]
     ends = np.bincount(owners, minlength=len(blocks)).cumsum()
     out_ends, out_table = np.empty_like(ends), np.empty((len(table) * len(tiers.keeps), 6), np.int64)
-    out_cells = space.out_cells.view(CELL)
+    # one more of each: the kernel writes one place ahead
+    out_votes, out_cells = array("out votes", all_votes + 1, np.uint64), array("out cells", all_cells + 1, CELL)
     pages, used, filled = settle_blocks(
-        ends, table, space.votes, space.cells.view(CELL), tiers.spans_ns, tiers.keeps, space.counts, space.tiers,
-        out_ends, out_table, space.out_votes, out_cells,
+        ends, table, raw_votes, raw_cells.view(CELL), tiers.spans_ns, tiers.keeps, space.counts,
+        array("tiers", all_cells, np.int8), out_ends, out_table, out_votes, out_cells,
     )  # fmt: skip
-    return compact(out_ends, out_table[:pages], space.out_votes[:used], out_cells[:filled])
+    return compact(out_ends, out_table[:pages], out_votes[:used], out_cells[:filled], space)

@@ -186,7 +186,7 @@ def _copy(source: Any, first: int, end: int, out: Any, used: int) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _emit_votes(counts: Any, planes: Any, newest: Any, out: Any, used: int) -> int:
+def _emit_votes(counts: Any, planes: Any, newest: Any, out: Any, used: int) -> Any:
     """Move counts to votes in the order of their places, saturated; returns where they end."""
     low, high = 0, CELLS
     while not newest[low]:
