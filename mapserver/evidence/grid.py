@@ -178,7 +178,7 @@ class Grid:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()
         settle_all(self._timelines.values())
-        blocks = ((x, y, self._timelines[x, y].settled()) for x, y in sorted(self._timelines))
+        blocks = ((x, y, self._timelines[x, y].kept) for x, y in sorted(self._timelines))
         return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns)
 
     @classmethod
