@@ -14,7 +14,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: venv
-	$(BIN)/sitegrid demo
+	$(BIN)/sitegrid demo --web
 
 quick: venv
 	$(BIN)/python -m pytest --quiet --numprocesses auto -m "not slow and not processes" tests/unit

@@ -1,5 +1,6 @@
 """One machine's process: driver -> pipeline -> spool -> uplink; it publishes pose and health too."""
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,17 +14,20 @@ from agents.config import AgentConfig
 from agents.delivery.audit import AuditLog
 from agents.delivery.spool import Spool
 from agents.delivery.uplink import Uplink
-from agents.delivery.uplink_thread import Sign, UplinkThread, linger
+from agents.delivery.uplink_thread import Check, Sign, UplinkThread, linger
 from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
-from agents.presence import Owner, Presence
+from agents.presence import Presence
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
+from protocol.wire.owners import Owner
+
+log = logging.getLogger("agents.agent")
 
 HEALTH_S = 1.0
 MOST_UNSAVED = 100_000  # samples that wait in memory while the disk is full or fails
@@ -52,15 +56,18 @@ class Agent:
         withhold: bool = False,
         owner: Owner | None = None,
         sign: Sign | None = None,
+        check: Check | None = None,
     ) -> None:
         self._config = config
         self._calibration_file = CalibrationFile(places.calibration, machine.name)
         self._pipeline = Pipeline(site, machine, config.pipeline, self._calibration_file.read())
         self._holdout = Holdout(site, machine, config.holdout) if withhold else None
         self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
+        if self._spool.damage:
+            log.error("recorded samples are gone spool=%s problem=%r", places.spool, self._spool.damage)
         self._presence = Presence(session, site.name, machine.name, owner)
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
-        self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign)
+        self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
         self._unsaved, self._given_up, self._spool_problem = empty(), 0, ""
         self._readings = 0
         self._samples = 0
@@ -105,6 +112,7 @@ class Agent:
             "pipeline": self._pipeline.health(),
             "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._given_up},
             "spool_problem": self._spool_problem,
+            "spool_damage": self._spool.damage,
             "calibration_problem": self._calibration_file.problem,
             "uplink": {
                 "problem": uplink.held or uplink.problem,

@@ -2,60 +2,28 @@
 
 The token shows that an agent is there, for as long as the router believes so (up to the lease after a broken link). A
 query on the same key is answered by a live agent only: so a machine that restarts never mistakes its own
-killed predecessor for another agent. (A router passes nothing between two sessions in peer mode: of two agents that
-both started without a router, neither sees the other. Their samples have different identities all the same, see
-spool.py.)
+killed predecessor for another agent (protocol/wire/owners.py).
 """
 
-import os
-import secrets
-import socket
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import zenoh
 
 from agents.localisation.filters.belief import PoseBelief
-from protocol.errors import MessageError
 from protocol.wire import keys
-from protocol.wire.codec import MAX_SMALL_BYTES, encode_health, encode_pose, pack, take, unpack
+from protocol.wire.codec import encode_health, encode_pose
 from protocol.wire.messages import Health, Pose
+from protocol.wire.owners import ANSWER_S, EVERY_OTHER, Owner, encode_owner, owner_of, this_process
 
 POSE_NS = 200_000_000  # five a second, of the machine's own time
-ANSWER_S = 1.0  # how long to wait for another agent of the same name
 PATIENCE = 5  # looks without an answer, until another agent counts as gone
-# Every agent but this one, each with its own answer.
-EVERY_OTHER: Any = {
-    "target": zenoh.QueryTarget.ALL,
-    "consolidation": zenoh.ConsolidationMode.NONE,
-    "allowed_destination": zenoh.Locality.REMOTE,
-}
-
-
-@dataclass(frozen=True, order=True)
-class Owner:
-    """One running agent. Of two with one name, the lesser one keeps it: the earlier, then by chance."""
-
-    started_ns: int
-    token: int
-    host: str
-    pid: int
-
-    def __str__(self) -> str:
-        return f"pid {self.pid} on host {self.host}"
-
-
-def this_process(now_ns: Callable[[], int] = time.time_ns) -> Owner:
-    """An agent that starts now in this process."""
-    return Owner(now_ns(), secrets.randbits(62), socket.gethostname(), os.getpid())
 
 
 def find_namesake(session: zenoh.Session, site: str, machine: str, wait_s: float = ANSWER_S) -> Owner | None:
     """Ask for a live agent of this name elsewhere; None if none answers."""
     asked = session.get(keys.alive(site, machine), timeout=wait_s, **EVERY_OTHER)
-    return min((owner for reply in asked if (owner := _owner(reply))), default=None)
+    return min((owner for reply in asked if (owner := owner_of(reply))), default=None)
 
 
 class Presence:
@@ -120,18 +88,9 @@ class Presence:
 
     def _on_query(self, query: zenoh.Query) -> None:
         with query:
-            query.reply(query.key_expr, pack(asdict(self._owner)))
+            query.reply(query.key_expr, encode_owner(self._owner))
 
     def _on_reply(self, reply: zenoh.Reply) -> None:
-        owner = _owner(reply)
+        owner = owner_of(reply)
         if owner and owner != self._owner:
             self._answers.add(owner)
-
-
-def _owner(reply: zenoh.Reply) -> Owner | None:
-    try:
-        table = unpack(reply.ok.payload.to_bytes() if reply.ok else b"", MAX_SMALL_BYTES)
-        fields = (("started_ns", int), ("token", int), ("host", str), ("pid", int))
-        return Owner(*(take(table, name, kind) for name, kind in fields))
-    except MessageError:
-        return None

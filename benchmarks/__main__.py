@@ -8,8 +8,8 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import filter as filters
-from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, query, sim
+from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, query, sim
+from benchmarks.agents import filter as filters
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 
@@ -31,6 +31,7 @@ OPTIONS = {
     "samples": ("N", _count, "in a run, or a journal"),
     "steps": ("N", _count, "in a run"),
     "queries": ("N", _count, "of each kind"),
+    "machines": ("N", _count, "that send at the same time"),
     "hours": ("H", _positive, "of work"),
     "seconds": ("S", _positive, "simulated, or of the site's time, in a run"),
 }
@@ -55,6 +56,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
     ),
     "query": (query.run, "queries of a real server, while samples come in", {"hours": HOURS, "queries": 200}),
     "ingest": (ingest.run, "samples that the server takes, from bytes to the grid", {"runs": 5, "samples": 20_000}),
+    "fleet": (
+        fleet.run,
+        "a fleet at a real server: acknowledgements, and what they cost",
+        {"machines": 500, "seconds": 70.0, "hours": HOURS},
+    ),
     "sim": (sim.run, "simulated time of small and large fleets, sensors on", {"runs": 5, "seconds": 20.0}),
     "filter": (filters.run, "steps of the filters, and a whole agent's CPU and memory", {"runs": 5, "steps": 1000}),
 }

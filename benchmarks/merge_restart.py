@@ -20,8 +20,8 @@ from benchmarks.merge_work import A_SECOND, BATCH, batches, seconds_of
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
+from mapserver.ingest.snapshot_times import RESTART_SAMPLES
 from mapserver.ingest.store import JOURNAL_FILE, Store
-from mapserver.ingest.writer import SNAPSHOT_ROWS
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Admission
 from protocol.arrays import Table
@@ -30,7 +30,7 @@ from protocol.wire.messages import SampleBatch
 
 SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()
 GOAL_S = 4.0
-TAIL_ROWS = SNAPSHOT_ROWS  # as many as a crash can leave without a snapshot
+TAIL_SAMPLES = RESTART_SAMPLES  # as many as a crash can leave without a snapshot
 IN_ONE_COMMIT = 10_000  # journal rows: what is measured is the opening, not the writing
 MB = 1e6
 
@@ -49,7 +49,7 @@ def _opened(samples: int, in_row: int) -> dict[str, float]:
     rows = -(-samples // in_row)
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
-        build_s = timed(lambda: build(folder, rows, TAIL_ROWS, in_row))
+        build_s = timed(lambda: build(folder, rows, TAIL_SAMPLES // in_row, in_row))
         opened_store: Report = {}
         process_s = timed(lambda: opened_store.update(in_child("benchmarks.merge_restart", path)))
         if opened_store["journalled"] != rows or opened_store["merged"] != rows:

@@ -52,9 +52,9 @@ def samples_of(hours: float) -> int:
 def batches(seed: int = 0) -> Iterator[tuple[str, Table]]:
     """Names of machines and batches of samples, in the order in which they would come in, day after day."""
     draws = np.random.default_rng(seed).spawn(MACHINES)
-    drives = [_legs(draw) for draw in draws]
+    drives = [drive(draw) for draw in draws]
     while True:
-        driven = [_drive(next(legs), draw) for legs, draw in zip(drives, draws, strict=True)]
+        driven = [next(legs) for legs in drives]
         for first in range(0, LEG_SAMPLES, BATCH):
             for number, rows in enumerate(driven, start=1):
                 yield f"loader-{number}", rows[first : first + BATCH]
@@ -66,6 +66,11 @@ def seconds_of(work: Iterator[tuple[str, Table]]) -> Iterator[Batches]:
         machines = {name: np.concatenate([rows for other, rows in leg if other == name]) for name, _ in leg}
         for first in range(0, LEG_SAMPLES, A_SECOND):
             yield [(name, rows[first : first + A_SECOND]) for name, rows in machines.items()]
+
+
+def drive(draw: np.random.Generator) -> Iterator[Table]:
+    """Samples of one machine, leg by leg, day after day."""
+    return (_drive(leg, draw) for leg in _legs(draw))
 
 
 def _legs(draw: np.random.Generator) -> Iterator[RoadLeg]:

@@ -18,7 +18,8 @@ from agents.delivery.audit import read_audit
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot
-from mapserver.evidence.grid import REFOLD_ROWS, Grid, GridState, PlacedPage
+from mapserver.evidence.grid import REFOLD_ROWS, Grid
+from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import Page
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from mapserver.change.detection import ChangeConfig
@@ -15,16 +16,19 @@ class StoreConfig:
     """What is kept on disk beside the journal.
 
     snapshot_s: a snapshot of the grid is written so often. archive_after_h: journal rows move to Parquet files once
-    they are so old, 0 for never.
+    they are so old, 0 for never. checkpoints_gb: so much room have checkpoints, which make maps of the past quick; 0
+    for none.
     """
 
     snapshot_s: float = 60.0
     archive_after_h: float = 24.0
+    checkpoints_gb: float = 5.0
 
     def __post_init__(self) -> None:
         require_positive(self, ("snapshot_s",))
-        if not self.archive_after_h >= 0:
-            raise ValueError("archive_after_h: negative")
+        for name in ("archive_after_h", "checkpoints_gb"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: {getattr(self, name)} is not 0 or more")
 
 
 @dataclass(frozen=True)

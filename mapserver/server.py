@@ -7,24 +7,28 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import zenoh
 
+from mapserver.claim import WriterClaim
 from mapserver.config import ServerConfig
 from mapserver.evidence import grid
 from mapserver.follower.follower import Follower
 from mapserver.ingest import batches
-from mapserver.ingest.store import Incoming, Store, Verify
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store, Verify
+from mapserver.ingest.store_folder import store_id
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records
+from mapserver.past.past import Past
 from mapserver.query.answer_pool import AnswerPool
-from mapserver.query.answering import Answers, reads_past
+from mapserver.query.answering import Answers
 from protocol.errors import ConfigError, QueryError, Refusal
 from protocol.queries.answer_codec import encode_change, encode_error
 from protocol.queries.answers import GroundChange
 from protocol.queries.parameters import split_selector
-from protocol.queries.requests import parse_query
+from protocol.queries.requests import parse_query, reads_past
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import encode_reply
@@ -34,6 +38,7 @@ COMMAND_THREADS = 8  # a command waits for its map; those given meanwhile are ke
 ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 tiles, or 2000 points
 MOST_PAST, MOST_COMMANDS = 16, 16  # that wait or are in work
 MAX_QUESTION = 4096  # bytes of a query's parameters
+SignReply = Callable[[str, bytes, bytes], bytes]  # key expression, batch and reply to signature
 log = logging.getLogger("mapserver")
 
 
@@ -49,17 +54,30 @@ class Server:
         config: ServerConfig,
         now_ns: Callable[[], int],
         verify: Verify | None = None,
+        *,
+        sign: SignReply | None = None,
+        take_over: bool = False,
     ) -> None:
         """ingest: for batches alone, since an answer that nobody takes holds up its whole link. readers: for all else.
 
-        verify: of signed batches, see Store; without it signatures are not asked for.
+        verify: of signed batches, see Store; without it signatures are not asked for. sign: makes the
+        signature that goes beside the reply to a signed batch. take_over: have another server of
+        the site end, where there is one; otherwise a LinkError says so.
         """
-        self._writer = Writer(Store(folder, site, config, now_ns, verify))
+        self._sign = sign
+        with ExitStack() as opened:
+            self._claim = WriterClaim(ingest, site.name, store_id(folder / JOURNAL_FILE))
+            opened.callback(self._claim.close)
+            self._claim.acquire(take_over=take_over)
+            self._writer = Writer(Store(folder, site, config, now_ns, verify))
+            self._claim.store = self._writer.store_id
+            opened.pop_all()
         self._changed = readers.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
-        self._follower = Follower(self._writer, self._publish)
-        self.answers = Answers(self._writer, self._follower)
+        past = Past.of_store(folder, site.cell_m, config.fold)
+        self._follower = Follower(self._writer, self._publish, past)
+        self.answers = Answers(self._writer, self._follower, past)
         self._now = AnswerPool("query", config.query_threads, ANSWER_BYTES)
         # Others: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
         self._past = AnswerPool("past", 1, MOST_PAST)
@@ -75,6 +93,11 @@ class Server:
         """Whether the writer's thread has died; the process should end."""
         return self._writer.failed
 
+    @property
+    def ended(self) -> str:
+        """Why another server is the site's writer now, empty while none is; the process should end."""
+        return self._claim.ended
+
     def close(self) -> None:
         """Stop listening, finish what has come in, commit, snapshot."""
         for queryable in self._queryables:
@@ -84,6 +107,7 @@ class Server:
         self._follower.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()
+        self._claim.close()  # the last: another server may use the store now
 
     def _on_batch(self, query: zenoh.Query) -> None:
         payload = query.payload.to_bytes() if query.payload else b""
@@ -92,14 +116,20 @@ class Server:
         except ConfigError:  # a wildcard in the key names no machine
             machine = ""
 
+        signature = query.attachment.to_bytes() if query.attachment else b""
+
         def reply(answer: Ack | Refused) -> None:
             with query:
+                data = encode_reply(answer)
+                signed = self._sign(str(query.key_expr), payload, data) if self._sign and signature else None
                 try:
-                    query.reply(query.key_expr, encode_reply(answer))
+                    query.reply(query.key_expr, data, attachment=signed)
                 except zenoh.ZError as error:  # the asker is gone; it will ask again
                     log.info("reply failed machine=%s error=%r", machine, str(error))
 
-        signature = query.attachment.to_bytes() if query.attachment else b""
+        if not self._claim.held:
+            reply(Refused(Refusal.NOT_WRITER, "it is not certain that no other map server writes; send this one again"))
+            return
         self._writer.submit(Incoming(machine, payload, signature), reply)
 
     def _on_query(self, asked: zenoh.Query) -> None:

@@ -25,6 +25,7 @@ class Refusal(StrEnum):
     SERVER_CLOCK = "server_clock"
     OTHER_STORE = "other_store"
     NOT_WRITER = "not_writer"
+    UNSIGNED = "unsigned"
     OVERLOADED = "overloaded"
     STORE = "store"
     UNKNOWN_PARAMETER = "unknown_parameter"

@@ -11,6 +11,8 @@ from typing import Any, BinaryIO
 
 from protocol.errors import ConfigError
 
+PRIVATE = 0o600  # what a site's machines sent is nobody else's business on a shared host
+
 
 def load_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; errors name the file and the line."""
@@ -52,6 +54,11 @@ def write_whole(path: Path, data: bytes, permissions: int = 0o666) -> None:
     """Write a file whole or not at all; raises OSError."""
     with whole_file(path, permissions) as file:
         file.write(data)
+
+
+def make_private(path: Path) -> None:
+    """Make an empty file that only its owner reads, whatever the umask, unless there is one; raises OSError."""
+    os.close(os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE))
 
 
 def sync_folder(folder: Path) -> None:

@@ -14,7 +14,10 @@ def __getattr__(name: str) -> object:
     """Import what a program uses when it does: the command begins here too, and hears Ctrl-C before numpy is loaded."""
     from importlib import import_module
 
-    return getattr(import_module("sitegrid.api"), name)
+    api = import_module("sitegrid.api")
+    if not hasattr(api, name):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(api, name)
 
 
 def __dir__() -> list[str]:

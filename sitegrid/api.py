@@ -6,12 +6,16 @@ from protocol.queries.answers import (
     HistorySpan,
     MachineState,
     MapInfo,
+    MapVersion,
     PointAnswer,
     Region,
     SampleCounts,
+    ServerAlive,
     SiteInfo,
     TrustAnswer,
 )
+from protocol.queries.map_tiles import MapTile, TilesAnswer
+from protocol.queries.reasons import CellReasons, Votes
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
 from protocol.version import package_version
@@ -21,5 +25,6 @@ from sitegrid.listener import Listener
 __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
 __all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
-__all__ += ["Bounds", "KnownGround", "SampleCounts", "SiteInfo"]
+__all__ += ["CellReasons", "MapTile", "MapVersion", "TilesAnswer", "Votes"]
+__all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __version__ = package_version()

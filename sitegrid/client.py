@@ -10,9 +10,21 @@ import zenoh
 
 from protocol.errors import LinkError, QueryError, Refusal
 from protocol.queries import answer_codec, requests
-from protocol.queries.answers import GroundChange, HistorySpan, MachineState, MapInfo, PointAnswer, Region, TrustAnswer
+from protocol.queries.answers import (
+    GroundChange,
+    HistorySpan,
+    MachineState,
+    MapInfo,
+    MapVersion,
+    PointAnswer,
+    Region,
+    ServerAlive,
+    TrustAnswer,
+)
 from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command
+from protocol.queries.map_tiles import TilesAnswer, decode_tiles
 from protocol.queries.parameters import selector_of
+from protocol.queries.reasons import CellReasons, decode_why
 from protocol.queries.tiles import Progress, joined
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
@@ -105,6 +117,18 @@ class Client:
         query = requests.HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, fresh)
         return answer_codec.decode_history(self._ask(query)).spans
 
+    def tiles(self, since: MapVersion | None = None, *, as_of_ns: int | None = None) -> TilesAnswer:
+        """The map in tiles of 8-bit layers, for pages that draw it: those that differ since a version, or all."""
+        return decode_tiles(self._ask(requests.TilesQuery(since, as_of_ns)))
+
+    def why(self, x_m: float, y_m: float, *, as_of_ns: int | None = None) -> CellReasons:
+        """Everything that is known of the cell at a position in `map`: votes, passes, machines, changes."""
+        return decode_why(self._ask(requests.WhyQuery(float(x_m), float(y_m), as_of_ns)))
+
+    def alive(self) -> ServerAlive:
+        """Whether the server takes batches: for probes, since it waits for nothing."""
+        return answer_codec.decode_alive(self._ask(requests.AliveQuery()))
+
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
         return answer_codec.decode_info(self._ask(requests.InfoQuery(requests.Freshness(after, wait_s))))
@@ -164,10 +188,7 @@ class Client:
 
     def _ask(self, query: requests.MapQuery) -> bytes:
         wait_s = query.fresh.wait_s if query.fresh.after else 0.0
-        if isinstance(query, requests.HistoryQuery) or (
-            isinstance(query, requests.PointQuery | requests.RegionQuery) and query.when != requests.NOW
-        ):
-            wait_s += PAST_S
+        wait_s += PAST_S if requests.reads_past(query) else 0.0
         return self._get(keys.map_query(self.site, query.name), requests.encode_query(query), wait_s)
 
     def _tiles(self, query: requests.RegionQuery) -> Iterator[Region]:

@@ -19,11 +19,11 @@ from mapserver.config import ServerConfig
 from mapserver.ingest.store import ACCEPTED, JOURNAL_FILE, Store
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.archive_file import ArchiveFile
-from mapserver.journal.copier import Copier, SpoolKey, merged
+from mapserver.journal.copier import Copier, merged
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import JournalReader
-from mapserver.journal.rows import JournalRow, Selection, Watermark
+from mapserver.journal.rows import JournalRow, Selection, SpoolKey, Watermark
 from protocol.config import from_table
 from protocol.errors import ConfigError
 from protocol.files import load_toml

@@ -21,8 +21,11 @@ import numpy as np
 
 from agents.delivery.audit import AuditLog
 from agents.delivery.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
+from agents.delivery.spool_mark import RunEnd, runs_cut_short
 from agents.delivery.uplink import Head
 from protocol.arrays import Table
+from protocol.disk.high_water_mark import HighWaterMark, mark_path
+from protocol.disk.traces import Traces, look_beside
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty
 
@@ -57,11 +60,12 @@ class SpoolRun:
 
 @dataclass(frozen=True)
 class _Meta:
-    """Counts of the file: the last number given out, samples that were dropped, samples that were recorded."""
+    """Counts of the file: the last number given out, samples dropped, samples recorded, samples gone with its disk."""
 
     newest: int
     dropped: int
     recorded: int
+    gone: int
 
 
 _SampleRow = tuple[int, bytes, int, int]  # number, sample, whether it is final, checksum
@@ -75,7 +79,8 @@ def random_id() -> int:
 class Spool:
     """One machine's samples that are not yet acknowledged. All methods may be called from any thread.
 
-    StoreError if the file is damaged, if another process has it open, or if the disk is full or fails.
+    StoreError if the file is damaged, if another process has it open, or if the disk is full or fails. damage: what
+    the file had lost when it was opened, one line; empty for nothing.
     """
 
     def __init__(
@@ -87,14 +92,17 @@ class Spool:
         self._draw_id = draw_id
         self._lock = threading.Lock()
         path.parent.mkdir(parents=True, exist_ok=True)
+        traces = look_beside(path)  # before SQLite drops what it cannot use
         with contextlib.ExitStack() as opened:
             try:
                 self._db = self._connect(path)
                 opened.callback(self._db.close)
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
-                self._open()
-            except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
+                self._mark = HighWaterMark(mark_path(path))
+                opened.callback(self._mark.close)
+                self._open(traces)
+            except (sqlite3.Error, OSError, ValueError, KeyError, TypeError) as error:
                 raise StoreError(path, why_unusable(error)) from None
             opened.pop_all()
 
@@ -122,6 +130,7 @@ class Spool:
                 "dropped": meta.dropped,
                 "put_aside": self._quarantined,
                 "recorded": meta.recorded,
+                "gone": meta.gone,
             }
 
     def is_settled(self) -> bool:
@@ -184,6 +193,7 @@ class Spool:
                 deleted = self._db.execute("DELETE FROM sample WHERE number > ? AND number <= ?", numbers).rowcount
                 self._save_run(new)
             self._runs[at] = new
+            self._mark.write(self._run_end(at).values())
             self._depth -= deleted
             if at == self._sending and is_earlier and watermark >= end:
                 self._sending += 1
@@ -199,6 +209,7 @@ class Spool:
             with transaction(self._db):
                 self._save_run(new)
             self._runs[at], self._sending = new, 0
+            self._mark.write(self._run_end(at).values())
 
     def start_new_run(self) -> None:
         """Give what is not acknowledged of this run a new identity: another agent sends under the present one."""
@@ -212,6 +223,8 @@ class Spool:
                 for run in (*ended, new):
                     self._save_run(run)
             self._runs[-1:] = [*ended, new]
+            self._mark.write(RunEnd(old.spool_id, old.acknowledged, old.acknowledged).values())
+            self._mark.write(self._run_end(-1).values())
             self._sending = len(self._runs) - 1
             if self._audit and waiting:
                 seqs = [number - old.base for number, _ in waiting]
@@ -231,6 +244,7 @@ class Spool:
             with contextlib.suppress(sqlite3.Error):  # a full disk: the log stays, and is read at the next opening
                 self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._db.close()
+            self._mark.close()
             if self._audit:
                 self._audit.close()
 
@@ -246,31 +260,58 @@ class Spool:
             except sqlite3.Error as error:
                 raise StoreError(self._path, f"cannot be used: {error}; look at the machine's disk") from None
 
-    def _open(self) -> None:
-        """Make or read the file, and start a run."""
+    def _open(self, traces: Traces) -> None:
+        """Make or read the file, name what it has lost, and start a run."""
         with transaction(self._db):  # all together: a kill leaves all or nothing
             make_or_check(self._db)
             # After a crash pending samples are sent as they are: a coarse place is better than none.
             self._db.execute("UPDATE sample SET final = 1 WHERE final IS NOT 1")
             self._meta = _Meta(**{k: int(v) for k, v in self._db.execute("SELECT key, value FROM meta")})
-            self._runs = self._start_run()
+            self._runs = self._runs_of_file()
+            self.damage = self._compare(traces)
+            self._start_run()
+        with contextlib.suppress(OSError):  # it stays behind, which is no alarm
+            self._mark.replace({k: n for i in range(len(self._runs)) for k, n in self._run_end(i).values().items()})
         self._sending = 0  # index of the run that is being sent
         self._depth = int(self._db.execute("SELECT COUNT(*) FROM sample").fetchone()[0])
         self._quarantined = int(self._db.execute("SELECT COUNT(*) FROM quarantine").fetchone()[0])
         if self._audit:
             self._audit.complete(self._identified())
 
-    def _start_run(self) -> list[SpoolRun]:
-        """Add a run to those that are still of interest: not closed, or among the last. One without samples is not."""
+    def _runs_of_file(self) -> list[SpoolRun]:
+        """Runs that have samples, or had some."""
         runs = [_run_from(*row) for row in self._db.execute("SELECT * FROM run ORDER BY base")]
-        filled = [run for run in runs if run.base < self._meta.newest]
-        last = filled[-KEPT_RUNS:]
-        first = next((i for i, run in enumerate(filled) if not run.closed or run in last), len(filled))
-        runs = [*filled[first:], SpoolRun(self._meta.newest, self._draw_id())]
+        return [run for run in runs if run.base < self._meta.newest]
+
+    def _compare(self, traces: Traces) -> str:
+        """Compare the file with its mark: runs go as far as they went, so that what is gone is declared to the server.
+
+        Where no log was cut short, a copy may have taken the file's place: what it lacks is counted, and not declared,
+        for the other file may still be sent.
+        """
+        short = runs_cut_short([self._run_end(i) for i in range(len(self._runs))], traces.mark)
+        gone, meta = sum(n for _, n in short), self._meta
+        if traces.cut_short:
+            for end, _ in short:
+                if not self._runs or self._runs[-1].spool_id != end.spool_id:
+                    self._runs.append(SpoolRun(meta.newest, end.spool_id, end.acknowledged))
+                meta = replace(meta, newest=self._runs[-1].base + end.recorded)
+        self._meta = replace(meta, gone=meta.gone + gone)
+        self._save(self._meta)
+        if traces.damage or gone:
+            with contextlib.suppress(OSError):  # a full disk: it is named all the same
+                traces.keep_log(self._meta.newest)
+        lost = f"{gone} recorded samples are gone" if gone else ""
+        return "; ".join(text for text in (traces.damage, lost) if text)
+
+    def _start_run(self) -> None:
+        """Add a run to those that are still of interest: not closed, or among the last."""
+        runs, last = self._runs, self._runs[-KEPT_RUNS:]
+        first = next((i for i, run in enumerate(runs) if not run.closed or run in last), len(runs))
+        self._runs = [*runs[first:], SpoolRun(self._meta.newest, self._draw_id())]
         self._db.execute("DELETE FROM run")
-        for run in runs:
+        for run in self._runs:
             self._save_run(run)
-        return runs
 
     def _identified(self) -> Iterator[tuple[int, int, Table]]:
         """All samples of the file as (spool_id, seq, row)."""
@@ -283,6 +324,10 @@ class Spool:
         """The last seq of a run."""
         is_last = at == len(self._runs) - 1
         return (self._meta.newest if is_last else self._runs[at + 1].base) - self._runs[at].base
+
+    def _run_end(self, at: int) -> RunEnd:
+        run = self._runs[at]
+        return RunEnd(run.spool_id, self._end(at % len(self._runs)), run.acknowledged)
 
     def _index(self, spool_id: int) -> int:
         return next(i for i, run in enumerate(self._runs) if run.spool_id == spool_id)
@@ -299,9 +344,10 @@ class Spool:
             if excess:
                 oldest = "SELECT number FROM sample ORDER BY number LIMIT ?"
                 self._db.execute(f"DELETE FROM sample WHERE number IN ({oldest})", (excess,))  # noqa: S608 - no input
-            new = _Meta(old.newest + n, old.dropped + excess, old.recorded + n)
+            new = replace(old, newest=old.newest + n, dropped=old.dropped + excess, recorded=old.recorded + n)
             self._save(new)
         self._meta = new
+        self._mark.write(self._run_end(-1).values())
         self._depth += n - excess
 
     def _oldest(self, limit: int) -> list[_SampleRow]:

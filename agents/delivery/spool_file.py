@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from agents.delivery.spool_mark import RunEnd
+from protocol.files import make_private
+
 SCHEMA = 4
 LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
 _TABLES = (
@@ -13,13 +16,14 @@ _TABLES = (
     "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INT, closed INT, store TEXT, crc32 INT)",
     "CREATE TABLE sample (number INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL, crc32 INTEGER)",
     "CREATE TABLE quarantine (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL)",
-    "INSERT INTO meta VALUES ('newest', '0'), ('dropped', '0'), ('recorded', '0')",
+    "INSERT INTO meta VALUES ('newest', '0'), ('dropped', '0'), ('recorded', '0'), ('gone', '0')",
     f"PRAGMA user_version={SCHEMA}",
 )
 
 
 def connect(path: Path, kind: type[sqlite3.Connection] = sqlite3.Connection) -> sqlite3.Connection:
     """Open a file for this process alone: two agents on one file would send one sample twice, or not at all."""
+    make_private(path)
     db = sqlite3.connect(path, LOCK_WAIT_S, isolation_level=None, check_same_thread=False, factory=kind)
     db.execute("PRAGMA locking_mode=EXCLUSIVE")
     return db
@@ -33,6 +37,15 @@ def make_or_check(db: sqlite3.Connection) -> None:
     (schema,) = db.execute("PRAGMA user_version").fetchone()
     if schema != SCHEMA:
         raise ValueError(f"schema {schema}, this agent knows {SCHEMA}")
+
+
+def run_ends_in(db: sqlite3.Connection) -> list[RunEnd]:
+    """Runs that have samples, or had some, as a file at rest has them."""
+    (newest,) = db.execute("SELECT value FROM meta WHERE key = 'newest'").fetchone()
+    runs = db.execute("SELECT base, spool_id, acknowledged FROM run ORDER BY base").fetchall()
+    ends = [*(base for base, _, _ in runs[1:]), int(newest)]
+    each = zip(runs, ends, strict=True)
+    return [RunEnd(int(name, 16), end - base, acked) for (base, name, acked), end in each if end > base]
 
 
 def checksum(number: int, row: bytes) -> int:

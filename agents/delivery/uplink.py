@@ -28,6 +28,7 @@ BLOCKING = {
     Refusal.WALL_CLOCK,
     Refusal.SERVER_CLOCK,
     Refusal.OTHER_STORE,
+    Refusal.UNSIGNED,
     Refusal.NOT_MSGPACK,
     Refusal.MISSING_FIELD,
     Refusal.WRONG_TYPE,
@@ -163,9 +164,7 @@ class Uplink:
         self.machine = machine
         self.timeout_s = timeout_s
         self.counters: Counter[str] = Counter()
-        self.problem = ""
-        self.stuck = ""
-        self.held = ""
+        self.problem = self.stuck = self.held = ""
         self.ack_s_max = 0.0
         self._frame = frame
         self._pacing = pacing or Pacing()
@@ -263,11 +262,16 @@ class Uplink:
         self.counters[f"refused_{refused.reason}"] += 1
         self.problem = refused.problem
         self.stuck = refused.problem if refused.reason in BLOCKING else ""
+        if refused.reason in PASSING and refused.retry_after_s > 0:
+            pause_s = min(refused.retry_after_s, self._pacing.max_backoff_s)
+            return Wait(float(pause_s * self._rng.uniform(1.0, 1.5)))  # no sooner, and not all machines at once
         if refused.reason in PASSING or refused.reason in BLOCKING or head is None or not len(head.rows):
             return self._back_off()
         if refused.reason == Refusal.GAP:
-            knows_less = 1 <= refused.expected <= head.acknowledged
-            return LowerWatermark(head.spool_id, refused.expected - 1) if knows_less else self._back_off()
+            if not 1 <= refused.expected <= head.acknowledged:
+                return self._back_off()
+            self.counters["lowered_watermarks"] += 1
+            return LowerWatermark(head.spool_id, refused.expected - 1)
         if len(head.rows) > 1:  # find the sample that is to blame
             self._limit = len(head.rows) // 2
             return Wait(0.0)

@@ -9,7 +9,7 @@ import zenoh
 
 from agents.delivery.spool import Spool
 from agents.delivery.uplink import Action, Delete, LowerWatermark, Quarantine, ReadHead, Send, StartNewRun, Uplink, Wait
-from protocol.errors import MessageError, StoreError
+from protocol.errors import MessageError, Refusal, StoreError
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply
 from protocol.wire.messages import Ack, Refused
@@ -17,6 +17,7 @@ from protocol.wire.messages import Ack, Refused
 log = logging.getLogger("agents.delivery.uplink_thread")
 
 Sign = Callable[[str, bytes], bytes]  # key expression and payload to signature
+Check = Callable[[str, bytes, bytes, bytes], bool]  # key expression, payload, reply, signature: whether it is genuine
 Ask = Callable[[bytes], tuple[Ack | Refused | None, float]]  # payload to reply (None: none), and how long it took [s]
 
 
@@ -33,6 +34,7 @@ def perform(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
             case Delete(spool_id, watermark, store):
                 spool.acknowledge(spool_id, watermark, store)
             case LowerWatermark(spool_id, watermark):
+                log.warning("the map server has lost samples run=%016x until=%d", spool_id, watermark)
                 spool.lower_watermark(spool_id, watermark)
             case StartNewRun():
                 spool.start_new_run()
@@ -48,14 +50,20 @@ class UplinkThread:
     """Runs an uplink on a thread of its own."""
 
     def __init__(
-        self, session: zenoh.Session, site: str, uplink: Uplink, spool: Spool, sign: Sign | None = None
+        self,
+        session: zenoh.Session,
+        site: str,
+        uplink: Uplink,
+        spool: Spool,
+        sign: Sign | None = None,
+        check: Check | None = None,
     ) -> None:
-        """sign: makes the signature that goes beside each batch."""
+        """sign: makes the signature that goes beside each batch; check: of that beside each reply."""
         self._session = session
         self._key = keys.ingest(site, uplink.machine)
         self._uplink = uplink
         self._spool = spool
-        self._sign = sign
+        self._sign, self._check = sign, check
         self._new_samples = threading.Event()
         self._logged = ""
         self._stop = threading.Event()
@@ -115,10 +123,19 @@ class UplinkThread:
             )
             for reply in replies:
                 if reply.ok is not None:
-                    return decode_reply(reply.ok.payload.to_bytes())
+                    return self._believed(payload, reply.ok)
         except (zenoh.ZError, MessageError) as error:
             log.warning("no usable answer error=%r", str(error))
         return None
+
+    def _believed(self, payload: bytes, reply: zenoh.Sample) -> Ack | Refused:
+        """What a reply says, if the map server has signed it; a forged one could have samples deleted."""
+        data = reply.payload.to_bytes()
+        signature = reply.attachment.to_bytes() if reply.attachment else b""
+        if self._check and not self._check(self._key, payload, data, signature):
+            problem = "the reply is not signed by the site's map server: compare the server's keys with servers.pub"
+            return Refused(Refusal.UNSIGNED, problem)
+        return decode_reply(data)
 
 
 def linger(is_empty: Callable[[], bool], wait: Callable[[float], object], clock: Callable[[], float], s: float) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapserver.evidence import cells as ev
 from mapserver.evidence.buffers import Buffers
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
-from mapserver.evidence.fold_kernels import fold_sorted
+from mapserver.evidence.fold_kernels import BUCKET_BITS, fold_sorted
 from mapserver.evidence.pages import CELL, RAW_CELL, PackedPages
 from mapserver.evidence.sample_kernels import locate, split, weigh
 from protocol.arrays import AnyArray, Bools, Ints, Table
@@ -33,12 +33,18 @@ class Scratch(Buffers):
 
 
 def fold(
-    rows: Table, names: NDArray[np.uint64], cell_m: float, config: FoldConfig, scratch: Scratch
+    rows: Table,
+    names: NDArray[np.uint64],
+    cell_m: float,
+    config: FoldConfig,
+    scratch: Scratch,
+    spans: Ints | None = None,
 ) -> Iterator[tuple[int, int, PackedPages]]:
     """Fold samples; yields block column, block row and pages of buckets (tier 0), a block maybe more than once.
 
     names (n,): hashes of the rows' machines. The weight of all samples together stays within COUNT_MAX. Samples that
-    do not know their place well enough have no vote.
+    do not know their place well enough have no vote. spans (n,): numbers below 2**BUCKET_BITS of the pages that the
+    rows count in, in place of their buckets.
     """
     limits = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2)
     n = len(rows)
@@ -51,8 +57,12 @@ def fold(
         locate(rows, limits, config.bucket_ns, places, stencils, keys, touching)
     if area > MOST_SHARES and n > 1:  # tiny cells under unsure positions
         for part in (slice(n // 2), slice(n // 2, None)):
-            yield from fold(rows[part], names[part], cell_m, config, scratch)
+            yield from fold(
+                rows[part], names[part], cell_m, config, scratch, spans[part] if spans is not None else None
+            )
         return
+    if spans is not None:
+        keys[:pairs] = keys[:pairs] >> BUCKET_BITS << BUCKET_BITS | spans[touching[:pairs]]
     starts, shares = array("starts", n, np.int64), array("shares", area, np.uint32)
     weigh(rows, places, stencils, starts, shares)
     bins, bin_shares = array("bins", n, np.int64, 4), array("bin_shares", n, np.uint32, 3)
@@ -99,4 +109,5 @@ def _by_block(
     raw = cells.view(RAW_CELL)
     places = np.column_stack([pages[firsts][:, [0, 1, 3, 5]], pages[ends - 1][:, [4, 6]], firsts, ends])
     for x, y, vote, cell, end_vote, end_cell, first, end in places.tolist():
-        yield x, y, PackedPages(tables[first:end].copy(), few[vote:end_vote].copy(), raw[cell:end_cell].copy())
+        own_cells = raw[cell:end_cell].copy().view(CELL)
+        yield x, y, PackedPages(tables[first:end].copy(), few[vote:end_vote].copy(), own_cells)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import Scratch, fold
 from mapserver.evidence.fold_config import FoldConfig, name_hash
-from mapserver.evidence.pages import CompactPages, PackedPages, Page
+from mapserver.evidence.grid_state import GridCounts, GridState
+from mapserver.evidence.pages import PackedPages
 from mapserver.evidence.sample_kernels import count_foldable, extent
 from mapserver.evidence.settling import Space, Tiers
 from mapserver.evidence.timeline import PATIENCE, Block, TimedPage, Timeline, evidence, settle_all
@@ -28,51 +28,20 @@ PIECE = 4096  # samples whose weights together stay far below COUNT_MAX
 READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
 
 
-@dataclass(frozen=True)
-class PlacedPage:
-    """A page, and where it belongs: the block's column and row, the tier of its timeline and the index there."""
-
-    x: int
-    y: int
-    tier: int
-    index: int
-    page: Page
-
-
-@dataclass(frozen=True)
-class GridState:
-    """Everything that a snapshot keeps; equal grids have equal states.
-
-    blocks: column, row and pages of each block, in the order of places. newest_ns: of all samples, 0 for none.
-    """
-
-    blocks: tuple[tuple[int, int, CompactPages], ...]
-    folded: int
-    skipped: int
-    newest_ns: int
-
-    @property
-    def pages(self) -> list[PlacedPage]:
-        """All pages, one by one."""
-        return [
-            PlacedPage(x, y, tier, index, page)
-            for x, y, pages in self.blocks
-            for tier, index, page in pages.expanded().items()
-        ]
-
-
 class Grid:
-    """Evidence of one site. newest_ns: the newest stamp of all samples."""
+    """Evidence of one site. newest_ns, oldest_ns: the newest and the oldest stamp of all samples, 0 for none."""
 
     def __init__(self, cell_m: float, config: FoldConfig, waiting_rows: int = LIVE_ROWS) -> None:
         """waiting_rows: so many samples are folded together, LIVE_ROWS or REFOLD_ROWS; the grid is the same."""
         self.cell_m = cell_m
         self.config = config
-        self.newest_ns = 0
-        self._folded = self._skipped = 0
+        self.newest_ns = self.oldest_ns = 0
+        self._folded = self._skipped = self._cells = 0
+        self._blocks: tuple[int, int, int, int] | None = None  # bounds of all blocks: west, south, east, north
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
+        self._turn, self._turns = 0, dict[Block, int]()  # how often anything was folded; the last turn of each block
         self._workers, self._scratch, self._spaces = ALONE, [Scratch()], [Space()]
         self._rows: AnyArray = np.empty(waiting_rows, RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
@@ -109,12 +78,15 @@ class Grid:
             raise ValueError(f"folded otherwise: {other.cell_m} m, {other.config}; {self.cell_m} m, {self.config}")
         self._drain()
         other._drain()
+        self._turn += 1
+        self._extend(other._timelines)
         for block, timeline in other._timelines.items():
-            self._timeline(block).add(timeline.settled().expanded())
+            self._cells += self._timeline(block).add(timeline.settled().expanded())
             self._touched.add(block)
+            self._turns[block] = self._turn
         self._folded += other._folded
         self._skipped += other._skipped
-        self.newest_ns = max(self.newest_ns, other.newest_ns)
+        self._widen(other.oldest_ns, other.newest_ns)
 
     @contextmanager
     def bulk(self, workers: Workers = ALONE) -> Iterator[None]:
@@ -156,6 +128,11 @@ class Grid:
         self._drain()
         return [self._touched.pop() for _ in range(min(most, len(self._touched)))]
 
+    def folded_since(self, turn: int) -> tuple[list[Block], int]:
+        """Blocks that were folded into after a turn of this grid, all after turn -1; and the turn that it is now."""
+        self._drain()
+        return [block for block, last in self._turns.items() if last > turn], self._turn
+
     def evidence(self, blocks: Iterable[Block]) -> ev.Evidence:
         """Everything that was ever seen of these blocks, whether it still holds or not."""
         return evidence(self.pages(blocks))
@@ -163,37 +140,52 @@ class Grid:
     def bounds(self) -> tuple[int, int, int, int] | None:
         """First column, first row, end column, end row of all blocks with evidence."""
         self._drain()
-        if not self._timelines:
-            return None
-        xs, ys = zip(*self._timelines, strict=True)
-        n = BLOCK_CELLS
-        return min(xs) * n, min(ys) * n, (max(xs) + 1) * n, (max(ys) + 1) * n
+        return self.counts().bounds
 
     def known_cells(self) -> int:
         """How many cells have any evidence."""
         self._drain()
-        return sum(timeline.known_cells for timeline in self._timelines.values())
+        return self._cells
+
+    def counts(self) -> GridCounts:
+        """What is there, from counters: nothing is folded or looked through for it."""
+        waiting = self._rows[: self._waiting].view(SAMPLE_DTYPE)
+        voting, n = count_foldable(waiting, self.config.std_cap_m**2), BLOCK_CELLS
+        bounds = None
+        if self._blocks:
+            west, south, east, north = self._blocks
+            bounds = west * n, south * n, (east + 1) * n, (north + 1) * n
+        return GridCounts(self._folded + voting, self._skipped + len(waiting) - voting, self._cells, bounds)
 
     def state(self) -> GridState:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()
         settle_all(self._timelines.values())
         blocks = ((x, y, self._timelines[x, y].kept) for x, y in sorted(self._timelines))
-        return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns)
+        return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns, self.oldest_ns)
 
     @classmethod
     def from_state(cls, cell_m: float, config: FoldConfig, state: GridState) -> Grid:
         """Undo `state`."""
         grid = cls(cell_m, config)
+        grid._extend((x, y) for x, y, _ in state.blocks)
         for x, y, pages in state.blocks:
-            grid._timelines[x, y] = Timeline(grid._tiers, grid._spaces[0], pages)
-        grid._folded, grid._skipped, grid.newest_ns = state.folded, state.skipped, state.newest_ns
+            timeline = grid._timelines[x, y] = Timeline(grid._tiers, grid._spaces[0], pages)
+            grid._turns[x, y] = 0
+            grid._cells += timeline.known_cells
+        grid._folded, grid._skipped = state.folded, state.skipped
+        grid.newest_ns, grid.oldest_ns = state.newest_ns, state.oldest_ns
         return grid
+
+    def _widen(self, oldest_ns: int, newest_ns: int) -> None:
+        """Take in the span of stamps of other samples; 0, 0 for none."""
+        self.newest_ns = max(self.newest_ns, newest_ns)
+        self.oldest_ns = min(self.oldest_ns or oldest_ns, oldest_ns or self.oldest_ns)
 
     def _take(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Let rows wait; what waits is folded before its weight could exceed a count."""
-        newest_ns, driven_m = extent(rows)
-        self.newest_ns = max(self.newest_ns, newest_ns)
+        oldest_ns, newest_ns, driven_m = extent(rows)
+        self._widen(oldest_ns, newest_ns)
         weight = int(driven_m * ev.WEIGHT_UNITS_PER_M) + len(rows)
         if self._weight + weight > ev.COUNT_MAX:
             self._drain()
@@ -214,6 +206,7 @@ class Grid:
         rows, names = self._rows[: self._waiting].view(SAMPLE_DTYPE), self._names[: self._waiting]
         count = self._workers.count
         pages: list[list[tuple[Block, PackedPages]]] = [[] for _ in range(count)]  # of each worker's blocks
+        cells = [0] * count
 
         def fold_share(worker: int) -> None:
             """Fold a stretch of the samples."""
@@ -226,12 +219,16 @@ class Grid:
             for block, packed in pages[worker]:
                 timeline = self._timeline(block)
                 timeline.space = self._spaces[worker]
-                timeline.add(packed)
+                cells[worker] += timeline.add(packed)
                 self._touched.add(block)
+                self._turns[block] = self._turn
             settle_all({self._timelines[block] for block, _ in pages[worker]}, PATIENCE)
 
+        self._turn += 1
         self._workers.each(fold_share)
         self._workers.each(add_share)
+        self._cells += sum(cells)
+        self._extend({block for share in pages for block, _ in share})
         voting = count_foldable(rows, self.config.std_cap_m**2)
         self._folded += voting
         self._skipped += len(rows) - voting
@@ -242,6 +239,12 @@ class Grid:
         if timeline is None:
             timeline = self._timelines[block] = Timeline(self._tiers, self._spaces[0])
         return timeline
+
+    def _extend(self, blocks: Iterable[Block]) -> None:
+        """Keep the bounds of all blocks."""
+        for x, y in blocks:
+            west, south, east, north = self._blocks or (x, y, x, y)
+            self._blocks = min(west, x), min(south, y), max(east, x), max(north, y)
 
     def _settle(self, worker: int) -> None:
         """Settle a worker's own blocks."""

@@ -121,6 +121,16 @@ def expand_cells(table: Any, compact: Any, words: Any, out: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
+def note(known: Any, cells: Any) -> int:
+    """Set known (256,) for cells (k,) CELL; returns for how many it was not set."""
+    more = 0
+    for cell in cells:
+        more += not known[cell.cell]
+        known[cell.cell] = True
+    return more
+
+
+@numba.njit(cache=True, nogil=True)
 def are_votes(table: Any, runs: Any, cells: Any, counts: Any, high: Any) -> bool:
     """Whether these can be the votes of pages: what is read from a disk is looked at before it is expanded."""
     run, vote = 0, 0

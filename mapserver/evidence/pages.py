@@ -49,7 +49,7 @@ class PackedPages(NamedTuple):
     """Pages of one block end to end: few long arrays instead of many short ones.
 
     table (n, 6): tier, index, first and end of the votes and of the cells of each page. votes (m,), uint32 or,
-    where one does not fit, uint64: place in the lower 16 bits, count above; cells (k,) CELL, or RAW_CELL.
+    where one does not fit, uint64: place in the lower 16 bits, count above; cells (k,) CELL.
     """
 
     table: Ints
@@ -61,7 +61,7 @@ class PackedPages(NamedTuple):
         votes: Table = np.empty(len(self.votes), NARROW if int(self.votes.max(initial=0)) < 2**32 else WIDE)
         votes["place"], votes["count"] = self.votes & np.uint64(0xFFFF), self.votes >> np.uint64(16)
         for tier, index, first, end, first_cell, end_cell in self.table.tolist():
-            yield tier, index, Page(votes[first:end], self.cells[first_cell:end_cell].view(CELL))
+            yield tier, index, Page(votes[first:end], self.cells[first_cell:end_cell])
 
 
 @dataclass(frozen=True, slots=True)

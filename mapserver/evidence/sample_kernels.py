@@ -32,13 +32,14 @@ _TABLE = TABLE.astype(np.uint32)
 
 
 @numba.njit(cache=True, nogil=True)
-def extent(rows: Any) -> tuple[int, float]:
-    """Newest stamp of rows, and how far they were driven [m]."""
-    newest_ns, driven_m = 0, 0.0
+def extent(rows: Any) -> tuple[int, int, float]:
+    """Oldest and newest stamp of rows, and how far they were driven [m]."""
+    oldest_ns, newest_ns, driven_m = rows[0].stamp_ns, rows[0].stamp_ns, 0.0
     for k in range(len(rows)):
+        oldest_ns = min(oldest_ns, rows[k].stamp_ns)
         newest_ns = max(newest_ns, rows[k].stamp_ns)
         driven_m += np.float64(rows[k].distance_m)
-    return newest_ns, driven_m
+    return oldest_ns, newest_ns, driven_m
 
 
 @numba.njit(cache=True, nogil=True)

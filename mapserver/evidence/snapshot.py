@@ -17,14 +17,15 @@ import numpy as np
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
-from mapserver.evidence.grid import Grid, GridState
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.grid_state import GridState
 from mapserver.evidence.pages import EMPTY, CompactPages
 from protocol.arrays import AnyArray
-from protocol.files import whole_file
+from protocol.files import PRIVATE, whole_file
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2
-_TOTALS = ("folded", "skipped", "newest_ns")
+_TOTALS = ("folded", "skipped", "newest_ns", "oldest_ns")
 log = logging.getLogger("mapserver.evidence.snapshot")
 
 
@@ -39,8 +40,8 @@ def save(
     for part in folder.glob(".snapshot-*.part"):  # of a process that was killed: one alone writes to a store
         part.unlink(missing_ok=True)
     totals = {name: getattr(state, name) for name in _TOTALS}
-    header = {**_parameters(cell_m, config, excluded), "row": row, **totals}
-    with whole_file(path) as file:
+    header = {**parameters(cell_m, config, excluded), "row": row, **totals}
+    with whole_file(path, PRIVATE) as file:
         np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.blocks))  # type: ignore[arg-type]
     for old in rows_on_disk(folder)[KEEP:]:
         (folder / f"snapshot-{old}.npz").unlink(missing_ok=True)
@@ -56,10 +57,11 @@ def rows_on_disk(folder: Path) -> list[int]:
 def remove_beyond(folder: Path, last_row: int) -> None:
     """Remove snapshots that the journal does not reach: once it grew past them they would pass for true.
 
-    They are left where the journal was restored from a backup.
+    They are left where the journal was restored from a backup, or lost its end.
     """
     for row in rows_on_disk(folder):
         if row > last_row:
+            log.warning("snapshot removed row=%d problem='the journal ends at row %d'", row, last_row)
             (folder / f"snapshot-{row}.npz").unlink(missing_ok=True)
 
 
@@ -68,7 +70,7 @@ def load(path: Path, cell_m: float, config: FoldConfig, excluded: Collection[str
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
-            expected = _parameters(cell_m, config, excluded)
+            expected = parameters(cell_m, config, excluded)
             if {key: header.get(key) for key in expected} != expected:
                 return None
             state = GridState(_blocks(file), *(header[name] for name in _TOTALS))
@@ -90,8 +92,11 @@ def load_newest(
     return 0, Grid(cell_m, config)
 
 
-def _parameters(cell_m: float, config: FoldConfig, excluded: Collection[str]) -> dict[str, object]:
-    """What the evidence depends on."""
+def parameters(cell_m: float, config: FoldConfig, excluded: Collection[str]) -> dict[str, object]:
+    """What the evidence depends on beside the samples: its form, the fold, and the facts about machines.
+
+    A snapshot or a checkpoint made with others is not used. excluded: machines whose rows are not folded.
+    """
     fold = {**asdict(config), "std_floor_m": STD_FLOOR_M}
     bins = [ev.RESISTANCE_BINS, ev.GRADE_BINS, ev.SECTORS]
     return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": bins, "excluded": sorted(excluded), **fold}

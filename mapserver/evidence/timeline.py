@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.pages import CELL, EMPTY, CompactPages, PackedPages, Page, pick
+from mapserver.evidence.page_kernels import note
+from mapserver.evidence.pages import EMPTY, CompactPages, PackedPages, Page, pick
 from mapserver.evidence.settling import Space, Tiers, settled
-from protocol.arrays import Ints
+from protocol.arrays import Bools, Ints
 
 PATIENCE = 24  # pages that wait before a timeline is settled: fewer cost time, more cost memory
 Block = tuple[int, int]  # column and row
@@ -83,10 +84,10 @@ def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
 class Timeline:
     """Pages of one block: kept are those that are settled, fresh those that came since, waiting is how many.
 
-    space: where it is settled, that of the thread which adds or reads.
+    known_cells: how many cells have evidence. space: where it is settled, that of the thread which adds or reads.
     """
 
-    __slots__ = ("_known_cells", "_timed", "fresh", "kept", "space", "tiers", "waiting")
+    __slots__ = ("_known", "_timed", "fresh", "kept", "known_cells", "space", "tiers", "waiting")
 
     def __init__(self, tiers: Tiers, space: Space, settled: CompactPages = EMPTY) -> None:
         self.tiers, self.space = tiers, space
@@ -94,28 +95,24 @@ class Timeline:
         self.fresh: list[PackedPages] = []
         self.waiting = 0
         self._timed: TimedPages | None = None
-        self._known_cells: int | None = None
+        self._known: Bools = np.zeros(ev.CELLS, np.bool_)
+        self._known[settled.marks[:, 0]] = True
+        self.known_cells = int(np.count_nonzero(self._known))
 
-    def add(self, pages: PackedPages) -> None:
-        """Add evidence of any tiers and spans, also of those that are there; `settle_all` once PATIENCE pages wait."""
+    def add(self, pages: PackedPages) -> int:
+        """Add evidence of any tiers and spans, also of those that are there; returns how many cells are new.
+
+        It waits to be settled; see `settle_all`.
+        """
         self.fresh.append(pages)
         self.waiting += len(pages.table)
-        self._known_cells = None
+        more = note(self._known, pages.cells)
+        self.known_cells += more
+        return more
 
     def keep(self, pages: CompactPages) -> None:
         """Go on with these pages, which hold the fresh ones as well."""
         self.kept, self.fresh, self.waiting, self._timed = pages, [], 0, None
-
-    @property
-    def known_cells(self) -> int:
-        """How many cells have evidence."""
-        if self._known_cells is None:
-            known = np.zeros(ev.CELLS, np.bool_)
-            known[self.kept.marks[:, 0]] = True
-            for pages in self.fresh:
-                known[pages.cells.view(CELL)["cell"]] = True
-            self._known_cells = int(np.count_nonzero(known))
-        return self._known_cells
 
     def settled(self) -> CompactPages:
         """All pages, in the order of tier and index, each cell's newest spans apart."""

@@ -10,7 +10,8 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import JOURNAL_FILE, Store
@@ -25,7 +26,8 @@ from protocol.errors import QueryError, Refusal, SitegridError
 
 FEW_ROWS = 8  # may be left to the writer's thread: some ms
 MOST_ROUNDS = 20  # where batches come in as fast as they are folded, the writer has to make them wait
-RETRY_S = 1.0  # after rows that could not be read
+RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after rows that could not be read; doubled, as a fold up to them may take minutes
+T = TypeVar("T")
 log = logging.getLogger("mapserver.follower.exclusion")
 
 
@@ -54,26 +56,19 @@ class Exclusion:
             return self._decisions.newest(machine)
 
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
-        """Decide what the audit may decide, which may be nothing: `machines` names its verdicts in any case."""
+        """Decide what the audit may decide, which may be nothing: `machines` names its verdicts in any case.
+
+        Raises QueryError as `decide` does; the audit then decides the same the next time.
+        """
         if self._writer.config.trust.exclude:
-            with self._changed:
-                decisions = self._decisions.judge(verdicts, stamp_ns)
-            for decision in decisions:
-                self.decide(decision)
+            self._write(lambda store: self._judge(store, verdicts, stamp_ns))
 
     def decide(self, decision: TrustDecision) -> int:
         """Keep a decision on disk, then have the map folded so; returns its number, to wait for.
 
         Raises QueryError where it cannot be written: nothing has changed then.
         """
-        try:
-            number = self._writer.run(lambda store: self._keep(store, decision))
-        except (sqlite3.Error, OSError) as error:
-            problem = f"the decision about `{decision.machine}` cannot be written, so it does not count: {error}"
-            raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
-        values = (decision.machine, decision.trusted, decision.by, decision.reason)
-        log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
-        return number
+        return self._write(lambda store: self._keep(store, decision))
 
     def wait(self, number: int, wait_s: float) -> None:
         """Wait until a decision, which is kept, counts in the map; QueryError after wait_s."""
@@ -93,9 +88,27 @@ class Exclusion:
         self._thread.join()
         self._reader.close()
 
+    def _write(self, work: Callable[[Store], T]) -> T:
+        """Have work done on the writer's thread, one at a time: what is in memory is what is on disk, in its order."""
+        try:
+            return self._writer.run(work)
+        except TimeoutError:  # an OSError, but the work still waits
+            problem = "the server has not written the decision yet, and may still do so; ask for `machines`"
+            raise QueryError(Refusal.AFTER_TIMEOUT, problem) from None
+        except (sqlite3.Error, OSError) as error:
+            problem = f"the decision cannot be written, so it does not count: {error}"
+            raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
+
+    def _judge(self, store: Store, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
+        with self._changed:
+            decisions = self._decisions.judge(verdicts, stamp_ns)
+        for decision in decisions:
+            self._keep(store, decision)
+
     def _keep(self, store: Store, decision: TrustDecision) -> int:
-        """On the writer's thread, so that what is in memory is what is on disk, also where nobody waits any more."""
         store.decide(decision)
+        values = (decision.machine, decision.trusted, decision.by, decision.reason)
+        log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
         with self._changed:
             self._decisions.add(decision)
             self._wanted = self._decisions.distrusted
@@ -105,28 +118,39 @@ class Exclusion:
 
     def _run(self) -> None:
         """Have the map follow the decisions; those that were made in the meantime are followed together."""
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._ending or self._folded < self._decided)
-                if self._ending:
-                    return
-                number, excluded = self._decided, self._wanted
-            try:
-                follows = self._follow(excluded)
-                problem = ""
-            except (SitegridError, OSError) as error:
-                follows, problem = False, str(error)
-                log.error("follower failed job=exclusion error=%r", problem)
-            except Exception:  # a bug here must not end the server, nor pass unseen
-                follows, problem = False, "the server failed; see its log"
-                log.exception("follower failed job=exclusion")
+        retry_s = RETRY_S
+        while decided := self._next():
+            number, excluded = decided
+            follows, problem = self._attempt(excluded)
             with self._changed:
                 self._problem = problem
                 if follows:
                     self._folded = number
                     self._changed.notify_all()
-                elif problem:
-                    self._changed.wait_for(lambda: self._ending, RETRY_S)
+            retry_s = self._pause(number, retry_s) if problem else RETRY_S
+
+    def _next(self) -> tuple[int, frozenset[str]] | None:
+        """Wait for decisions that the map does not follow yet: how many there are, and whom they leave out."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ending or self._folded < self._decided)
+            return None if self._ending else (self._decided, self._wanted)
+
+    def _pause(self, number: int, retry_s: float) -> float:
+        """Wait after a fold that failed, unless something else is decided; returns how long the next time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ending or self._decided > number, retry_s)
+        return min(2 * retry_s, MOST_RETRY_S)
+
+    def _attempt(self, excluded: frozenset[str]) -> tuple[bool, str]:
+        """Whether the map follows, and what keeps it from that."""
+        try:
+            return self._follow(excluded), ""
+        except (SitegridError, OSError) as error:
+            log.error("follower failed job=exclusion error=%r", str(error))
+            return False, str(error)
+        except Exception:  # a bug here must not end the server, nor pass unseen
+            log.exception("follower failed job=exclusion")
+            return False, "the server failed; see its log"
 
     def _follow(self, excluded: frozenset[str]) -> bool:
         """Have a map without these machines; whether it is there, else it is to be another one meanwhile."""
@@ -149,7 +173,7 @@ class Exclusion:
         replaced.clear()  # here: to let go of a grid takes time that the writer's thread does not have
         release_memory()
         values = (",".join(sorted(excluded)), rounds, time.monotonic() - began_s)
-        log.info("map folded again without=%s rounds=%d seconds=%.1f", *values)
+        log.warning("map folded again without=%s rounds=%d seconds=%.1f", *values)
         return True
 
     def _superseded(self, excluded: frozenset[str]) -> bool:

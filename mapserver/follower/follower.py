@@ -1,21 +1,27 @@
-"""The follower: a thread beside the writer that runs three jobs in turn, and one that folds the map again."""
+"""The follower: a thread beside the writer that runs four jobs in turn, and one that folds the map again."""
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from typing import Any
 
+from mapserver.follower.checkpointing import Checkpointing
 from mapserver.follower.exclusion import Exclusion
 from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Publish
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.reader import JournalReader
+from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
 from protocol.queries.answers import GroundChange
 
-TURN_S = 1.0  # between two turns: how late a change of the ground is published
+# Between two turns, which is how late a change of the ground is published: where a large fleet drives everywhere at
+# once, each turn looks at all of the map again, and no more than a share of one core should go into that.
+TURN_S, LATEST_S = 1.0, 5.0
+SHARE = 0.2
 log = logging.getLogger("mapserver.follower.follower")
 
 
@@ -25,14 +31,15 @@ class Follower:
     publish: is given each change when it is new or grows.
     """
 
-    def __init__(self, writer: Writer, publish: Publish) -> None:
+    def __init__(self, writer: Writer, publish: Publish, past: Past) -> None:
         self._writer = writer
         self._reader = reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ending = threading.Event()
         self._exclusion = Exclusion(writer)
         self._audit = Audit(writer, reader, self._exclusion.judge, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
-        self._jobs = (self._audit, self._changes, Archiving(writer, reader, self._ending))
+        self._checkpointing = Checkpointing(writer, reader, past, self._ending)
+        self._jobs = (self._audit, self._changes, Archiving(writer, reader, self._ending), self._checkpointing)
         self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
         self._thread.start()
 
@@ -68,6 +75,7 @@ class Follower:
         self._ending.set()
         self._exclusion.close()
         self._thread.join()
+        self._checkpointing.close()
         self._reader.close()
 
     def _machine(self, name: str, sent: dict[str, int]) -> dict[str, Any]:
@@ -94,6 +102,7 @@ class Follower:
 
     def _run(self) -> None:
         while not self._ending.is_set():
+            began_s = time.thread_time()
             for job in self._jobs:
                 if self._ending.is_set():
                     break
@@ -103,4 +112,9 @@ class Follower:
                     log.error("follower failed job=%s error=%r", job.name, str(error))
                 except Exception:  # a bug here must not end the server, nor pass unseen
                     log.exception("follower failed job=%s", job.name)
-            self._ending.wait(TURN_S)
+            self._ending.wait(pause_s(time.thread_time() - began_s))
+
+
+def pause_s(worked_s: float) -> float:
+    """How long to wait after a turn that took so much processor time."""
+    return min(max(TURN_S, worked_s * (1 / SHARE - 1)), LATEST_S)

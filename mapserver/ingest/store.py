@@ -22,14 +22,16 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
 from mapserver.ingest.batches import decode_batches
-from mapserver.ingest.lock import hold
+from mapserver.ingest.losses import by_machine, name_shortfalls
+from mapserver.ingest.store_folder import hold
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
 from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
+from mapserver.past import checkpoints
 from mapserver.trust.decisions import KIND as TRUST
-from mapserver.trust.decisions import TrustDecision, TrustDecisions
+from mapserver.trust.decisions import TrustDecision, TrustDecisions, last_counted
 from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
@@ -39,7 +41,6 @@ from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
-
 JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
@@ -80,23 +81,32 @@ class Store:
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
-            last_row = self.journal.last_row
-            self.excluded = TrustDecisions(self.journal.events(TRUST)).distrusted
+            self.excluded, last_row = TrustDecisions(self.journal.events(TRUST)).distrusted, self.journal.last_row
+            self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
+            checkpoints.remove_beyond(folder, last_row)
             self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
             self.snapshot_row = self.merged
+            in_snapshot = self.grid.counts()
             fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
             release_memory()
-            self.merged = last_row
+            self.merged, counts = last_row, self.grid.counts()
+            tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
+            self._snapshot_samples = self.journal.samples - tail
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
-            self.fact = self._last_fact()
+            self.fact = last_counted(self.journal.events(TRUST), self.excluded)
             self._opened = opened.pop_all()
 
     @property
     def journalled(self) -> int:
         """The last row on disk."""
         return self.journal.last_row
+
+    @property
+    def samples_behind(self) -> int:
+        """How many samples the newest snapshot lacks: a start would have to fold them."""
+        return self.journal.samples - self._snapshot_samples
 
     @property
     def newest_ns(self) -> int:
@@ -138,13 +148,13 @@ class Store:
         """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
         if self.merged <= self.snapshot_row:
             return None
-        row, grid, excluded = self.merged, self.grid, self.excluded
+        row, grid, excluded, samples = self.merged, self.grid, self.excluded, self.journal.samples
         state = grid.state()
 
         def write() -> None:
             snapshot.save(self.folder, row, state, self.site.cell_m, self.config.fold, excluded)
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
-                self.snapshot_row = row
+                self.snapshot_row, self._snapshot_samples = row, samples
 
         return write
 
@@ -157,13 +167,13 @@ class Store:
         for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
             grid.fold_all(rows.samples, rows.names())
         self.grid, self.excluded = grid, excluded
-        self.fact = self._last_fact()
-        self.snapshot_row = 0  # what is on disk has other machines in it
+        self.fact = last_counted(self.journal.events(TRUST), self.excluded)
+        self.snapshot_row = self._snapshot_samples = 0  # what is on disk has other machines in it
 
     def decide(self, decision: TrustDecision) -> None:
         """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
         self.journal.append_event(TRUST, decision.stamp_ns, asdict(decision))
-        self.fact = self._last_fact()
+        self.fact = last_counted(self.journal.events(TRUST), self.excluded)
 
     def accept(self, store: str, reason: str) -> None:
         """Take the place of another store for good, since a person says so: its runs are taken on here."""
@@ -177,7 +187,8 @@ class Store:
         self._opened.close()
 
     def info(self) -> dict[str, Any]:
-        """State of the store in plain values."""
+        """State of the store in plain values, from counters."""
+        counts = self.grid.counts()
         return {
             "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
             "store": self.identity.id,
@@ -187,29 +198,24 @@ class Store:
             "journalled": self.journalled,
             "merged": self.merged,
             "snapshot": self.snapshot_row,
-            "samples_merged": self.grid.folded,
-            "samples_too_unsure": self.grid.skipped,
-            "cells": self.grid.known_cells(),
-            "bounds": self.grid.bounds(),
+            "samples_merged": counts.folded,
+            "samples_too_unsure": counts.skipped,
+            "cells": counts.cells,
+            "bounds": counts.bounds,
+            "first_ns": self.grid.oldest_ns,
             "stamp_ns": self.newest_ns,
             "wall_ns": self.now_ns(),
             "version": package_version(),
             "server": {"host": socket.gethostname(), "pid": os.getpid()},
             "machines": self.machines(),
             "distrusted": sorted(self.excluded),
+            "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
             "counters": dict(self.counters),
         }
 
     def machines(self) -> dict[str, dict[str, int]]:
-        """What each machine sent: spools, samples, samples that it declared lost, newest stamp."""
-        machines: dict[str, dict[str, int]] = {}
-        for (machine, _), mark in self.journal.watermarks().items():
-            entry = machines.setdefault(machine, {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0})
-            entry["spools"] += 1
-            entry["samples"] += mark.seq - mark.lost
-            entry["lost"] += mark.lost
-            entry["newest_ns"] = max(entry["newest_ns"], mark.newest_ns)
-        return machines
+        """What each machine sent and lost; see `by_machine`."""
+        return by_machine(self.journal, self.shortfalls)
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
         """What each batch holds, or why it is refused; one that is not signed is not looked at."""
@@ -261,15 +267,6 @@ class Store:
         is_there = last_row > self.journal.archived_row
         return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
 
-    def _last_fact(self) -> int:
-        """Number of the last decision up to which the decisions exclude whom the map excludes; 0 for none."""
-        decisions, fact = TrustDecisions(()), 0
-        for event in self.journal.events(TRUST):
-            decisions.add(TrustDecision(**event.body))
-            if decisions.distrusted == self.excluded:
-                fact = event.id
-        return fact
-
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count what became of a batch, once it is certain."""
         if isinstance(answer, Refused):
@@ -278,6 +275,8 @@ class Store:
             self.counters["batches"] += len(admission.batch.rows) > 0
             self.counters["samples_trimmed"] += admission.trimmed
             self.counters["samples_lost"] += admission.lost
+            if admission.lost:
+                log.warning("declared lost machine=%s samples=%d", admission.batch.machine, admission.lost)
 
     def _fold(self, batches: list[SampleBatch]) -> None:
         """Fold what was committed: all of it that there is, up to the last journal row."""

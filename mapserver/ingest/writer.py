@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import logging
-import queue
+import math
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from mapserver.ingest.backlog import Backlog, Pace, size_of
 from mapserver.ingest.merge_waits import MergeWaits
+from mapserver.ingest.snapshot_times import SnapshotTimes
 from mapserver.ingest.store import Incoming, Store
 from protocol.errors import QueryError, Refusal
+from protocol.queries.answers import ServerAlive
 from protocol.wire.messages import Ack, Refused
 
 T = TypeVar("T")
 Reply = Callable[[Ack | Refused], None]
+_Batch = tuple[Incoming, Reply]
 log = logging.getLogger("mapserver.ingest.writer")
 
-QUEUE_BATCHES = 256  # so many batches may wait before machines have to send again later; some MB
-GROUP_BATCHES = 64  # committed together at most: one sync to disk for all of them
-SNAPSHOT_ROWS = 2000  # a burst of so many rows brings the next snapshot forward: the next start would have to fold them
+COMMIT_EVERY_S = 0.01  # at most: a commit costs a sync, some pages and 0.5 ms, however few batches are in it
+HANGS_S = 30.0  # at one piece of work: a group or a look takes less than a second, a disk that hangs for ever
 
 
 @dataclass(frozen=True)
@@ -40,53 +44,84 @@ class Writer:
     waits: who waits for a row to be merged.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, clock: Callable[[], float] = time.monotonic) -> None:
+        """clock: steady, in seconds."""
         self.site, self.config, self.folder, self.now_ns = store.site, store.config, store.folder, store.now_ns
         self.store_id = store.identity.id
-        self._snapshot_s = self.config.store.snapshot_s
-        self._store = store
-        self._batches: queue.Queue[tuple[Incoming, Reply] | _Work | None] = queue.Queue()
-        self._waiting = threading.Semaphore(QUEUE_BATCHES)
-        self._overloaded = 0
+        self._store, self._clock = store, clock
+        self._turn = threading.Condition()  # of all that waits
+        self._backlog: Backlog[_Batch] = Backlog()
+        self._group: list[_Batch] = []  # of this turn, as far as nobody has an answer
+        self._works: deque[_Work] = deque()
+        self._pace = Pace()
+        self._refusals: Counter[str] = Counter()  # of what never comes to the store
+        self._is_closing = False
+        self._ended = ""  # why nothing is taken any more
+        self._busy_since_s: float | None = None
+        self._committed_s = -math.inf  # when the last commit began
         self.waits = MergeWaits(store.merged)
         self.failed = False
+        self._times = SnapshotTimes(self.config.store.snapshot_s, clock())
         self._snapshots = ThreadPoolExecutor(1, thread_name_prefix="snapshot")
-        self._snapshot: Future[None] = Future()
-        self._snapshot.set_result(None)
         self._thread = threading.Thread(target=self._guard, name="writer", daemon=True)
         self._thread.start()
 
     def submit(self, incoming: Incoming, reply: Reply) -> None:
-        """Hand in a batch; `reply` is called on the owner's thread, at once here if too many are waiting."""
-        if not self._waiting.acquire(blocking=False):
-            self._overloaded += 1
-            reply(Refused(Refusal.OVERLOADED, "too many batches are waiting; send this one again later"))
-            return
-        self._batches.put((incoming, reply))
+        """Hand in a batch; `reply` is called on the owner's thread, or at once for one that has to come again later."""
+        with self._turn:
+            ended = self._ended
+            gone = [] if ended else self._backlog.add(incoming.machine, size_of(incoming.payload), (incoming, reply))
+            self._refusals[f"refused_{Refusal.OVERLOADED}"] += len(gone)
+            retry_after_s = self._pace.retry_after_s(self._backlog.size)
+            self._turn.notify()
+        if ended:
+            reply(Refused(Refusal.STORE, ended))
+        for _, overloaded in gone:
+            problem = "too many batches are waiting; send this one again later"
+            overloaded(Refused(Refusal.OVERLOADED, problem, retry_after_s=retry_after_s))
 
     def run(self, work: Callable[[Store], T], timeout_s: float = 60.0) -> T:
         """Run `work` on the owner's thread, between two groups of batches, and return its result."""
         result: Future[T] = Future()
-        self._batches.put(_Work(work, result))
+        with self._turn:
+            if self._ended:
+                raise QueryError(Refusal.STORE, self._ended)
+            self._works.append(_Work(work, result))
+            self._turn.notify()
         return result.result(timeout_s)
 
     def count_refusal(self, reason: str) -> None:
-        """Count a refused query, soon: nobody waits for that."""
-        self._batches.put(_Work(lambda store: store.counters.update({f"refused_query_{reason}": 1}), Future()))
+        """Count a refused query."""
+        with self._turn:
+            self._refusals[f"refused_query_{reason}"] += 1
+
+    def alive(self) -> ServerAlive:
+        """Whether batches are taken, without waiting for the owner; QueryError where it has ended, or hangs."""
+        if self._ended:
+            raise QueryError(Refusal.STORE, self._ended)
+        since_s = self._busy_since_s
+        busy_s = 0.0 if since_s is None else max(0.0, self._clock() - since_s)
+        if busy_s > HANGS_S:
+            problem = f"the writer has been at one piece of work for {busy_s:.0f} s; look at the server's disk and log"
+            raise QueryError(Refusal.STORE, problem)
+        return ServerAlive(self.store_id, self._store.journalled, self._store.merged, busy_s)
 
     def info(self) -> dict[str, Any]:
         """State of the store."""
         info = self.run(Store.info)
         commits, commit_s = self._store.commits, self._store.commit_s
-        info["writer"] = {"waiting": self._batches.qsize(), "commits": commits, "commit_s": commit_s}
-        if self._overloaded:
-            info["counters"][f"refused_{Refusal.OVERLOADED}"] = self._overloaded
+        waiting = {"waiting": len(self._backlog), "waiting_bytes": self._backlog.size}
+        info["writer"] = {**waiting, "commits": commits, "commit_s": commit_s}
+        with self._turn:
+            info["counters"] |= +self._refusals
         return info
 
     def close(self) -> None:
         """Finish what is waiting, snapshot, close; once more does nothing."""
         self.waits.close()
-        self._batches.put(None)
+        with self._turn:
+            self._is_closing = True
+            self._turn.notify()
         self._thread.join()
 
     def _guard(self) -> None:
@@ -94,84 +129,87 @@ class Writer:
         try:
             self._serve()
         except Exception:
-            self.failed = True
+            with self._turn:  # what comes from here on is refused by who hands it in
+                self.failed, self._ended = True, "the server's writer has failed; restart the server"
             log.critical("writer failed", exc_info=True)
             self._refuse_all()
-        else:
-            self._snapshot.result()
-            self._save_snapshot()
-        finally:
             self._snapshots.shutdown()
+        else:
+            self._snapshots.shutdown()
+            if write := self._store.snapshot():
+                self._written(write)
+        finally:
             self._store.close()
 
     def _refuse_all(self) -> None:
-        """Leave nobody waiting until the process ends."""
-        problem = "the server's writer has failed; restart the server"
-        while (item := self._batches.get()) is not None:
-            if isinstance(item, _Work):
-                item.result.set_exception(QueryError(Refusal.STORE, problem))
-            else:
-                self._waiting.release()
-                item[1](Refused(Refusal.STORE, problem))
+        """Leave nobody waiting."""
+        while self._group:
+            for _, reply in self._group:
+                reply(Refused(Refusal.STORE, self._ended))
+            self._group = self._backlog.take()
+        for item in self._works:
+            item.result.set_exception(QueryError(Refusal.STORE, self._ended))
 
     def _serve(self) -> None:
-        tried_row = self._store.snapshot_row
-        next_snapshot_s = time.monotonic() + self._snapshot_s
-        while (first := self._next(next_snapshot_s)) is not None:
-            if isinstance(first, _Work):
-                _answer(first, self._store)
-            elif first:
-                self._commit_group(first)
-            if self._store.merged - tried_row >= SNAPSHOT_ROWS or time.monotonic() >= next_snapshot_s:
+        while self._next():
+            self._busy_since_s = self._clock()
+            if self._group:
+                self._commit()
+            for _ in range(len(self._works)):  # those that come meanwhile wait for the next group
+                _answer(self._works.popleft(), self._store)
+            if self._clock() >= self._times.due_s(self._store.samples_behind):
                 self._save_snapshot()
-                tried_row = self._store.merged
-                next_snapshot_s = time.monotonic() + self._snapshot_s
+            self._busy_since_s = None
 
-    def _next(self, deadline_s: float) -> tuple[Incoming, Reply] | _Work | tuple[()] | None:
-        """Return the next piece of work, () when it is time for a snapshot, None to end."""
-        try:
-            return self._batches.get(timeout=max(0.0, deadline_s - time.monotonic()))
-        except queue.Empty:
-            return ()
+    def _next(self) -> bool:
+        """Wait until there are batches, work of others, or a snapshot to take; False to end."""
+        with self._turn:
+            if not (self._backlog or self._works or self._is_closing):
+                wait_s = self._times.due_s(self._store.samples_behind) - self._clock()
+                self._turn.wait(min(max(0.0, wait_s), threading.TIMEOUT_MAX))
+            is_early = self._backlog and self._gather()
+            self._group = [] if is_early else self._backlog.take()
+            if self._is_closing and not (self._group or self._works):
+                self._ended = "the server is ending"
+            return not self._ended
 
-    def _commit_group(self, first: tuple[Incoming, Reply]) -> None:
-        group, works, ending = [first], [], False
-        while len(group) < GROUP_BATCHES and not ending:
-            try:
-                item = self._batches.get_nowait()
-            except queue.Empty:
-                break
-            if isinstance(item, _Work):
-                works.append(item)
-            elif item is None:
-                ending = True
-            else:
-                group.append(item)
-        if ending:
-            self._batches.put(None)
-        answers = self._store.commit([incoming for incoming, _ in group])
+    def _gather(self) -> bool:
+        """Let more batches come for the next commit, where the last one is not long ago; True if work comes first."""
+        wait_s = self._committed_s + COMMIT_EVERY_S - self._clock()
+        came = wait_s > 0 and self._turn.wait_for(lambda: self._works or self._is_closing, wait_s)
+        return bool(came) and not self._is_closing
+
+    def _commit(self) -> None:
+        began_s = self._committed_s = self._clock()
+        answers = self._store.commit([incoming for incoming, _ in self._group])
+        self._pace.worked(sum(size_of(incoming.payload) for incoming, _ in self._group), self._clock() - began_s)
         self.waits.advance(self._store.merged)
-        for (incoming, reply), answer in zip(group, answers, strict=True):
-            self._waiting.release()
+        for answer in answers:
+            incoming, reply = self._group.pop(0)
             if isinstance(answer, Refused):
                 log.warning("refused machine=%s reason=%s problem=%r", incoming.machine, answer.reason, answer.problem)
             reply(answer)
-        for item in works:
-            _answer(item, self._store)
 
     def _save_snapshot(self) -> None:
-        """Have a snapshot written beside the work; one that is still being written puts the next off."""
-        if self._snapshot.done() and (write := self._store.snapshot()):
-            self._snapshot = self._snapshots.submit(_written, write)
+        """Have a snapshot written beside the work."""
+        self._times.began(self._clock())
+        if write := self._store.snapshot():
+            self._snapshots.submit(self._written, write)
+        else:
+            self._times.ended(self._clock())
 
-
-def _written(write: Callable[[], None]) -> None:
-    try:
-        write()
-    except OSError as error:  # the journal is the truth; a missing snapshot only makes the next start longer
-        log.error("snapshot failed error=%r", str(error))
-    except Exception:  # a bug; it must not pass unseen, nor keep the last snapshot from being tried
-        log.exception("snapshot failed")
+    def _written(self, write: Callable[[], None]) -> None:
+        failed = True
+        try:
+            write()
+            failed = False
+        except OSError as error:  # the journal is the truth; a missing snapshot only makes the next start longer
+            log.error("snapshot failed error=%r", str(error))
+        except Exception:  # a bug; it must not pass unseen, nor keep the last snapshot from being tried
+            log.exception("snapshot failed")
+        self._times.ended(self._clock(), failed=failed)
+        with self._turn:
+            self._turn.notify()  # who waits for the owner counts the time anew
 
 
 def _answer(item: _Work, store: Store) -> None:

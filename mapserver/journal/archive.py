@@ -30,6 +30,7 @@ FILE_SAMPLES = 2_000_000  # about; an hour with more is cut into several files
 GROUP_SAMPLES = 50_000  # of a row group, about: a batch is never cut
 HOUR_NS = 3_600_000_000_000
 TEMPORARY = "next.parquet.tmp"
+READABLE = 0o640  # its files never change and are for other programs too: their users come into its owner's group
 ReceivedRow = tuple[JournalRow, int]  # and when it came in [ns]
 
 
@@ -66,6 +67,11 @@ class Archive:
         if reached < until:
             problem = f"the file with row {reached + 1} is missing; restore it from a backup"
             raise StoreError(self.folder, problem)
+
+    def next_stamp(self, from_ns: int) -> int | None:
+        """The least stamp from `from_ns` on of all files; None for none."""
+        stamps = (self.open(path).next_stamp(from_ns) for path in self.paths())
+        return min((stamp for stamp in stamps if stamp is not None), default=None)
 
 
 def archive(
@@ -167,7 +173,7 @@ def write_file(folder: Path, store: str, site: SiteConfig, rows: Iterator[Receiv
     temporary = folder / TEMPORARY
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(temporary) as file:
+        with whole_file(temporary, READABLE) as file:
             last_row = write_parquet(file, store, site, chain([first], (row for row, _ in rows)))
             seal(file)
         hour = datetime.fromtimestamp(received_ns // HOUR_NS * 3600, UTC).strftime("%Y-%m-%dT%H")

@@ -102,6 +102,15 @@ class ArchiveFile:
             if len(rows := _rows(file.read_row_group(group), after, until, selection)):
                 yield rows
 
+    def next_stamp(self, from_ns: int) -> int | None:
+        """The least stamp from `from_ns` on; None for none. Only row groups that reach across it are read."""
+        first_ns = self._groups.first_ns
+        stamps = first_ns[first_ns >= from_ns].tolist()
+        for rows in self.read_many(selection=Selection(from_ns=from_ns, to_ns=min(stamps, default=LAST) - 1)):
+            some = rows.samples["stamp_ns"]
+            stamps.append(int(some[some >= from_ns].min()))
+        return min(stamps, default=None)
+
 
 def row_range(path: Path) -> tuple[int, int]:
     """First and last journal row of a file, by its name."""

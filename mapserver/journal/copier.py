@@ -13,12 +13,10 @@ import numpy as np
 
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import LAST
-from mapserver.journal.rows import Admission, JournalRow, Selection, Watermark
+from mapserver.journal.rows import Admission, JournalRow, Selection, SpoolKey, Watermark
 from protocol.arrays import Bools
 from protocol.errors import StoreError
 from protocol.wire.messages import SampleBatch
-
-SpoolKey = tuple[str, int]  # machine, spool_id
 
 
 def merged(sources: Sequence[tuple[str, int, Iterator[JournalRow]]]) -> Iterator[tuple[str, JournalRow]]:

@@ -11,31 +11,45 @@ import json
 import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mapserver.journal.progress import Progress
 from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
 from mapserver.journal.records import extent_of, record
-from mapserver.journal.rows import Admission, JournalRow, Watermark, checksum, extent_checksum
+from mapserver.journal.rows import Admission, JournalRow, MachineTotals, Watermark, checksum, extent_checksum
+from mapserver.journal.shortfall import EVENT, ROW, Shortfall, compare, marked, spool_name
+from mapserver.journal.shortfall import KIND as SHORTFALL
+from protocol.disk.high_water_mark import HighWaterMark, mark_path
+from protocol.disk.traces import Traces, look_beside
 from protocol.errors import StoreError
+from protocol.files import make_private
 
+_LAST_EVENT = "SELECT COALESCE(MAX(id), 0) FROM events"
 _WAL_LIMIT = 64 * 2**20
 SPARE = 0.25  # share of free pages above which a file is made smaller
 
 
 class Journal(JournalQueries):
-    """One writer's connection to the journal of one site. StoreError where anything in it is damaged (`check`)."""
+    """One writer's connection to the journal of one site. StoreError where anything in it is damaged (`check`).
+
+    shortfall: what was acknowledged and was not in it when it was opened now, None where nothing is missing.
+    """
 
     last_row: int
+    shortfall: Shortfall | None = None
 
     def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
         """descends: ids of the stores that a new one is made from."""
         self.path = path
+        self._changed: dict[str, int] = {}  # by the open transaction, for the mark
         path.parent.mkdir(parents=True, exist_ok=True)
+        traces = look_beside(path)  # before SQLite drops what it cannot use
         with ExitStack() as opened:
             try:
+                make_private(path)
                 self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
                 opened.callback(self._db.close)
                 self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")  # only a new file takes it
@@ -45,17 +59,29 @@ class Journal(JournalQueries):
                 self._create_or_check(site, frame, descends)
                 self.check()
                 self._return_to_disk()
-            except sqlite3.Error as error:
+                self._mark = HighWaterMark(mark_path(path))
+                opened.callback(self._mark.close)
+                self._compare(traces)
+            except (sqlite3.Error, OSError) as error:
                 raise StoreError(path, f"is no usable journal: {error}") from None
             opened.pop_all()
 
     def watermark(self, machine: str, spool_id: int) -> Watermark:
         """Progress of a spool."""
-        return self._watermarks.get((machine, spool_id), Watermark())
+        return self._progress.watermark(machine, spool_id)
 
     def watermarks(self) -> dict[tuple[str, int], Watermark]:
         """Progress of all spools."""
-        return dict(self._watermarks)
+        return self._progress.watermarks()
+
+    def machines(self) -> dict[str, MachineTotals]:
+        """What each machine sent."""
+        return self._progress.machines()
+
+    @property
+    def samples(self) -> int:
+        """How many samples all machines sent."""
+        return self._progress.samples
 
     def begin(self) -> None:
         """Open a transaction; rows appended from here on are one group commit."""
@@ -86,11 +112,15 @@ class Journal(JournalQueries):
         """Write a watermark into the open transaction."""
         values = (machine, _spool_bytes(spool_id), watermark.seq, watermark.lost, watermark.newest_ns)
         self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", (*values, checksum(*values)))
-        self._watermarks[machine, spool_id] = watermark
+        self._progress.put(machine, spool_id, watermark)
+        self._changed[spool_name(machine, spool_id)] = watermark.seq
 
     def commit(self) -> None:
         """Commit to disk; only then may anything be acknowledged."""
         self._db.execute("COMMIT")
+        if self._changed:
+            self._mark.write({ROW: self.last_row, **self._changed})
+            self._changed.clear()
 
     def rollback(self) -> None:
         """Give up the open transaction and return to what is on disk."""
@@ -102,10 +132,17 @@ class Journal(JournalQueries):
         """Commit an event, outside of any other transaction; returns its number."""
         text = json.dumps(body, allow_nan=False)
         with self._transaction():
-            number = self._number("SELECT COALESCE(MAX(id), 0) + 1 FROM events")
+            number = self._number(_LAST_EVENT) + 1
             values = (number, kind, stamp_ns, text)
             self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
+            self._changed[EVENT] = number
         return number
+
+    def note_shortfall(self, shortfall: Shortfall) -> None:
+        """Keep what is missing as an event; no file that proves it is needed from then on."""
+        self.shortfall = shortfall
+        newest_ns = max((mark.newest_ns for mark in self.watermarks().values()), default=0)
+        self.append_event(SHORTFALL, newest_ns, shortfall.body())
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
         """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.
@@ -136,6 +173,7 @@ class Journal(JournalQueries):
         """Fold the write-ahead log into the file and close."""
         self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         self._db.close()
+        self._mark.close()
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -155,15 +193,41 @@ class Journal(JournalQueries):
             store = " ".join((*words, f"{checksum(*words):08x}"))
             self._db.executemany("INSERT INTO meta VALUES (?, ?)", {**expected, "store": store}.items())
             self._db.execute("COMMIT")
+            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # no damage of a log takes the store's id away
         meta = self._meta()
         for key, value in expected.items():
             if meta.get(key) != value:
                 problem = f"the store has {key} {meta.get(key)!r}, this server {value!r}; choose another --store"
                 raise StoreError(self.path, problem)
 
+    def _compare(self, traces: Traces) -> None:
+        """Compare what there is with the mark and the log beside it, and name what is missing."""
+        present = marked(self.last_row, self._number(_LAST_EVENT), self.watermarks())
+        if shortfall := compare(traces, present):
+            with suppress(OSError):  # a full disk: the shortfall is named all the same
+                traces.keep_log(self.last_row)
+            self._require_agreement()
+            self.note_shortfall(shortfall)
+        with suppress(OSError):  # it stays behind, which is no alarm, or is compared again
+            self._mark.replace(marked(self.last_row, self._number(_LAST_EVENT), self.watermarks()))
+
+    def _require_agreement(self) -> None:
+        """StoreError where pages of different times are in the file, as a damaged log may leave them.
+
+        A watermark behind its rows would take their samples once more.
+        """
+        ((verdict,), *_) = self._query("PRAGMA integrity_check(1)")
+        reached = all(row.first_seq + len(row.rows) - 1 <= self._seq_of(row) for row in self.read(self.archived_row))
+        if verdict != "ok" or not reached:
+            raise self._damaged("what its write-ahead log left")
+
+    def _seq_of(self, row: JournalRow) -> int:
+        return self.watermark(row.machine, row.spool_id).seq
+
     def _return_to_disk(self) -> None:
-        self._watermarks = self._load_watermarks()
+        self._progress = Progress(self._load_watermarks())
         self.last_row = self._last_row()
+        self._changed.clear()
 
 
 def _spool_bytes(spool_id: int) -> bytes:

@@ -123,6 +123,23 @@ class JournalQueries:
             if is_end:
                 return
 
+    def stamps_by_chunk(self, after: int, until: int, chunk: int) -> list[tuple[int, int, int]]:
+        """Chunks of so many rows among after < row <= until: number, least and greatest stamp of each."""
+        query = "SELECT (row - 1) / ?, MIN(first_stamp_ns), MAX(last_stamp_ns) FROM extent"
+        return self._query(f"{query} WHERE row > ? AND row <= ? GROUP BY 1", (chunk, after, until))
+
+    def least_stamp(self, after: int, until: int, from_ns: int) -> int | None:
+        """The least stamp of rows after < row <= until, `from_ns` of a row that reaches across it; None for none."""
+        query = "SELECT MIN(MAX(first_stamp_ns, ?)) FROM extent WHERE last_stamp_ns >= ? AND row > ? AND row <= ?"
+        ((stamp,),) = self._query(query, (from_ns, from_ns, after, until))
+        return None if stamp is None else int(stamp)
+
+    def rows_before(self, after: int, until: int, stamp_ns: int) -> int:
+        """How many of the rows after < row <= until have a stamp before a time; of archived ones none is counted."""
+        query = "SELECT COUNT(*) FROM extent WHERE first_stamp_ns < ? AND row > ? AND row <= ?"
+        ((count,),) = self._query(query, (stamp_ns, after, until))
+        return int(count)
+
     def identity(self) -> StoreIdentity:
         """Which store this is; StoreError where that is damaged."""
         words = self._meta().get("store", "").split()

@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.workers import ALONE, Workers
 from mapserver.journal.history import History, read_history
 from mapserver.journal.reader import LAST
 from mapserver.journal.rows import ALL, Selection
+from protocol.arrays import Table
 
-# The kernels run beside each other, what is Python between them does not.
-THREADS = min(2, len(os.sched_getaffinity(0)))
+# Kernels run beside each other, what is Python between them does not. Not more are tried: docs/results/refold.md
+THREADS = min(2, os.cpu_count() or 1)
+PIECE = 16_384  # samples
+AHEAD = 24  # pieces that are read ahead: about as many as are folded at once, while nothing is taken
+Samples = tuple[Table, NDArray[np.uint64]]  # and the hashes of their machines' names
+T = TypeVar("T")
 
 
 class _StoppedError(Exception):
@@ -45,15 +55,36 @@ def fold_history(
 
     Whether it came to the end: where `stopped` says so it ends early, and the grid is of no use.
     """
+    pieces = _pieces(history, after, until, selection)
     try:
-        with lent(threads) as workers, grid.bulk(workers):
-            for rows in read_history(history, after, until, selection):
-                grid.fold_all(*rows.selected(selection))
+        with lent(threads) as workers, grid.bulk(workers), closing(ahead(pieces) if threads > 1 else pieces) as coming:
+            for samples, names in coming:
+                grid.fold_all(samples, names)
                 if stopped():
                     raise _StoppedError  # past what ends a fold in order, which takes its time
     except _StoppedError:
         return False
     return True
+
+
+def ahead(pieces: Iterator[T]) -> Generator[T, None, None]:
+    """Have the next pieces made on another thread while one is used."""
+    with ThreadPoolExecutor(1, thread_name_prefix="read") as pool:
+        try:
+            coming = deque(pool.submit(next, pieces, None) for _ in range(AHEAD))
+            while (piece := coming.popleft().result()) is not None:
+                coming.append(pool.submit(next, pieces, None))
+                yield piece
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _pieces(history: History, after: int, until: int, selection: Selection) -> Generator[Samples, None, None]:
+    """Samples in pieces, none of them long, so that those read ahead take little memory."""
+    for rows in read_history(history, after, until, selection):
+        samples, names = rows.selected(selection)
+        for first in range(0, len(samples), PIECE):
+            yield samples[first : first + PIECE], names[first : first + PIECE]
 
 
 def release_memory() -> None:

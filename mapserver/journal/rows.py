@@ -18,6 +18,7 @@ from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
 
+SpoolKey = tuple[str, int]  # machine, spool_id
 _EXTENT = struct.Struct("<3q4d")
 
 
@@ -152,6 +153,16 @@ class StoreIdentity:
 
 
 @dataclass(frozen=True)
+class MachineTotals:
+    """What one machine sent: spools, samples, samples that it declared lost, newest stamp."""
+
+    spools: int = 0
+    samples: int = 0
+    lost: int = 0
+    newest_ns: int = 0
+
+
+@dataclass(frozen=True)
 class Event:
     """Something that the server has to remember and that is no sample; body: plain values."""
 
@@ -171,7 +182,4 @@ def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float) -> int:
 
 def checksum(*values: object) -> int:
     """CRC-32 of plain values, bytes among them."""
-    crc32 = 0
-    for value in values:
-        crc32 = zlib.crc32(value if isinstance(value, bytes) else repr(value).encode(), crc32)
-    return crc32
+    return zlib.crc32(repr(values).encode())

@@ -19,7 +19,7 @@ import numpy as np
 from mapserver.evidence import cells as ev
 from mapserver.layers.gap_filling import AREA_LAYERS, Area
 from mapserver.layers.statistics import linear_count, ratio, robust_centre, robust_spread
-from protocol.arrays import AnyArray, Floats, Floats32
+from protocol.arrays import AnyArray, Floats, Floats32, Ints
 from protocol.config import require_positive
 from protocol.errors import QueryError, Refusal
 from protocol.site import ground_classes
@@ -56,11 +56,11 @@ class ReadConfig:
 class CellEvidence:
     """What the layers of cells are derived from.
 
-    evidence: of cells, arrays (cells, ...) as in Evidence. now_ns: the site's now, 0 where it is not known.
+    evidence: of cells, arrays (cells, ...) as in Evidence. now_ns (cells,): the site's now, 0 where it is not known.
     """
 
     evidence: ev.Evidence
-    now_ns: int
+    now_ns: Ints
     config: ReadConfig
 
     def votes(self, part: slice) -> Floats:
@@ -203,12 +203,17 @@ def select(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(names) or tuple(LAYERS)
 
 
-def read(evidence: ev.Evidence, names: Sequence[str], config: ReadConfig, now_ns: int = 0) -> dict[str, Floats32]:
-    """Derive layers of cells, each (blocks, 256), NaN where the evidence is too thin. now_ns: the site's now."""
+def read(
+    evidence: ev.Evidence, names: Sequence[str], config: ReadConfig, now_ns: int | Ints = 0
+) -> dict[str, Floats32]:
+    """Derive layers of cells, each (blocks, 256), NaN where the evidence is too thin.
+
+    now_ns: the site's now, one or (blocks, 1).
+    """
     metres = evidence.weight
     known = (metres > 0) & (metres >= config.min_weight_m * ev.WEIGHT_UNITS_PER_M)
     known_cells = {field.name: getattr(evidence, field.name)[known] for field in dataclasses.fields(evidence)}
-    cells = CellEvidence(ev.Evidence(**known_cells), now_ns, config)
+    cells = CellEvidence(ev.Evidence(**known_cells), np.broadcast_to(now_ns, known.shape)[known], config)
     out = {name: np.full(known.shape, np.nan, np.float32) for name in names}
     for name, values in out.items():
         values[known] = LAYERS[name](cells)
@@ -234,15 +239,19 @@ def derive_area(
 ) -> dict[str, Floats32]:
     """Make these layers, of cells or areas, from the `required` layers of cells, all (rows, columns)."""
     done: dict[str, Floats] = {name: values.astype(np.float64) for name, values in cells.items()}
+    return {name: _derived(name, done, cell_m, config).astype(np.float32) for name in names}
 
-    def derive(name: str) -> Floats:
-        if name not in done:
-            for need in AREA_LAYERS[name].needs:
-                derive(need)
-            done[name] = AREA_LAYERS[name].derive(Area(done, cell_m, config.fill_reach_m, config.boundaries))
-        return done[name]
 
-    return {name: derive(name).astype(np.float32) for name in names}
+def _derived(name: str, done: dict[str, Floats], cell_m: float, config: ReadConfig) -> Floats:
+    """One layer, with those that it needs added to `done`.
+
+    No closure: one that calls itself is a cycle, and keeps the arrays of a query until the next collection.
+    """
+    if name not in done:
+        for need in AREA_LAYERS[name].needs:
+            _derived(need, done, cell_m, config)
+        done[name] = AREA_LAYERS[name].derive(Area(done, cell_m, config.fill_reach_m, config.boundaries))
+    return done[name]
 
 
 # --- shared by layers -------------------------------------------------------------------------------------------------
@@ -258,6 +267,6 @@ def _class_votes(cells: CellEvidence) -> Floats:
     return votes
 
 
-def _seconds_ago(stamp_ns: AnyArray, now_ns: int) -> Floats:
+def _seconds_ago(stamp_ns: AnyArray, now_ns: Ints) -> Floats:
     """Time since stamps [s], not below 0; NaN where either is 0, which means not known."""
     return np.where((stamp_ns > 0) & (now_ns > 0), np.maximum(now_ns - stamp_ns, 0) / 1e9, np.nan)

@@ -121,7 +121,7 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
     counters, writer = info["counters"], info["writer"]
     queries = _without(counters, _REFUSED_QUERY)
     batches = {k: v for k, v in _without(counters, _REFUSED).items() if not k.startswith("query_")}
-    trimmed = counters.get("samples_trimmed", 0)
+    trimmed, past = counters.get("samples_trimmed", 0), info["checkpoints"]
     return [
         _counter("sitegrid_batches_total", "Batches with new samples that were taken.", counters.get("batches", 0)),
         _counter("sitegrid_batches_refused_total", "Batches that were refused.", batches, "reason"),
@@ -130,12 +130,18 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _gauge("sitegrid_journal_rows", "The last row of the journal on disk.", info["journalled"]),
         _gauge("sitegrid_merged_rows", "The last row of the journal that is in the map.", info["merged"]),
         _gauge("sitegrid_snapshot_rows", "The row that the newest snapshot is true for.", info["snapshot"]),
+        _gauge("sitegrid_checkpoints", "Checkpoints that maps of the past can begin with.", past["count"]),
+        _gauge("sitegrid_checkpoint_bytes", "Size of all checkpoints.", past["bytes"]),
+        _gauge("sitegrid_checkpoint_newest_timestamp_seconds", "Until when the newest goes.", past["newest_ns"] / 1e9),
+        _counter("sitegrid_checkpoints_passed_over_total", "Damaged ones; they are made again.", past["passed_over"]),
         _gauge("sitegrid_map_samples", "Samples that are in the map.", info["samples_merged"]),
         _gauge("sitegrid_map_samples_too_unsure", "Samples whose place is too unsure.", info["samples_too_unsure"]),
         _gauge("sitegrid_map_cells", "Cells that are known.", info["cells"]),
         _gauge("sitegrid_map_newest_timestamp_seconds", "Newest stamp of trusted machines.", info["stamp_ns"] / 1e9),
         _gauge("sitegrid_map_ahead_seconds", "How far that is ahead of the server's clock.", _ahead_s(info)),
+        _gauge("sitegrid_shortfalls", "Times that acknowledged samples were gone.", len(info["shortfalls"])),
         _gauge("sitegrid_waiting_batches", "Batches that wait to be taken.", writer["waiting"]),
+        _gauge("sitegrid_waiting_bytes", "What these batches take in memory.", writer["waiting_bytes"]),
         _counter("sitegrid_commits_total", "Commits of the journal.", writer["commits"]),
         _counter("sitegrid_commit_seconds_total", "Time spent on commits.", writer["commit_s"]),
     ]
@@ -156,6 +162,7 @@ def _machines(info: Mapping[str, Any]) -> Iterable[Metric]:
     return [
         _counter("sitegrid_machine_samples_total", "Samples of a machine that were taken.", by_machine("samples")),
         _counter("sitegrid_machine_samples_lost_total", "Samples that it declared lost.", by_machine("lost")),
+        _gauge("sitegrid_machine_samples_missing", "Acknowledged samples that are gone.", by_machine("missing")),
         _gauge("sitegrid_machine_newest_timestamp_seconds", "Its newest stamp.", by_machine("newest_ns", 1e-9)),
         _gauge("sitegrid_machine_trusted", "Whether its samples are in the map.", trusted),
     ]
@@ -173,6 +180,7 @@ def _agent_health(agents: Mapping[str, ReceivedHealth]) -> Iterable[Metric]:
         _gauge("sitegrid_agent_unsaved_samples", "Samples its disk has not taken.", of_spool("unsaved")),
         _counter("sitegrid_agent_samples_recorded_total", "Samples in its spool ever.", of_spool("recorded")),
         _counter("sitegrid_agent_samples_dropped_total", "Samples a full spool dropped.", of_spool("dropped")),
+        _counter("sitegrid_agent_samples_gone_total", "Samples that its disk has lost.", of_spool("gone")),
         _counter("sitegrid_agent_samples_aside_total", "Samples the server never takes.", of_spool("put_aside")),
         _problems(agents),
     ]
@@ -188,6 +196,7 @@ def _problems(agents: Mapping[str, ReceivedHealth]) -> Metric:
         parts = {
             "uplink": uplink.get("problem") if isinstance(uplink, Mapping) else None,
             "spool": health.values.get("spool_problem"),
+            "disk": health.values.get("spool_damage"),
             "calibration": health.values.get("calibration_problem"),
         }
         for part, problem in parts.items():

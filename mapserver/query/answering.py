@@ -12,18 +12,32 @@ from mapserver.change.detection import reach_blocks
 from mapserver.follower.follower import Follower
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
-from mapserver.journal.history import SpanEvidence
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
+from mapserver.past.cell_history import CellHistory
+from mapserver.past.past import Past
+from mapserver.query.map_tiles import Tiles, tiles_of
 from mapserver.query.tiles import TILE_BYTES, OpenRegions, Reading, TileGrid
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
+from mapserver.query.why import reasons
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
 from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
 from protocol.queries.commands import AcceptCommand, TrustCommand, parse_command
-from protocol.queries.requests import MAX_SPANS, NOW, HistoryQuery, MapQuery, PointQuery, RegionQuery, When
+from protocol.queries.map_tiles import TilesAnswer, encode_tiles
+from protocol.queries.reasons import CellReasons, encode_why
+from protocol.queries.requests import (
+    MAX_SPANS,
+    HistoryQuery,
+    MapQuery,
+    PointQuery,
+    RegionQuery,
+    TilesQuery,
+    When,
+    WhyQuery,
+)
 from protocol.site.geometry import Bounds, CellWindow
 
 SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
@@ -33,15 +47,16 @@ WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 class Answers:
     """Answers the queries of one map, from any thread."""
 
-    def __init__(self, writer: Writer, follower: Follower) -> None:
+    def __init__(self, writer: Writer, follower: Follower, past: Past) -> None:
         self._writer, self._follower = writer, follower
         self._site, self._config = writer.site, writer.config
         self._open = OpenRegions()
-        self._past = PastMaps(writer.folder / JOURNAL_FILE, self._site.cell_m, self._config)
+        self._tiles = Tiles(writer)
+        self._past = PastMaps(writer.folder / JOURNAL_FILE, past, self._config)
 
     def size(self, query: MapQuery) -> int:
         """About how many bytes the answer has."""
-        if isinstance(query, requests.TileQuery):
+        if isinstance(query, requests.TileQuery | TilesQuery):
             return TILE_BYTES
         if not isinstance(query, RegionQuery):
             return SMALL_BYTES
@@ -65,8 +80,14 @@ class Answers:
                 return codec.encode_region(self.region(query))
             case requests.TileQuery():
                 return codec.encode_region(self.tile(query))
+            case requests.TilesQuery():
+                return encode_tiles(self.tiles(query))
+            case requests.WhyQuery():
+                return encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
+            case requests.AliveQuery():
+                return codec.encode_alive(self._writer.alive())
             case requests.MachinesQuery():
                 return codec.encode_machines(self._follower.machines(), self._version())
             case requests.ChangesQuery():
@@ -76,7 +97,8 @@ class Answers:
 
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
-        return {**self._writer.info(), "layers": [*cell_layers.LAYERS, *AREA_LAYERS]}
+        names = {"layers": [*cell_layers.LAYERS, *AREA_LAYERS], "boundaries": list(self._config.read.boundaries)}
+        return {**self._writer.info(), "checkpoints": self._past.past.checkpoints.state, **names}
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
@@ -108,10 +130,30 @@ class Answers:
         from_ns, to_ns = _time_of(query, now_ns, span_s)
         cell = self._cell(query.x_m, query.y_m)
         selection = Selection(from_ns, to_ns, without=self._follower.excluded())
-        moments, merged = self._past.moments((cell.column, cell.row), selection, span_s)
+        past, merged = self._past.history((cell.column, cell.row), selection, round(span_s * 1e9))
         x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
         version = MapVersion(self._writer.store_id, merged, fact)
-        return HistoryAnswer(x_m, y_m, tuple(self._span(moment, names) for moment in moments), version, now_ns)
+        return HistoryAnswer(x_m, y_m, self._spans(past, names), version, now_ns)
+
+    def tiles(self, query: TilesQuery) -> TilesAnswer:
+        """Tiles of the map as it is, or of all of it as of a time."""
+        if query.as_of_ns is None:
+            return self._tiles.answer(query)
+        bounds, version = self._writer.run(lambda store: (store.grid.bounds(), store.version))
+        if bounds is None:
+            return TilesAnswer(version, query.as_of_ns, self._site.cell_m, whole=True, tiles=())
+        west, south, east, north = bounds
+        view = self._view(CellWindow(west, south, east - west, north - south), query.as_of_ns)
+        return tiles_of(view, MapVersion(version.store, view.merged, view.fact), self._site.cell_m, self._config)
+
+    def why(self, query: WhyQuery) -> CellReasons:
+        """Everything that is known of the cell that a position lies in."""
+        window = self._cell(query.x_m, query.y_m)
+        view = self._view(window, query.as_of_ns)
+        excluded = self._follower.excluded()
+        names = self._writer.run(lambda store: [name for name in store.machines() if name not in excluded])
+        version = MapVersion(self._writer.store_id, view.merged, view.fact)
+        return reasons(view, version, (window.column, window.row), names, self._site.cell_m, self._config)
 
     def trust(self, command: TrustCommand) -> dict[str, Any]:
         """What is known of the machine once the command counts, and the version of the map that it counts in."""
@@ -167,14 +209,13 @@ class Answers:
         fact = self._writer.run(lambda store: store.fact)
         return replace(self._past.view(window, as_of_ns, self._follower.excluded()), fact=fact)
 
-    def _span(self, moment: SpanEvidence, names: tuple[str, ...]) -> HistorySpan:
-        values = cell_layers.read(moment.evidence, names, self._config.read, moment.last_ns)
-        return HistorySpan(moment.first_ns, moment.last_ns, {name: float(values[name][0, 0]) for name in names})
-
-
-def reads_past(query: MapQuery) -> bool:
-    """Whether a query folds the journal, which takes a while."""
-    return isinstance(query, HistoryQuery) or (isinstance(query, PointQuery | RegionQuery) and query.when != NOW)
+    def _spans(self, past: CellHistory, names: tuple[str, ...]) -> tuple[HistorySpan, ...]:
+        values = cell_layers.read(past.evidence, names, self._config.read, past.last_ns[:, None])
+        columns = (past.first_ns.tolist(), past.last_ns.tolist(), *(values[name][:, 0].tolist() for name in names))
+        return tuple(
+            HistorySpan(first_ns, last_ns, dict(zip(names, of_span, strict=True)))
+            for first_ns, last_ns, *of_span in zip(*columns, strict=True)
+        )
 
 
 def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -21,8 +21,8 @@ from protocol.queries.answers import Tile
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 TILE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
-MOST_OPEN = 8  # regions that are answered at the same time
-IDLE_S = 10.0  # a region of which nobody takes a tile for so long makes room
+MOST_OPEN = 16  # regions that are read at the same time
+IDLE_S = 30.0  # a region of which nobody takes a tile for so long makes room; one tile takes 20 s at 300 kbit/s
 OPEN_S = 600.0  # ... and one that is open for so long, since its pages leave the grid one by one
 RETRY_AFTER_S = 2.0
 

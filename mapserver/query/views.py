@@ -15,10 +15,11 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block, evidence
 from mapserver.ingest.store import Store
-from mapserver.journal.history import History, SpanEvidence, grid_as_of, point_history
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
+from mapserver.past.cell_history import CellHistory, cell_history
+from mapserver.past.past import Past
 from protocol.arrays import Floats32
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -52,26 +53,26 @@ class PastMaps:
     """Maps of one store as of any time. Every call opens the journal anew, so that any thread may ask."""
 
     journal: Path
-    cell_m: float
+    past: Past
     config: ServerConfig
 
     def view(self, window: CellWindow, stamp_ns: int, without: frozenset[str]) -> View:
         """The map from samples stamped so or earlier; journal rows that are committed meanwhile may be in it."""
-        reach = reach_blocks(self.cell_m, self.config.change)
-        with self._history() as (history, last_row):
-            grid = grid_as_of(history, stamp_ns, self.cell_m, self.config.fold, _surroundings(window, reach), without)
+        reach = reach_blocks(self.past.cell_m, self.config.change)
+        with self._reader() as (reader, last_row):
+            grid = self.past.grid_as_of(reader, stamp_ns, _surroundings(window, reach), without)
         return View(_pages(grid, window, reach), last_row, stamp_ns)
 
-    def moments(self, cell: tuple[int, int], selection: Selection, span_s: float) -> tuple[list[SpanEvidence], int]:
+    def history(self, cell: tuple[int, int], selection: Selection, span_ns: int) -> tuple[CellHistory, int]:
         """Evidence of a cell (column, row) span by span, and the journal row that it is true for."""
-        with self._history() as (history, last_row):
-            return point_history(history, cell, self.cell_m, self.config.fold, selection, span_s), last_row
+        with self._reader() as (reader, last_row):
+            return cell_history(self.past, reader, cell, span_ns, selection), last_row
 
     @contextmanager
-    def _history(self) -> Iterator[tuple[History, int]]:
+    def _reader(self) -> Iterator[tuple[JournalReader, int]]:
         try:
             with JournalReader(self.journal) as reader:
-                yield History.beside(reader), reader.last_row
+                yield reader, reader.last_row
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None
 

@@ -1,6 +1,7 @@
 """Answers to map queries, to MessagePack and back (docs/protocol.md, "Map queries").
 
 Reading ignores fields that it does not know, and refuses an answer without one that it does: a MessageError names it.
+It is one module because all answers are read by the same few rules.
 """
 
 import functools
@@ -86,7 +87,7 @@ def _take_tile(table: dict[str, Any], columns: int, rows: int) -> answers.Tile |
     """Where a tile of columns x rows cells lies, if that is said; it has to lie within its region."""
     if table.get("tile") is None:
         return None
-    tile = _record(answers.Tile, table, "tile")
+    tile = take_record(answers.Tile, table, "tile")
     inside = 0 <= tile.column <= tile.columns - columns and 0 <= tile.row <= tile.rows - rows
     if not (inside and 0 <= tile.number < tile.count and tile.columns * tile.rows <= MAX_CELLS):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{tile} of {columns} x {rows} cells", field="tile")
@@ -157,6 +158,18 @@ def _take_tables(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
 # --- records ---------------------------------------------------------------------------------------------------------
 
 
+def encode_alive(alive: answers.ServerAlive) -> bytes:
+    """Answer of `alive`."""
+    return pack(asdict(alive))
+
+
+def decode_alive(data: bytes) -> answers.ServerAlive:
+    """Undo `encode_alive`."""
+    table = unpack(data, MAX_SMALL_BYTES)
+    journalled, merged = (take(table, name, int) for name in ("journalled", "merged"))
+    return answers.ServerAlive(take_store(table), journalled, merged, take(table, "busy_s", float))
+
+
 def encode_info(info: answers.MapInfo | Mapping[str, Any]) -> bytes:
     """Answer of `info`; here and below, a record or a table of its fields."""
     return pack({"info": _table(info)})
@@ -164,7 +177,7 @@ def encode_info(info: answers.MapInfo | Mapping[str, Any]) -> bytes:
 
 def decode_info(data: bytes) -> answers.MapInfo:
     """Undo `encode_info`."""
-    return _record(answers.MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
+    return take_record(answers.MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
 
 
 def encode_machines(machines: Iterable[answers.MachineState | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
@@ -184,7 +197,7 @@ def encode_machine(machine: answers.TrustAnswer | Mapping[str, Any]) -> bytes:
 
 def decode_machine(data: bytes) -> answers.TrustAnswer:
     """Undo `encode_machine`."""
-    return _record(answers.TrustAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
+    return take_record(answers.TrustAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
 
 
 def encode_changes(changes: Iterable[answers.GroundChange | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
@@ -204,14 +217,14 @@ def encode_change(change: answers.GroundChange | Mapping[str, Any]) -> bytes:
 
 def decode_change(data: bytes) -> answers.GroundChange:
     """Undo `encode_change`."""
-    return _record(answers.GroundChange, unpack(data, MAX_SMALL_BYTES), "change")
+    return take_record(answers.GroundChange, unpack(data, MAX_SMALL_BYTES), "change")
 
 
 def _table(record: Any) -> dict[str, Any]:
     return dict(record) if isinstance(record, Mapping) else asdict(record)
 
 
-def _record(cls: type[T], table: dict[str, Any], name: str) -> T:
+def take_record(cls: type[T], table: dict[str, Any], name: str) -> T:
     """Take the field `name` as a record."""
     record: T = _value(cls, take(table, name, dict), name)
     return record

@@ -1,7 +1,7 @@
 """Answers to map queries as values (docs/protocol.md, "Map queries"); their bytes: `answer_codec.py`.
 
 Stamps are UTC in nanoseconds. `version` is the version of the map that an answer is true for, `merged` its journal row;
-`stamp_ns` is the site's now, or the time that the map is as of.
+`stamp_ns` is the site's now, or the time that the map is as of. It is one module because they are read side by side.
 """
 
 from collections.abc import Mapping
@@ -129,12 +129,30 @@ class SiteInfo:
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """What one machine sent: spools, samples accepted, samples declared lost, and its newest stamp."""
+    """What one machine sent: spools, samples accepted, samples that it declared lost, and its newest stamp.
+
+    missing: samples that were acknowledged, are gone, and that it has neither sent again nor declared lost since.
+    """
 
     spools: int
     samples: int
     lost: int
     newest_ns: int
+    missing: int
+
+
+@dataclass(frozen=True)
+class CheckpointCounts:
+    """Checkpoints of the evidence, from which maps of the past are made.
+
+    count: of those that can be used. bytes: of all. newest_ns: when the newest one that can be used is closed, 0 for
+    none. passed_over: how many were damaged since the start.
+    """
+
+    count: int
+    bytes: int
+    newest_ns: int
+    passed_over: int
 
 
 @dataclass(frozen=True)
@@ -151,8 +169,10 @@ class MapInfo:
 
     store: its id; descends: ids of the stores that it was folded from; accepted: ids of those whose place a person let
     it take; fact: see MapVersion. journalled, merged, snapshot: journal rows. bounds: first column, first row, end
-    column and end row of the blocks with evidence; None without any. wall_ns: the server's clock. distrusted: machines
-    whose samples are excluded.
+    column and end row of the blocks with evidence; None without any. first_ns, stamp_ns: the map's oldest stamp, and
+    the site's now; 0 without any. wall_ns: the server's clock. distrusted: machines whose samples are excluded.
+    boundaries: of the classes of resistance. shortfalls: what the journal lacked of what was acknowledged, one line for
+    each start that noticed.
     """
 
     site: SiteInfo
@@ -167,14 +187,31 @@ class MapInfo:
     samples_too_unsure: int
     cells: int
     bounds: tuple[int, int, int, int] | None
+    first_ns: int
     stamp_ns: int
     wall_ns: int
     version: str
     server: ServerProcess
+    checkpoints: CheckpointCounts
     machines: Mapping[str, SampleCounts]
     distrusted: tuple[str, ...]
+    shortfalls: tuple[str, ...]
     counters: Mapping[str, int]
     layers: tuple[str, ...]
+    boundaries: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ServerAlive:
+    """A map server that takes batches. journalled, merged: journal rows.
+
+    busy_s: how long it has been at the work that it does now, 0 for none.
+    """
+
+    store: str
+    journalled: int
+    merged: int
+    busy_s: float
 
 
 @dataclass(frozen=True)
@@ -198,6 +235,7 @@ class MachineState:
     samples: int
     lost: int
     newest_ns: int
+    missing: int
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Map queries as selector parameters (docs/protocol.md, "Map queries"); their answers: `answers.py`.
 
-The server parses a query once, into a frozen type; an unknown parameter is refused by name.
+The server parses a query once, into a frozen type; an unknown parameter is refused by name. It is one module because
+both directions of a parameter have to agree.
 """
 
 from collections.abc import Callable, Mapping
@@ -8,6 +9,7 @@ from dataclasses import dataclass
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries import parameters as ps
+from protocol.queries.answers import MapVersion
 from protocol.site.geometry import MAX_CELLS, Bounds
 
 MAX_WAIT_S = 60.0
@@ -99,6 +101,15 @@ class InfoQuery:
 
 
 @dataclass(frozen=True)
+class AliveQuery:
+    """Whether the server takes batches: for probes, since it waits for nothing."""
+
+    fresh = Freshness()
+
+    name = "alive"
+
+
+@dataclass(frozen=True)
 class MachinesQuery:
     """What the server knows of each machine."""
 
@@ -117,7 +128,31 @@ class ChangesQuery:
     name = "changes"
 
 
-MapQuery = PointQuery | RegionQuery | TileQuery | HistoryQuery | InfoQuery | MachinesQuery | ChangesQuery
+@dataclass(frozen=True)
+class TilesQuery:
+    """Tiles of the map: all, or those that differ since a version of it; or all as of a time [ns]."""
+
+    since: MapVersion | None = None
+    as_of_ns: int | None = None
+    fresh = Freshness()
+
+    name = "tiles"
+
+
+@dataclass(frozen=True)
+class WhyQuery:
+    """Everything that is known of the cell at a position in `map` [m]."""
+
+    x_m: float
+    y_m: float
+    as_of_ns: int | None = None
+    fresh = Freshness()
+
+    name = "why"
+
+
+CellQuery = PointQuery | RegionQuery | TileQuery | HistoryQuery | WhyQuery
+MapQuery = CellQuery | TilesQuery | InfoQuery | AliveQuery | MachinesQuery | ChangesQuery
 
 
 def check_size(columns: int, rows: int) -> None:
@@ -131,26 +166,45 @@ def check_size(columns: int, rows: int) -> None:
 
 def encode_query(query: MapQuery) -> dict[str, str]:
     """Selector parameters."""
-    if isinstance(query, ChangesQuery):
-        return {"after": str(query.after)} if query.after else {}
-    if isinstance(query, TileQuery):
-        return {"cursor": str(query.cursor), "number": str(query.number)}
-    parameters: dict[str, str] = {}
-    if isinstance(query, PointQuery | HistoryQuery):
-        parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
-    if isinstance(query, RegionQuery):
-        b = query.bounds
-        parameters["bounds"] = ",".join(ps.text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
-    if isinstance(query, PointQuery | RegionQuery | HistoryQuery) and query.layers:
-        parameters["layers"] = ",".join(query.layers)
-    if isinstance(query, PointQuery | RegionQuery):
-        parameters |= _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
-    if isinstance(query, HistoryQuery):
-        parameters |= _stamps({"from": query.from_ns, "to": query.to_ns})
-        parameters |= {"span": ps.text_of(query.span_s)} if query.span_s is not None else {}
+    match query:
+        case AliveQuery():
+            return {}
+        case ChangesQuery():
+            return {"after": str(query.after)} if query.after else {}
+        case TileQuery():
+            return {"cursor": str(query.cursor), "number": str(query.number)}
+        case TilesQuery(None):
+            return _stamps({"as_of": query.as_of_ns})
+        case TilesQuery(MapVersion() as since):
+            return {"store": since.store, "row": str(since.row), "fact": str(since.fact)}
+        case WhyQuery():
+            return {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m), **_stamps({"as_of": query.as_of_ns})}
+    parameters = _of_map(query) if isinstance(query, PointQuery | RegionQuery | HistoryQuery) else {}
     if query.fresh.after:
         parameters |= {"after": str(query.fresh.after), "wait": ps.text_of(query.fresh.wait_s)}
     return parameters
+
+
+def reads_past(query: MapQuery) -> bool:
+    """Whether the server has to read its journal for a query, which takes a while."""
+    if isinstance(query, TilesQuery | WhyQuery):
+        return query.as_of_ns is not None
+    if isinstance(query, PointQuery | RegionQuery):
+        return query.when != NOW
+    return isinstance(query, HistoryQuery)
+
+
+def _of_map(query: PointQuery | RegionQuery | HistoryQuery) -> dict[str, str]:
+    parameters = {"layers": ",".join(query.layers)} if query.layers else {}
+    if isinstance(query, RegionQuery):
+        b = query.bounds
+        parameters["bounds"] = ",".join(ps.text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
+    else:
+        parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
+    if isinstance(query, HistoryQuery):
+        parameters |= _stamps({"from": query.from_ns, "to": query.to_ns})
+        return parameters | ({"span": ps.text_of(query.span_s)} if query.span_s is not None else {})
+    return parameters | _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
 
 
 def _stamps(stamps: Mapping[str, int | None]) -> dict[str, str]:
@@ -193,6 +247,21 @@ def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
     return HistoryQuery(x_m, y_m, _layers(parameters), from_ns, to_ns, span_s, _freshness(parameters))
 
 
+def _parse_tiles(parameters: ps.Parameters) -> TilesQuery:
+    as_of_ns = ps.stamp(parameters, "as_of")
+    if "store" not in parameters and not {"row", "fact"} & set(parameters):
+        return TilesQuery(None, as_of_ns)
+    if as_of_ns is not None:
+        raise QueryError(Refusal.OUT_OF_RANGE, "`as_of` with a version: the tiles of a time do not change, ask for all")
+    store = ps.required(parameters, "store")
+    row, fact = (ps.count({name: ps.required(parameters, name)}, name) for name in ("row", "fact"))
+    return TilesQuery(MapVersion(store, row, fact))
+
+
+def _parse_why(parameters: ps.Parameters) -> WhyQuery:
+    return WhyQuery(*_place(parameters), ps.stamp(parameters, "as_of"))
+
+
 _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
     "point": (("x", "y", "layers", "as_of", "minus", *_FRESH), _parse_point),
@@ -201,6 +270,9 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
+    "tiles": (("store", "row", "fact", "as_of"), _parse_tiles),
+    "why": (("x", "y", "as_of"), _parse_why),
+    "alive": ((), lambda _: AliveQuery()),
     "info": (_FRESH, lambda parameters: InfoQuery(_freshness(parameters))),
 }
 

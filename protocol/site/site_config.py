@@ -87,7 +87,7 @@ class SiteConfig:
             "+k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
         )
 
-    @property
+    @cached_property
     def frame(self) -> str:
         """Eight hex digits that tell site frames apart; batches carry them, so that frames never mix in one map."""
         return hashlib.sha256(f"{self.crs} {float(self.origin_height_m)!r}".encode()).hexdigest()[:8]
@@ -121,6 +121,11 @@ class Projection:
         """Position in `map` [m]."""
         x, y = self._proj(lon_deg, lat_deg)
         return float(x), float(y), height_m - self._height_m
+
+    def to_map_many(self, lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
+        """Positions in `map` [m], x and y, of places of one shape (...); infinite where that is impossible."""
+        x, y = self._proj(lon_deg.ravel(), lat_deg.ravel())
+        return np.asarray(x).reshape(lat_deg.shape), np.asarray(y).reshape(lat_deg.shape)
 
     def to_geodetic(self, x_m: float, y_m: float, z_m: float = 0.0) -> tuple[float, float, float]:
         """Latitude and longitude [deg] and height [m]."""

@@ -23,6 +23,7 @@ MAX_ITEMS = 1000  # of one list, except in answers: the decoder reserves memory 
 MAX_DEPTH = 16  # of plain values
 MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
+MAX_RETRY_S = 3600.0
 _WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
 _NO_ROWS = empty()
 STORE_ID = re.compile(r"[0-9a-f]{16}")
@@ -176,10 +177,12 @@ def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
 
 def encode_reply(reply: Ack | Refused) -> bytes:
     """The server's answer to a batch."""
+    table: dict[str, Any]
     if isinstance(reply, Ack):
         table = {"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed}
         return pack({**table, "store": reply.store} | ({"replaces": reply.replaces} if reply.replaces else {}))
-    return pack({"ack": False, "reason": reply.reason, "problem": reply.problem, "expected": reply.expected})
+    table = {"ack": False, "reason": reply.reason, "problem": reply.problem, "expected": reply.expected}
+    return pack(table | ({"retry_after_s": reply.retry_after_s} if reply.retry_after_s else {}))
 
 
 def decode_reply(data: bytes) -> Ack | Refused:
@@ -188,7 +191,11 @@ def decode_reply(data: bytes) -> Ack | Refused:
     if take(table, "ack", bool):
         watermark, row, trimmed = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
         return Ack(watermark, row, trimmed, take_store(table), take_store(table, "replaces", optional=True))
-    return Refused(take(table, "reason", str), take(table, "problem", str), _take_int(table, "expected", 0, MAX_SEQ))
+    expected, retry_after_s = _take_int(table, "expected", 0, MAX_SEQ), take(table, "retry_after_s", float, 0.0)
+    if not 0 <= retry_after_s <= MAX_RETRY_S:
+        problem = f"{retry_after_s} is not between 0 and {MAX_RETRY_S}"
+        raise MessageError(Refusal.OUT_OF_RANGE, problem, field="retry_after_s")
+    return Refused(take(table, "reason", str), take(table, "problem", str), expected, retry_after_s)
 
 
 # --- readings --------------------------------------------------------------------------------------------------------

@@ -14,7 +14,8 @@ from protocol.errors import ConfigError
 from protocol.files import load_toml
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, IDENTITY_FILE = "ca.pem", "cert.pem", "key.pem", "identity.toml"
-SIGNING_FILE = "sign.pem"  # machines only
+SIGNING_FILE = "sign.pem"  # machines and map servers only
+SERVERS_FILE = "servers.pub"  # machines only: public keys that replies to batches are signed with, one a line
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,11 @@ def admin_all(site: str) -> str:
     return f"{ROOT}/{check_name(site, 'site')}/admin/*"
 
 
+def writer(site: str) -> str:
+    """Who takes the samples of a site: a query that map servers answer, and ask each other."""
+    return f"{ROOT}/{check_name(site, 'site')}/writer"
+
+
 def machine_of(key: str) -> str:
     """Name of the machine in a key of `ingest/` or `machine/`; a ConfigError where there is none."""
     parts = key.split("/")

@@ -62,12 +62,14 @@ class Ack:
 class Refused:
     """The server did not take a batch. expected: the next sequence number it would take, 0 where that is not known.
 
+    retry_after_s: when there may be room for it again; 0 where that is not known, or not what keeps it out.
     reason, problem: one line each; characters that cannot be printed are escaped.
     """
 
     reason: str
     problem: str
     expected: int = 0
+    retry_after_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("reason", "problem"):

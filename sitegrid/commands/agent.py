@@ -21,12 +21,12 @@ from sitegrid.options.groups import add_network
 from sitegrid.options.outputs import OutputFile
 from sitegrid.options.values import not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
-from sitegrid.security.join import join, signer
+from sitegrid.security.join import join, reply_check, signer
 
 if TYPE_CHECKING:
     from agents.config import AgentConfig
     from agents.drivers import Driver
-    from agents.presence import Owner
+    from protocol.wire.owners import Owner
 
 HELP = "run the localisation agent of one machine"
 EXTRA = "agent"
@@ -64,8 +64,9 @@ def run(arguments: Namespace) -> int:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
         places = Places(arguments.spool, arguments.audit, _calibration(arguments))
-        sign, withhold = signer(arguments.keys), arguments.withhold
-        agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign)
+        key, check, withhold = signer(arguments.keys), reply_check(arguments.keys), arguments.withhold
+        sign = key.sign if key else None
+        agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign, check=check)
         opened.callback(agent.close)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
         report = agent.run(_driver(arguments, log, session, site.name, machine.name), stop.is_set, wait=stop.wait)
@@ -83,7 +84,8 @@ def _open(settings: SessionConfig) -> zenoh.Session:
 
 def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) -> Owner:
     """Refuse to start while another agent of the same name runs."""
-    from agents.presence import find_namesake, this_process
+    from agents.presence import find_namesake
+    from protocol.wire.owners import this_process
 
     if other := find_namesake(session, site, machine):
         problem = f"an agent of {machine} runs already, {other}; stop it, or start this one with another --name"

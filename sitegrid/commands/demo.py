@@ -9,7 +9,7 @@ from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import positive
 
 HELP = "run the whole system in simulation and draw the maps"
-EXTRA = "agent,server,sim"
+EXTRA = "agent,server,sim,web"
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -22,6 +22,8 @@ def add_options(parser: ArgumentParser) -> None:
     add("--machines", type=int, help="number of machines in the scenario's first fleet (overrides the scenario)")
     add("--seed", type=int, help="random seed (overrides the scenario)")
     add("--out", type=FOLDER, default="demo-output", help="folder for pictures and stores (default %(default)s)")
+    add("--web", action="store_true", help="show the map in browsers meanwhile; prints the address at the start")
+    add("--stay", action="store_true", help="keep map server and page up in the end, until Ctrl-C; with --web")
     add("--headless", action="store_true", help="no live display; print plain lines")
     add("--log", type=Path, help="manifest of a real log, which another agent replays")
     add("--data", type=Path, help="folder with the CSV files of that log")

@@ -17,6 +17,7 @@ from sitegrid.options.values import days
 from sitegrid.process.lifetime import say, tell
 from sitegrid.security import register as registers
 from sitegrid.security.register import REGISTER_FILE, ROLES, ROUTER, Register, RegisterEntry
+from sitegrid.security.tokens import load_tokens, save_tokens
 
 HELP = "make, list and revoke the certificates of a site"
 EXTRA = "security"
@@ -36,12 +37,15 @@ def add_options(parser: ArgumentParser) -> None:
     add.add_argument("--renew", action="store_true", help=renew)
     revoke = add_action(actions, "revoke", "revoke the access of a name")
     show = add_action(actions, "list", "list who has access, and until when")
-    lifetime = "days that the certificate is valid (default %(default)s)"
-    for action in (init, add):
+    token = add_action(actions, "token", "make a token for a person who may see the map on the web, or revoke it")
+    token.add_argument("name", metavar="PERSON")
+    token.add_argument("--revoke", action="store_true", help="revoke the person's token, from now on")
+    lifetime = "days that the certificate, or token, is valid (default %(default)s)"
+    for action in (init, add, token):
         action.add_argument("--days", type=days, default=365, help=lifetime)
     for action in (add, revoke):
         action.add_argument("name", metavar="MACHINE")
-    for action, act in ((init, _init), (add, _add), (revoke, _revoke), (show, _list)):
+    for action, act in ((init, _init), (add, _add), (revoke, _revoke), (token, _token), (show, _list)):
         folder = "folder with all keys of the site (default %(default)s)"
         action.add_argument("--dir", type=FOLDER if action is init else Path, default="keys", help=folder)
         action.set_defaults(act=act)
@@ -114,18 +118,40 @@ def _revoke(arguments: Namespace, _: datetime) -> None:
     _tell(arguments, line, name=arguments.name, revoked=True)
 
 
+def _token(arguments: Namespace, now: datetime) -> None:
+    """A new token in place of an older one of the same person; what is kept of it is a hash."""
+    folder, name = arguments.dir, check_name(arguments.name, "keys token")
+    registers.load_register(folder)
+    tokens = load_tokens(folder)
+    if arguments.revoke:
+        save_tokens(folder, tokens.without(name))
+        _tell(arguments, f"{name} sees nothing more from now on", name=name, revoked=True)
+        return
+    expires = now + timedelta(days=arguments.days)
+    tokens, token = tokens.with_new(name, expires)
+    save_tokens(folder, tokens)
+    line = f"{name}'s token until {expires.date()}, shown this once: {token}\n"
+    line += f"send {name} the address of `sitegrid web` with ?token={token} at its end"
+    _tell(arguments, line, name=name, token=token, expires=expires.isoformat())
+
+
 def _list(arguments: Namespace, now: datetime) -> None:
     register = registers.load_register(arguments.dir)
     rows = [_row(name, entry, now) for name, entry in sorted(register.names.items())]
+    people = [
+        {"name": name, "role": "token", "expires": entry.expires.isoformat(), "state": _state(entry.expires, now)}
+        for name, entry in sorted(load_tokens(arguments.dir).names.items())
+    ]
     if arguments.json:
-        say({"site": register.site, "hosts": register.hosts, "names": rows})
+        say({"site": register.site, "hosts": register.hosts, "names": rows, "tokens": people})
         return
+    rows += people
     for row in rows:
         tell(f"{row['name']:24} {row['role']:8} {row['expires'][:10]}  {row['state']}")
 
 
 def _row(name: str, entry: RegisterEntry, now: datetime) -> dict[str, Any]:
-    state = "revoked" if entry.revoked else "expired" if entry.expires < now else "valid"
+    state = "revoked" if entry.revoked else _state(entry.expires, now)
     plain = {"name": name, "role": entry.role, "expires": entry.expires.isoformat(), "state": state}
     return {
         **plain,
@@ -133,6 +159,10 @@ def _row(name: str, entry: RegisterEntry, now: datetime) -> dict[str, Any]:
         "serial": entry.serial,
         "registers.common_name": registers.common_name(name, entry.issue),
     }
+
+
+def _state(expires: datetime, now: datetime) -> str:
+    return "expired" if expires < now else "valid"
 
 
 def _tell(arguments: Namespace, line: str, **values: Any) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.files import whole_file
-from protocol.queries.answers import GroundChange, MachineState, PointAnswer, Region
+from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, Region
 from protocol.queries.tiles import Progress
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
@@ -55,6 +55,7 @@ def add_options(parser: ArgumentParser) -> None:
     changes = _add_query(queries, _changes, "list of ground changes: place and time")
     changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
     _add_query(queries, _info, "state of the map and its server")
+    _add_query(queries, _alive, "whether the map server takes batches: for probes")
 
 
 def _add_query(queries: Subparsers, ask: Ask, summary: str) -> ArgumentParser:
@@ -208,6 +209,7 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     return info, [
         f"site {info.site.name}: {info.cells} cells known, bounds {info.bounds and list(info.bounds)}",
         f"  journal row {info.journalled}, merged {info.merged}, snapshot {info.snapshot}",
+        f"  {_checkpoints(info.checkpoints)}",
         f"  samples merged {info.samples_merged}, too unsure of their place {info.samples_too_unsure}",
         *(
             f"  {name}: {m.samples} samples, {m.lost} lost, {m.spools} spools"
@@ -215,6 +217,18 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
         ),
         *(f"  {name}: {count}" for name, count in sorted(info.counters.items())),
     ]
+
+
+def _alive(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:
+    alive = client.alive()
+    return alive, [f"batches are taken: journal row {alive.journalled}, merged {alive.merged}"]
+
+
+def _checkpoints(counts: CheckpointCounts) -> str:
+    """What makes maps of the past quick."""
+    newest = f", samples until {utc_text(counts.newest_ns)}" if counts.newest_ns else ""
+    damaged = f", {counts.passed_over} damaged" if counts.passed_over else ""
+    return f"checkpoints {counts.count} ({counts.bytes / 1e6:.0f} MB){newest}{damaged}"
 
 
 def _stamps(client: Client, **times: SiteTime | None) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import zenoh
 
 from protocol.config import from_table
+from protocol.errors import LinkError
 from protocol.files import load_toml
 from protocol.site.site_file import load_site
 from protocol.version import package_version
@@ -19,7 +20,7 @@ from sitegrid.options.groups import add_network
 from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import address
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
-from sitegrid.security.join import join
+from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ def add_options(parser: ArgumentParser) -> None:
     add("--store", type=FOLDER, required=True, help="folder with journal, archive and snapshots")
     add("--config", type=Path, help="file with options (config/server.toml)")
     add("--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register")
+    over = "have another map server of the site end, and take its place; without this, it stays, and this one ends"
+    add("--take-over", action="store_true", help=over)
     usual = ("127.0.0.1", 9464)
     exports = f"serve Prometheus metrics over HTTP; without a value at {usual[0]}:{usual[1]}"
     add("--metrics", type=address, nargs="?", const=usual, metavar="[HOST:]PORT", help=exports)
@@ -57,10 +60,14 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
-        ingest, readers = open_session(joined), open_session(joined)
-        for session in (ingest, readers):
-            opened.callback(session.close)
-        server = Server(ingest, readers, arguments.store, site, config, time.time_ns, _verifier(arguments.signed))
+        ingest = opened.enter_context(closing(open_session(joined)))
+        readers = opened.enter_context(closing(open_session(joined)))
+        check, take_over = _verifier(arguments.signed), arguments.take_over
+        key = signer(arguments.keys)
+        sign = key.sign_reply if key else None
+        server = Server(
+            ingest, readers, arguments.store, site, config, time.time_ns, check, sign=sign, take_over=take_over
+        )
         opened.callback(server.close)
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:
@@ -69,6 +76,8 @@ def run(arguments: Namespace) -> int:
         while not stop.wait(0.5):
             if server.failed:
                 break
+            if server.ended:
+                raise LinkError(arguments.endpoint, f"{server.ended}; this one ends")
     return 1 if server.failed else 0
 
 

@@ -104,6 +104,12 @@ def start_agent(plan: DemoPlan, children: Children, config: Path) -> Child:
     return children.start(name, *base, *files, "--json")
 
 
+def start_web(plan: DemoPlan, children: Children) -> str:
+    """The live page; returns its address."""
+    words = ("web", "--endpoint", plan.endpoint, "--site", plan.scenario.site.name, "--listen", "0")
+    return str(children.start("web", *words).expect("ready", READY_S)["url"])
+
+
 def start_sim(plan: DemoPlan, children: Children) -> Child:
     """The simulator."""
     options = {name: getattr(plan.config, name) for name in SIM_OPTIONS}

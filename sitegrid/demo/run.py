@@ -20,10 +20,10 @@ from protocol.site.site_file import load_site
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.demo.plan import READY_S, DemoPlan, LogReplay, make_plan, start_agent, start_server, start_sim
+from sitegrid.demo.plan import READY_S, DemoPlan, LogReplay, make_plan, start_agent, start_server, start_sim, start_web
 from sitegrid.pictures.draw import TrackRecorder, draw, draw_both, draw_differences, truth_layers
 from sitegrid.process.children import Child, Children
-from sitegrid.process.lifetime import note, plain, say, stop_flag, tell
+from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
 from sitegrid.process.progress import Display
 
 
@@ -33,18 +33,26 @@ def run(arguments: Namespace) -> int:
     began_s = time.monotonic()
     plan = make_plan(arguments)
     with Children(plan.work) as children:
-        result = _drive(plan, children, stop, Display("machines drive", headless=arguments.headless or arguments.json))
-    if result is None:
-        note("stopped; everything is ended")
-        return 130
-    result["wall_s"] = round(time.monotonic() - began_s, 1)
-    say(plain(result)) if arguments.json else _print(result)
+        display = Display("machines drive", headless=arguments.headless or arguments.json)
+        children.start("router", "router", "--listen", plan.endpoint).expect("ready", READY_S)
+        url = start_web(plan, children) if arguments.web or arguments.stay else ""
+        if url:
+            note(f"the map is at {url}")
+        result = _drive(plan, children, stop, display)
+        if result is None:
+            note("stopped; everything is ended")
+            return 130
+        result["wall_s"] = round(time.monotonic() - began_s, 1)
+        say(plain(result)) if arguments.json else _print(result)
+        if arguments.stay:
+            start_server(plan, children, "server", plan.site_file)
+            note(f"the map stays at {url} until Ctrl-C")
+            wait(stop)
     return 0 if result["lost"] == result["double"] == 0 else 1
 
 
 def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: Display) -> dict[str, Any] | None:
     """Start everything, wait for the end, judge and draw; None if stopped on the way."""
-    children.start("router", "router", "--listen", plan.endpoint).expect("ready", READY_S)
     server = start_server(plan, children, "server", plan.site_file)
     agents = {path.stem: start_agent(plan, children, path) for path in plan.configs}
     log_replay = LogReplay(plan, plan.log, children) if plan.log else None

@@ -7,13 +7,17 @@ import shutil
 import sqlite3
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
+from agents.delivery.spool_file import run_ends_in
+from agents.delivery.spool_mark import runs_cut_short
+from protocol.disk.traces import Traces, look_beside
+from protocol.disk.write_ahead_log import LogScan
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
@@ -48,21 +52,27 @@ class InUseError(StoreError):
 
 @dataclass(frozen=True)
 class SpoolState:
-    """A spool at rest. oldest_ns: stamp of the oldest sample, 0 for none."""
+    """A spool at rest. gone: samples that its disk has lost. oldest_ns: stamp of the oldest sample, 0 for none.
+
+    damage: what is wrong with its write-ahead log, empty where nothing is.
+    """
 
     depth: int
     dropped: int
     quarantined: int
     oldest_ns: int
+    gone: int = 0
+    damage: str = ""
 
 
 def read_spool(path: Path) -> SpoolState:
     """The state of a spool at rest; StoreError where it cannot be used, InUseError while an agent runs on it."""
     if not path.is_file():
         raise StoreError(path, "no such file; an agent makes it when it starts")
+    traces = look_beside(path)
     try:
         with closing(sqlite3.connect(_read_only(path), uri=True, timeout=0.2)) as db:
-            return _spool_state(path, db)
+            return _spool_state(path, db, traces)
     except sqlite3.Error as error:
         if "locked" in str(error):
             raise InUseError(path, "an agent has it open") from None
@@ -76,15 +86,17 @@ def _read_only(path: Path) -> str:
     return f"{path.absolute().as_uri()}?mode=ro" + ("&immutable=1" if at_rest else "")
 
 
-def _spool_state(path: Path, db: sqlite3.Connection) -> SpoolState:
+def _spool_state(path: Path, db: sqlite3.Connection, traces: Traces) -> SpoolState:
     (schema,) = db.execute("PRAGMA user_version").fetchone()
     if schema != SPOOL_SCHEMA:
         raise StoreError(path, f"has schema {schema}, this version knows {SPOOL_SCHEMA}")
     (depth,), (quarantined,) = (db.execute(f"SELECT COUNT(*) FROM {t}").fetchone() for t in ("sample", "quarantine"))  # noqa: S608
-    (dropped,) = db.execute("SELECT value FROM meta WHERE key = 'dropped'").fetchone() or (0,)
+    meta = {key: int(value) for key, value in db.execute("SELECT key, value FROM meta")}
     oldest = db.execute("SELECT row FROM sample ORDER BY number LIMIT 1").fetchone()
     oldest_ns = int(np.frombuffer(oldest[0], SAMPLE_DTYPE)["stamp_ns"][0]) if oldest else 0
-    return SpoolState(depth, int(dropped), quarantined, oldest_ns)
+    short = runs_cut_short(run_ends_in(db), traces.mark)
+    gone = meta.get("gone", 0) + sum(n for _, n in short)
+    return SpoolState(depth, meta.get("dropped", 0), quarantined, oldest_ns, gone, traces.damage)
 
 
 def check_spool(state: SpoolState, now_ns: int) -> Finding:
@@ -92,7 +104,10 @@ def check_spool(state: SpoolState, now_ns: int) -> Finding:
     age_s = (now_ns - state.oldest_ns) * 1e-9 if state.oldest_ns else 0.0
     message = f"{state.depth} samples wait" + (f", the oldest is of {_ago(age_s)}" if state.oldest_ns else "")
     message += f"; {state.dropped} were dropped, {state.quarantined} quarantined"
-    advice = []
+    message += f", {state.gone} are gone" if state.gone else ""
+    advice = [state.damage] if state.damage else []
+    if state.gone:
+        advice.append("its disk has lost recorded samples: look at the disk")
     if state.depth and age_s > WAITING_S:
         advice.append("start its agent, and see what it says of its uplink")
     if state.dropped:
@@ -107,9 +122,10 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     spool, uplink = (_table_of(values, part) for part in ("spool", "uplink"))
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
     message = f"{machine} runs: {counts[0]}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
-    problems = [uplink.get("problem"), values.get("spool_problem"), values.get("calibration_problem")]
-    advice = "; ".join(str(problem) for problem in problems if problem)
-    lost = any(spool.get(key) for key in ("dropped", "put_aside"))
+    problems = [uplink.get("problem"), *(values.get(f"{part}_problem") for part in ("spool", "calibration"))]
+    advice = "; ".join(str(problem) for problem in (*problems, values.get("spool_damage")) if problem)
+    message += f", {spool['gone']} are gone" if spool.get("gone") else ""
+    lost = any(spool.get(key) for key in ("dropped", "put_aside", "gone"))
     return Finding(Level.WARN if advice or lost else Level.PASS, "spool", message, advice)
 
 
@@ -120,7 +136,12 @@ def _table_of(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class StoreState:
-    """A store. snapshot_row, snapshot_age_s: of the newest snapshot, 0 and infinity where there is none."""
+    """A store. snapshot_row, snapshot_age_s: of the newest snapshot, 0 and infinity where there is none.
+
+    shortfall: what its files lack now of what was acknowledged, one line, empty where nothing is missing. missing: what
+    earlier starts found so, by machine.
+    checkpoints, damaged_checkpoints: how many; checkpoint_bytes: of all.
+    """
 
     site: str
     frame: str
@@ -130,6 +151,11 @@ class StoreState:
     machines: int
     snapshot_row: int
     snapshot_age_s: float
+    shortfall: str = ""
+    missing: Mapping[str, int] = field(default_factory=dict)
+    checkpoints: int = 0
+    checkpoint_bytes: int = 0
+    damaged_checkpoints: int = 0
 
 
 def read_store(folder: Path, now_s: float) -> StoreState:
@@ -137,18 +163,34 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     # imported here: needs the `server` extra, which a machine's host does not have
     from mapserver.evidence import snapshot
     from mapserver.ingest.store import JOURNAL_FILE
+    from mapserver.ingest.store_folder import is_in_use
+    from mapserver.journal import shortfall as short
     from mapserver.journal.reader import SCHEMA, JournalReader
+    from mapserver.past.checkpoints import Checkpoints
 
     if not (folder / JOURNAL_FILE).is_file():
         raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")
+    traces = look_beside(folder / JOURNAL_FILE)  # the mark first: it is never ahead of the journal
+    if is_in_use(folder):
+        traces = replace(traces, log=LogScan())  # it is being written; the server has looked at it when it started
     with JournalReader(folder / JOURNAL_FILE) as journal:
         journal.check()
         last_row, archived = journal.last_row, journal.archived_row
-        machines = {machine for machine, _ in journal.watermarks()}
+        watermarks, events = journal.watermarks(), journal.events()
+        machines = {machine for machine, _ in watermarks}
         site, frame = journal.site, journal.frame
+    lacks = short.compare(traces, short.marked(last_row, len(events), watermarks))
+    known = [short.Shortfall.from_event(event) for event in events if event.kind == short.KIND]
+    missing = short.missing(known, watermarks)
     newest = next(iter(snapshot.rows_on_disk(folder)), 0)
     age_s = now_s - (folder / f"snapshot-{newest}.npz").stat().st_mtime if newest else math.inf
-    return StoreState(site, frame, SCHEMA, last_row, archived, len(machines), newest, age_s)
+    if newest > last_row:
+        lacks = lacks or short.beyond(last_row, newest)
+    text = str(lacks) if lacks else ""
+    past = Checkpoints(folder).entries({}, last_row)
+    sizes, damaged = sum(entry.bytes for entry in past), sum(entry.header is None for entry in past)
+    rows = (SCHEMA, last_row, archived, len(machines), newest, age_s)
+    return StoreState(site, frame, *rows, text, missing, len(past) - damaged, sizes, damaged)
 
 
 def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
@@ -156,10 +198,21 @@ def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
     rows = f"{state.last_row} rows of {state.machines} machines, {state.archived_row} archived"
     tail = state.last_row - state.snapshot_row
     snapshot = f"snapshot of row {state.snapshot_row}, {_ago(state.snapshot_age_s)}" if state.snapshot_row else ""
-    message = f"site {state.site}, schema {state.schema}: {rows}; {snapshot or 'no snapshot'}"
+    checkpoints = f"{state.checkpoints} checkpoints of the past, {state.checkpoint_bytes / 1e9:.1f} GB"
+    if state.damaged_checkpoints:
+        checkpoints += f"; {state.damaged_checkpoints} damaged, the server makes them again"
+    message = f"site {state.site}, schema {state.schema}: {rows}; {snapshot or 'no snapshot'}; {checkpoints}"
     if site and (site.name, site.frame) != (state.site, state.frame):
         problem = f"it is of site {state.site} with frame {state.frame}, the site file {site.name} with {site.frame}"
         return Finding(Level.FAIL, "store", problem, "choose another --store, or the site file that belongs to it")
+    if state.shortfall:
+        advice = (
+            "restore a backup, or start the server: it goes on without them, and machines send what they still have"
+        )
+        return Finding(Level.FAIL, "store", state.shortfall, advice)
+    if state.missing:
+        counts = ", ".join(f"{n} of {machine}" for machine, n in sorted(state.missing.items()))
+        return Finding(Level.WARN, "store", message, f"acknowledged samples are missing: {counts}; look at the disk")
     if tail > TAIL_ROWS:
         return Finding(Level.WARN, "store", message, f"a restart folds {tail} rows: see the log for failed snapshots")
     return Finding(Level.PASS, "store", message)

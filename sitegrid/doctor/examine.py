@@ -23,7 +23,7 @@ from sitegrid.security.join import join
 
 ANYBODY = "doctor"  # where there are no keys, every name is as good
 ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
-OF_SERVER = ("server", "clock", "time", "version", "permission")  # checks that need the map server
+OF_SERVER = ("server", "losses", "clock", "time", "writer", "version", "permission")  # checks that need the map server
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,11 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
     if info is not None:
         site = subject.site_file
         findings += [
+            network.check_losses(info),
             network.check_site(site, info) if site else skipped("site", "give --site-file FILE to compare"),
             network.check_clock(*network.offset_of(info, asked_ns), site),
             network.check_time(info),
+            network.check_writers(network.ask_writers(session, subject.site)),
             network.check_version(package_version(), info.version),
         ]
     return [*findings, _permission(subject, session, info)]

@@ -9,6 +9,7 @@ import math
 import secrets
 import socket
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,6 +113,27 @@ def ask_info(session: zenoh.Session, site: str) -> tuple[MapInfo | None, tuple[i
     return (decode_info(data) if data else None), asked_ns
 
 
+def ask_writers(session: zenoh.Session, site: str) -> list[MapInfo]:
+    """The `info` of every map server of a site; without those whose answers cannot be read."""
+    every: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+    servers = []
+    for reply in session.get(keys.map_query(site, "info"), timeout=ANSWER_S, **every):
+        with suppress(MessageError):
+            servers += [decode_info(reply.ok.payload.to_bytes())] if reply.ok is not None else []
+    return servers
+
+
+def check_writers(servers: list[MapInfo]) -> Finding:
+    """Whether one map server alone takes the samples of the site."""
+    names = [f"pid {info.server.pid} on host {info.server.host}, store {info.store}" for info in servers]
+    if len(servers) == 1:
+        return Finding(Level.PASS, "writer", names[0])
+    if not servers:
+        return skipped("writer", "no map server has answered a second time")
+    problem = f"{len(servers)} map servers take samples of this site: {'; '.join(names)}"
+    return Finding(Level.FAIL, "writer", problem, "stop all but one: each lacks what the others have")
+
+
 def offset_of(info: MapInfo, asked_ns: tuple[int, int]) -> tuple[float, float]:
     """How far this host's clock is ahead of the server's, and how well that is known [s]."""
     before_ns, after_ns = asked_ns
@@ -131,6 +153,20 @@ def check_server(site: str, info: MapInfo | None, *, is_there: bool, role: str =
     if role:
         advice += "; or these keys are revoked, or not in its register, and it shows them nothing"
     return Finding(Level.FAIL, "server", f"site {site}: the router knows of no map server", advice)
+
+
+def check_losses(info: MapInfo) -> Finding:
+    """What was recorded or acknowledged once and is not in the map server's store, by machine and number."""
+    parts = {
+        "declared lost": {name: counts.lost for name, counts in info.machines.items() if counts.lost},
+        "acknowledged and gone": {name: counts.missing for name, counts in info.machines.items() if counts.missing},
+    }
+    texts = [f"{what}: " + ", ".join(f"{n} of {name}" for name, n in by.items()) for what, by in parts.items() if by]
+    texts += info.shortfalls[-1:]
+    if not texts:
+        return Finding(Level.PASS, "losses", "no machine has lost samples, and the store none")
+    advice = "look at the disks of machines and server, and at their logs; a backup may have what the store lacks"
+    return Finding(Level.WARN, "losses", "; ".join(texts), advice)
 
 
 def check_site(site: SiteConfig, info: MapInfo) -> Finding:
@@ -193,7 +229,7 @@ def ask_permission(
     key = keys.ingest(site, machine)
     batch = encode_batch(SampleBatch(machine, secrets.randbits(64) or 1, 1, empty(), frame))
     try:
-        data = _ask(session, key, batch, sign(key, batch) if (sign := signer(folder)) else None)
+        data = _ask(session, key, batch, signing.sign(key, batch) if (signing := signer(folder)) else None)
         return decode_reply(data) if data else None
     except MessageError as error:
         return Refused(error.reason, f"its answer cannot be read: {error}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import suppress
 from typing import Any
 
 from sitegrid.process.lifetime import note
@@ -29,7 +30,8 @@ class Display:
     def show(self, done_s: float, total_s: float, what: str) -> None:
         """Show how many simulated seconds are done, and what there is to say."""
         if self._bar:
-            self._bar.update(self._task, completed=done_s, total=total_s or None, what=what)
+            with suppress(OSError):  # a terminal that was closed ends no work
+                self._bar.update(self._task, completed=done_s, total=total_s or None, what=what)
         elif time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + EVERY_S
             note(f"{done_s:5.0f} of {total_s:g} s, {what}")
@@ -41,4 +43,5 @@ class Display:
 
     def __exit__(self, *_: object) -> None:
         if self._bar:
-            self._bar.stop()
+            with suppress(OSError):
+                self._bar.stop()

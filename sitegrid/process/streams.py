@@ -6,16 +6,18 @@ be written is dropped, and the door says so at the end. A reader that left has w
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 import sys
 from typing import TextIO
 
-_errors: list[OSError] = []  # of standard output
+_problems: list[str] = []  # of standard output; empty ones where nobody reads any more
 
 
 def complete() -> None:
     """Open what the caller closed (`2>&-`), on nothing: else a database became file 1 or 2, where Zenoh may write."""
-    _errors.clear()
+    _problems.clear()
     while (descriptor := os.open(os.devnull, os.O_RDWR)) < 3:
         pass
     os.close(descriptor)
@@ -42,13 +44,12 @@ def flush() -> None:
 
 def is_open() -> bool:
     """Whether standard output could be written so far."""
-    return not _errors
+    return not _problems
 
 
 def problem() -> str:
     """Why standard output could not be written; nothing if it could, or if its reader has left."""
-    texts = [error.strerror or str(error) for error in _errors if not isinstance(error, BrokenPipeError)]
-    return texts[0] if texts else ""
+    return next(filter(None, _problems), "")
 
 
 def _write(stream: TextIO, text: str) -> None:
@@ -57,8 +58,15 @@ def _write(stream: TextIO, text: str) -> None:
         stream.flush()
     except OSError as error:
         if stream is sys.stdout:
-            _errors.append(error)
+            _problems.append("" if _is_left(stream, error) else error.strerror or str(error))
         _mute(stream)
+
+
+def _is_left(stream: TextIO, error: OSError) -> bool:
+    """Whether nobody reads any more: the other end of a pipe was closed, or the terminal."""
+    if error.errno != errno.EIO:
+        return isinstance(error, BrokenPipeError)
+    return stat.S_ISCHR(os.fstat(stream.fileno()).st_mode)
 
 
 def _mute(stream: TextIO) -> None:

@@ -53,7 +53,8 @@ def grant(role: str, site: str, name: str) -> Grant:
         "server": Grant(
             publish=(map_all,),
             subscribe=(poses, health),
-            answer=(keys.ingest_all(site), asks, keys.admin_all(site)),
+            query=(keys.writer(site),),
+            answer=(keys.ingest_all(site), asks, keys.admin_all(site), keys.writer(site)),
             watch=(keys.alive_all(site),),
         ),
         "sim": Grant(publish=(_sensors_all(site),)),
@@ -87,6 +88,7 @@ def size_limits(site: str) -> list[dict[str, Any]]:
     limits = (
         ("batches", ["query"], keys.ingest_all(site), MAX_BATCH_BYTES + SPARE_BYTES),
         ("questions", ["query"], keys.map_queries_all(site), MAX_BUNDLE_BYTES),
+        ("claims", ["query"], keys.writer(site), MAX_SMALL_BYTES),
         ("commands", ["query"], keys.admin_all(site), MAX_SMALL_BYTES),
         ("readings", ["put"], _sensors_all(site), MAX_BUNDLE_BYTES),
         ("poses", ["put"], keys.poses_all(site), MAX_SMALL_BYTES),

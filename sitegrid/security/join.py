@@ -6,10 +6,14 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from ipaddress import ip_address
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from protocol.errors import ConfigError
-from protocol.wire.credentials import SIGNING_FILE, check_valid, load_credentials
+from protocol.wire.credentials import SERVERS_FILE, SIGNING_FILE, check_valid, load_credentials
 from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT, SessionConfig
+
+if TYPE_CHECKING:
+    from sitegrid.security.signing import Signer
 
 
 def join(
@@ -33,14 +37,23 @@ def join(
         raise ConfigError("network", str(error)) from None
 
 
-def signer(keys: Path | None) -> Callable[[str, bytes], bytes] | None:
-    """What signs a machine's batches, from key expression and payload, if its folder of keys has a signing key."""
+def reply_check(keys: Path | None) -> Callable[[str, bytes, bytes, bytes], bool] | None:
+    """What checks replies to a machine's batches, if its folder has the keys of map servers and one to sign with."""
+    if not keys or not (keys / SIGNING_FILE).is_file() or not (keys / SERVERS_FILE).is_file():
+        return None
+    from sitegrid.security.signing import ReplyVerifier
+
+    return ReplyVerifier((keys / SERVERS_FILE).read_text(encoding="ascii").split()).is_genuine
+
+
+def signer(keys: Path | None) -> Signer | None:
+    """What signs a machine's batches or a server's replies, if its folder of keys has a signing key."""
     file = keys / SIGNING_FILE if keys else None
     if not file or not file.is_file():
         return None
-    from sitegrid.security.signing import Signer  # imported here: only machines with keys need `cryptography`
+    from sitegrid.security.signing import Signer  # imported here: only those with keys need `cryptography`
 
-    return Signer(file.read_bytes()).sign
+    return Signer(file.read_bytes())
 
 
 def with_keys(endpoint: str) -> str:

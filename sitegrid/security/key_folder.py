@@ -11,7 +11,14 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from protocol.errors import ConfigError
-from protocol.wire.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, IDENTITY_FILE, KEY_FILE, SIGNING_FILE
+from protocol.wire.credentials import (
+    AUTHORITY_FILE,
+    CERTIFICATE_FILE,
+    IDENTITY_FILE,
+    KEY_FILE,
+    SERVERS_FILE,
+    SIGNING_FILE,
+)
 from sitegrid.security.certificates import KeyPair, expires_at, issue, make_authority
 from sitegrid.security.register import ROUTER, Register, RegisterEntry, common_name, save_register, write_private
 from sitegrid.security.signing import make_signing_key
@@ -36,18 +43,28 @@ def certify(folder: Path, register: Register, name: str, role: str, expires: dat
     number = register.next_issue(name)
     hosts = register.hosts if role == ROUTER else ()
     pair = issue(authority, common_name(name, number), now, expires, hosts)
-    signing_key, public = make_signing_key() if role == "machine" else (b"", "")
+    signing_key, public = _signing_key(folder, register, name, role)
     entry = RegisterEntry(role, pair.serial, expires_at(pair), number, signing=public)
     identity = f'site = "{register.site}"\nname = "{name}"\nrole = "{role}"\nexpires = {entry.expires.isoformat()}\n'
     files = {AUTHORITY_FILE: authority.certificate, CERTIFICATE_FILE: pair.certificate, KEY_FILE: pair.key}
     if signing_key:
         files[SIGNING_FILE] = signing_key
+    if role == "machine":
+        files[SERVERS_FILE] = "".join(f"{key}\n" for key in register.server_keys()).encode()
     _private_folder(folder / name)
     for file, data in {**files, IDENTITY_FILE: identity.encode()}.items():
         write_private(folder / name / file, data)
     register = register.with_entry(name, entry)
     save_register(folder, register)
     return register
+
+
+def _signing_key(folder: Path, register: Register, name: str, role: str) -> tuple[bytes, str]:
+    """What it signs with, private and public; a map server keeps its own, which all machines know, while it is here."""
+    known, file = register.names.get(name), folder / name / SIGNING_FILE
+    if role == "server" and known and known.signing and not known.revoked and file.is_file():
+        return file.read_bytes(), known.signing
+    return make_signing_key() if role in ("machine", "server") else (b"", "")
 
 
 def _authority(folder: Path) -> KeyPair:

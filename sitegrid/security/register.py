@@ -26,7 +26,7 @@ class RegisterEntry:
     """One name.
 
     serial: of its newest certificate, hex. issue: 1, and one more each time it comes back from revoked. signing: the
-    public key that its batches are signed with, base64; none where it sends none.
+    public key that its batches or replies are signed with, base64; none where it sends none.
     """
 
     role: str
@@ -59,7 +59,12 @@ class Register:
 
     def signing_keys(self) -> dict[str, str]:
         """Public keys of the machines whose batches are accepted."""
-        return {name: entry.signing for name, entry in self.admitted().items() if entry.signing}
+        entries = self.admitted().items()
+        return {name: entry.signing for name, entry in entries if entry.signing and entry.role == "machine"}
+
+    def server_keys(self) -> list[str]:
+        """Public keys of the map servers, whose replies are believed."""
+        return [entry.signing for entry in self.admitted().values() if entry.signing and entry.role == "server"]
 
     def next_issue(self, name: str) -> int:
         """The issue that a new certificate of this name belongs to."""

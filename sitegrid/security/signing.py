@@ -1,15 +1,17 @@
-"""Ed25519 signatures over batches: nobody on the way, not even the router, can forge or alter one.
+"""Ed25519 signatures over batches and replies: nobody on the way, not even the router, can forge or alter one.
 
 The signature is the attachment of the query; the bytes of the batch stay the same, and a server without signatures
 ignores it. Key expression and payload are signed, so that a batch is valid for one machine of one site. A replay
-does no harm: the map server knows each sample by its number. Needs `cryptography`.
+does no harm: the map server knows each sample by its number. The reply to a signed batch is signed together with that
+batch, so that it answers no other one. Needs `cryptography`.
 """
 
 from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Iterable, Mapping
 
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
@@ -18,10 +20,14 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from protocol.errors import ConfigError, MessageError, Refusal
 
 _CONTEXT = b"sitegrid batch 1\0"  # a signature of something else is not valid for a batch
+_REPLY_CONTEXT = b"sitegrid reply 1\0"
 
 
 class Signer:
-    """Signs the batches of one machine. private_key: PEM; ConfigError where it is no Ed25519 key."""
+    """Signs the batches of one machine, or the replies of a map server.
+
+    private_key: PEM; ConfigError where it is no Ed25519 key.
+    """
 
     def __init__(self, private_key: bytes) -> None:
         try:
@@ -35,6 +41,22 @@ class Signer:
     def sign(self, key_expression: str, payload: bytes) -> bytes:
         """The signature of a batch that is sent to a key, 64 bytes."""
         return self._key.sign(_signed(key_expression, payload))
+
+    def sign_reply(self, key_expression: str, payload: bytes, reply: bytes) -> bytes:
+        """The signature of the reply to a batch that came to a key, 64 bytes."""
+        return self._key.sign(_signed_reply(key_expression, payload, reply))
+
+
+class ReplyVerifier:
+    """Checks the signatures of replies. public_keys: of the site's map servers, base64 of 32 bytes each."""
+
+    def __init__(self, public_keys: Iterable[str]) -> None:
+        self._keys = [_public_key("a map server", text) for text in public_keys]
+
+    def is_genuine(self, key_expression: str, payload: bytes, reply: bytes, signature: bytes) -> bool:
+        """Whether a map server of the site has given this reply to this batch."""
+        signed = _signed_reply(key_expression, payload, reply)
+        return any(_fits(key, signature, signed) for key in self._keys)
 
 
 class Verifier:
@@ -50,11 +72,9 @@ class Verifier:
             raise MessageError(Refusal.WRONG_MACHINE, f"no signing key of {machine!r} is in the register")
         if not signature:
             raise MessageError(Refusal.WRONG_MACHINE, "the batch is not signed, and this server asks for it")
-        try:
-            key.verify(signature, _signed(key_expression, payload))
-        except InvalidSignature:
+        if not _fits(key, signature, _signed(key_expression, payload)):
             problem = f"the signature is not that of {machine!r}; compare its keys with the register"
-            raise MessageError(Refusal.WRONG_MACHINE, problem) from None
+            raise MessageError(Refusal.WRONG_MACHINE, problem)
 
 
 def make_signing_key() -> tuple[bytes, str]:
@@ -74,3 +94,15 @@ def _public_key(machine: str, text: str) -> Ed25519PublicKey:
 
 def _signed(key_expression: str, payload: bytes) -> bytes:
     return _CONTEXT + key_expression.encode() + b"\0" + payload
+
+
+def _signed_reply(key_expression: str, payload: bytes, reply: bytes) -> bytes:
+    return _REPLY_CONTEXT + key_expression.encode() + b"\0" + hashlib.sha256(payload).digest() + reply
+
+
+def _fits(key: Ed25519PublicKey, signature: bytes, signed: bytes) -> bool:
+    try:
+        key.verify(signature, signed)
+    except InvalidSignature:
+        return False
+    return True

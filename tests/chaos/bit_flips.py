@@ -126,6 +126,7 @@ def read_spool(path: Path) -> Content:
         raise
     finally:
         spool._db.close()
+        spool._mark.close()
 
 
 def _flip_all(path: Path, look: Callable[[Path], Content], rng: random.Random, n: int, folder: Path) -> Counter[str]:

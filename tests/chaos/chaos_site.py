@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from benchmarks.measure import memory_mb
 from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE
@@ -71,6 +72,7 @@ class ChaosSite:
         self._running: dict[str, Process] = {}
         self._starts = 0
         site = replace(open_log(recordings.data(self.machines[0])).site, clock=clock)
+        self.name = site.name
         (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
         (folder / "server.toml").write_text(SERVER_TOML, encoding="utf-8")
 
@@ -109,6 +111,15 @@ class ChaosSite:
 
     def send(self, role: str, number: signal.Signals) -> None:
         self._running[role].send(number)
+
+    def peak_mb(self, role: str) -> float:
+        """The most memory that a process had since its start, or since that was forgotten."""
+        return memory_mb("VmHWM", self._running[role].pid)
+
+    def forget_peak_mb(self, role: str) -> float:
+        """Have the peak counted from now on; returns what the process has now."""
+        Path(f"/proc/{self._running[role].pid}/clear_refs").write_text("5", encoding="ascii")
+        return memory_mb("VmRSS", self._running[role].pid)
 
     def kill(self, role: str) -> None:
         with self.fault():

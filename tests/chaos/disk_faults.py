@@ -28,7 +28,7 @@ from protocol.machine.samples import content_hash, empty
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from tests.chaos import power_worker as work
-from tests.chaos.disk_model import Disk, Kind, Operation, read_trace
+from tests.chaos.disk_model import SECTOR, Disk, Kind, Operation, read_trace
 from tests.chaos.disk_shim import DiskError, FailingDisk, build
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
@@ -94,10 +94,25 @@ def cut(
         folder = Path(tempfile.mkdtemp(prefix="chaos-", dir=IN_MEMORY if IN_MEMORY.is_dir() else None))
         try:
             disk.cut(rng, folder)
+            wear_marks(folder, rng)
             judge(outcome, promises, LOOK[what](folder))
         finally:
             shutil.rmtree(folder)
     return outcome
+
+
+def wear_marks(folder: Path, rng: random.Random) -> None:
+    """Leave marks as they are, or behind, or torn, or none: they are never synced, and must never raise an alarm."""
+    for mark in folder.rglob("*-mark"):
+        match rng.randrange(4):
+            case 0:
+                mark.unlink()
+            case 1:
+                os.truncate(mark, rng.randint(0, mark.stat().st_size))
+            case 2:
+                content = bytearray(mark.read_bytes())
+                at = rng.randrange(len(content) + 1)
+                mark.write_bytes(content[:at] + bytes(min(SECTOR, len(content) - at)) + content[at + SECTOR :])
 
 
 def judge(outcome: FaultOutcome, promises: str, left: Remains) -> None:
@@ -134,9 +149,10 @@ def _look_at_spool(folder: Path) -> Remains:
         for i, row in enumerate(head.rows):
             contents.setdefault((head.spool_id, head.first_seq + i), []).append(content_hash(row))
         spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
-    is_settled = spool.is_settled()
+    problem = "" if spool.is_settled() else "spool does not settle"
+    problem = f"false alarm: {spool.damage}" if spool.damage else problem
     spool.close()
-    return Remains(contents, "" if is_settled else "spool does not settle")
+    return Remains(contents, problem)
 
 
 def _look_at_store(folder: Path) -> Remains:
@@ -159,6 +175,8 @@ def _look_at_store(folder: Path) -> Remains:
     payload = encode_batch(SampleBatch(work.MACHINE, work.SPOOL_ID, watermark + 1, rows, work.SITE.frame, 0))
     if not isinstance(store.commit([Incoming(work.MACHINE, payload)])[0], Ack):
         problem = "store takes nothing more"
+    if store.shortfalls:
+        problem = f"false alarm: {store.shortfalls[-1]}"
     store.close()
     return Remains(contents, problem)
 

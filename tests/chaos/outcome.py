@@ -13,9 +13,9 @@ TimeSpan = tuple[float, float]  # [s] of one clock
 
 COLUMNS = (
     *("fault", "count", "recorded", "merged", "declared", "lost", "double", "silent", "longest ack", "longest pause"),
-    "",
+    *("memory", "answer", ""),
 )
-LINE = "{:<16}{:>6}{:>10}{:>9}{:>10}{:>6}{:>8}{:>8}{:>13}{:>15}  {}"
+LINE = "{:<16}{:>6}{:>10}{:>9}{:>10}{:>6}{:>8}{:>8}{:>13}{:>15}{:>8}{:>8}  {}"
 
 
 class InterruptError(Exception):
@@ -30,7 +30,9 @@ class FaultOutcome:
     declared lost to the server; lost: those that are in no journal and were not; silent: those of the lost that no log,
     health or metric named either. ack_ms_max: the longest time from the first sending of a batch until it was
     acknowledged, as agents that ended in order report it; longest_pause_s: between two commits of one machine, without
-    the time that faults lasted; both None where no agents run. skipped: why it did not run.
+    the time that faults lasted; both None where no agents run. memory_ratio: the server's peak, as a multiple of what
+    it has with one reader; answer_s_max: the longest time that this reader waited; both None but for faults of readers.
+    skipped: why it did not run.
     """
 
     fault: str
@@ -43,6 +45,8 @@ class FaultOutcome:
     silent: int = 0
     ack_ms_max: int | None = None
     longest_pause_s: float | None = None
+    memory_ratio: float | None = None
+    answer_s_max: float | None = None
     skipped: str = ""
     problems: list[str] = field(default_factory=list)
     pids: list[int] = field(default_factory=list)
@@ -102,10 +106,12 @@ def table(outcomes: Iterable[FaultOutcome]) -> str:
 
 def _row(outcome: FaultOutcome) -> tuple[str, ...]:
     if outcome.skipped:
-        return (outcome.fault, *("-",) * 9, f"skipped: {outcome.skipped}")
+        return (outcome.fault, *("-",) * 11, f"skipped: {outcome.skipped}")
     pause = "-" if outcome.longest_pause_s is None else f"{outcome.longest_pause_s:.1f} s"
     ack = "-" if outcome.ack_ms_max is None else f"{outcome.ack_ms_max} ms"
     names = ("count", "recorded", "merged", "declared", "lost", "double", "silent")
     counts = (getattr(outcome, name) for name in names)
     verdict = "ok" if outcome.is_good else "FAILED: " + "; ".join(outcome.problems or ["lost or double"])
-    return (outcome.fault, *map(str, counts), ack, pause, verdict)
+    ratio = "-" if outcome.memory_ratio is None else f"{outcome.memory_ratio} x"
+    answer = "-" if outcome.answer_s_max is None else f"{outcome.answer_s_max:.1f} s"
+    return (outcome.fault, *map(str, counts), ack, pause, ratio, answer, verdict)

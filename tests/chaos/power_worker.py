@@ -17,6 +17,8 @@ import numpy as np
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
+from mapserver.journal.journal import Journal
+from mapserver.journal.shortfall import ROW
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash, empty
@@ -75,6 +77,7 @@ def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, carele
             spool = None
     if spool:
         spool._db.close()  # as a kill leaves it
+        spool._mark.close()
 
 
 def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
@@ -96,6 +99,18 @@ def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, carele
                 store.save_snapshot()
     if store:
         store.journal._db.close()
+        store.journal._mark.close()
+
+
+def mark_before_commit() -> None:
+    """Have the journal write its mark too early: it then claims what a power cut may take away."""
+    commit = Journal.commit
+
+    def hasty(journal: Journal) -> None:
+        journal._mark.write({ROW: journal.last_row, **journal._changed})
+        commit(journal)
+
+    Journal.commit = hasty  # type: ignore[method-assign]
 
 
 def _sync(db: sqlite3.Connection, careless: bool) -> None:
@@ -107,6 +122,8 @@ USE = {"spool": use_spool, "store": use_store}
 
 if __name__ == "__main__":
     FOLDER = Path(sys.argv[2])
+    if "hasty" in sys.argv:
+        mark_before_commit()
     USE[sys.argv[1]](
         FOLDER, Promises(FOLDER / PROMISES), int(sys.argv[3]), int(sys.argv[4]), careless="careless" in sys.argv
     )

@@ -101,6 +101,7 @@ class FaultySpool(Spool):
         """End the process that has the file open, as it is."""
         self.plan.killed = True
         self._db.close()
+        self._mark.close()
 
     def _connect(self, path: Path) -> sqlite3.Connection:
         db = connect(path, FaultyConnection)

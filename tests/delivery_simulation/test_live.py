@@ -20,14 +20,16 @@ from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import Uplink, UplinkConfig, Wait
 from agents.delivery.uplink_thread import UplinkThread
 from agents.localisation.filters.belief import PoseBelief
-from agents.presence import ANSWER_S, PATIENCE, Presence, find_namesake
+from agents.presence import PATIENCE, Presence, find_namesake
 from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol.errors import LinkError
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
-from protocol.wire.codec import decode_health, decode_pose
+from protocol.wire.codec import decode_batch, decode_health, decode_pose, encode_reply
+from protocol.wire.messages import Ack, Refused
+from protocol.wire.owners import ANSWER_S
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.commands.agent import _claim_name, _open
 from sitegrid.process.children import wait_until
@@ -164,6 +166,34 @@ def test_uplink_ends_at_once_while_a_server_does_not_answer(opened: Opened, tmp_
     for query in held:
         query.drop()
     queryable.undeclare()
+
+
+def test_forged_or_unsigned_reply_is_counted_and_not_believed(opened: Opened, tmp_path: Path) -> None:
+    """As one who controls the router's host could give it: the samples would be deleted, and nobody would have them."""
+    signatures = [None, b"forged"]
+    store = "0123456789abcdef"
+
+    def acknowledge(query: zenoh.Query) -> None:
+        with query:
+            batch = decode_batch(query.payload.to_bytes(), SITE.extent_m)
+            signature = signatures.pop(0) if signatures else b"genuine"
+            reply = Refused("out_of_range", "bad") if signature == b"forged" else Ack(batch.last_seq, 1, 0, store)
+            query.reply(query.key_expr, encode_reply(reply), attachment=signature)
+
+    def is_genuine(key: str, payload: bytes, reply: bytes, signature: bytes) -> bool:
+        return signature == b"genuine"
+
+    uplink, server = Uplink("loader-1", SITE.frame, 1.0), opened()
+    with contextlib.closing(Spool(tmp_path / "spool.db", SpoolConfig())) as spool:
+        spool.record(made_up_samples(5))
+        queryable = server.declare_queryable(keys.ingest(SITE.name, "loader-1"), acknowledge)
+        thread = UplinkThread(opened(), SITE.name, uplink, spool, lambda *_: b"mine", is_genuine)
+        wait_until(lambda: uplink.counters["refused_unsigned"] == 2, WAIT_S, "two replies are not believed")
+        assert spool.counters()["recorded"] == 5
+        wait_until(spool.is_settled, WAIT_S, "the third one is")
+        thread.close()
+        assert (uplink.counters["refused_unsigned"], spool.counters()["put_aside"]) == (2, 0)
+        queryable.undeclare()
 
 
 def test_bug_does_not_end_delivery_silently(

@@ -35,6 +35,7 @@ from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu
 from protocol.queries import requests
+from protocol.queries.answers import MapVersion
 from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
 from protocol.site.geometry import Bounds
@@ -85,7 +86,7 @@ def _messages() -> Iterator[Decoder]:
         yield Decoder(name, seeds, partial(_again, name, encode, decode), (MessageError,), messages)
 
 
-_SINGLE = ("bundle", "pose", "health", "point", "region", "history", *PLAIN[1:], "error")
+_SINGLE = ("bundle", "pose", "health", "point", "region", "history", "tiles", "why", *PLAIN[1:], "error")
 
 
 def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], Any], data: bytes) -> None:
@@ -113,6 +114,9 @@ def _selectors() -> Iterator[Decoder]:
         requests.PointQuery(12.0, -40.5, ("resistance", "visits"), fresh, when),
         requests.RegionQuery(Bounds(0.0, 0.0, 200.0, 150.0), ("resistance",), fresh, when),
         requests.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
+        requests.TilesQuery(MapVersion("0123456789abcdef", 17, 3)),
+        requests.TilesQuery(as_of_ns=T0),
+        requests.WhyQuery(12.0, 40.5, T0),
         requests.MachinesQuery(fresh),
         requests.ChangesQuery(3),
         requests.InfoQuery(fresh),

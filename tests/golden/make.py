@@ -5,6 +5,7 @@ Only after a deliberate change of the wire, with docs/protocol.md. The tests com
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu,
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
+from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
+from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
 from protocol.wire import codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -116,6 +119,7 @@ MACHINE = records.MachineState(
     samples=1200,
     lost=3,
     newest_ns=T0 + 1,
+    missing=5,
 )
 TRUST = records.TrustAnswer(**vars(MACHINE), store=STORE, merged=17, fact=3)
 CHANGE = records.GroundChange(
@@ -129,6 +133,29 @@ CHANGE = records.GroundChange(
     grade_before=0.0,
     grade_after=None,
 )
+TILES = TilesAnswer(
+    VERSION, T0, 0.5, whole=True, tiles=(MapTile(-1, 2, 17, 3, T0, zlib.compress(bytes(range(256)) * 96, 6)),)
+)
+VOTES = Votes((0.01, 0.1), (1.5, 0.0), (0.0, 2.25))
+WHY = CellReasons(
+    store=STORE,
+    merged=17,
+    fact=3,
+    stamp_ns=T0 + 9,
+    x_m=0.5,
+    y_m=1.5,
+    cell_m=1.0,
+    values={"resistance": 0.015625, "grade": None},
+    before={"resistance": 0.25, "grade": None},
+    metres=1.5,
+    newest_ns=T0,
+    changed_ns=T0 - 5,
+    resistance=VOTES,
+    grade_east=VOTES,
+    grade_north=VOTES,
+    sectors=(1.0, 0.5),
+    machines=("loader-1", "loader-2"),
+)
 ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 OVERLOADED = QueryError(Refusal.OVERLOADED, "the server has too many queries to answer", 2.5)
 
@@ -139,11 +166,16 @@ GOLDEN: dict[str, Golden] = {
     "ack.bin": Golden(Ack(43, 17, 2, STORE), codec.encode_reply, codec.decode_reply),
     "ack_replaces.bin": Golden(Ack(43, 17, 2, STORE, "fedcba9876543210"), codec.encode_reply, codec.decode_reply),
     "refused.bin": Golden(Refused("gap", "first_seq: 41: 12 is expected", 12), codec.encode_reply, codec.decode_reply),
+    "refused_later.bin": Golden(
+        Refused("overloaded", "too many batches are waiting", retry_after_s=1.5), codec.encode_reply, codec.decode_reply
+    ),
     "bundle.bin": Golden(SensorBundle("loader-1", 5, readings(), last=True), codec.encode_bundle, codec.decode_bundle),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
+    "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
+    "why.bin": Golden(WHY, encode_why, decode_why),
     "tile.bin": Golden(tile(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
     "machines.bin": Golden(
@@ -158,6 +190,7 @@ GOLDEN: dict[str, Golden] = {
         answers.decode_changes,
     ),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
+    "alive.bin": Golden(records.ServerAlive(STORE, 18, 17, 0.25), answers.encode_alive, answers.decode_alive),
     "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, answers.encode_info, decode_info_table),
     "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),
     "overloaded.bin": Golden(OVERLOADED, answers.encode_error, answers.decode_error),

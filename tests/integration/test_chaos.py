@@ -18,7 +18,7 @@ from agents.delivery.spool import Spool, SpoolConfig
 from protocol.machine.samples import empty
 from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
-from tests.chaos import bit_flips, disk_faults, site_faults, stepped_clock
+from tests.chaos import bit_flips, disk_faults, reader_faults, site_faults, stepped_clock
 from tests.chaos.__main__ import ChaosFault, run_suite, totals
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
@@ -56,6 +56,20 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
 
 
 @pytest.mark.processes
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_readers_that_sleep_cost_machines_nothing(tmp_path):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=60)
+    outcome = reader_faults.sleeping_reader(scenario(tmp_path / "run", recordings=recordings, seconds=1.0))
+    assert outcome.problems == [], "among others: a slow acknowledgement, a server that took more memory"
+    assert outcome.is_good
+    assert outcome.count == sum(readers for _, readers in reader_faults.SLEEPING)
+    assert outcome.recorded == outcome.merged > 30
+    assert 0 < outcome.ack_ms_max <= reader_faults.LONGEST_ACK_MS
+    assert 0.9 < outcome.memory_ratio <= reader_faults.MOST_MEMORY
+    assert outcome.answer_s_max > 0
+
+
+@pytest.mark.processes
 @pytest.mark.skipif(sys.platform != "linux", reason="LD_PRELOAD")
 def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
     outcome = disk_faults.power(scenario(tmp_path / "run", strikes=40))
@@ -68,6 +82,13 @@ def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
 def test_power_cuts_find_a_file_that_is_not_synced_at_every_commit(tmp_path, library, what):
     operations = disk_faults.trace(library, tmp_path / "run", what, 3, "careless")
     assert disk_faults.cut(operations, what, 20, random.Random(1)).lost > 0
+
+
+@pytest.mark.processes
+def test_power_cuts_find_a_mark_that_is_written_before_its_commit(tmp_path, library):
+    operations = disk_faults.trace(library, tmp_path / "run", "store", 3, "hasty")
+    outcome = disk_faults.cut(operations, "store", 60, random.Random(1))
+    assert any("false alarm" in problem for problem in outcome.problems)
 
 
 @pytest.mark.processes

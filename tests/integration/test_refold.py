@@ -164,7 +164,7 @@ def test_a_decision_that_a_full_disk_does_not_take_is_refused_and_one_that_was_a
     server = serve(site)
     with site.connect() as client:
         with full_disk(server):
-            with pytest.raises(QueryError, match="`loader-3` cannot be written, so it does not count") as refused:
+            with pytest.raises(QueryError, match="the decision cannot be written, so it does not count") as refused:
                 client.distrust("loader-3", "a test")
             assert refused.value.reason == Refusal.STORE
             assert list(client.info().distrusted) == []

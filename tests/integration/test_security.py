@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -32,6 +33,7 @@ from sitegrid import connect
 from sitegrid.cli import main
 from sitegrid.process.children import Child, Children, wait_until
 from sitegrid.security.access import SPARE_BYTES
+from sitegrid.security.join import reply_check
 from sitegrid.security.signing import Signer
 
 certificates = pytest.importorskip("sitegrid.security.certificates", reason="cryptography is not installed")
@@ -168,6 +170,9 @@ def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_
             assert decode_reply(reply).reason == "wrong_machine", site.still_works()
         (reply,) = answers(session, key, batch, attachment=mine)
         assert isinstance(decode_reply(reply), Ack)
+        (signed,) = session.get(key, payload=batch, attachment=mine, timeout=READY_S)
+        signature = signed.ok.attachment.to_bytes()
+        assert reply_check(site.keys / "loader-1")(key, batch, signed.ok.payload.to_bytes(), signature)
     agent, _ = site.drive(tmp_path / "spool.db", 10)
     report = agent.expect("ended", READY_S)["ended"]
     assert report["delivered"], f"agent pid {agent.pid}, server pid {site.server.pid}"
@@ -425,6 +430,17 @@ def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
             put_until(received, b"last", lambda: loader.put(keys.pose(SITE, "loader-1"), b"last"))
             most = 50 * (time.monotonic() - began) + 5
         assert received.count(b"flood") <= most, guarded.still_works()
+
+
+def test_connections_that_say_nothing_delay_no_link(guarded: Guarded):
+    place = tuple(guarded.endpoint.removeprefix("tls/").rsplit(":", 1))
+    with contextlib.ExitStack() as opened:
+        for _ in range(150):
+            opened.enter_context(socket.create_connection(place, READY_S))
+        began = time.monotonic()
+        with guarded.session("guest"):
+            took_s = time.monotonic() - began
+        assert took_s < 2.0, guarded.still_works()
 
 
 # --- revoked ---------------------------------------------------------------------------------------------------------

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from protocol.queries.answers import MachineState, MapInfo, MapVersion, SampleCounts, ServerProcess, SiteInfo
+from protocol.queries.answers import (
+    CheckpointCounts,
+    MachineState,
+    MapInfo,
+    MapVersion,
+    SampleCounts,
+    ServerProcess,
+    SiteInfo,
+)
 from protocol.site.site_config import SiteConfig
 
 STORE = "0123456789abcdef"
@@ -16,16 +24,17 @@ def version(row: int = 0, fact: int = 0) -> MapVersion:
 
 def map_info(site: SiteConfig, **values: Any) -> MapInfo:
     rows = ("fact", "journalled", "merged", "snapshot")
-    zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "stamp_ns", "wall_ns")
+    zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "first_ns", "stamp_ns", "wall_ns")
     defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
     defaults |= {"site": SiteInfo(**vars(site), frame=site.frame, crs=site.crs), "version": "1.0", "bounds": None}
     defaults |= {"store": STORE, "descends": (), "accepted": (), "server": ServerProcess("office", 7)}
-    defaults |= {"machines": {}, "distrusted": (), "counters": {}, "layers": ()}
+    defaults |= {"checkpoints": CheckpointCounts(0, 0, 0, 0)}
+    defaults |= {"machines": {}, "distrusted": (), "shortfalls": (), "counters": {}, "layers": (), "boundaries": ()}
     return MapInfo(**(defaults | values))
 
 
 def machine_state(name: str, **values: Any) -> MachineState:
     decision = {"trusted": True, "by": "", "reason": "", "since_ns": 0}
     audit = {"contradicts": False, "reasons": (), "evidence": {}}
-    counts = vars(SampleCounts(spools=1, samples=0, lost=0, newest_ns=0))
+    counts = vars(SampleCounts(spools=1, samples=0, lost=0, newest_ns=0, missing=0))
     return MachineState(name, **(decision | audit | counts | values))

@@ -9,15 +9,19 @@ def test_ingest_prints_one_json_object(capsys):
     assert main(["ingest", "--json", "--samples", "250", "--runs", "1"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["benchmark"], result["samples"]) == ("ingest", 250)
-    assert all(set(row) == {"batch", "batches_per_commit", "samples_per_s", "ms_per_commit"} for row in result["rows"])
+    assert [(row["batch"], row["batches_per_commit"]) for row in result["rows"]] == [
+        (size, group) for size in (6, 100, 1000) for group in (1, 16)
+    ]
+    names = {"batch", "batches_per_commit", "samples_per_s", "samples_per_cpu_s", "ms_per_commit"}
+    assert all(set(row) == names for row in result["rows"])
     assert all(value > 0 for row in result["rows"] for value in row.values())
 
 
 def test_without_json_a_table_is_printed(capsys):
     main(["ingest", "--samples", "100", "--runs", "1"])
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["batch", "batches_per_commit", "samples_per_s", "ms_per_commit"]
-    assert len(lines) == 5
+    assert lines[0].split() == ["batch", "batches_per_commit", "samples_per_s", "samples_per_cpu_s", "ms_per_commit"]
+    assert len(lines) == 7
     assert len({len(line) for line in lines}) == 1
 
 

@@ -160,11 +160,11 @@ def test_more_hours_are_more_samples():
 
 @pytest.mark.slow
 def test_restart_opens_a_store_with_snapshot_and_tail(monkeypatch, capsys):
-    monkeypatch.setattr(merge_restart, "TAIL_ROWS", 7)
+    monkeypatch.setattr(merge_restart, "TAIL_SAMPLES", 700)
     assert main(["restart", "--json", "--samples", "1950"]) == 0
     result = json.loads(capsys.readouterr().out)
     names = ("samples_in_row", "journal_rows", "tail_rows")
-    assert [tuple(row[name] for name in names) for row in result["rows"]] == [(100, 20, 7), (6, 325, 7)]
+    assert [tuple(row[name] for name in names) for row in result["rows"]] == [(100, 20, 7), (6, 325, 116)]
     for row in result["rows"]:
         assert row["samples"] >= result["samples"] == 1950
         assert 0 < row["open_s"] < row["process_s"]

@@ -1,5 +1,6 @@
 """Samples, batches and stores for the tests of the map server."""
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,10 +14,12 @@ import zenoh
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
-from mapserver.evidence.grid import LIVE_ROWS, Grid, GridState, PlacedPage
+from mapserver.evidence.grid import LIVE_ROWS, Grid
+from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import CompactPages, Page
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
+from mapserver.past.past import Past
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from protocol.site.geometry import CellWindow
@@ -110,7 +113,7 @@ def total(grid: Grid) -> np.ndarray:
 def same(one: Grid, other: Grid) -> bool:
     """Equal to the bit."""
     a, b = one.state(), other.state()
-    totals = [(state.folded, state.skipped, state.newest_ns) for state in (a, b)]
+    totals = [(state.folded, state.skipped, state.newest_ns, state.oldest_ns) for state in (a, b)]
     return totals[0] == totals[1] and [*map(_bits, a.pages)] == [*map(_bits, b.pages)]
 
 
@@ -167,8 +170,14 @@ def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = S
     return Store(folder, site, config, now_ns)
 
 
-def open_writer(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Writer:
-    return Writer(open_store(folder, config, site))
+def open_writer(
+    folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE, clock: Callable[[], float] = time.monotonic
+) -> Writer:
+    return Writer(open_store(folder, config, site), clock)
+
+
+def past_of(writer: Writer) -> Past:
+    return Past.of_store(writer.folder, writer.site.cell_m, writer.config.fold)
 
 
 class Replies:

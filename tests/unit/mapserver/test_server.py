@@ -16,6 +16,7 @@ from protocol.queries.answers import MapVersion
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
 from protocol.queries.requests import (
+    AliveQuery,
     Freshness,
     HistoryQuery,
     InfoQuery,
@@ -29,7 +30,18 @@ from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, WAIT_S, batch, now_ns, routed, samples, wait_for
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    WAIT_S,
+    batch,
+    held,
+    now_ns,
+    routed,
+    samples,
+    wait_for,
+)
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +92,17 @@ def test_a_batch_is_acknowledged_and_seen_by_a_query_that_waits_for_it(served):
     assert region.merged == 1
     point = codec.decode_point(ask(client, PointQuery(8.2, 8.9, ("resistance",))))
     assert point.values["resistance"] == region["resistance"][8, 8]
+
+
+def test_a_probe_is_answered_while_the_writer_is_busy(served):
+    server, client = served
+    deliver(client, batch(samples(5)))
+    with held(server._writer):
+        alive = codec.decode_alive(ask(client, AliveQuery()))
+        assert (alive.journalled, alive.merged, alive.store) == (1, 1, server._writer.store_id)
+        assert 0 < alive.busy_s < WAIT_S
+    error = refusal(client, "alive", {"after": "1"})
+    assert error.reason == Refusal.UNKNOWN_PARAMETER
 
 
 def test_a_refused_batch_gets_its_reason(served):
@@ -248,6 +271,15 @@ def test_events_and_queries_below_the_map_do_not_meet(served):
     assert here.wait(WAIT_S)
     assert received == [codec.encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
     subscriber.undeclare()
+
+
+def test_no_batch_is_taken_while_another_server_may_be_the_writer(served):
+    server, client = served
+    server._claim.held = False
+    refused = deliver(client, batch(samples(5)))
+    assert refused.reason == Refusal.NOT_WRITER
+    server._claim.held = True
+    assert deliver(client, batch(samples(5))).watermark == 5
 
 
 def test_a_command_reaches_the_follower_with_its_reason(served):

@@ -281,7 +281,7 @@ def test_full_spool_drops_the_oldest_counts_them_and_declares_them_lost(tmp_path
     head = spool.head(99)
     assert (head.first_seq, head.lost_before) == (61 - limit, 60 - limit)
     assert hashes(head.rows) == hashes(ROWS[-limit:])
-    expected = {"depth": limit, "dropped": 60 - limit, "put_aside": 0, "recorded": 60}
+    expected = {"depth": limit, "dropped": 60 - limit, "put_aside": 0, "recorded": 60, "gone": 0}
     assert spool.counters() == expected
     spool.close()
     again = opened(tmp_path, limit)
@@ -301,7 +301,7 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     rest = spool.head(99)
     assert (rest.first_seq, rest.lost_before) == (7, 1)
     assert hashes(rest.rows) == hashes(ROWS[6:10])
-    assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10}
+    assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10, "gone": 0}
     spool.close()
     problem = "damaged on the machine's disk"
     assert [(seq, why) for seq, _, why in quarantined(tmp_path)] == [(seq, problem) for seq in (1, 2, 3, 6)]
@@ -485,7 +485,7 @@ def test_failed_commit_leaves_no_transaction_open(
     for attempt in attempts:
         with pytest.raises(StoreError, match="disk is full; look at the machine's disk"):
             attempt()
-        assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 0, "recorded": 4}
+        assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 0, "recorded": 4, "gone": 0}
         assert (spool.spool_id, spool.newest, spool.acknowledged) == (identity, 4, 0)
     monkeypatch.setattr(FullDisk, "full_at", "never")
     assert spool.record(ROWS[4:6]) == 5

@@ -39,7 +39,6 @@ ROWS = made_up_samples(500)
 QUICK_S = 0.01  # an exchange over a good link
 TIMEOUT_S = UplinkConfig().timeout_s
 LAST_NS = int(ROWS["stamp_ns"].max())
-MEMORY = Path(":memory:")  # the spool's files have tests of their own
 
 
 class Server:
@@ -70,8 +69,11 @@ class Server:
 class Delivery:
     """An uplink and its spool; the actions between them are carried out, what is sent and replied is up to a test."""
 
+    folder: Path  # of the test, for spools
+    _names = itertools.count()
+
     def __init__(self, n: int = 0, spool: Spool | None = None, max_samples: int = 10_000, **pacing: Any) -> None:
-        self.spool = spool or Spool(MEMORY, SpoolConfig(max_samples))
+        self.spool = spool or Spool(self.folder / f"{next(self._names)}.db", SpoolConfig(max_samples))
         if n:
             self.spool.record(ROWS[:n])
         self.quarantined: list[tuple[int, str]] = []
@@ -104,6 +106,11 @@ class Delivery:
                 self.quarantined += [(action.head.first_seq, content_hash(row)) for row in action.head.rows]
             action = perform(action, self.uplink, self.spool, lambda _: (None, 0.0))
         return action
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Delivery, "folder", tmp_path, raising=False)
 
 
 def met(n: int = 0, **options: Any) -> Delivery:
@@ -207,6 +214,21 @@ def test_batch_is_never_less_than_one_sample() -> None:
         d.payload()
         d.reply(None)
     assert len(d.batch().rows) == 1
+
+
+@pytest.mark.parametrize(("asked_s", "least_s"), [(0.3, 0.3), (4.0, 4.0), (3000.0, 5.0)])
+def test_a_machine_comes_again_when_the_server_has_room_and_not_all_at_once(asked_s: float, least_s: float) -> None:
+    """As often as it is asked to, and never much later than by itself."""
+    d = met(5, max_backoff_s=5.0)
+    pauses = []
+    for _ in range(50):
+        d.payload()
+        pauses.append(d.reply(Refused(Refusal.OVERLOADED, "", retry_after_s=asked_s)))
+    assert least_s <= min(pauses) < 1.1 * least_s
+    assert 1.4 * least_s < max(pauses) <= 1.5 * least_s
+    d.payload()
+    assert d.reply(None) <= 0.2  # which has nothing to do with failures
+    assert d.counter("depth") == 5
 
 
 @pytest.mark.parametrize("reply", [None, Refused(Refusal.OVERLOADED, "")])
@@ -341,7 +363,7 @@ def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
     assert sorted(h for _, _, h in server.accepted) == sorted(good)
     assert set(server.accepted.values()) == {1}
     assert server.lost == (bad < 19)
-    assert d.spool.counters() == {"depth": 0, "dropped": 0, "put_aside": 1, "recorded": 20}
+    assert d.spool.counters() == {"depth": 0, "dropped": 0, "put_aside": 1, "recorded": 20, "gone": 0}
     assert d.quarantined == [(bad + 1, content_hash(rows[bad]))]
     assert d.uplink.counters["refused_out_of_range"] >= 1
 

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold_config import FoldConfig
+from mapserver.evidence.fold_config import FoldConfig, is_foldable
 from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks
+from mapserver.evidence.grid_state import GridCounts
 from protocol.site.geometry import CellWindow
 from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
 
@@ -50,6 +51,29 @@ def test_window_finds_the_blocks_that_it_touches(window, expected):
 def test_bounds_are_those_of_the_blocks():
     grid = folded(samples(2, x_m=[8.0, -24.0], y_m=[8.0, 40.0]))
     assert grid.bounds() == (-32, 0, 16, 48)
+
+
+def test_counts_are_kept_while_folding_and_fold_nothing(monkeypatch):
+    """Through folds, merges and snapshots; what waits is counted at once, its cells and bounds once it is folded."""
+    grid, parts = Grid(1.0, FoldConfig(), 200), [random_samples(90, seed, std_m=4.0) for seed in range(5)]
+    for part in parts[:4]:
+        grid.fold(part, "a")
+        with monkeypatch.context() as patched:
+            patched.setattr(Grid, "_drain", lambda _: pytest.fail("folds"))
+            counts = grid.counts()
+        sure = is_foldable(part, grid.config)
+        assert 0 < sure.sum() < len(part)
+        assert (counts.cells, counts.bounds) != (grid.known_cells(), grid.bounds())
+        assert (counts.folded, counts.skipped) == (grid.folded, grid.skipped)
+    again = Grid.from_state(1.0, grid.config, grid.state())
+    grid.merge(folded(parts[4]))
+    for each, rows in ((again, parts[:4]), (grid, parts)):
+        timelines = each._timelines
+        xs, ys = zip(*timelines, strict=True)
+        bounds = (16 * min(xs), 16 * min(ys), 16 * max(xs) + 16, 16 * max(ys) + 16)
+        cells = sum(timeline.known_cells for timeline in timelines.values())
+        sure = sum(int(is_foldable(part, grid.config).sum()) for part in rows)
+        assert each.counts() == GridCounts(sure, 90 * len(rows) - sure, cells, bounds)
 
 
 def test_known_cells_are_counted_once_over_all_buckets():

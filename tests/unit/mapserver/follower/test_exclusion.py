@@ -16,7 +16,9 @@ from mapserver.follower.exclusion import Exclusion
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.reader import JournalReader
-from mapserver.trust.decisions import KIND, PERSON, TrustDecision
+from mapserver.trust.auditor import Verdict
+from mapserver.trust.decisions import DISTRUST_AFTER, KIND, PERSON, TrustDecision
+from mapserver.trust.judgement import Reason
 from protocol.errors import QueryError, Refusal
 from tests.unit.mapserver.data import (
     CONFIG,
@@ -24,6 +26,7 @@ from tests.unit.mapserver.data import (
     SITE,
     WAIT_S,
     grid_copy,
+    held,
     incoming,
     open_store,
     open_writer,
@@ -200,7 +203,7 @@ def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer,
     before = writer.run(lambda store: store.grid)
     with closing(Exclusion(writer)) as excluding, JournalReader(tmp_path / JOURNAL_FILE) as reader:
         writer.run(lambda store: room(store, full=True))
-        with pytest.raises(QueryError, match=r"`b` cannot be written, so it does not count: .*full; make") as refused:
+        with pytest.raises(QueryError, match=r"cannot be written, so it does not count: .*full; make room") as refused:
             excluding.decide(long)
         assert refused.value.reason == Refusal.STORE
         assert (excluding.decision("b"), excluding.excluded(), reader.events(KIND)) == (None, frozenset(), [])
@@ -211,3 +214,44 @@ def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer,
         assert [event.body["machine"] for event in reader.events(KIND)] == ["b"]
         deliver(writer, range(5, 6))
     assert same(writer.run(grid_copy), map_without("b", 6))
+
+
+def test_the_audit_decides_again_what_a_full_disk_did_not_take(writer):
+    bad = {"b": Verdict("b", (Reason.GAIN,), {"why": "evidence that needs new pages" * 1000}, True)}
+    with closing(Exclusion(writer)) as excluding:
+        writer.run(lambda store: room(store, full=True))
+        for _ in range(DISTRUST_AFTER - 1):
+            excluding.judge(bad, NOW_NS)
+        with pytest.raises(QueryError, match="cannot be written"):
+            excluding.judge(bad, NOW_NS)
+        assert (excluding.decision("b"), excluding.excluded()) == (None, frozenset())
+        writer.run(lambda store: room(store, full=False))
+        excluding.judge(bad, NOW_NS)
+        wait_for(lambda: excluding.excluded() == {"b"})
+
+
+def test_a_person_is_not_overruled_by_an_audit_that_judged_at_the_same_time(writer):
+    bad = {"b": Verdict("b", (Reason.GAIN,), {}, True)}
+    with closing(Exclusion(writer)) as excluding:
+        for _ in range(DISTRUST_AFTER - 1):
+            excluding.judge(bad, NOW_NS)
+        person = Thread(target=excluding.decide, args=(decision("b", trusted=True),))
+        judge = Thread(target=excluding.judge, args=(bad, NOW_NS))
+        with held(writer):  # both wait for the writer's thread
+            person.start()
+            judge.start()
+        for thread in (person, judge):
+            thread.join(WAIT_S)
+        assert excluding.decision("b") == decision("b", trusted=True)
+        wait_for(lambda: excluding.excluded() == frozenset())
+
+
+def test_a_decision_that_the_writer_has_no_time_for_is_not_said_to_be_refused(writer, monkeypatch):
+    run = writer.run
+    with closing(Exclusion(writer)) as excluding:
+        with held(writer), monkeypatch.context() as patch:
+            patch.setattr(writer, "run", lambda work: run(work, timeout_s=0.01))
+            with pytest.raises(QueryError, match="may still do so") as refused:
+                excluding.decide(decision("b"))
+        assert refused.value.reason == Refusal.AFTER_TIMEOUT
+        wait_for(lambda: excluding.decision("b") == decision("b"))

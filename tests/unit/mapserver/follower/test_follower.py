@@ -30,6 +30,7 @@ from tests.unit.mapserver.data import (
     incoming,
     open_store,
     open_writer,
+    past_of,
     random_samples,
     same,
     samples,
@@ -48,7 +49,7 @@ class Site:
         self.published: list[GroundChange] = []
         self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0), trust=TrustConfig(judge_s, exclude))
         self.writer = open_writer(folder, self.config)
-        self.follower = Follower(self.writer, self.published.append)
+        self.follower = Follower(self.writer, self.published.append, past_of(self.writer))
 
     @property
     def grid(self) -> Grid:
@@ -117,6 +118,11 @@ def fold_of(sent: dict[str, list[Any]], config: ServerConfig, without: str = "")
             for part in rows:
                 grid.fold(part, name)
     return grid
+
+
+@pytest.mark.parametrize(("worked_s", "pause_s"), [(0.0, 1.0), (0.2, 1.0), (0.5, 2.0), (1.0, 4.0), (60.0, 5.0)])
+def test_turns_of_a_large_fleet_leave_most_of_the_time_to_others(worked_s, pause_s):
+    assert follower.pause_s(worked_s) == pytest.approx(pause_s)
 
 
 def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):

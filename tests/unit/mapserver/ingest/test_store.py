@@ -36,6 +36,10 @@ def store(tmp_path):
     opened.close()
 
 
+def counts(spools: int, samples: int, lost: int, newest_ns: int) -> dict[str, int]:
+    return {"spools": spools, "samples": samples, "lost": lost, "newest_ns": newest_ns, "missing": 0}
+
+
 def test_a_group_is_answered_in_order(store):
     group = [
         incoming(samples(3), 1),
@@ -93,7 +97,13 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
     again = store.commit([incoming(samples(3), 3), incoming(samples(4), machine="b")])
     assert [(a.watermark, a.trimmed) for a in again] == [(5, 0), (4, 0)]
     assert store.grid.folded == 9
-    assert store.info()["machines"]["b"] == {"spools": 1, "samples": 4, "lost": 0, "newest_ns": NOW_NS + 3 * 10**9}
+    assert store.info()["machines"]["b"] == {
+        "spools": 1,
+        "samples": 4,
+        "lost": 0,
+        "newest_ns": NOW_NS + 3 * 10**9,
+        "missing": 0,
+    }
 
 
 @pytest.mark.parametrize("method", ["begin", "append"])
@@ -111,7 +121,7 @@ def test_a_journal_that_cannot_be_written_refuses(store, monkeypatch, method):
 def test_losses_and_repeats_are_counted(store):
     store.commit([incoming(samples(3)), incoming(samples(2), 2), incoming(samples(1), 10, lost_before=6)])
     assert store.counters == {"batches": 2, "samples_trimmed": 2, "samples_lost": 6}
-    assert store.info()["machines"] == {"a": {"spools": 1, "samples": 4, "lost": 6, "newest_ns": NOW_NS + 2 * 10**9}}
+    assert store.info()["machines"] == {"a": counts(1, 4, 6, NOW_NS + 2 * 10**9)}
 
 
 def test_info_tells_the_state_in_plain_values(store):
@@ -120,6 +130,7 @@ def test_info_tells_the_state_in_plain_values(store):
         incoming(samples(2), spool_id=8),
         incoming(samples(2, cov_xx_m2=10.0, x_m=900.0, stamp_ns=NOW_NS + 10**12), machine="b"),
     ])  # fmt: skip
+    store.grid.known_cells()  # folds what waits: cells and bounds follow then
     info = store.info()
     assert info["site"]["name"] == SITE.name
     assert info["site"]["frame"] == SITE.frame
@@ -129,7 +140,13 @@ def test_info_tells_the_state_in_plain_values(store):
     assert (info["samples_merged"], info["samples_too_unsure"], info["cells"]) == (5, 2, 1)
     assert info["bounds"] == (0, 0, 16, 16)
     assert info["stamp_ns"] == NOW_NS + 10**12
-    assert info["machines"]["a"] == {"spools": 2, "samples": 5, "lost": 0, "newest_ns": NOW_NS + 2 * 10**9}
+    assert info["machines"]["a"] == {
+        "spools": 2,
+        "samples": 5,
+        "lost": 0,
+        "newest_ns": NOW_NS + 2 * 10**9,
+        "missing": 0,
+    }
 
 
 def test_now_is_the_newest_accepted_stamp_also_after_a_restart(tmp_path):
@@ -299,7 +316,13 @@ def test_samples_at_the_end_of_a_spool_are_declared_lost_without_a_row(tmp_path)
     assert store.counters["samples_lost"] == 4
     store.close()
     store = open_store(tmp_path)
-    assert store.machines()["a"] == {"spools": 1, "samples": 3, "lost": 4, "newest_ns": NOW_NS + 2 * 10**9}
+    assert store.machines()["a"] == {
+        "spools": 1,
+        "samples": 3,
+        "lost": 4,
+        "newest_ns": NOW_NS + 2 * 10**9,
+        "missing": 0,
+    }
     store.close()
 
 

@@ -1,5 +1,9 @@
+import math
+import queue
 import sqlite3
 import threading
+import time
+from collections import Counter
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -10,12 +14,16 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
+from mapserver.ingest import backlog, snapshot_times
 from mapserver.ingest import writer as writer_module
+from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, MOST_RETRY_S, size_of
+from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
-from mapserver.ingest.writer import GROUP_BATCHES, QUEUE_BATCHES, Writer
+from mapserver.ingest.writer import HANGS_S, Writer
 from mapserver.journal.journal import Journal
 from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
+from protocol.queries.answers import ServerAlive
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
 from protocol.wire.messages import Ack
 from tests.unit.mapserver.data import (
@@ -30,6 +38,7 @@ from tests.unit.mapserver.data import (
     held,
     incoming,
     open_writer,
+    past_of,
     random_samples,
     same,
     samples,
@@ -43,9 +52,9 @@ from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
 def start(tmp_path, monkeypatch):
     writers = []
 
-    def start_writer(site=SITE, snapshot_rows: int = 2000, **options: Any) -> Writer:
-        monkeypatch.setattr(writer_module, "SNAPSHOT_ROWS", snapshot_rows)
-        writers.append(open_writer(tmp_path, ServerConfig(store=StoreConfig(**options)), site))
+    def start_writer(site=SITE, restart_samples: int = RESTART_SAMPLES, clock=time.monotonic, **options: Any) -> Writer:
+        monkeypatch.setattr(snapshot_times, "RESTART_SAMPLES", restart_samples)
+        writers.append(open_writer(tmp_path, ServerConfig(store=StoreConfig(**options)), site, clock))
         return writers[-1]
 
     yield start_writer
@@ -103,6 +112,21 @@ def test_what_waits_is_committed_in_groups(start, monkeypatch, waiting, commits)
     assert len(events) == commits
 
 
+def test_batches_that_follow_closely_are_committed_together_and_keep_no_work_waiting(start, monkeypatch):
+    monkeypatch.setattr(writer_module, "COMMIT_EVERY_S", 0.3)
+    events = spied(monkeypatch, "commit")
+    writer, replies = start(clock=Clock()), Replies()
+    assert isinstance(send(writer, [incoming(samples(1))])[0], Ack)  # at once: nothing was committed before
+    for i in (1, 2, 3):
+        writer.submit(incoming(samples(1), i + 1), replies[i])
+    assert writer.run(lambda store: store.journalled) == 1
+    assert [answer.watermark for answer in replies.wait(3)] == [2, 3, 4]
+    assert len(events) == 2
+    writer.submit(incoming(samples(1), 5), replies[5])
+    writer.close()
+    assert replies.wait(4)[-1].watermark == 5
+
+
 def test_a_failed_commit_refuses_all_and_later_batches_work(start, monkeypatch):
     writer, replies = start(), Replies()
     journal = writer.run(lambda store: store.journal)
@@ -123,19 +147,67 @@ def test_a_failed_commit_refuses_all_and_later_batches_work(start, monkeypatch):
     assert not writer.failed
 
 
-def test_a_full_queue_refuses_at_once_and_is_counted(start):
+def test_where_too_much_waits_a_batch_is_refused_at_once_and_told_when_to_come_again(start, monkeypatch):
+    batches = [incoming(samples(1), i + 1) for i in range(12)]
+    room = 10 * (len(batches[0].payload) + BATCH_BYTES)
+    monkeypatch.setattr(backlog.Backlog.__init__, "__defaults__", (room,))
     writer, waiting, refused = start(), Replies(), Replies()
     with held(writer):
-        for i in range(QUEUE_BATCHES):
-            writer.submit(incoming(samples(1), i + 1), waiting[i])
-        for i in range(2):
-            writer.submit(incoming(samples(1), QUEUE_BATCHES + 1), refused[i])
-        assert [a.reason for _, a in refused.all] == [Refusal.OVERLOADED] * 2
-    waiting.wait(QUEUE_BATCHES)
-    assert writer.info()["counters"]["refused_overloaded"] == 2
-    assert writer.info()["samples_merged"] == QUEUE_BATCHES
-    answers = send(writer, [incoming(samples(1), QUEUE_BATCHES + 1)])
-    assert isinstance(answers[0], Ack)  # room again
+        for i, each in enumerate(batches[:10]):
+            writer.submit(each, waiting[i])
+        for i, each in enumerate(batches[10:]):
+            writer.submit(each, refused[i])
+        assert [answer.reason for _, answer in refused.all] == [Refusal.OVERLOADED] * 2
+        assert all(0 < answer.retry_after_s < MOST_RETRY_S for _, answer in refused.all)
+    waiting.wait(10)
+    info = writer.info()
+    assert (info["counters"]["refused_overloaded"], info["samples_merged"]) == (2, 10)
+    assert (info["writer"]["waiting"], info["writer"]["waiting_bytes"]) == (0, 0)
+    assert isinstance(send(writer, [batches[10]])[0], Ack)  # room again
+
+
+def test_the_backlog_of_one_machine_keeps_no_other_out(start, monkeypatch):
+    large = [incoming(samples(100), 1 + 100 * i) for i in range(8)]
+    small = [incoming(samples(1), machine=f"m-{i}") for i in range(20)]
+    monkeypatch.setattr(backlog.Backlog.__init__, "__defaults__", (8 * (len(large[0].payload) + BATCH_BYTES),))
+    writer, late, live = start(), Replies(), Replies()
+    with held(writer):
+        for i, each in enumerate(large):
+            writer.submit(each, late[i])
+        for i, each in enumerate(small):
+            writer.submit(each, live[i])
+        gone = [(key, answer.reason) for key, answer in late.all]
+        assert gone == [(key, Refusal.OVERLOADED) for key in range(7, 7 - len(gone), -1)]  # the newest first
+        assert 1 < len(gone) < 8
+    assert all(isinstance(answer, Ack) for answer in live.wait(20))
+    answers = dict(late.all) if late.wait(8) else {}
+    assert [answers[key].watermark for key in range(8 - len(gone))] == [100 * (i + 1) for i in range(8 - len(gone))]
+
+
+def test_a_fleet_with_backlogs_is_served_to_the_end_through_little_room(start, monkeypatch):
+    """As after a server was away: all machines at once, and room for a few; refused ones come again at once."""
+    machines, batches_each = [f"m-{i}" for i in range(12)], 5
+    parts = {name: [incoming(samples(40), 1 + 40 * i, name) for i in range(batches_each)] for name in machines}
+    room = 4 * size_of(parts[machines[0]][0].payload)
+    monkeypatch.setattr(backlog.Backlog.__init__, "__defaults__", (room,))
+    writer, answers = start(), queue.SimpleQueue()
+    reached, refused = Counter(), 0
+    with held(writer):
+        for name in machines:
+            writer.submit(parts[name][0], lambda answer, name=name: answers.put((name, answer)))
+    while sum(reached.values()) < len(machines) * batches_each:
+        name, answer = answers.get(timeout=WAIT_S)
+        if isinstance(answer, Ack):
+            reached[name] += 1
+            assert answer.watermark == 40 * reached[name]
+            if reached[name] == batches_each:
+                continue
+        else:
+            assert answer.reason == Refusal.OVERLOADED
+            refused += 1
+        writer.submit(parts[name][reached[name]], lambda answer, name=name: answers.put((name, answer)))
+    assert writer.info()["samples_merged"] == 40 * batches_each * len(machines)
+    assert refused > 0
 
 
 def test_closing_finishes_what_is_waiting(start, tmp_path):
@@ -172,7 +244,7 @@ def test_work_between_batches_is_done_and_sees_those_before(start):
         writer.submit(incoming(samples(2)), replies[0])
         reader = threading.Thread(target=lambda: seen.append(writer.run(lambda store: store.grid.folded)))
         reader.start()
-        wait_for(lambda: writer._batches.qsize() == 2)
+        wait_for(lambda: writer._works)
         writer.submit(incoming(samples(2), 3), replies[1])
     reader.join(WAIT_S)
     replies.wait(2)
@@ -203,17 +275,47 @@ def test_waiting_for_a_row_that_does_not_come_times_out(start):
 # --- snapshots -------------------------------------------------------------------------------------------------------
 
 
-def test_a_snapshot_is_made_after_so_many_rows(start, tmp_path):
-    writer = start(snapshot_rows=3)
+class Clock:
+    """Seconds that pass when a test says so."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def turn(writer: Writer) -> None:
+    """Have the owner look what is due, to the end."""
+    for _ in range(2):
+        writer.run(lambda _: None)
+
+
+def is_written(writer: Writer) -> bool:
+    return writer._times.due_s(0) < math.inf
+
+
+def test_a_snapshot_is_made_once_a_restart_would_take_long(start, tmp_path):
+    writer = start(restart_samples=3, clock=Clock())
     expected = {0: [], 3: [3], 6: [6, 3]}
     for row in range(1, 8):
         send(writer, [incoming(samples(1), row)])
-        writer.info()  # what was due has begun
-        wait_for(lambda row=row: snapshot.rows_on_disk(tmp_path) == expected[row // 3 * 3] and writer._snapshot.done())
+        turn(writer)
+        wait_for(lambda row=row: snapshot.rows_on_disk(tmp_path) == expected[row // 3 * 3] and is_written(writer))
+
+
+def test_what_a_start_has_folded_counts_for_the_next_snapshot(start, tmp_path):
+    writer = start(clock=Clock())
+    send(writer, [incoming(samples(2)), incoming(samples(2), machine="b")])
+    writer.close()
+    next(tmp_path.glob("snapshot-*")).unlink()
+    again = start(restart_samples=4, clock=Clock())
+    turn(again)
+    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [2])
 
 
 def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start, tmp_path, monkeypatch):
-    release, entered, real = threading.Event(), threading.Event(), snapshot.save
+    release, entered, real, clock = threading.Event(), threading.Event(), snapshot.save, Clock()
 
     def slow(*args):
         entered.set()
@@ -221,16 +323,23 @@ def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start
         return real(*args)
 
     monkeypatch.setattr(snapshot, "save", slow)
-    writer = start(snapshot_rows=2)
+    writer = start(restart_samples=2, clock=clock)
     for row in range(1, 7):
         assert send(writer, [incoming(samples(1), row)]) == [Ack(row, row, store=writer.store_id)]
     assert entered.wait(WAIT_S)
     assert snapshot.rows_on_disk(tmp_path) == []
+    clock.now_s += 3.0
     release.set()
-    wait_for(lambda: writer._snapshot.done())
+    wait_for(lambda: is_written(writer))
+    turn(writer)
     assert snapshot.rows_on_disk(tmp_path) == [2]
+    clock.now_s += 3.0 * (1 / SHARE - 1) - 0.01
+    turn(writer)
+    assert snapshot.rows_on_disk(tmp_path) == [2]  # it took 3 s: nothing for a minute
+    clock.now_s += 0.02
+    turn(writer)
+    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [6, 2])
     writer.close()
-    assert snapshot.rows_on_disk(tmp_path) == [6, 2]
     assert start().info()["snapshot"] == 6
 
 
@@ -243,44 +352,56 @@ def test_a_snapshot_is_of_the_moment_at_which_it_was_taken(start, tmp_path, monk
         return real(*args)
 
     monkeypatch.setattr(snapshot, "save", slow)
-    writer = start(snapshot_rows=1)
+    writer = start(restart_samples=1)
     parts = np.split(random_samples(60, 14), 3)
     for i, part in enumerate(parts):
         send(writer, [incoming(part, 1 + 20 * i)])
     release.set()
-    wait_for(lambda: writer._snapshot.done())
+    wait_for(lambda: is_written(writer))
     row, grid = snapshot.load_newest(tmp_path, 3, 1.0, CONFIG.fold)
     assert row == 1
     assert same(grid, folded(parts[0]))
 
 
-def test_a_snapshot_is_made_after_so_many_seconds_even_if_nothing_comes(start, tmp_path):
+def test_a_snapshot_is_made_when_its_time_has_come_even_if_nothing_comes(start, tmp_path):
+    clock = Clock()
+    writer = start(snapshot_s=60.0, clock=clock)
+    send(writer, [incoming(samples(1))])
+    clock.now_s += 59.9
+    turn(writer)
+    assert snapshot.rows_on_disk(tmp_path) == []
+    clock.now_s += 0.1
+    turn(writer)
+    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [1] and is_written(writer))
+    clock.now_s += 60.0
+    turn(writer)
+    assert snapshot.rows_on_disk(tmp_path) == [1]  # nothing new
+    send(writer, [incoming(samples(1), 2)])
+    turn(writer)
+    assert snapshot.rows_on_disk(tmp_path) == [1]  # and it was looked at a moment ago
+
+
+def test_the_owner_wakes_up_for_a_snapshot(start, tmp_path):
     writer = start(snapshot_s=0.02)
     send(writer, [incoming(samples(1))])
-    wait_for(lambda: writer.info()["snapshot"] == 1)
-    assert snapshot.rows_on_disk(tmp_path) == [1]
+    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [1])
 
 
-def test_no_snapshot_is_made_before_its_time(start, tmp_path):
-    writer = start()
-    for i in range(5):
-        send(writer, [incoming(samples(1), i + 1)])
-    assert snapshot.rows_on_disk(tmp_path) == []
-
-
-def test_a_snapshot_that_fails_is_tried_again_only_when_due(start, tmp_path, monkeypatch):
-    tries = []
+def test_a_snapshot_that_fails_is_tried_again_only_after_a_while(start, tmp_path, monkeypatch):
+    tries, clock = [], Clock()
 
     def full(*args):
         tries.append(args[1])
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(snapshot, "save", full)
-    writer = start(snapshot_rows=3)
+    writer = start(restart_samples=3, snapshot_s=60.0, clock=clock)
     for i in range(7):
-        assert send(writer, [incoming(samples(1), i + 1)]) == [Ack(i + 1, i + 1, store=writer.store_id)]
-        writer.info()
-        wait_for(lambda i=i: len(tries) == (i + 1) // 3 and writer._snapshot.done())
+        if i == 5:
+            clock.now_s += 60.0
+        assert isinstance(send(writer, [incoming(samples(1), i + 1)])[0], Ack)
+        turn(writer)
+        wait_for(lambda i=i: len(tries) == (i >= 2) + (i >= 5) and is_written(writer))
     assert tries == [3, 6]
     writer.close()
     assert not writer.failed
@@ -290,11 +411,40 @@ def test_a_snapshot_that_fails_is_tried_again_only_when_due(start, tmp_path, mon
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_bug_in_the_snapshot_is_logged(start, monkeypatch, caplog):
     monkeypatch.setattr(snapshot, "save", lambda *_: 1 // 0)
-    writer = start(snapshot_rows=1)
+    writer = start(restart_samples=1)
     send(writer, [incoming(samples(1))])
     writer.info()
-    wait_for(lambda: writer._snapshot.done())
+    wait_for(lambda: is_written(writer))
     assert writer.failed or "snapshot failed" in caplog.text
+
+
+# --- probes ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_probe_waits_for_nobody_and_hears_of_a_writer_that_hangs(start):
+    clock = Clock()
+    writer = start(clock=clock)
+    send(writer, [incoming(samples(3))])
+    turn(writer)
+    with held(writer):
+        clock.now_s += HANGS_S
+        assert writer.alive() == ServerAlive(writer.store_id, 1, 1, HANGS_S)
+        clock.now_s += 1.0
+        with pytest.raises(QueryError, match="at one piece of work for 31 s") as caught:
+            writer.alive()
+        assert caught.value.reason == Refusal.STORE
+    turn(writer)
+    writer.close()
+    with pytest.raises(QueryError, match="the server is ending"):
+        writer.alive()
+
+
+def test_what_comes_after_the_end_is_refused_at_once(start):
+    writer = start()
+    writer.close()
+    assert [answer.reason for answer in send(writer, [incoming(samples(1))])] == [Refusal.STORE]
+    with pytest.raises(QueryError, match="the server is ending"):
+        writer.run(lambda _: None)
 
 
 # --- the end of the thread -------------------------------------------------------------------------------------------
@@ -321,7 +471,7 @@ def test_closing_after_a_bug_in_the_last_group_ends(start, monkeypatch):
         writer.submit(incoming(samples(1)), lambda _: None)
         closing = threading.Thread(target=writer.close)
         closing.start()
-        wait_for(lambda: writer._batches.qsize() == 2)
+        wait_for(lambda: writer._is_closing)
     closing.join(WAIT_S)
     assert not closing.is_alive()
     assert writer.failed
@@ -410,14 +560,16 @@ QUERIES = [
 
 @pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
 def test_a_refused_query_says_why(start, reason, name, parameters):
+    writer = start()
     with pytest.raises(QueryError) as caught:
-        answered(Answers(start(), FakeFollower()), name, parameters)
+        answered(Answers(writer, FakeFollower(), past_of(writer)), name, parameters)
     assert caught.value.reason == reason
 
 
 def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
     elsewhere |= {Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}  # in the tests of admission, and of the claim
+    elsewhere |= {Refusal.UNSIGNED}  # which a sender says, and no server
     elsewhere |= {Refusal.UNKNOWN_MACHINE, Refusal.EXPIRED}  # commands and tiles, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 

@@ -181,7 +181,7 @@ def test_without_pyarrow_the_error_says_what_to_install(day, monkeypatch):
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(archive_file, "import_module", missing)
-    with pytest.raises(ConfigError, match=r"pyarrow is not installed: pip install 'sitegrid\[archive\]'"):
+    with pytest.raises(ConfigError, match=r"pyarrow is not installed: pip install '\.\[archive\]'"):
         day.archive()
     assert day.journal.archived_row == 0
 

@@ -34,21 +34,23 @@ INFO: dict[str, Any] = {
     "journalled": 12,
     "merged": 11,
     "snapshot": 5,
+    "checkpoints": {"count": 12, "bytes": 9000, "newest_ns": 1_750_000_000_000_000_000, "passed_over": 1},
     "samples_merged": 300,
     "samples_too_unsure": 4,
     "cells": 250,
     "stamp_ns": NOW_NS,
     "wall_ns": NOW_NS - 3 * 10**9,
     "machines": {
-        "loader-1": {"spools": 1, "samples": 200, "lost": 3, "newest_ns": NOW_NS},
-        "loader-2": {"spools": 2, "samples": 104, "lost": 0, "newest_ns": NOW_NS - 10**9},
+        "loader-1": {"spools": 1, "samples": 200, "lost": 3, "newest_ns": NOW_NS, "missing": 5},
+        "loader-2": {"spools": 2, "samples": 104, "lost": 0, "newest_ns": NOW_NS - 10**9, "missing": 0},
     },
     "distrusted": ["loader-2"],
+    "shortfalls": ["5 acknowledged samples of loader-1 are gone"],
     "counters": {"batches": 12, "samples_trimmed": 7, "refused_gap": 2, "refused_query_unknown_layer": 1},
-    "writer": {"waiting": 3, "commits": 20, "commit_s": 0.5},
+    "writer": {"waiting": 3, "waiting_bytes": 4096, "commits": 20, "commit_s": 0.5},
 }
 HEALTH = {
-    "spool": {"depth": 40, "unsaved": 1, "recorded": 90, "dropped": 2, "put_aside": 1},
+    "spool": {"depth": 40, "unsaved": 1, "recorded": 90, "dropped": 2, "put_aside": 1, "gone": 6},
     "uplink": {"problem": "no answer"},
     "spool_problem": "",
 }
@@ -88,12 +90,18 @@ def test_the_state_of_the_server_is_exposed(tmp_path: Path):
         "journal_rows": 12,
         "merged_rows": 11,
         "snapshot_rows": 5,
+        "checkpoints": 12,
+        "checkpoint_bytes": 9000,
+        "checkpoint_newest_timestamp_seconds": 1.75e9,
+        "checkpoints_passed_over_total": 1,
         "map_samples": 300,
         "map_samples_too_unsure": 4,
         "map_cells": 250,
+        "shortfalls": 1,
         "map_newest_timestamp_seconds": NOW_NS / 1e9,
         "map_ahead_seconds": 3,
         "waiting_batches": 3,
+        "waiting_bytes": 4096,
         "commits_total": 20,
         "commit_seconds_total": 0.5,
         "store_bytes": 0,
@@ -106,6 +114,7 @@ def test_the_state_of_the_server_is_exposed(tmp_path: Path):
     }
     assert at(values, "sitegrid_machine_samples_total", machine="loader-2") == 104
     assert at(values, "sitegrid_machine_samples_lost_total", machine="loader-1") == 3
+    assert at(values, "sitegrid_machine_samples_missing", machine="loader-1") == 5
     newest_s = at(values, "sitegrid_machine_newest_timestamp_seconds", machine="loader-2")
     assert newest_s == pytest.approx(NOW_NS / 1e9 - 1)
     assert [at(values, "sitegrid_machine_trusted", machine=f"loader-{i}") for i in (1, 2)] == [1, 0]
@@ -115,6 +124,8 @@ def test_agents_are_exposed_as_they_describe_themselves(tmp_path: Path):
     values = read(exposition(tmp_path, loader_1=HEALTH))
     assert at(values, "sitegrid_agent_problem", machine="loader-1", part="uplink") == 1
     assert at(values, "sitegrid_agent_problem", machine="loader-1", part="spool") == 0
+    damaged = read(exposition(tmp_path, loader_1={**HEALTH, "spool_damage": "spool.db-wal is damaged"}))
+    assert at(damaged, "sitegrid_agent_problem", machine="loader-1", part="disk") == 1
     assert not [key for key in values if ("part", "calibration") in key[1]], "it said nothing of it"
     agent = {name: value for (name, labels), value in values.items() if "_agent_" in name and len(labels) == 1}
     assert agent == {
@@ -123,6 +134,7 @@ def test_agents_are_exposed_as_they_describe_themselves(tmp_path: Path):
         "sitegrid_agent_unsaved_samples": 1,
         "sitegrid_agent_samples_recorded_total": 90,
         "sitegrid_agent_samples_dropped_total": 2,
+        "sitegrid_agent_samples_gone_total": 6,
         "sitegrid_agent_samples_aside_total": 1,
     }
 

@@ -14,7 +14,18 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
 from protocol.queries.requests import PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, folded, incoming, open_writer, random_samples, samples, send
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    folded,
+    incoming,
+    open_writer,
+    past_of,
+    random_samples,
+    samples,
+    send,
+)
 from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
 
 # One sample in each cell of two diagonals, the value tells the cell.
@@ -26,7 +37,7 @@ def diagonal() -> np.ndarray:
 
 
 def asked(writer: Writer) -> Answers:
-    return Answers(writer, FakeFollower())
+    return Answers(writer, FakeFollower(), past_of(writer))
 
 
 @pytest.fixture

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from mapserver.layers.cell_layers import LAYERS
-from mapserver.query.answering import Answers, reads_past
+from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.commands import TrustCommand, encode_command
-from protocol.queries.requests import MAX_SPANS, Freshness, HistoryQuery, PointQuery, RegionQuery, When
+from protocol.queries.requests import MAX_SPANS, Freshness, HistoryQuery, PointQuery, RegionQuery, When, reads_past
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, samples, send
+from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, past_of, random_samples, samples, send
 from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
 
 S, HOUR_NS = 10**9, 3600 * 10**9
@@ -35,7 +35,7 @@ def served(tmp_path_factory):
             half = len(table) // 2
             send(writer, [incoming(part, machine=machine) for part in (table[:half],) if len(part)])
             send(writer, [incoming(table[half:], 1 + half, machine)])
-        return Answers(writer, follower or FakeFollower())
+        return Answers(writer, follower or FakeFollower(), past_of(writer))
 
     yield start
     for writer in opened:
@@ -201,7 +201,7 @@ def test_too_many_spans_are_refused_before_any_is_read(served, monkeypatch):
     answers = served(hours(0.02, 0.05))
     to_ns = NOW_NS + MAX_SPANS * 300 * S - 1
     assert len(answers.history(HistoryQuery(8.5, 8.5, ("weight",), NOW_NS, to_ns)).spans) == 2
-    monkeypatch.setattr("mapserver.query.views.point_history", None)
+    monkeypatch.setattr("mapserver.query.views.cell_history", None)
     with pytest.raises(QueryError, match=r"2001 spans of 300 s; at most 2000 .* a longer `span`") as caught:
         answers.history(HistoryQuery(8.5, 8.5, ("weight",), NOW_NS, to_ns + 1))
     assert caught.value.reason == Refusal.TOO_LARGE
@@ -239,7 +239,7 @@ def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
     with closing(open_writer(tmp_path)) as writer:
         writer.folder = tmp_path / "elsewhere"
         with pytest.raises(QueryError, match="no usable journal") as caught:
-            getattr(Answers(writer, FakeFollower()), query.name)(query)
+            getattr(Answers(writer, FakeFollower(), past_of(writer)), query.name)(query)
     assert caught.value.reason == Refusal.STORE
 
 

@@ -15,7 +15,7 @@ from protocol.queries.answers import Region
 from protocol.queries.requests import RegionQuery, TileQuery, When
 from protocol.queries.tiles import joined
 from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow
-from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, send
+from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, past_of, random_samples, send
 from tests.unit.mapserver.query.fake_follower import FakeFollower
 
 NAMES = ("resistance", "visits", "resistance_filled", "grade_filled_std")
@@ -26,7 +26,7 @@ ROWS = random_samples(3000, 8, std_m=1.0)
 def served(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(ROWS)])
-        yield writer, Answers(writer, FakeFollower())
+        yield writer, Answers(writer, FakeFollower(), past_of(writer))
 
 
 def read(answers: Answers, query: RegionQuery) -> list[Region]:

@@ -13,6 +13,7 @@ from protocol.queries import answers
 from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
 from protocol.queries.requests import (
+    AliveQuery,
     ChangesQuery,
     Freshness,
     HistoryQuery,
@@ -60,6 +61,7 @@ def histories(draw):
     | st.builds(MachinesQuery, freshness)
     | st.builds(ChangesQuery, st.integers(0, 10**15))
     | st.builds(InfoQuery, freshness)
+    | st.builds(AliveQuery)
 )
 def test_query_round_trip(query):
     assert parse_query(query.name, split_selector(selector_of(encode_query(query)))) == query
@@ -307,7 +309,7 @@ def test_malformed_history_is_refused(spans, words):
         )
 
 
-MACHINE = answers.MachineState("a", True, "", "", 0, False, ("gain",), {"shift_m": 1.5}, 1, 7, 0, 5)
+MACHINE = answers.MachineState("a", True, "", "", 0, False, ("gain",), {"shift_m": 1.5}, 1, 7, 0, 5, 2)
 CHANGE = answers.GroundChange(1, 5, 6, (0.0, 0.0, 1.0, 2.0), 7, 0.25, None, None, None)
 SITE = SiteConfig("pit", 48.0, 11.0, known_ground=(KnownGround("pad", 0.01, ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))),))
 INFO = answers.MapInfo(
@@ -323,14 +325,18 @@ INFO = answers.MapInfo(
     samples_too_unsure=2,
     cells=7,
     bounds=(0, -16, 16, 16),
+    first_ns=3,
     stamp_ns=9,
     wall_ns=10,
     version="1.0",
     server=answers.ServerProcess("office", 7),
-    machines={"a": answers.SampleCounts(1, 42, 0, 9)},
+    checkpoints=answers.CheckpointCounts(12, 900_000_000, 1_767_225_600_000_000_000, 1),
+    machines={"a": answers.SampleCounts(1, 42, 0, 9, 0)},
     distrusted=("b",),
+    shortfalls=("3 journal rows after row 5 are gone",),
     counters={"refused_gap": 2},
     layers=("resistance",),
+    boundaries=(0.014, 0.03),
 )
 
 

@@ -222,9 +222,15 @@ stores = st.from_regex(codec.STORE_ID, fullmatch=True)
 acks = st.builds(Ack, counts, counts, counts, stores, stores | st.just(""))
 
 
-@given(acks | st.builds(Refused, st.text(max_size=20), st.text(max_size=200), counts))
+@given(acks | st.builds(Refused, st.text(max_size=20), st.text(max_size=200), counts, st.floats(0, codec.MAX_RETRY_S)))
 def test_reply_round_trip(reply):
     assert codec.decode_reply(codec.encode_reply(reply)) == reply
+
+
+@pytest.mark.parametrize("after_s", [-0.1, 3600.1, float("nan"), float("inf"), "1", True])
+def test_a_server_cannot_keep_a_machine_waiting_for_ever(after_s):
+    data = codec.pack({"ack": False, "reason": "overloaded", "problem": "", "expected": 0, "retry_after_s": after_s})
+    assert refusal(data, codec.decode_reply).field == "retry_after_s"
 
 
 @given(st.builds(Pose, names, stamps, *[numbers] * 7))

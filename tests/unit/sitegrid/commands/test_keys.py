@@ -277,6 +277,21 @@ def test_only_machines_have_signing_keys_and_the_register_knows_them(folder: Pat
     assert register.without("loader-1").signing_keys() == {}
 
 
+def test_a_machine_knows_the_keys_of_the_map_servers_which_outlast_a_new_certificate(folder: Path):
+    from sitegrid.security.signing import ReplyVerifier, Signer
+
+    assert act(folder, "add", "loader-1") == 0
+    known = (folder / "loader-1" / "servers.pub").read_text().split()
+    assert known == load_register(folder).server_keys()
+    assert act(folder, "add", "server", "--renew") == 0
+    signature = Signer((folder / "server" / "sign.pem").read_bytes()).sign_reply("a", b"b", b"c")
+    assert ReplyVerifier(known).is_genuine("a", b"b", b"c", signature)
+    assert act(folder, "revoke", "server") == 0
+    assert load_register(folder).server_keys() == []
+    assert act(folder, "add", "server", "--role", "server") == 0
+    assert load_register(folder).server_keys() not in ([], known)  # after a theft it is another one
+
+
 def test_common_names_never_meet():
     names = {common_name(name, issue) for name in ("a", "a-2", "a2", "a_2") for issue in (1, 2, 3)}
     assert len(names) == 12

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import zenoh
 
-from protocol.queries.answer_codec import encode_history, encode_info, encode_point, encode_region
-from protocol.queries.answers import HistoryAnswer, HistorySpan, PointAnswer, Region
+from protocol.queries.answer_codec import encode_alive, encode_history, encode_info, encode_point, encode_region
+from protocol.queries.answers import HistoryAnswer, HistorySpan, PointAnswer, Region, ServerAlive
 from protocol.queries.parameters import split_selector
 from protocol.queries.requests import (
+    AliveQuery,
     Freshness,
     HistoryQuery,
     InfoQuery,
@@ -56,6 +57,8 @@ class Session:
     def _answer(self, asked: MapQuery) -> bytes:
         if isinstance(asked, InfoQuery):
             return encode_info(map_info(SITE, stamp_ns=self.now_ns))
+        if isinstance(asked, AliveQuery):
+            return encode_alive(ServerAlive(STORE, 18, 17, 0.5))
         if isinstance(asked, HistoryQuery):
             first = HistorySpan(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
             spans = (first, HistorySpan(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
@@ -104,6 +107,14 @@ def test_point_and_region_are_asked_as_of_a_time_and_less_another(session: Sessi
     point, region = (asked for asked in session.asked if not isinstance(asked, InfoQuery))
     assert point == PointQuery(-500.0, -2.5, ("visits",), Freshness(3), when)
     assert region == RegionQuery(Bounds(-5, 0, 1, 2), when=when)
+
+
+def test_a_probe_is_one_line_or_one_object(session: Session, capsys):
+    assert main(["query", "alive"]) == 0
+    assert capsys.readouterr().out == "batches are taken: journal row 18, merged 17\n"
+    assert main(["query", "alive", "--json"]) == 0
+    expected = {"store": STORE, "journalled": 18, "merged": 17, "busy_s": 0.5}
+    assert json.loads(capsys.readouterr().out) == expected
 
 
 def test_without_times_the_map_is_asked_as_it_is(session: Session):

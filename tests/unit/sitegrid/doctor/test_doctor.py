@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -69,7 +70,7 @@ GOOD = Certificate(
     fits=True,
     mode=0o100600,
 )
-COUNTS = {"spools": 1, "samples": 3, "lost": 0}
+COUNTS = {"spools": 1, "samples": 3, "lost": 0, "missing": 0}
 AHEAD = replace(
     INFO,
     stamp_ns=NOW_NS + 72_000 * 10**9,
@@ -86,6 +87,10 @@ def router(took_s: float | None, **link: bool) -> Finding:
 
 def server(info: MapInfo | None, *, is_there: bool, role: str = "") -> Finding:
     return network.check_server("pit", info, is_there=is_there, role=role)
+
+
+def lossy(lost: int, missing: int) -> MapInfo:
+    return replace(INFO, machines={"loader-1": SampleCounts(1, 200, lost, NOW_NS, missing)})
 
 
 def permission(answer: Ack | Refused | None, *, is_there: bool = True, has_keys: bool = False) -> Finding:
@@ -114,6 +119,10 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (router(None, listens=True, has_keys=True), FAIL, "these keys may be of another site"),
         (server(INFO, is_there=True), PASS, "journal row 12"),
         (server(replace(INFO, merged=10), is_there=True), PASS, "journal row 12, merged only up to 10"),
+        (network.check_losses(INFO), PASS, "no machine has lost samples, and the store none"),
+        (network.check_losses(lossy(3, 0)), WARN, "declared lost: 3 of loader-1; look at"),
+        (network.check_losses(lossy(0, 7)), WARN, "acknowledged and gone: 7 of loader-1; look at"),
+        (network.check_losses(replace(INFO, shortfalls=("a", "row 3 is gone"))), WARN, "row 3 is gone"),
         (server(None, is_there=True, role="visitor"), FAIL, "; the router denies the question"),
         (server(None, is_there=False), FAIL, "start `sitegrid server`"),
         (server(None, is_there=False, role="machine"), FAIL, "revoked"),
@@ -125,6 +134,9 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (permission(None, is_there=False), FAIL, "start `sitegrid server`"),
         (permission(None, has_keys=True), FAIL, "under the name of its keys alone"),
         (permission(None), FAIL, "denies it, or the server hangs"),
+        (network.check_writers([INFO]), PASS, f"pid 7 on host office, store {INFO.store}"),
+        (network.check_writers([INFO, INFO]), FAIL, "2 map servers take samples of this site: pid 7 on host office"),
+        (network.check_writers([]), SKIP, "no map server"),
         (network.check_time(INFO), PASS, "no stamp is ahead"),
         (network.check_time(replace(INFO, stamp_ns=NOW_NS, wall_ns=NOW_NS + 10**18)), PASS, "no stamp is ahead"),
         (
@@ -172,6 +184,10 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (spool(5, oldest_ns=NOW_NS, age_s=4 * 3600), WARN, "4 h ago; 0 were dropped, 0 quarantined; start its agent"),
         (spool(0, dropped=3), WARN, "raise max_samples"),
         (spool(0, quarantined=2), WARN, "table `quarantine`"),
+        (disk.check_spool(SpoolState(0, 0, 0, 0, gone=9), NOW_NS), WARN, "9 are gone; its disk has lost recorded"),
+        (disk.check_spool(SpoolState(0, 0, 0, 0, damage="a.db-wal is damaged"), NOW_NS), WARN, "a.db-wal is damaged"),
+        (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "gone": 8}}), WARN, "8 are gone"),
+        (disk.check_health("loader-1", {**HEALTHY, "spool_damage": "the log is damaged"}), WARN, "the log is damaged"),
         (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait"),
         (disk.check_health("loader-1", {**HEALTHY, "uplink": {"problem": "no answer"}}), WARN, "; no answer"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
@@ -180,8 +196,12 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (disk.check_health("loader-1", {"spool": 7, "uplink": "no"}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {"spool": [], "spool_problem": None}), PASS, "? samples wait"),
         (store(), PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
+        (store(None, checkpoints=3, checkpoint_bytes=2 * 10**8), PASS, "ago; 3 checkpoints of the past, 0.2 GB"),
+        (store(None, damaged_checkpoints=1), PASS, "; 1 damaged, the server makes them again"),
         (store(None, snapshot_row=0, snapshot_age_s=math.inf), PASS, "no snapshot"),
         (store(None, last_row=30_000), WARN, "a restart folds 26000 rows"),
+        (store(shortfall="3 journal rows after row 5 are gone"), FAIL, "rows after row 5 are gone; restore a backup"),
+        (store(missing={"loader-1": 4}), WARN, "acknowledged samples are missing: 4 of loader-1"),
         (store(frame="0"), FAIL, "choose another --store"),
         (store(replace(SITE, name="hill")), FAIL, "choose another --store"),
     ],
@@ -311,6 +331,15 @@ def filled_store(folder: Path) -> None:
         store.commit([Incoming("loader-1", payload)])
 
 
+def test_checkpoints_of_a_store_are_counted(tmp_path: Path):
+    filled_store(tmp_path)
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    (folder / "2026-01-01T10.checkpoint").write_bytes(b"half of one")
+    state = disk.read_store(tmp_path, time.time())
+    assert (state.checkpoints, state.damaged_checkpoints, state.checkpoint_bytes) == (0, 1, 11)
+
+
 def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
     with pytest.raises(StoreError, match=r"holds no journal\.db"):
         disk.read_store(tmp_path, time.time())
@@ -319,6 +348,43 @@ def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
         state = disk.read_store(tmp_path, time.time() + 100)
     assert state == StoreState("pit", SITE.frame, 4, 2, 0, 1, 1, state.snapshot_age_s)
     assert 99 < state.snapshot_age_s < 160
+
+
+def test_a_store_whose_log_is_damaged_is_a_finding_before_the_server_starts(tmp_path: Path, capsys):
+    left = tmp_path / "left"
+    with closing(Store(tmp_path / "store", SITE, ServerConfig(), time.time_ns)) as store:
+        for first_seq in (1, 5, 9):
+            payload = encode_batch(SampleBatch("loader-1", 5, first_seq, samples(4), SITE.frame))
+            assert isinstance(store.commit([Incoming("loader-1", payload)])[0], Ack)
+        shutil.copytree(tmp_path / "store", left)  # as kill -9 leaves it
+    assert disk.read_store(left, time.time()).shortfall == ""
+    log = left / "journal.db-wal"
+    log.write_bytes(log.read_bytes()[:-3000] + bytes(3000))
+    assert "4 acknowledged samples of loader-1 are gone" in disk.read_store(left, time.time()).shortfall
+    assert main(["doctor", "--endpoint", free_endpoint(), "--store", str(left)]) == 1
+    assert "4 acknowledged samples of loader-1 are gone; restore a backup" in capsys.readouterr().out
+    Store(left, SITE, ServerConfig(), time.time_ns).close()
+    state = disk.read_store(left, time.time())
+    assert (state.shortfall, state.missing) == ("", {"loader-1": 4})
+
+
+def test_a_snapshot_beyond_the_journal_is_a_finding(tmp_path: Path):
+    filled_store(tmp_path)
+    (tmp_path / "snapshot-1.npz").rename(tmp_path / "snapshot-9.npz")
+    assert disk.read_store(tmp_path, time.time()).shortfall == (
+        "a snapshot of row 9 lies beyond the journal; 7 journal rows after row 2 are gone"
+    )
+
+
+def test_a_spool_whose_disk_lost_its_end_is_a_finding(tmp_path: Path):
+    (tmp_path / "left").mkdir()
+    with closing(Spool(tmp_path / "spool.db", SpoolConfig())) as spool:
+        spool.record(samples(7))
+        shutil.copytree(tmp_path, tmp_path / "left", dirs_exist_ok=True, ignore=shutil.ignore_patterns("left"))
+    assert disk.read_spool(tmp_path / "left" / "spool.db").gone == 0
+    log = tmp_path / "left" / "spool.db-wal"
+    log.write_bytes(log.read_bytes()[:-3000] + bytes(3000))
+    assert disk.read_spool(tmp_path / "left" / "spool.db").gone == 7
 
 
 def test_a_store_that_hides_rows_is_a_finding(tmp_path: Path, capsys):
@@ -460,7 +526,7 @@ def test_a_running_agent_is_heard(site: Site, capsys):
 def test_people_read_one_line_each(capsys):
     assert main(["doctor", "--endpoint", free_endpoint()]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["-", "FAIL", "-", "-", "-", "-", "-", "-", "-"]
+    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"-" * 9]
     assert lines[1].startswith("FAIL  router        nothing listens at tcp/127.0.0.1:")
 
 

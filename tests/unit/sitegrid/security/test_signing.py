@@ -84,3 +84,29 @@ def test_a_wrong_private_key_says_what_to_do(pem: bytes):
 def test_a_wrong_public_key_is_named(text: str):
     with pytest.raises(ConfigError, match="signing key of loader-1"):
         signing.Verifier({"loader-1": text})
+
+
+# --- replies ---------------------------------------------------------------------------------------------------------
+
+REPLY = b"ack"
+
+
+@pytest.fixture(scope="module")
+def server():
+    return signing.make_signing_key()
+
+
+def test_a_reply_is_believed_as_the_answer_to_one_batch_of_one_machine(made, server):
+    private, public = server
+    verifier = signing.ReplyVerifier([made["loader-1"][1], public])  # of several map servers any may answer
+    signature = signing.Signer(private).sign_reply(KEY, BATCH, REPLY)
+    assert verifier.is_genuine(KEY, BATCH, REPLY, signature)
+    for key, payload, reply in ((f"{KEY}x", BATCH, REPLY), (KEY, BATCH + b"x", REPLY), (KEY, BATCH, b"nak")):
+        assert not verifier.is_genuine(key, payload, reply, signature)
+    for forged in (b"", bytes(64), signature[:-1], signing.Signer(private).sign(KEY, REPLY)):
+        assert not verifier.is_genuine(KEY, BATCH, REPLY, forged)
+
+
+def test_no_machine_can_sign_a_reply_to_another_one(made, server):
+    forged = signing.Signer(made["loader-2"][0]).sign_reply(KEY, BATCH, REPLY)
+    assert not signing.ReplyVerifier([server[1]]).is_genuine(KEY, BATCH, REPLY, forged)

@@ -1,6 +1,6 @@
 """What a whole agent costs: CPU share of a core and memory, of the pure core fed as a machine feeds it.
 
-It is measured in a process of its own, `python -m benchmarks.agent SECONDS`, which imports nothing but an agent's core.
+It is measured in a process of its own, `python -m benchmarks.agents.agent SECONDS`, which imports an agent alone.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SECONDS = 60
 
 def measured(runs: int) -> dict[str, float | int]:
     """Run the agent's core in processes of its own; the median of the runs counts."""
-    runs_figures = [in_child("benchmarks.agent", str(SECONDS)) for _ in range(runs)]
+    runs_figures = [in_child("benchmarks.agents.agent", str(SECONDS)) for _ in range(runs)]
     cpu, memory = (statistics.median(each[name] for each in runs_figures) for name in ("cpu_percent", "memory_mb"))
     return {"seconds": SECONDS, "cpu_percent": round(cpu, 2), "memory_mb": round(memory, 1)}
 

@@ -18,7 +18,7 @@ from agents.localisation.filters.motion import MotionModel, motion
 from agents.localisation.filters.square_root import definite
 from agents.localisation.filters.state import ATTITUDE, POSITION, RATE, VELOCITY, Layout
 from agents.localisation.filters.ukf import Ukf
-from benchmarks import agent
+from benchmarks.agents import agent
 from benchmarks.measure import Report, machine, medians, timed
 from protocol.arrays import Floats
 

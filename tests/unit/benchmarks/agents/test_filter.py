@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from agents.pipeline import Pipeline, PipelineConfig
-from benchmarks import agent
-from benchmarks import filter as filters
 from benchmarks.__main__ import main
+from benchmarks.agents import agent
+from benchmarks.agents import filter as filters
 
 STEPS = ("predict", "update position", "update rate")
 

@@ -1,0 +1,1 @@
+"""What runs on a machine: the steps of the filters, and a whole agent."""

@@ -1,0 +1,138 @@
+"""The job that makes checkpoints of the evidence, a piece in every turn, and removes those that are not needed."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapserver.ingest.writer import Writer
+from mapserver.journal.reader import JournalReader
+from mapserver.past.checkpoints import Entry
+from mapserver.past.making import make, remove_unfinished
+from mapserver.past.past import Past
+from mapserver.past.plan import due, surplus, thinned
+from protocol.errors import StoreError
+
+PIECE_S = 0.3  # of a turn, while other jobs wait; with ten machines, an hour takes a second in all
+LATE_ROWS = 5000  # so many that came in late are read for a map of the past, in 50 ms, before they are folded in
+RESERVE_BYTES = 2**30  # of the disk: what machines send goes before
+LATER_S = 60.0  # after damage, or without room
+MINUTE_NS = 60 * 10**9
+log = logging.getLogger("mapserver.follower.checkpointing")
+
+
+@dataclass(frozen=True)
+class _Making:
+    """A checkpoint in the making. began_s: on the monotonic clock."""
+
+    path: Path
+    without: frozenset[str]
+    steps: Iterator[None]
+    began_s: float
+
+
+class Checkpointing:
+    """Makes checkpoints, again where one cannot be used or lacks much that came in late, and keeps within limits."""
+
+    name = "checkpoints"
+
+    def __init__(self, writer: Writer, reader: JournalReader, past: Past, ending: threading.Event) -> None:
+        self._writer, self._reader, self._past, self._ending = writer, reader, past, ending
+        self._limit_bytes = round(writer.config.store.checkpoints_gb * 1e9)
+        self._making: _Making | None = None
+        self._expected_bytes = 0  # of the next one: as many as the last one had
+        self._nothing_due: object = None  # what there was when nothing was
+        self._looked = 0
+        self._due_s = 0.0
+        remove_unfinished(past.checkpoints)
+
+    def run(self) -> None:
+        """Go on with the one in the making, or begin with one that is due."""
+        if time.monotonic() < self._due_s:
+            return
+        try:
+            self._turn()
+        except (StoreError, OSError):
+            self.close()
+            self._due_s = time.monotonic() + LATER_S
+            raise
+
+    def close(self) -> None:
+        """Give up the one in the making."""
+        if self._making:
+            self._making.steps.close()  # type: ignore[attr-defined]
+            self._making = None
+
+    def _turn(self) -> None:
+        now_ns, without = self._writer.run(lambda store: (store.newest_ns, store.excluded))
+        if self._making and self._making.without != without:
+            self.close()
+        if not self._making:
+            facts = self._past.facts(self._reader, without)
+            entries = self._past.checkpoints.look(facts, self._reader.last_row)
+            self._remove(entries, surplus(now_ns, [entry.closed_ns for entry in entries]))
+            closed_ns = self._next(now_ns, without, entries)
+            more = 0 if closed_ns is None else max([self._expected_bytes, *(entry.bytes for entry in entries[-1:])])
+            if not self._has_room(now_ns, entries, more) or closed_ns is None:
+                return
+            steps = make(self._past, self._reader, closed_ns, without)
+            self._making = _Making(self._past.checkpoints.path(closed_ns), without, steps, time.monotonic())
+        self._go_on(self._making)
+
+    def _go_on(self, making: _Making) -> None:
+        until_s = time.monotonic() + PIECE_S
+        for _ in making.steps:
+            if time.monotonic() >= until_s or self._ending.is_set():
+                return
+        self._making = None
+        self._expected_bytes = making.path.stat().st_size
+        values = (making.path.name, self._expected_bytes, time.monotonic() - making.began_s)
+        log.info("checkpoint made name=%s bytes=%d seconds=%.1f", *values)
+
+    def _next(self, now_ns: int, without: frozenset[str], entries: list[Entry]) -> int | None:
+        """When the next one is closed; None where there is nothing to do."""
+        usable, unusable = ([entry.closed_ns for entry in entries if entry.usable == each] for each in (True, False))
+        there = (now_ns // MINUTE_NS, without, *usable, None, *unusable)
+        if there != self._nothing_due:
+            closed_ns = due(now_ns, usable, unusable, lambda from_ns: self._past.next_stamp(self._reader, from_ns))
+            if closed_ns is not None:
+                return closed_ns
+            self._nothing_due = there
+        return self._overtaken([entry for entry in entries if entry.usable])
+
+    def _overtaken(self, usable: list[Entry]) -> int | None:
+        """Look whether one of those that there are, another in each turn, lacks so much that it is to be made again."""
+        self._looked += 1
+        for entry in usable[self._looked % max(1, len(usable)) :][:1]:
+            if entry.header and self._past.late_rows(self._reader, entry.header) >= LATE_ROWS:
+                return entry.closed_ns
+        return None
+
+    def _has_room(self, now_ns: int, entries: list[Entry], more: int) -> bool:
+        """Make room for so many bytes, within the limit and what the disk has to spare; whether there is."""
+        there = sum(entry.bytes for entry in entries)
+        spare = shutil.disk_usage(self._writer.folder).free - RESERVE_BYTES
+        most = min(self._limit_bytes, there + spare) - more
+        if there > most:
+            begin_ns = self._past.next_stamp(self._reader, 0) or 0
+            sizes = {entry.closed_ns: entry.bytes for entry in entries}
+            self._remove(entries, thinned(begin_ns, now_ns, sizes, most))
+        if most > 0:
+            return True
+        self._due_s = time.monotonic() + LATER_S
+        if self._limit_bytes:
+            values = (more, self._limit_bytes, spare)
+            log.warning("no room for checkpoints, maps of the past take longer bytes=%d limit=%d spare=%d", *values)
+        return False
+
+    def _remove(self, entries: list[Entry], closed: Iterable[int]) -> None:
+        gone = set(closed)
+        for entry in list(entries):
+            if entry.closed_ns in gone:
+                entry.path.unlink(missing_ok=True)
+                entries.remove(entry)

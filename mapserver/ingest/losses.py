@@ -1,0 +1,35 @@
+"""What machines sent, and what of it a store has lost: by machine and number, for logs and `info`."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+
+from mapserver.journal.journal import Journal
+from mapserver.journal.rows import MachineTotals
+from mapserver.journal.shortfall import KIND, Shortfall, beyond, missing
+
+log = logging.getLogger("mapserver.ingest.losses")
+
+
+def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shortfall]:
+    """Say what was acknowledged and was not in a journal that has just been opened; returns all that ever was.
+
+    snapshot_rows: of the snapshots beside it; one that the journal does not reach proves that it was longer.
+    """
+    shortfall, newest = journal.shortfall, max(snapshot_rows, default=0)
+    if newest > max(journal.last_row, shortfall.expected_row if shortfall else 0):
+        shortfall = beyond(journal.last_row, newest)
+        journal.note_shortfall(shortfall)
+    if shortfall:
+        log.error("acknowledged samples are missing journal=%s shortfall=%r", journal.path, str(shortfall))
+    return [Shortfall.from_event(event) for event in journal.events(KIND)]
+
+
+def by_machine(journal: Journal, shortfalls: Sequence[Shortfall]) -> dict[str, dict[str, int]]:
+    """What each machine sent: spools, samples, samples that it declared lost, newest stamp, and what is missing."""
+    gone = missing(shortfalls, journal.watermarks()) if shortfalls else Counter()
+    sent = journal.machines()
+    names = dict.fromkeys([*sent, *gone])
+    return {name: {**vars(sent.get(name, MachineTotals())), "missing": gone[name]} for name in names}

@@ -1,0 +1,210 @@
+"""One checkpoint on disk: the evidence of all samples stamped before a time, block by block, each to be read alone.
+
+    MAGIC | blocks, each padded to 8 bytes | index, one INDEX per block in the order of places | header, JSON | TAIL
+
+The tail has the lengths of index and header and the CRC-32 of both; the index has one of each block. So a read of a few
+blocks checks what it uses, and needs nothing of the rest. Files never change.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+
+from mapserver.evidence.grid_state import GridState
+from mapserver.evidence.pages import EMPTY, CompactPages
+from protocol.arrays import Ints, Table
+from protocol.errors import StoreError
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
+
+MAGIC = b"SGCHECK1"
+# As they lie in a block: large numbers first, so that all are aligned.
+PARTS = ("words", "table", "counts", "high", "runs", "cells", "marks")
+INDEX = np.dtype([("x", "<i4"), ("y", "<i4"), ("first", "<i8"), ("lengths", "<i4", len(PARTS)), ("crc32", "<u4")])
+TAIL = struct.Struct("<QII8s")  # blocks, bytes of the header, CRC-32 of index and header, MAGIC
+READ_BYTES = 2**22  # of neighbouring blocks at once
+_EMPTY = [getattr(EMPTY, name) for name in PARTS]
+_WIDTHS = np.array([part.itemsize * math.prod(part.shape[1:]) for part in _EMPTY])  # bytes of each one's rows
+
+
+FileState = tuple[int, int, int]
+
+
+def file_state(stat: os.stat_result) -> FileState:
+    """Inode, time of change and bytes of a file: what tells it from one that has replaced it."""
+    return stat.st_ino, stat.st_mtime_ns, stat.st_size
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a checkpoint is true for.
+
+    closed_ns: it has the samples stamped before this time, from all journal rows up to `row`. facts: what its evidence
+    depends on besides. The others: as of a grid's state.
+    """
+
+    closed_ns: int
+    row: int
+    facts: Mapping[str, Any]
+    folded: int = 0
+    skipped: int = 0
+    newest_ns: int = 0
+    oldest_ns: int = 0
+
+    @property
+    def state(self) -> GridState:
+        """The state of the grid but for its blocks."""
+        return GridState((), self.folded, self.skipped, self.newest_ns, self.oldest_ns)
+
+
+class DamagedError(StoreError):
+    """A file is no checkpoint, or not what was written."""
+
+
+class Checkpoint:
+    """An open checkpoint. Everything raises DamagedError where it cannot be used, OSError where it cannot be read.
+
+    index (blocks,): INDEX. state: of the file that was opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("rb", buffering=0)
+        try:
+            stat = os.fstat(self._file.fileno())
+            self.state = file_state(stat)
+            self.header, self.index = self._read_end(stat.st_size)
+        except BaseException:
+            self.close()
+            raise
+        self._sizes = _padded((self.index["lengths"] * _WIDTHS).sum(axis=1))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def numbers_in(self, window: CellWindow | None) -> Ints:
+        """Numbers of the blocks that a window touches, in the order of places; of all without one."""
+        if window is None:
+            return np.arange(len(self.index))
+        n, x, y = BLOCK_CELLS, self.index["x"], self.index["y"]
+        inside = (x >= window.column // n) & (x <= (window.column + window.columns - 1) // n)
+        inside &= (y >= window.row // n) & (y <= (window.row + window.rows - 1) // n)
+        return np.flatnonzero(inside)
+
+    def records(self, numbers: Ints) -> Iterator[memoryview]:
+        """The bytes of some blocks, in order of places, each checked; neighbours are read at once."""
+        at = 0
+        firsts, sizes, crcs = (
+            part[numbers].tolist() for part in (self.index["first"], self._sizes, self.index["crc32"])
+        )
+        while at < len(numbers):
+            end = at + 1
+            while end < len(numbers) and firsts[end] == firsts[end - 1] + sizes[end - 1] < firsts[at] + READ_BYTES:
+                end += 1
+            data = self._read(firsts[at], firsts[end - 1] + sizes[end - 1] - firsts[at])
+            for i in range(at, end):
+                start = firsts[i] - firsts[at]
+                record = data[start : start + sizes[i]]
+                if zlib.crc32(record) != crcs[i]:
+                    raise self._damaged("a block")
+                yield record
+            at = end
+
+    def blocks(self, numbers: Ints) -> Iterator[tuple[int, int, CompactPages]]:
+        """Column, row and pages of some blocks."""
+        places = zip(self.index["x"][numbers].tolist(), self.index["y"][numbers].tolist(), strict=True)
+        ends = np.cumsum(self.index["lengths"][numbers] * _WIDTHS, axis=1).tolist()
+        for (x, y), record, ends_of_parts in zip(places, self.records(numbers), ends, strict=True):
+            parts = zip(PARTS, _EMPTY, [0, *ends_of_parts], ends_of_parts, strict=False)
+            data = np.frombuffer(record, np.uint8)
+            pages = CompactPages(
+                **{name: data[i:j].view(empty.dtype).reshape(-1, *empty.shape[1:]) for name, empty, i, j in parts}
+            )
+            if not pages.is_sound:
+                raise self._damaged(f"block {x}, {y}")
+            yield x, y, pages
+
+    def _read_end(self, size: int) -> tuple[Header, Table]:
+        if size < len(MAGIC) + TAIL.size:
+            raise self._damaged("its end")
+        blocks, header_bytes, crc32, magic = TAIL.unpack(self._read(size - TAIL.size, TAIL.size))
+        index_bytes = blocks * INDEX.itemsize
+        first = size - TAIL.size - header_bytes - index_bytes
+        if magic != MAGIC or first < len(MAGIC):
+            raise self._damaged("its end")
+        data = self._read(first, index_bytes + header_bytes)
+        if zlib.crc32(data) != crc32:
+            raise self._damaged("its index")
+        try:
+            return Header(**json.loads(data[index_bytes:].tobytes())), np.frombuffer(data[:index_bytes], INDEX)
+        except (TypeError, ValueError):
+            raise self._damaged("its header") from None
+
+    def _read(self, first: int, length: int) -> memoryview:
+        """Bytes of the file, in memory that may be written to: kernels are compiled for such arrays."""
+        data = np.empty(length, np.uint8).data
+        if length and os.preadv(self._file.fileno(), [data], first) != length:
+            raise self._damaged("its length")
+        return data
+
+    def _damaged(self, what: str) -> DamagedError:
+        return DamagedError(self.path, f"{what} is damaged; it is made again")
+
+
+class CheckpointWriter:
+    """Writes a checkpoint into a new file: `add` for each block in the order of places, then `finish`. Raises OSError.
+
+    bytes_written: so far.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._index: list[Table] = []
+        self.bytes_written = file.write(MAGIC)
+
+    def add(self, x: int, y: int, pages: CompactPages) -> None:
+        """Write a block."""
+        parts = [getattr(pages, name) for name in PARTS]
+        data = b"".join(part.tobytes() for part in parts)
+        data += bytes(int(_padded(len(data))) - len(data))
+        entry: Table = np.zeros(1, INDEX)
+        entry["x"], entry["y"], entry["lengths"], entry["crc32"] = x, y, [[*map(len, parts)]], zlib.crc32(data)
+        self._put(entry, data)
+
+    def copy(self, source: Checkpoint, numbers: Ints) -> None:
+        """Write blocks as they are in another checkpoint."""
+        for number, record in zip(numbers.tolist(), source.records(numbers), strict=True):
+            self._put(source.index[number : number + 1].copy(), record)
+
+    def finish(self, header: Header) -> None:
+        """Write what a reader starts with."""
+        index = np.concatenate([np.empty(0, INDEX), *self._index])
+        end = index.tobytes() + json.dumps(asdict(header)).encode()
+        tail = TAIL.pack(len(index), len(end) - index.nbytes, zlib.crc32(end), MAGIC)
+        self.bytes_written += self._file.write(end + tail)
+
+    def _put(self, entry: Table, data: bytes | memoryview) -> None:
+        entry["first"] = self.bytes_written
+        self._index.append(entry)
+        self.bytes_written += self._file.write(data)
+
+
+def _padded(length: Any) -> Any:
+    """Bytes with those that fill up the last eight."""
+    return (length + 7) // 8 * 8

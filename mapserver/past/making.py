@@ -1,0 +1,119 @@
+"""A checkpoint made in small steps: of the nearest one before it, and of the samples that this one lacks.
+
+Only these are folded, and only the blocks that they touch are merged; all others are copied as they are. So it takes
+time in proportion to the samples since, and little memory beside a server's own grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.grid_state import GridState
+from mapserver.evidence.pages import CompactPages
+from mapserver.evidence.timeline import Block
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Selection
+from mapserver.past.checkpoint_file import Checkpoint, CheckpointWriter, DamagedError, Header
+from mapserver.past.checkpoints import Checkpoints
+from mapserver.past.past import Past
+from protocol.files import whole_file
+
+FOLDED_AT_ONCE = 32_768  # samples: 30 ms
+MERGED_AT_ONCE = 32  # blocks: 10 ms
+SPILL_SAMPLES = 1_000_000  # what was folded of them takes 50 MB; then it goes to disk, and memory is free again
+SPILL_FILE = "spill"
+
+
+def make(past: Past, reader: JournalReader, closed_ns: int, without: frozenset[str]) -> Iterator[None]:
+    """Make the checkpoint that is closed at a full hour, without some machines, step by step.
+
+    It is true for all rows that the journal has at the first step. Ended early, it leaves nothing. Raises OSError, and
+    StoreError where the journal, the archive or the checkpoint that it begins with is damaged; that one is passed over.
+    """
+    header = Header(closed_ns, reader.last_row, past.facts(reader, without))
+    base = past.checkpoints.nearest(closed_ns, header.facts, header.row)
+    spill = past.checkpoints.folder / SPILL_FILE
+    try:
+        part, waiting = Grid(past.cell_m, past.config, FOLDED_AT_ONCE), 0
+        selection = Selection(to_ns=closed_ns - 1, without=without)
+        for samples, names in past.lacking(reader, base.header if base else None, selection, header.row):
+            part.fold_all(samples, names)
+            waiting += len(samples)
+            yield
+            if waiting >= SPILL_SAMPLES:
+                yield from _write(spill, base, part, header)
+                base = _reopened(base, spill)
+                part, waiting = Grid(past.cell_m, past.config, FOLDED_AT_ONCE), 0
+        yield from _write(past.checkpoints.path(closed_ns), base, part, header)
+    except DamagedError as error:
+        if base:
+            past.checkpoints.pass_over(base, error)
+        raise
+    finally:
+        if base:
+            base.close()
+        spill.unlink(missing_ok=True)
+
+
+def remove_unfinished(checkpoints: Checkpoints) -> None:
+    """Remove what a process that was killed left; raises OSError. Nothing may be in the making."""
+    for left in (checkpoints.folder / SPILL_FILE, *checkpoints.folder.glob(".*.part")):
+        left.unlink(missing_ok=True)
+
+
+def _reopened(base: Checkpoint | None, path: Path) -> Checkpoint:
+    if base:
+        base.close()
+    return Checkpoint(path)
+
+
+def _write(path: Path, base: Checkpoint | None, part: Grid, header: Header) -> Iterator[None]:
+    """Write the evidence of a checkpoint and a grid together, step by step."""
+    state = part.state()
+    fresh = {(x, y): pages for x, y, pages in state.blocks}
+    numbers = _numbers(base)
+    places = sorted(fresh.keys() | numbers.keys())
+    path.parent.mkdir(exist_ok=True)
+    with whole_file(path, 0o600) as file:
+        writer = CheckpointWriter(file)
+        for first in range(0, len(places), MERGED_AT_ONCE):
+            some = places[first : first + MERGED_AT_ONCE]
+            merged = _merged(base, numbers, part, {place: fresh[place] for place in some if place in fresh})
+            for place in some:
+                if place in merged:
+                    writer.add(*place, merged[place])
+                elif base:
+                    writer.copy(base, np.array([numbers[place]]))
+            yield
+        sums = Grid.from_state(part.cell_m, part.config, (base.header if base else header).state)
+        sums.merge(Grid.from_state(part.cell_m, part.config, replace(state, blocks=())))
+        writer.finish(replace(header, **{f.name: getattr(sums, f.name) for f in fields(GridState)[1:]}))
+
+
+def _numbers(base: Checkpoint | None) -> dict[Block, int]:
+    """Number of each block in a checkpoint, by its place."""
+    if base is None:
+        return {}
+    places = zip(base.index["x"].tolist(), base.index["y"].tolist(), strict=True)
+    return {place: number for number, place in enumerate(places)}
+
+
+def _merged(
+    base: Checkpoint | None, numbers: Mapping[Block, int], part: Grid, fresh: Mapping[Block, CompactPages]
+) -> dict[Block, CompactPages]:
+    """The pages of some blocks with those that a checkpoint has of them."""
+    both = sorted(numbers[place] for place in fresh if place in numbers)
+    if base is None or not both:
+        return dict(fresh)
+    grids = (
+        Grid.from_state(part.cell_m, part.config, GridState(tuple(blocks), 0, 0, 0, 0))
+        for blocks in (base.blocks(np.array(both)), ((*place, pages) for place, pages in fresh.items()))
+    )
+    merged, more = grids
+    merged.merge(more)
+    return {(x, y): pages for x, y, pages in merged.state().blocks}

@@ -1,0 +1,134 @@
+"""The past of one store: its samples by stamp and place, the checkpoints of its evidence, and maps as of any time.
+
+A map of the past is the nearest checkpoint before it, and the samples that this one lacks: those stamped since it was
+closed, and late ones, stamped before but journalled after it was made. A fold commutes, so the map is the fold of all
+samples up to that time, bit for bit, whichever checkpoint it begins with, and also with none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.snapshot import parameters
+from mapserver.journal.archive import FOLDER, Archive
+from mapserver.journal.history import History, read_history
+from mapserver.journal.reader import LAST, JournalReader
+from mapserver.journal.refold import THREADS, lent
+from mapserver.journal.rows import Selection
+from mapserver.journal.stamp_index import StampIndex
+from mapserver.past.checkpoint_file import Checkpoint, DamagedError, Header
+from mapserver.past.checkpoints import Checkpoints
+from protocol.arrays import Table
+from protocol.site.geometry import Bounds, CellWindow, GridGeometry
+
+NamedSamples = tuple[Table, NDArray[np.uint64]]  # and the hashes of their machines' names
+
+
+@dataclass(frozen=True)
+class Past:
+    """What the past of one store is read from. For any thread, each with a journal's reader of its own."""
+
+    archive: Archive
+    stamps: StampIndex
+    checkpoints: Checkpoints
+    cell_m: float
+    config: FoldConfig
+
+    @classmethod
+    def of_store(cls, folder: Path, cell_m: float, config: FoldConfig) -> Past:
+        """The past of the store in a folder."""
+        return cls(Archive(folder / FOLDER), StampIndex(), Checkpoints(folder), cell_m, config)
+
+    def facts(self, reader: JournalReader, without: frozenset[str]) -> dict[str, Any]:
+        """What evidence of this store depends on beside its samples; checkpoints made with other facts are not used.
+
+        without: machines whose samples are excluded.
+        """
+        return {"store": reader.identity().id, **parameters(self.cell_m, self.config, without)}
+
+    def samples(
+        self, reader: JournalReader, selection: Selection, after: int = 0, until: int = LAST
+    ) -> Iterator[NamedSamples]:
+        """The selected samples of rows after < row <= until, many at a time."""
+        history = History(reader, self.archive)
+        for stretch in self.stamps.stretches(reader, after, until, selection):
+            for rows in read_history(history, *stretch, selection):
+                yield rows.selected(selection)
+
+    def lacking(
+        self, reader: JournalReader, base: Header | None, selection: Selection, until: int = LAST
+    ) -> Iterator[NamedSamples]:
+        """The selected samples of rows up to `until` that are not in a checkpoint: all of them without one.
+
+        selection: has its end after the checkpoint's, and no beginning.
+        """
+        if base is None:
+            yield from self.samples(reader, selection, until=until)
+        else:
+            yield from self.samples(reader, replace(selection, from_ns=base.closed_ns), until=base.row)
+            yield from self.samples(reader, selection, after=base.row, until=until)
+
+    def next_stamp(self, reader: JournalReader, from_ns: int) -> int | None:
+        """The least stamp from `from_ns` on; that itself, where a journal row reaches across it."""
+        stamps = (self.stamps.next_stamp(reader, from_ns), self.archive.next_stamp(from_ns))
+        return min((stamp for stamp in stamps if stamp is not None), default=None)
+
+    def late_rows(self, reader: JournalReader, header: Header) -> int:
+        """How many journal rows have samples that a checkpoint lacks though they were stamped before it was closed."""
+        selection = Selection(to_ns=header.closed_ns - 1)
+        stretches = self.stamps.stretches(reader, header.row, LAST, selection)
+        return sum(reader.rows_before(*stretch, header.closed_ns) for stretch in stretches)
+
+    def grid(self, checkpoint: Checkpoint | None, window: CellWindow | None = None) -> Grid:
+        """The evidence of a checkpoint, of the blocks that a window touches or of all; none without a checkpoint."""
+        if checkpoint is None:
+            return Grid(self.cell_m, self.config)
+        blocks = tuple(checkpoint.blocks(checkpoint.numbers_in(window)))
+        return Grid.from_state(self.cell_m, self.config, replace(checkpoint.header.state, blocks=blocks))
+
+    def grid_as_of(
+        self,
+        reader: JournalReader,
+        to_ns: int,
+        window: CellWindow | None = None,
+        without: frozenset[str] = frozenset(),
+    ) -> Grid:
+        """The fold of all samples stamped `to_ns` or earlier, without the machines in `without`.
+
+        window: only the evidence of these cells is complete, and nothing far from them is read.
+        """
+        grid, base = self._nearest(reader, to_ns, window, without)
+        bounds = reach_of(window, self.cell_m, self.config) if window else None
+        with lent(1 if window else THREADS) as workers, grid.bulk(workers):
+            for samples, names in self.lacking(reader, base, Selection(to_ns=to_ns, bounds=bounds, without=without)):
+                grid.fold_all(samples, names)
+        return grid
+
+    def _nearest(
+        self, reader: JournalReader, to_ns: int, window: CellWindow | None, without: frozenset[str]
+    ) -> tuple[Grid, Header | None]:
+        """The evidence of the nearest checkpoint without later samples, and its header; empty where there is none."""
+        facts, last_row = self.facts(reader, without), reader.last_row
+        while checkpoint := self.checkpoints.nearest(to_ns + 1, facts, last_row):
+            with checkpoint:
+                try:
+                    return self.grid(checkpoint, window), checkpoint.header
+                except (DamagedError, OSError) as error:
+                    self.checkpoints.pass_over(checkpoint, error)
+        return self.grid(None), None
+
+
+def reach_of(window: CellWindow, cell_m: float, config: FoldConfig) -> Bounds:
+    """Where samples that vote in a window can lie: 3 sigma of the least certain, and a cell for rounding."""
+    reach_m = 3 * math.hypot(config.std_cap_m, STD_FLOOR_M) + cell_m
+    inner = GridGeometry(cell_m).bounds(window)
+    return Bounds(inner.west_m - reach_m, inner.south_m - reach_m, inner.east_m + reach_m, inner.north_m + reach_m)

@@ -1,0 +1,138 @@
+"""Tiles of the map as it is, kept and brought up to date where evidence came in; and of the map as of any time.
+
+A tile is a function of the evidence alone: the age of a cell is counted from the tile's newest sample, so that time
+alone changes no tile.
+"""
+
+from __future__ import annotations
+
+import threading
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapserver.change.detection import reach_blocks
+from mapserver.change.validity import Pages, around, valid_pages
+from mapserver.config import ServerConfig
+from mapserver.evidence.grid import chunks
+from mapserver.evidence.timeline import Block, evidence
+from mapserver.ingest.store import Store
+from mapserver.ingest.writer import Writer
+from mapserver.layers import cell_layers
+from mapserver.query.views import View
+from protocol.arrays import AnyArray, Ints
+from protocol.queries.answers import MapVersion
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, Plane, TilesAnswer
+from protocol.queries.requests import TilesQuery
+from protocol.site.geometry import BLOCK_CELLS
+
+BLOCKS = TILE_CELLS // BLOCK_CELLS  # of a tile, along one side
+LEVEL = 6  # of deflate: 9 takes three times as long for 1 % less
+LAYERS = ("resistance", "confidence", "grade", "grade_std", "visits")  # as in PLANES; `since` is of the evidence
+Place = tuple[int, int]  # column and row of a tile
+
+
+@dataclass
+class _Square:
+    """A tile in the making. planes: (planes, 64, 64). newest_ns: (64, 64), 0 for none."""
+
+    planes: Plane
+    newest_ns: Ints
+
+    @classmethod
+    def empty(cls) -> _Square:
+        planes = np.zeros((len(PLANES), TILE_CELLS, TILE_CELLS), np.uint8)
+        return cls(planes, np.zeros((TILE_CELLS, TILE_CELLS), np.int64))
+
+    def tile(self, place: Place, row: int, fact: int) -> MapTile:
+        newest_ns = int(self.newest_ns.max())
+        since_s = np.where(self.newest_ns > 0, (newest_ns - self.newest_ns) / 1e9, np.nan)
+        self.planes[-1] = PLANES["since"].quantised(since_s)
+        return MapTile(*place, row, fact, newest_ns, zlib.compress(self.planes.tobytes(), LEVEL))
+
+
+class Tiles:
+    """Tiles of the map as it is; for any thread. What it costs is for what changed since somebody last asked."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer, self._config = writer, writer.config
+        self._cell_m = writer.site.cell_m
+        self._reach = reach_blocks(self._cell_m, self._config.change)
+        self._lock = threading.Lock()
+        self._squares: dict[Place, _Square] = {}
+        self._tiles: dict[Place, MapTile] = {}
+        self._turn, self._fact = -1, -1
+
+    def answer(self, query: TilesQuery) -> TilesAnswer:
+        """Tiles that differ since the version that the query names; all where it names none of this store."""
+        with self._lock:
+            version, stamp_ns = self._update()
+            since = query.since
+            whole = (
+                since is None or since.store != version.store or since.row > version.row or since.fact > version.fact
+            )
+            tiles = (tile for tile in self._tiles.values() if whole or _is_newer(tile, since))
+            return TilesAnswer(version, stamp_ns, self._cell_m, whole, tuple(tiles))
+
+    def _update(self) -> tuple[MapVersion, int]:
+        """Make anew what evidence came into, and what lies so near that a change of the ground there counts for it."""
+        blocks, pages, turn, version, stamp_ns = self._writer.run(self._folded)
+        whole = version.fact != self._fact
+        squares: dict[Place, _Square] = {} if whole else self._squares
+        changed = fill(squares, pages, blocks, self._cell_m, self._config)
+        for place in changed | (self._tiles.keys() - squares.keys()):
+            tile = squares.setdefault(place, _Square.empty()).tile(place, version.row, version.fact)
+            known = self._tiles.get(place)
+            if known is None or (known.planes, known.newest_ns) != (tile.planes, tile.newest_ns):
+                self._tiles[place] = tile
+        self._squares, self._turn, self._fact = squares, turn, version.fact
+        return version, stamp_ns
+
+    def _folded(self, store: Store) -> tuple[list[Block], Pages, int, MapVersion, int]:
+        grid, whole = store.grid, store.fact != self._fact  # after a fact, the map may be another grid
+        folded, turn = grid.folded_since(-1 if whole else self._turn)
+        blocks = folded if whole else sorted({near for one in folded for near in around(one, self._reach)})
+        wide = sorted({near for block in blocks for near in around(block, self._reach)})
+        pages = {block: pages for block, pages in zip(wide, grid.pages(wide), strict=True) if pages}
+        return [block for block in blocks if block in pages], pages, turn, store.version, store.newest_ns
+
+
+def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:
+    return since is None or tile.row > since.row or tile.fact > since.fact
+
+
+def tiles_of(view: View, version: MapVersion, cell_m: float, config: ServerConfig) -> TilesAnswer:
+    """All tiles of a view."""
+    squares: dict[Place, _Square] = {}
+    fill(squares, view.pages, list(view.pages), cell_m, config)
+    tiles = tuple(square.tile(place, version.row, version.fact) for place, square in sorted(squares.items()))
+    return TilesAnswer(version, view.stamp_ns, cell_m, whole=True, tiles=tiles)
+
+
+def fill(
+    squares: dict[Place, _Square], pages: Pages, blocks: Iterable[Block], cell_m: float, config: ServerConfig
+) -> set[Place]:
+    """Write blocks into their squares, with pages of all that lies around them; returns which squares these are."""
+    first = valid_pages(pages, cell_m, config.change)
+    places = set()
+    for some in chunks(list(blocks)):
+        sums = evidence([pages[block] for block in some], [first[block] for block in some])
+        values = cell_layers.read(sums, LAYERS, config.read)
+        planes = np.stack([PLANES[name].quantised(layer.astype(np.float64)) for name, layer in values.items()])
+        newest_ns = np.where(np.isnan(values["visits"]), 0, sums.newest_ns)
+        for index, block in enumerate(some):
+            places.add(_put(squares, block, planes[:, index], newest_ns[index]))
+    return places
+
+
+def _put(squares: dict[Place, _Square], block: Block, planes: Plane, newest_ns: AnyArray) -> Place:
+    """Write one block: planes (layers, 256), newest_ns (256,)."""
+    place = block[0] // BLOCKS, block[1] // BLOCKS
+    square = squares.setdefault(place, _Square.empty())
+    column, row = (BLOCK_CELLS * (at % BLOCKS) for at in block)
+    rows, columns = slice(row, row + BLOCK_CELLS), slice(column, column + BLOCK_CELLS)
+    square.planes[: len(planes), rows, columns] = planes.reshape(-1, BLOCK_CELLS, BLOCK_CELLS)
+    square.newest_ns[rows, columns] = newest_ns.reshape(BLOCK_CELLS, BLOCK_CELLS)
+    return place

@@ -1,0 +1,83 @@
+"""Why a cell has its value: its votes, those before its last change, and who gave them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from mapserver.change.validity import valid_pages
+from mapserver.config import ServerConfig
+from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import name_hash
+from mapserver.evidence.timeline import evidence
+from mapserver.layers import cell_layers
+from mapserver.query.views import View
+from protocol.arrays import AnyArray
+from protocol.queries.answers import MapVersion
+from protocol.queries.reasons import CellReasons, Votes
+from protocol.site.geometry import BLOCK_CELLS
+
+LAYERS = tuple(
+    name for name in cell_layers.LAYERS if name not in ("age_s", "changed_s")
+)  # which follow from the stamps
+MACHINE_SHIFT = 58  # the top six bits of a name's hash choose its bit
+
+
+def reasons(
+    view: View, version: MapVersion, cell: tuple[int, int], names: Iterable[str], cell_m: float, config: ServerConfig
+) -> CellReasons:
+    """What is known of one cell (column, row).
+
+    names: of all machines whose samples may be in the map; of those whose bit is set in the cell, one may have been
+    somewhere else only, where more than a few machines work: 64 bits are for all names.
+    """
+    block = cell[0] // BLOCK_CELLS, cell[1] // BLOCK_CELLS
+    pages = view.pages.get(block, ())
+    first = valid_pages(view.pages, cell_m, config.change).get(block)
+    place = cell[1] % BLOCK_CELLS * BLOCK_CELLS + cell[0] % BLOCK_CELLS
+    holds = _one(evidence([pages], None if first is None else [first]), place)
+    everything = _one(evidence([pages]), place)
+    before = dataclasses.replace(everything, counts=everything.counts - holds.counts)
+    bits = int(holds.bitmaps[0, 0, ev.MACHINES])
+    return CellReasons(
+        store=version.store,
+        merged=version.row,
+        fact=version.fact,
+        stamp_ns=view.stamp_ns,
+        x_m=(cell[0] + 0.5) * cell_m,
+        y_m=(cell[1] + 0.5) * cell_m,
+        cell_m=cell_m,
+        values=_values(holds, config),
+        before=_values(before, config),
+        metres=float(holds.weight[0, 0]) / ev.WEIGHT_UNITS_PER_M,
+        newest_ns=int(holds.newest_ns[0, 0]),
+        changed_ns=int(holds.changed_ns[0, 0]),
+        resistance=_votes(holds, before, ev.RESISTANCE, ev.RESISTANCE_CENTRES),
+        grade_east=_votes(holds, before, ev.GRADE_EAST, ev.GRADE_CENTRES),
+        grade_north=_votes(holds, before, ev.GRADE_NORTH, ev.GRADE_CENTRES),
+        sectors=_metres(holds, ev.HEADING),
+        machines=tuple(sorted(name for name in names if bits >> (name_hash(name) >> MACHINE_SHIFT) & 1)),
+    )
+
+
+def _one(sums: ev.Evidence, place: int) -> ev.Evidence:
+    """The evidence of one cell of one block, arrays (1, 1, ...)."""
+    parts = {item.name: getattr(sums, item.name)[:, place : place + 1] for item in dataclasses.fields(sums)}
+    return ev.Evidence(**parts)
+
+
+def _values(sums: ev.Evidence, config: ServerConfig) -> dict[str, float | None]:
+    layers = cell_layers.read(sums, LAYERS, config.read)
+    values = {name: float(layer[0, 0]) for name, layer in layers.items()}
+    return {name: None if math.isnan(value) else value for name, value in values.items()}
+
+
+def _votes(holds: ev.Evidence, before: ev.Evidence, part: slice, centres: AnyArray) -> Votes:
+    return Votes(tuple(np.asarray(centres).tolist()), _metres(holds, part), _metres(before, part))
+
+
+def _metres(sums: ev.Evidence, part: slice) -> tuple[float, ...]:
+    return tuple((sums.counts[0, 0, part].astype(np.float64) / ev.WEIGHT_UNITS_PER_M).tolist())

@@ -1,0 +1,108 @@
+"""A high-water mark beside a database: numbers that were committed to it, to be compared when it is opened again.
+
+The file NAME-mark is a chain of records; a record has the numbers that a commit changed, and a checksum that begins
+with that of the record before. It is read up to the first record that is not sound; the newest value of a name counts.
+
+A record is written after its commit is on disk, and is not synced: a mark never claims more than the database had, and
+a power cut may leave it behind or torn, which is no alarm. So it costs one write and no sync, and tells of all that was
+committed before a kill, or some seconds before a power cut: then the system has written it to disk by itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgpack
+
+from protocol.files import PRIVATE, whole_file
+
+_RECORD = struct.Struct("<II")  # length and checksum, before the values
+LIMIT = 2**20  # bytes; a longer file is written anew with the newest values alone
+_OFTEN = 400  # bytes for each value: about ten times what it needs
+
+
+def mark_path(database: Path) -> Path:
+    """Where the mark of a database lies."""
+    return database.with_name(f"{database.name}-mark")
+
+
+def read_mark(path: Path) -> dict[str, int]:
+    """The newest value of each name; none where there is no mark, or none that is sound. Raises OSError."""
+    return _read(path)[0]
+
+
+class HighWaterMark:
+    """One writer's mark. values: the newest ones. Raises OSError only where the file cannot be opened."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.values, self._end, self._crc = _read(path)
+        self._unwritten: dict[str, int] = {}
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE)
+
+    def write(self, values: Mapping[str, int]) -> None:
+        """Note what has just been committed; a disk that takes no more leaves the mark behind until it does."""
+        self.values.update(values)
+        self._unwritten.update(values)
+        with contextlib.suppress(OSError):
+            if self._end > max(LIMIT, _OFTEN * len(self.values)):
+                self._write_anew()
+            else:
+                self._append()
+
+    def replace(self, values: Mapping[str, int]) -> None:
+        """Note these values and no others, when the database was compared with the mark; raises OSError."""
+        if values != self.values:
+            self.values = dict(values)
+            self._write_anew()
+
+    def close(self) -> None:
+        """Close the file; nothing is written from then on."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1  # never a number that another file gets
+
+    def _append(self) -> None:
+        record, crc = _record(self._unwritten, self._crc)
+        if os.pwrite(self._file, record, self._end) == len(record):  # else the next one takes its place
+            self._end, self._crc = self._end + len(record), crc
+            self._unwritten.clear()
+
+    def _write_anew(self) -> None:
+        record, crc = _record(self.values, 0)
+        with whole_file(self.path, PRIVATE) as file:
+            file.write(record)
+        os.close(self._file)
+        self._file = os.open(self.path, os.O_RDWR)
+        self._end, self._crc = len(record), crc
+        self._unwritten.clear()
+
+
+def _record(values: Mapping[str, int], crc: int) -> tuple[bytes, int]:
+    body: bytes = msgpack.packb(dict(values))
+    crc = zlib.crc32(body, crc)
+    return _RECORD.pack(len(body), crc) + body, crc
+
+
+def _read(path: Path) -> tuple[dict[str, int], int, int]:
+    """Newest values, where the sound records end, and the checksum of the last one."""
+    values: dict[str, int] = {}
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return values, 0, 0
+    at = crc = 0
+    while at + _RECORD.size <= len(data):
+        length, expected = _RECORD.unpack_from(data, at)
+        end = at + _RECORD.size + length
+        body = data[at + _RECORD.size : end]
+        if length == 0 or len(body) < length or zlib.crc32(body, crc) != expected:
+            break
+        values.update(msgpack.unpackb(body))
+        at, crc = end, expected
+    return values, at, crc

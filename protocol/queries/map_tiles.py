@@ -1,0 +1,147 @@
+"""Tiles: the map in squares of 64 x 64 cells, a few layers in 8 bits each, for pages that draw it."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.arrays import Floats
+from protocol.errors import MessageError, Refusal
+from protocol.queries.answers import MapVersion
+from protocol.wire.codec import MAX_SEQ, pack, take, unpack
+
+TILE_CELLS = 64
+AREA = TILE_CELLS * TILE_CELLS
+MAX_TILES = 100_000  # of one answer: a square of 20 km
+MAX_TILES_BYTES = 2**28
+Plane = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What 8 bits mean: 0 unknown, 1 to 255 a value.
+
+    kind: "log" and "linear" from low to high, in even steps; "count" the value itself; "since" seconds before the
+    newest sample of the tile, low (2^((q - 1) / steps) - 1).
+    """
+
+    kind: Literal["log", "linear", "count", "since"]
+    low: float = 0.0
+    high: float = 0.0
+    steps: float = 0.0
+
+    def quantised(self, values: Floats) -> Plane:
+        """8 bits (...) for values (...): the nearest step, 0 for NaN; what is beyond the ends takes the end."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            match self.kind:
+                case "log":
+                    step = 1 + 254 * np.log(values / self.low) / np.log(self.high / self.low)
+                case "linear":
+                    step = 1 + 254 * (values - self.low) / (self.high - self.low)
+                case "count":
+                    step = values
+                case "since":
+                    step = 1 + self.steps * np.log2(1 + values / self.low)
+        known = ~np.isnan(step)
+        out: Plane = np.where(known, np.clip(np.rint(np.where(known, step, 0)), 1, 255), 0).astype(np.uint8)
+        return out
+
+    def values(self) -> Floats:
+        """The values (256,) of all steps; NaN for 0."""
+        step = np.arange(256, dtype=np.float64)
+        part = (step - 1) / 254
+        match self.kind:
+            case "log":
+                out = self.low * (self.high / self.low) ** part
+            case "linear":
+                out = self.low + (self.high - self.low) * part
+            case "count":
+                out = step
+            case "since":
+                out = self.low * (2 ** ((step - 1) / self.steps) - 1)
+        out[0] = np.nan
+        return out
+
+
+# A step of c_rr is 1.8 %, one of a slope 0.3 % of grade, one of time 4 %, up to a week. Cells in which machines drove
+# and measured nothing have visits alone.
+PLANES: dict[str, Scale] = {
+    "resistance": Scale("log", 0.004, 0.4),
+    "confidence": Scale("linear", 0.0, 1.0),
+    "grade": Scale("linear", 0.0, 0.75),
+    "grade_std": Scale("linear", 0.0, 0.25),
+    "visits": Scale("count"),
+    "since": Scale("since", low=10.0, steps=16.0),
+}
+
+
+@dataclass(frozen=True)
+class MapTile:
+    """One square: x, y columns and rows of tiles from the origin.
+
+    row, fact: the version of the map in which it was last another one. newest_ns: stamp of its newest sample. planes:
+    the planes of PLANES in their order, each row by row from the south, deflated (zlib).
+    """
+
+    x: int
+    y: int
+    row: int
+    fact: int
+    newest_ns: int
+    planes: bytes
+
+    def unpacked(self) -> dict[str, Plane]:
+        """The planes (64, 64) by name."""
+        data = np.frombuffer(zlib.decompress(self.planes), np.uint8).reshape(len(PLANES), TILE_CELLS, TILE_CELLS)
+        return dict(zip(PLANES, data, strict=True))
+
+
+@dataclass(frozen=True)
+class TilesAnswer:
+    """Tiles of one version of the map. whole: all that there are; else those that differ since a version."""
+
+    version: MapVersion
+    stamp_ns: int
+    cell_m: float
+    whole: bool
+    tiles: tuple[MapTile, ...]
+
+
+def encode_tiles(answer: TilesAnswer) -> bytes:
+    """Answer of `tiles`."""
+    version = {"store": answer.version.store, "merged": answer.version.row, "fact": answer.version.fact}
+    rows = [[tile.x, tile.y, tile.row, tile.fact, tile.newest_ns, tile.planes] for tile in answer.tiles]
+    state = {"stamp_ns": answer.stamp_ns, "cell_m": answer.cell_m, "whole": answer.whole}
+    return pack({**version, **state, "planes": list(PLANES), "tiles": rows})
+
+
+def decode_tiles(data: bytes) -> TilesAnswer:
+    """Undo `encode_tiles`; refuses tiles whose planes are not those of PLANES."""
+    table = unpack(data, MAX_TILES_BYTES, MAX_TILES)
+    if (names := take(table, "planes", list)) != list(PLANES):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{names!s:.80} are not {', '.join(PLANES)}", field="planes")
+    tiles = tuple(_tile(row, index) for index, row in enumerate(take(table, "tiles", list)))
+    version = MapVersion(take(table, "store", str), take(table, "merged", int), take(table, "fact", int))
+    stamp_ns, cell_m = take(table, "stamp_ns", int), take(table, "cell_m", float)
+    return TilesAnswer(version, stamp_ns, cell_m, take(table, "whole", bool), tiles)
+
+
+def _tile(row: Any, index: int) -> MapTile:
+    if type(row) is not list or [type(value) for value in row] != [int] * 5 + [bytes]:
+        raise MessageError(Refusal.WRONG_TYPE, "five whole numbers and bytes are expected", field="tiles", row=index)
+    x, y, version_row, fact, newest_ns, planes = row
+    if any(abs(number) > MAX_SEQ for number in row[:-1]):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{row[:-1]}", field="tiles", row=index)
+    stream = zlib.decompressobj()
+    try:
+        length = len(stream.decompress(planes, len(PLANES) * AREA + 1))
+    except zlib.error as error:
+        raise MessageError(Refusal.WRONG_TYPE, f"not deflated: {error}", field="tiles", row=index) from None
+    if length != len(PLANES) * AREA or not stream.eof:
+        problem = f"{length} bytes of planes, {len(PLANES)} take {len(PLANES) * AREA}"
+        raise MessageError(Refusal.COLUMN_LENGTH, problem, field="tiles", row=index)
+    return MapTile(x, y, version_row, fact, newest_ns, planes)

@@ -1,0 +1,237 @@
+"""The web server as an ASGI application: paths to resources, pages, tiles, live connections."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Sequence
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
+from starlette.websockets import WebSocket
+
+from protocol.errors import Refusal
+from protocol.queries.answers import MapInfo
+from protocol.site.geometry import Bounds
+from sitegrid.web import live, mercator, values
+from sitegrid.web.guard import Guard
+from sitegrid.web.openapi import PREFIX, description
+from sitegrid.web.problems import Problem, bad, problem_response
+from sitegrid.web.resources import RESOURCES, follows_now
+from sitegrid.web.site import SiteFeed
+
+PAGE = Path(__file__).parent / "page"
+FRESH_S = 1.0  # how old the version may be that a tile, or a copy that the asker has, is compared with
+PNG_KEPT = 4000  # some 20 MB
+log = logging.getLogger("sitegrid.web")
+MAX_TILE_CELLS = 4_000_000  # of one XYZ tile; a lower zoom shows less than a site, and is empty
+
+
+class WebApp:
+    """All sites, and what answers for them. person: see Guard."""
+
+    def __init__(self, feeds: Sequence[SiteFeed], person: Callable[[str], str | None] | None = None) -> None:
+        self._feeds = {feed.name: feed for feed in feeds}
+        self._pngs: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
+        site = f"{PREFIX}/sites/{{site}}"
+        routes = [
+            Route(f"{PREFIX}/sites", self._sites),
+            Route(f"{PREFIX}/openapi.json", self._openapi),
+            *(Route(f"{site}/{name}", self._resource, name=name) for name in RESOURCES),
+            WebSocketRoute(f"{site}/live", self._live),
+            Route(f"{site}/xyz/{{layer}}.json", self._tilejson),
+            Route(f"{site}/xyz/{{kind}}/{{layer}}/{{z:int}}/{{x:int}}/{{y:int}}.png", self._xyz),
+            Route("/healthz", self._healthz),
+            Route("/metrics", self._metrics),
+            Mount("/", StaticFiles(directory=PAGE, html=True)),
+        ]
+        handlers: dict[Any, Any] = {HTTPException: _not_there, Exception: _failed}
+        app = Starlette(routes=routes, exception_handlers=handlers, lifespan=self._lifespan)
+        app.add_middleware(GZipMiddleware, minimum_size=1000, compresslevel=5)
+        self.guard = Guard(app, person)
+        self.app: ASGIApp = self.guard
+
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        yield
+        await asyncio.gather(*(feed.close() for feed in self._feeds.values()))
+
+    def _feed(self, request: Request | WebSocket) -> SiteFeed:
+        name = request.path_params["site"]
+        if name not in self._feeds:
+            known = ", ".join(self._feeds)
+            raise Problem(HTTPStatus.NOT_FOUND, "unknown_site", f"site `{name[:40]}` is not here; known: {known}")
+        return self._feeds[name]
+
+    async def _sites(self, _: Request) -> Response:
+        return _json({"sites": [{"name": name, "href": f"{PREFIX}/sites/{name}/info"} for name in self._feeds]})
+
+    async def _openapi(self, _: Request) -> Response:
+        return _json(description())
+
+    async def _resource(self, request: Request) -> Response:
+        """One resource; a copy that the asker has is confirmed where the map is still that one."""
+        name = request.url.path.split("/", 5)[5]
+        resource, parameters = RESOURCES[name], _parameters(request)
+        try:
+            feed = self._feed(request)
+            values.check_known(parameters, tuple(resource.parameters))
+            tag = _tag(await feed.info(FRESH_S), with_now=follows_now(resource, parameters))
+            headers = {"ETag": tag, "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
+            if request.headers.get("if-none-match") == tag:
+                return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+            response = await resource.answer(feed, parameters)
+        except Exception as error:  # whatever it was: one answer, as a problem
+            return _failed(request, error)
+        response.headers.update(headers)
+        return response
+
+    async def _live(self, socket: WebSocket) -> None:
+        if socket.path_params["site"] not in self._feeds:
+            await socket.accept()
+            await socket.close(4404, "unknown site")
+            return
+        await live.serve(socket, self._feed(socket))
+
+    async def _tilejson(self, request: Request) -> Response:
+        """TileJSON of a layer in colours, and of its values."""
+        try:
+            feed, layer = self._feed(request), request.path_params["layer"]
+            kind = _parameters(request).get("kind", "colour")
+            info = await feed.info(FRESH_S)
+            _check_layer(kind, layer, info)
+            base = f"{request.url.scheme}://{request.url.netloc}{PREFIX}/sites/{feed.name}/xyz/{kind}/{layer}"
+            table: dict[str, Any] = {
+                "tilejson": "3.0.0",
+                "name": f"{feed.name}: {layer}",
+                "tiles": [f"{base}/{{z}}/{{x}}/{{y}}.png"],
+                "minzoom": 10,
+                "maxzoom": mercator.MAX_ZOOM,
+            }
+            if info.bounds:
+                table["bounds"] = await _geodetic_bounds(feed, info)
+            if kind == "value":
+                scale, offset = mercator.coding(layer)
+                coding = "value = offset + scale * (65536 * red + 256 * green + blue); red = green = blue = 0: unknown"
+                table |= {"encoding": coding, "scale": scale, "offset": offset, "unknown": 0}
+            return _json(table)
+        except Exception as error:
+            return _failed(request, error)
+
+    async def _xyz(self, request: Request) -> Response:
+        try:
+            return await self._tile(request)
+        except Exception as error:
+            return _failed(request, error)
+
+    async def _tile(self, request: Request) -> Response:
+        path = request.path_params
+        feed, kind, layer, z, x, y = self._feed(request), *(path[name] for name in ("kind", "layer", "z", "x", "y"))
+        if not (z <= mercator.MAX_ZOOM and x < 2**z and y < 2**z):
+            raise bad(Refusal.OUT_OF_RANGE, f"tile {z}/{x}/{y}: zooms 0 to {mercator.MAX_ZOOM}, x and y below 2^zoom")
+        info = await feed.info(FRESH_S)
+        _check_layer(kind, layer, info)
+        tag = _tag(info, with_now=layer in ("age_s", "changed_s"))
+        headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+        if request.headers.get("if-none-match") == tag:
+            return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+        key = (feed.name, kind, layer, z, x, y, tag)
+        if key not in self._pngs:
+            self._pngs[key] = await _png(feed, info, kind, layer, (z, x, y))
+            while len(self._pngs) > PNG_KEPT:
+                self._pngs.popitem(last=False)
+        return Response(self._pngs[key], headers=headers, media_type="image/png")
+
+    async def _healthz(self, _: Request) -> Response:
+        """Whether the web server answers; whether map servers do is in /metrics."""
+        return PlainTextResponse("ok\n")
+
+    async def _metrics(self, _: Request) -> Response:
+        lines = ["# TYPE sitegrid_web_total counter"]
+        lines += [f'sitegrid_web_total{{event="{name}"}} {n}' for name, n in sorted(self.guard.counts.items())]
+        feeds = self._feeds.values()
+        for name, figures in (("pages", [d.watchers for d in feeds]), ("server_away", [int(d.is_away) for d in feeds])):
+            lines.append(f"# TYPE sitegrid_web_{name} gauge")
+            lines += [f'sitegrid_web_{name}{{site="{d.name}"}} {n}' for d, n in zip(feeds, figures, strict=True)]
+        return PlainTextResponse("\n".join(lines) + "\n", media_type="text/plain; version=0.0.4")
+
+
+async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tuple[int, int, int]) -> bytes:
+    """An XYZ tile: the map's cells below its pixels."""
+    pixels = mercator.pixels_of(*place, await feed.projection())
+    cell_m = info.site.cell_m
+    bounds = _common(pixels.bounds(cell_m), info)
+    if bounds is None:
+        return mercator.EMPTY
+    if (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) > MAX_TILE_CELLS * cell_m**2:
+        raise bad(Refusal.TOO_LARGE, "too many cells in one tile; zoom in")
+    region = await feed.ask(feed.client.region, bounds, (layer,))
+    edges = region.bounds
+    values_px = pixels.sample(region[layer], edges.west_m, edges.south_m, cell_m)
+    return mercator.value_png(values_px, layer) if kind == "value" else mercator.colour_png(values_px, layer)
+
+
+def _common(bounds: Bounds, info: MapInfo) -> Bounds | None:
+    """What of a rectangle the map may know; None for nothing."""
+    if not info.bounds:
+        return None
+    known = [edge * info.site.cell_m for edge in info.bounds]
+    west, south = max(bounds.west_m, known[0]), max(bounds.south_m, known[1])
+    east, north = min(bounds.east_m, known[2]), min(bounds.north_m, known[3])
+    return Bounds(west, south, east, north) if west < east and south < north else None
+
+
+async def _geodetic_bounds(feed: SiteFeed, info: MapInfo) -> list[float]:
+    west, south, east, north = (edge * info.site.cell_m for edge in info.bounds or (0, 0, 0, 0))
+    projection = await feed.projection()
+    corners = [projection.to_geodetic(x, y) for x in (west, east) for y in (south, north)]
+    lats, lons = [corner[0] for corner in corners], [corner[1] for corner in corners]
+    return [min(lons), min(lats), max(lons), max(lats)]
+
+
+def _check_layer(kind: str, layer: str, info: MapInfo) -> None:
+    if kind not in ("colour", "value"):
+        raise bad(Refusal.OUT_OF_RANGE, f"`{kind[:40]}` is neither colour nor value")
+    if layer not in info.layers:
+        problem = f"layer `{layer[:40]}` is not known; known: {', '.join(info.layers)}"
+        raise Problem(HTTPStatus.NOT_FOUND, Refusal.UNKNOWN_LAYER, problem)
+
+
+def _parameters(request: Request) -> dict[str, str]:
+    return {name: value for name, value in request.query_params.items() if name != "token"}
+
+
+def _tag(info: MapInfo, *, with_now: bool) -> str:
+    """Which map an answer is of: its store and version, and the site's now where ages depend on it."""
+    now = f"-{info.stamp_ns}-{info.journalled}" if with_now else ""
+    return f'"{info.store}-{info.merged}-{info.fact}{now}"'
+
+
+def _json(value: Any) -> Response:
+    return Response(json.dumps(value), media_type="application/json")
+
+
+def _not_there(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    status = HTTPStatus(error.status_code)
+    reason = "wrong_method" if status == HTTPStatus.METHOD_NOT_ALLOWED else "not_found"
+    return problem_response(Problem(status, reason, f"{status.phrase}; see {PREFIX}/openapi.json"))
+
+
+def _failed(request: Request, error: Exception) -> Response:
+    response = problem_response(error)
+    if response.status_code == HTTPStatus.INTERNAL_SERVER_ERROR:
+        log.error("failed path=%s", request.url.path, exc_info=error)
+    return response

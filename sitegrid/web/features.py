@@ -1,0 +1,120 @@
+"""GeoJSON (RFC 7946) for GIS: areas of one kind of ground, changes, machines; longitude and latitude in degrees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from protocol.arrays import AnyArray, Bools, Floats
+from protocol.queries.answers import GroundChange
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, TilesAnswer
+from protocol.site.ground_classes import ZONES
+from protocol.site.site_config import Projection
+from sitegrid.web.values import iso
+
+LEAST_CELLS = 4  # smaller areas of one kind are noise to the eye
+Corner = tuple[float, float]
+
+
+def zones(answer: TilesAnswer, boundaries: Sequence[float], projection: Projection) -> dict[str, Any]:
+    """Areas of cells of the same class of resistance, as polygons with holes."""
+    if not answer.tiles:
+        return _collection([])
+    image, column, row = _resistance(answer)
+    classes = np.where(np.isnan(image), -1, np.digitize(image, boundaries))
+    areas = []
+    for kind in range(len(boundaries) + 1):
+        for rings in _polygons(classes == kind):
+            outline = [[_corner(x + column, y + row, answer.cell_m, projection) for x, y in ring] for ring in rings]
+            name = ZONES[kind].name if len(boundaries) + 1 == len(ZONES) else str(kind)
+            areas.append(_feature("Polygon", [[*ring, ring[0]] for ring in outline], {"class": kind, "name": name}))
+    return _collection(areas)
+
+
+def changes(ground_changes: Iterable[GroundChange], projection: Projection) -> dict[str, Any]:
+    """Rectangles around changes of the ground."""
+    out = []
+    for change in ground_changes:
+        west, south, east, north = change.bounds
+        ring = [(west, south), (east, south), (east, north), (west, north), (west, south)]
+        properties = {
+            "id": change.id,
+            "first_time": iso(change.first_ns),
+            "last_time": iso(change.last_ns),
+            "cells": change.cells,
+            "resistance_before": change.resistance_before,
+            "resistance_after": change.resistance_after,
+        }
+        out.append(_feature("Polygon", [[_corner(x, y, 1.0, projection) for x, y in ring]], properties))
+    return _collection(out)
+
+
+def machines(poses: Iterable[dict[str, Any]], projection: Projection) -> dict[str, Any]:
+    """Points where machines are."""
+    out = []
+    for pose in poses:
+        properties = {name: pose[name] for name in ("machine", "heading_rad", "speed_mps", "stamp_time", "age_s")}
+        out.append(_feature("Point", _corner(pose["x_m"], pose["y_m"], 1.0, projection), properties))
+    return _collection(out)
+
+
+def inside(outline: Sequence[Corner], x_m: Floats, y_m: Floats) -> Bools:
+    """Which cell centres (rows, columns) lie in a polygon."""
+    x, y = np.meshgrid(x_m, y_m)
+    within = np.zeros(x.shape, np.bool_)
+    corners = np.array(outline)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y0 != y1:
+            crosses = (y0 > y) != (y1 > y)
+            within ^= crosses & (x < (x1 - x0) * (y - y0) / (y1 - y0) + x0)
+    return within
+
+
+def _resistance(answer: TilesAnswer) -> tuple[Floats, int, int]:
+    """The whole map (rows, columns), and its first column and row."""
+    xs, ys = [tile.x for tile in answer.tiles], [tile.y for tile in answer.tiles]
+    left, bottom = min(xs), min(ys)
+    shape = ((max(ys) - bottom + 1) * TILE_CELLS, (max(xs) - left + 1) * TILE_CELLS)
+    image = np.full(shape, np.nan)
+    steps = PLANES["resistance"].values()
+    for tile in answer.tiles:
+        row, column = (tile.y - bottom) * TILE_CELLS, (tile.x - left) * TILE_CELLS
+        image[row : row + TILE_CELLS, column : column + TILE_CELLS] = steps[tile.unpacked()["resistance"]]
+    return image, left * TILE_CELLS, bottom * TILE_CELLS
+
+
+def _polygons(mask: AnyArray) -> Iterable[list[list[Corner]]]:
+    """Areas of a mask as lists of rings along the cells' edges: the outline, then holes.
+
+    OpenCV follows the centres of pixels; of a mask twice as fine, one pixel wider, these are the cells' edges.
+    """
+    fine = np.zeros((2 * mask.shape[0] + 1, 2 * mask.shape[1] + 1), np.uint8)
+    for dy in range(3):
+        for dx in range(3):
+            part = fine[dy : dy + 2 * mask.shape[0] : 2, dx : dx + 2 * mask.shape[1] : 2]
+            part |= mask.astype(np.uint8)
+    contours, order = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    for index, contour in enumerate(contours):
+        if order[0][index][3] >= 0 or cv2.contourArea(contour) < 4 * LEAST_CELLS:
+            continue
+        rings, hole = [contour], order[0][index][2]
+        while hole >= 0:
+            rings.append(contours[hole])
+            hole = order[0][hole][0]
+        yield [[(float(x) / 2, float(y) / 2) for x, y in ring[:, 0].tolist()] for ring in rings if len(ring) >= 3]
+
+
+def _corner(x: float, y: float, scale: float, projection: Projection) -> list[float]:
+    lat_deg, lon_deg, _ = projection.to_geodetic(x * scale, y * scale)
+    return [round(lon_deg, 8), round(lat_deg, 8)]
+
+
+def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
+
+
+def _collection(features: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"type": "FeatureCollection", "features": features}

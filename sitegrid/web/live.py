@@ -1,0 +1,106 @@
+"""The live connection of a page: the map as it was when the page last had time for it, never a queue.
+
+A page says which version it has. It gets what differs from that, says that it has taken it in, and only then gets the
+next: a slow page gets newer maps less often, and costs no memory.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from typing import Any
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from protocol.queries.answers import MapVersion
+from sitegrid.web.site import SiteFeed, frame
+
+TAKEN_S = 30.0  # a page that has not taken a map in for so long is disconnected; it comes back by itself
+QUIET_S = 1.0  # poses are sent at least so often
+NO_PERMISSION, TOO_SLOW = 4401, 4408
+
+
+async def serve(socket: WebSocket, feed: SiteFeed) -> None:
+    """Serve one page until it goes, or takes nothing any more."""
+    await socket.accept()
+    page = _Page(socket, feed, _version(socket.query_params))
+    async with feed.watched():
+        tasks = [asyncio.create_task(page.receive()), asyncio.create_task(page.send())]
+        done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in rest:
+            task.cancel()
+        for task in (*done, *rest):
+            with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
+                await task
+
+
+class _Page:
+    """One page. version: the map that it has taken in."""
+
+    def __init__(self, socket: WebSocket, feed: SiteFeed, version: MapVersion | None) -> None:
+        self._socket, self._door, self._version = socket, feed, version
+        self._sent: MapVersion | None = None  # on its way
+        self._sent_s = 0.0
+        self._state: Any = None
+        self._poses_s = -QUIET_S
+
+    async def receive(self) -> None:
+        """Take what the page says: the version that it has taken in."""
+        while True:
+            text = await self._socket.receive_text()
+            try:
+                table = json.loads(text)
+                said = int(table["row"]), int(table["fact"])
+            except (ValueError, KeyError, TypeError, RecursionError):
+                await self._socket.close(1007, "row and fact are expected")
+                return
+            if self._sent and said == (self._sent.row, self._sent.fact):
+                self._version, self._sent = self._sent, None
+            async with self._door.moved:
+                self._door.moved.notify_all()
+
+    async def send(self) -> None:
+        """Send what is new, whenever there is anything."""
+        feed, loop = self._door, asyncio.get_running_loop()
+        while True:
+            now_s = loop.time()
+            if self._sent and now_s - self._sent_s > TAKEN_S:
+                await self._socket.close(TOO_SLOW, "nothing was taken in")
+                return
+            await self._send_news(now_s)
+            async with feed.moved:
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(feed.moved.wait(), QUIET_S)
+
+    async def _send_news(self, now_s: float) -> None:
+        feed, socket = self._door, self._socket
+        state = (feed.is_away, json.dumps(feed.state))
+        if state != self._state:
+            self._state = state
+            news = {"state": "away"} if feed.is_away else {"state": "live", "site": feed.state}
+            await self._timely(socket.send_text(json.dumps(news if feed.state or feed.is_away else {})))
+        if self._sent is None and not feed.is_away and (answer := feed.since(self._version)):
+            if answer.tiles or answer.whole:
+                self._sent, self._sent_s = answer.version, now_s
+                await self._timely(socket.send_bytes(frame(answer)))
+            else:
+                self._version = answer.version  # nothing that the page shows is another one
+        if now_s - self._poses_s >= 0.2 and (poses := feed.poses()):
+            self._poses_s = now_s
+            await self._timely(socket.send_text(json.dumps({"poses": poses})))
+
+    async def _timely(self, sending: Any) -> None:
+        """Send; a page whose link takes nothing for long is given up."""
+        try:
+            await asyncio.wait_for(sending, TAKEN_S)
+        except TimeoutError:
+            raise WebSocketDisconnect(TOO_SLOW) from None
+
+
+def _version(parameters: Any) -> MapVersion | None:
+    """The version that a page has from an earlier connection; None where it has none."""
+    try:
+        return MapVersion(str(parameters["store"]), int(parameters["row"]), int(parameters["fact"]))
+    except (KeyError, ValueError):
+        return None

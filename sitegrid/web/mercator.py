@@ -1,0 +1,116 @@
+"""XYZ tiles in Web Mercator: which cells of the site a tile's pixels lie in, and the tile as a PNG."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from protocol.arrays import AnyArray, Floats, Floats32
+from protocol.site.geometry import Bounds
+from protocol.site.ground_classes import ZONES
+from protocol.site.site_config import Projection
+
+SIDE_PX = 256
+MAX_ZOOM = 24
+RADIUS_M = 6378137.0  # of the sphere of Web Mercator
+# Values as 24 bits in red, green, blue: value = offset + scale (65536 r + 256 g + b); 0 is unknown.
+COARSE = dict.fromkeys(("age_s", "changed_s"), (1.0, -1.0)) | dict.fromkeys(
+    ("visits", "machines", "weight"), (1e-3, -1e-3)
+)
+FINE = (1e-6, -4.0)  # single precision, and all of a slope's or angle's range
+MOST = 2**24 - 1
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Positions in `map` [m] of a tile's pixel centres, both (256, 256), row 0 in the north."""
+
+    x_m: Floats
+    y_m: Floats
+
+    def bounds(self, cell_m: float) -> Bounds:
+        """The rectangle of all, a cell wider."""
+        west, south, east, north = self.x_m.min(), self.y_m.min(), self.x_m.max(), self.y_m.max()
+        return Bounds(float(west) - cell_m, float(south) - cell_m, float(east) + cell_m, float(north) + cell_m)
+
+    def sample(self, layer: Floats32, first_x_m: float, first_y_m: float, cell_m: float) -> Floats:
+        """The cell that each pixel lies in (256, 256), NaN outside; first_x_m, first_y_m: the layer's outer corner."""
+        column = np.floor((self.x_m - first_x_m) / cell_m).astype(np.int64)
+        row = np.floor((self.y_m - first_y_m) / cell_m).astype(np.int64)
+        inside = (column >= 0) & (row >= 0) & (column < layer.shape[1]) & (row < layer.shape[0])
+        out = np.full(column.shape, np.nan)
+        out[inside] = layer[row[inside], column[inside]]
+        return out
+
+
+def pixels_of(z: int, x: int, y: int, projection: Projection) -> Pixels:
+    """Where the pixels of a tile lie."""
+    n = 2**z * SIDE_PX
+    lon_deg = (x * SIDE_PX + np.arange(SIDE_PX) + 0.5) / n * 360.0 - 180.0
+    north = math.pi * (1 - 2 * (y * SIDE_PX + np.arange(SIDE_PX) + 0.5) / n)
+    lat_deg = np.degrees(np.arctan(np.sinh(north)))
+    lon, lat = np.meshgrid(lon_deg, lat_deg)
+    return Pixels(*projection.to_map_many(lat, lon))
+
+
+def tile_at(lat_deg: float, lon_deg: float, z: int) -> tuple[int, int]:
+    """Column and row of the tile that a place lies in."""
+    x = (lon_deg + 180.0) / 360.0 * 2**z
+    y = (1 - math.asinh(math.tan(math.radians(lat_deg))) / math.pi) / 2 * 2**z
+    return int(x), int(y)
+
+
+def coding(layer: str) -> tuple[float, float]:
+    """Scale and offset of a layer's values in 24 bits."""
+    return COARSE.get(layer, FINE)
+
+
+def value_png(values: Floats, layer: str) -> bytes:
+    """Values (256, 256) in 24 bits; what is beyond them takes the end."""
+    known = ~np.isnan(values)
+    scale, offset = coding(layer)
+    steps = np.clip(np.rint((np.where(known, values, 0) - offset) / scale), 1, MOST)
+    steps = np.where(known, steps, 0).astype(np.int64)
+    return _png(np.stack([steps & 255, steps >> 8 & 255, steps >> 16 & 255], axis=-1).astype(np.uint8))
+
+
+def colour_png(values: Floats, layer: str) -> bytes:
+    """Values (256, 256) in the layer's colours; transparent where unknown."""
+    known = ~np.isnan(values)
+    colours = _colours(np.where(known, values, 0.0), layer)
+    alpha = np.where(known, 255, 0)[..., None]
+    return _png(np.concatenate([colours, alpha], axis=-1).astype(np.uint8))
+
+
+EMPTY = cv2.imencode(".png", np.zeros((SIDE_PX, SIDE_PX, 4), np.uint8))[1].tobytes()
+
+# Ends of a layer's palette; what is not here takes those of a share. Ages and counts are seen by their logarithm.
+ENDS = {"grade": (0.0, 0.3), "grade_std": (0.0, 0.2), "grade_east": (-0.3, 0.3), "grade_north": (-0.3, 0.3)}
+LOGARITHMIC = {"resistance": (0.006, 0.3), "visits": (1.0, 60.0), "age_s": (10.0, 86400.0), "weight": (0.1, 1000.0)}
+LOGARITHMIC |= {"resistance_std": (0.0005, 0.1), "changed_s": (10.0, 86400.0), "machines": (1.0, 60.0)}
+# Dark blue to yellow: ends of the page's ordered palette and points between them, even in OKLab; BGR.
+ORDERED = np.array(
+    [(119, 55, 36), (127, 71, 51), (140, 108, 90), (141, 139, 130), (131, 154, 155), (120, 190, 186), (92, 221, 251)]
+)
+
+
+def _colours(values: Floats, layer: str) -> AnyArray:
+    if layer == "resistance_class":
+        table = np.array([zone.bgr for zone in ZONES])
+        return np.asarray(table[np.clip(values.astype(np.int64), 0, len(table) - 1)])
+    if layer in LOGARITHMIC:
+        low, high = LOGARITHMIC[layer]
+        part = np.log(np.maximum(values, low) / low) / math.log(high / low)
+    else:
+        low, high = ENDS.get(layer, (0.0, 1.0))
+        part = (values - low) / (high - low)
+    place = np.clip(part, 0, 1) * (len(ORDERED) - 1)
+    axis = np.arange(len(ORDERED))
+    return np.stack([np.interp(place, axis, ORDERED[:, channel]) for channel in range(3)], axis=-1)
+
+
+def _png(image: AnyArray) -> bytes:
+    return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())

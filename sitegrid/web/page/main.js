@@ -1,0 +1,396 @@
+// The page: what is shown, how it is chosen, and a link that holds it.
+import { drawCell, drawChanges, drawCross, drawGround, drawMachine, drawPlan, inkOf, roundLength } from "./draw.js";
+import { Refused, connect, getJson } from "./live.js";
+import { KINDS, LAYERS, css, diverging, kindOf, layerOf, percent } from "./palette.js";
+import { PANELS } from "./panels.js";
+import { byId, element } from "./parts.js";
+import { readPlan } from "./plan.js";
+import { TileMap, difference } from "./tiles.js";
+import { TimeBar } from "./time.js";
+import { View, follow } from "./view.js";
+
+const SHOWS = [["machines", "Machines", "M"], ["tracks", "Tracks, last minute", "T"], ["changes", "Changed ground", "G"], ["plan", "Site picture", "P"], ["unsure", "Fade what is unsure", "U"], ["old", "Fade what is old", "O"]];
+const NOTICES = {
+  loading: ["Loading the map", "One moment; the first tiles are on their way."],
+  empty: ["No ground known yet", "Start a machine's agent; the map fills as it drives.", "sitegrid agent --config loader-1.toml --site-file site.toml --spool spool.db"],
+  away: ["No map server answers.", "This is what it said last. Trying again every 2 s.", null, true],
+  offline: ["The page's server does not answer.", "This is what it said last. Trying again every 2 s.", null, true],
+  refused: ["This link has no permission", "Ask the office for a visitor's token, then open the new link."],
+};
+const QUIET_MS = 400; // a page that loads faster than this says nothing about it
+const REST_MS = 120; // a pointer that stays so long asks for the value
+
+const asked = new URLSearchParams(location.search);
+const page = {
+  site: "", map: new TileMap(), machines: new Map(), changes: [], boundaries: [], ink: null, palette: asked.get("palette") ?? "ordered",
+  layer: layerOf(asked.get("layer")), shows: { machines: true, tracks: true, changes: true, plan: true, unsure: true, old: false },
+  state: "loading", panel: null, cell: null, keyboard: false, picture: null, info: null, frames: 0,
+  path: (name) => `/api/v1/sites/${page.site}/${name}`,
+  asOf: () => page.time.at ?? undefined,
+  redraw: () => { page.dirty = true; },
+  compareWith: (ns) => page.time.compareWith(ns),
+};
+window.sitegrid = page; // for tests, and for people with a console
+const canvas = byId("map"), view = new View();
+page.view = view;
+page.time = new TimeBar(page);
+let disconnect = null, clockOffset_s = 0, restTimer = 0;
+const nowSite_ns = () => (page.time.at ?? page.map.stamp_ns);
+
+// --- what is drawn
+function frame() {
+  requestAnimationFrame(frame);
+  if (!page.dirty && !page.machines.size) return;
+  page.dirty = false;
+  const ratio = Math.min(2, devicePixelRatio || 1), [width, height] = [innerWidth, innerHeight];
+  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) Object.assign(canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
+  Object.assign(view, { width, height });
+  const context = canvas.getContext("2d", { alpha: false });
+  context.setTransform(1, 0, 0, 1, 0, 0);
+  drawGround(context, ratio, page.ink);
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  if (page.picture && page.shows.plan) drawPlan(context, view, page.picture);
+  context.setTransform(1, 0, 0, 1, 0, 0);
+  drawTiles(context, ratio);
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  if (page.shows.changes) drawChanges(context, view, page.changes.filter((change) => change.first_ns <= nowSite_ns()), page.ink);
+  if (page.cell) drawCell(context, view, page.cell, page.map.cell_m, page.ink);
+  if (page.shows.machines && page.time.at === null) for (const machine of page.machines.values()) drawMachine(context, view, machine, performance.now() / 1000, page.shows, page.ink);
+  if (page.keyboard && document.activeElement === canvas) drawCross(context, view, page.ink);
+  const metres = roundLength(view.scale, 120), scale = byId("scale");
+  scale.lastElementChild.style.width = `${metres * view.scale}px`;
+  scale.firstElementChild.textContent = metres >= 1000 ? `${metres / 1000} km` : `${metres} m`;
+  page.frames++;
+}
+
+function drawTiles(context, ratio) {
+  const { time } = page, shown = time.map ?? page.map;
+  if (time.mode === "difference" && time.otherMap) {
+    if (page.differenceOf !== `${time.at}|${time.other}|${page.layer.id}|${shown.row}`) {
+      page.difference = difference(shown, time.otherMap, page.layer);
+      page.differenceOf = `${time.at}|${time.other}|${page.layer.id}|${shown.row}`;
+    }
+    page.difference.paint({ ...styleOf(page.difference), layer: { id: "difference", fades: null }, colour: diverging, key: "difference" });
+    return page.difference.draw(context, view, ratio);
+  }
+  shown.paint(styleOf(shown));
+  if (time.mode !== "beside" || !time.otherMap) return shown.draw(context, view, ratio);
+  const middle = Math.round(context.canvas.width * time.split);
+  time.otherMap.paint(styleOf(time.otherMap));
+  for (const [map, left, width] of [[time.otherMap, 0, middle], [shown, middle, context.canvas.width - middle]]) {
+    context.save();
+    context.beginPath();
+    context.rect(left, 0, width, context.canvas.height);
+    context.clip();
+    map.draw(context, view, ratio);
+    context.restore();
+  }
+  context.fillStyle = page.ink.text;
+  context.fillRect(middle - ratio, 0, 2 * ratio, context.canvas.height);
+}
+
+function styleOf(map) {
+  const kinds = page.palette === "kinds" && page.layer.id === "resistance";
+  const colour = kinds ? (v) => KINDS[Math.min(KINDS.length - 1, kindOf(v, page.boundaries))].rgb : page.layer.colour;
+  const key = [page.layer.id, page.palette, page.shows.unsure, page.shows.old, page.ink.driven].join();
+  return { layer: page.layer, colour, fade: page.shows.unsure, old: page.shows.old, driven: parseInt(page.ink.driven.slice(1), 16), now_ns: map === page.map ? nowSite_ns() : map.stamp_ns, key };
+}
+
+// --- cards
+function buildRail() {
+  byId("layers").append(...LAYERS.map((layer) => choice("radio", "layer", layer.name, layer.key, layer === page.layer, () => setLayer(layer))));
+  byId("shows").append(...SHOWS.map(([name, text, key]) => choice("checkbox", name, text, key, page.shows[name], (on) => setShow(name, on))));
+}
+
+function choice(type, name, text, key, checked, set) {
+  const input = element("input", { type, name, checked, onchange: (event) => set(event.target.checked) });
+  input.dataset.key = key;
+  const shape = element("i", {});
+  shape.setAttribute("aria-hidden", "true");
+  return element("label", { className: `choice ${type}` }, input, shape, element("span", {}, text), element("kbd", {}, key));
+}
+
+function setLayer(layer) {
+  page.layer = layer;
+  const input = [...document.getElementsByName("layer")][LAYERS.indexOf(layer)];
+  input.checked = true;
+  byId("drawer").textContent = layer.name;
+  buildLegend();
+  page.redraw();
+  keepLink();
+}
+
+function setShow(name, on) {
+  page.shows[name] = on;
+  document.getElementsByName(name)[0].checked = on;
+  page.redraw();
+}
+
+function buildLegend() {
+  const { layer } = page, bins = 48, kinds = layer.id === "resistance" && page.palette === "kinds";
+  const { counts, known } = page.map.values ? page.map.histogram(layer, bins, nowSite_ns()) : { counts: [], known: 0 };
+  const most = Math.max(1, ...counts), strip = element("canvas", { width: 400, height: 72 });
+  strip.setAttribute("role", "img");
+  strip.setAttribute("aria-label", `${layer.name}: how many cells have which value`);
+  const pen = strip.getContext("2d"), one = 400 / bins;
+  for (let i = 0; i < bins; i++) {
+    const value = inverse(layer, (i + 0.5) / bins), rgb = kinds ? KINDS[Math.min(KINDS.length - 1, kindOf(value, page.boundaries))].rgb : layer.colour(value);
+    pen.fillStyle = css(rgb);
+    pen.fillRect(Math.floor(i * one), 52, Math.ceil(one), 20);
+    const tall = 46 * Math.sqrt((counts[i] ?? 0) / most);
+    pen.fillRect(i * one + 1, 50 - tall, one - 2, tall);
+  }
+  const ticks = element("div", { className: "ticks" }, layer.ticks.map(([at, text]) => { const tick = element("span", {}, text); tick.style.left = `${100 * Math.min(0.94, Math.max(0.05, at))}%`; return tick; }));
+  const swap = element("div", { className: "swap", hidden: layer.id !== "resistance" }, ["ordered", "kinds"].map((name) => {
+    const button = element("button", { onclick: () => { page.palette = name; buildLegend(); page.redraw(); keepLink(); } }, name === "ordered" ? "Ordered" : "Kinds of ground");
+    button.setAttribute("aria-pressed", page.palette === name);
+    return button;
+  }));
+  const names = kinds ? element("ul", { className: "kinds" }, KINDS.map((kind) => { const swatch = element("i"); swatch.style.background = css(kind.rgb); return element("li", {}, swatch, kind.name, element("span", {}, percent(kind.value, kind.value < 0.01 ? 1 : 0))); })) : null;
+  const unknown = element("p", { className: "unknown" }, element("i", {}), "Unknown", element("i", { className: "driven" }), "Driven only");
+  byId("legend").replaceChildren(element("h2", { className: "cap" }, layer.name, element("b", {}, layer.unit)), strip, ticks, ...[names].filter(Boolean), unknown, swap);
+  byId("known").textContent = known ? `${Math.round(known * page.map.cell_m ** 2).toLocaleString("en")} m² known` : "";
+}
+
+function inverse(layer, u) { // the value at a place of the palette, by halving
+  let [low, high] = layer.id === "resistance" ? [0.001, 1] : layer.id === "age" ? [0, 1e7] : [0, 1000];
+  for (let i = 0; i < 60; i++) { const middle = (low + high) / 2; if (layer.at(middle) < u) low = middle; else high = middle; }
+  return (low + high) / 2;
+}
+
+// --- states
+function setState(state) {
+  if (state === page.state && state !== "loading") return;
+  page.state = state;
+  const empty = state === "live" && !page.map.tiles.size;
+  const kind = empty ? "empty" : state;
+  const [title, text, command, small] = NOTICES[kind] ?? [];
+  const notice = byId("notice");
+  notice.hidden = !title;
+  notice.classList.toggle("small", Boolean(small) && page.map.tiles.size > 0);
+  if (title) notice.replaceChildren(element("h2", {}, title), element("p", {}, text), ...(command ? [element("code", {}, command)] : []));
+  document.body.classList.toggle("blank", kind in NOTICES && !page.map.tiles.size);
+  showStatus();
+}
+
+function showStatus() {
+  const status = byId("status"), at = page.time.at, silent = [...page.machines.values()].filter((m) => performance.now() / 1000 - m.seen_s > 8).length;
+  const machines = `${page.machines.size} machine${page.machines.size === 1 ? "" : "s"}`;
+  const text = { loading: "Loading", away: "No map server", offline: "Not connected", refused: "No permission" }[page.state]
+    ?? (at !== null ? "The map as of an earlier time" : `Live, ${machines}${silent ? `, ${silent} silent` : ""}`);
+  status.lastElementChild.textContent = text;
+  status.className = ["away", "offline", "refused"].includes(page.state) ? "bad" : page.state === "live" && at === null ? "" : "off";
+}
+
+// --- choosing
+async function openPanel(name, subject) {
+  const panel = byId("panel"), body = element("div", {}, element("p", { className: "part note" }, "One moment."));
+  const close = element("button", { className: "icon", onclick: closePanel, ariaLabel: "Close" }, "×");
+  close.setAttribute("aria-label", "Close");
+  panel.replaceChildren(element("header", {}, element("h2", {}, PANELS[name].title), close), body);
+  panel.hidden = false;
+  document.body.classList.add("open");
+  page.panel = name;
+  keepLink();
+  const mine = Symbol(name);
+  page.opening = mine;
+  try {
+    const parts = await PANELS[name].build(page, subject);
+    if (page.opening === mine) body.replaceChildren(...parts.filter(Boolean));
+  } catch (error) {
+    if (page.opening === mine) body.replaceChildren(element("p", { className: "part note" }, error instanceof Refused ? error.message : `This could not be read: ${error.message}`));
+  }
+  page.redraw();
+}
+
+function closePanel() {
+  byId("panel").hidden = true;
+  document.body.classList.remove("open");
+  page.panel = page.cell = null;
+  page.redraw();
+  keepLink();
+  canvas.focus({ preventScroll: true });
+}
+
+const cellAt = (left, top) => view.toSite(left, top).map((v) => Math.floor(v / page.map.cell_m));
+function explain(left, top) {
+  page.cell = cellAt(left, top);
+  if (innerWidth <= 720) { view.shift(view.width / 2 - left, view.height * 0.28 - top); page.redraw(); } // above the panel
+  openPanel("why", page.cell);
+}
+
+function rest(left, top) {
+  clearTimeout(restTimer);
+  const readout = byId("readout");
+  if (left === null || page.time.mode === "difference") { readout.classList.remove("on"); return; }
+  restTimer = setTimeout(() => showValue(left, top), REST_MS);
+}
+
+async function showValue(left, top) {
+  const [column, row] = cellAt(left, top), shown = page.time.map ?? page.map, readout = byId("readout");
+  if (!shown.values || Number.isNaN(shown.at(column, row, "visits"))) { readout.classList.remove("on"); return; }
+  const name = { age: "age_s" }[page.layer.id] ?? page.layer.id, std = { resistance: "resistance_std", grade: "grade_std" }[page.layer.id];
+  const layers = [name, "resistance_class", ...(std ? [std] : [])];
+  try {
+    const { values } = await getJson(page.path("point"), { x: (column + 0.5) * shown.cell_m, y: (row + 0.5) * shown.cell_m, layers: layers.join(), as_of: page.asOf() });
+    const value = values[name], kind = KINDS[values.resistance_class];
+    const spread = std && values[std] !== null ? ` ± ${(100 * values[std]).toFixed(1)}` : "";
+    readout.replaceChildren(element("b", {}, value === null ? "not measured" : page.layer.text(value) + spread), element("small", {}, `${kind ? `${kind.name} · ` : ""}${(column * shown.cell_m).toFixed(0)} m E, ${(row * shown.cell_m).toFixed(0)} m N`));
+    readout.dataset.value = value ?? "";
+    readout.style.left = `${Math.min(innerWidth - 200, left + 14)}px`;
+    readout.style.top = `${Math.max(8, top - 46)}px`;
+    readout.classList.add("on");
+  } catch { readout.classList.remove("on"); }
+}
+
+// --- keys
+const KEYS = [["1 to 5", "Layer"], ["M T G P U O", "Show and hide"], ["Arrows, + −", "Move, zoom"], ["0", "Fit the site"], ["Enter", "Explain the cell at the cross"], ["Space, [ ]", "Play, step in time"], ["L", "Back to now"], ["C", "Compare two times"], ["D", "Light or dark"], ["Esc", "Close"]];
+function onKey(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || /^(select|textarea)$/i.test(event.target.tagName)) return;
+  const inRange = event.target.type === "range", onButton = event.target.tagName === "BUTTON" || event.target.type === "checkbox" || event.target.type === "radio";
+  const key = event.key.length === 1 ? event.key.toUpperCase() : event.key, move = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] }[key];
+  const layer = LAYERS.find((one) => one.key === key), show = SHOWS.find(([, , letter]) => letter === key);
+  if (move && document.activeElement === canvas) { view.shift(...move); page.keyboard = true; page.redraw(); keepLink(); }
+  else if (key === "Enter" && event.target === canvas) explain(view.width / 2, view.height / 2);
+  else if (key === "+" || key === "=") zoomBy(1.4);
+  else if (key === "-" || key === "−") zoomBy(1 / 1.4);
+  else if (key === "0") fit();
+  else if (layer) setLayer(layer);
+  else if (show) setShow(show[0], !page.shows[show[0]]);
+  else if (key === " " && !onButton && !inRange) page.time.play();
+  else if (key === "[") page.time.step(-1);
+  else if (key === "]") page.time.step(1);
+  else if (key === "L") page.time.goLive();
+  else if (key === "C") page.time.nextMode();
+  else if (key === "D") setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+  else if (key === "?") help();
+  else if (key === "Escape" && page.panel) closePanel();
+  else return;
+  event.preventDefault();
+}
+const zoomBy = (factor) => { view.zoom(factor); page.redraw(); keepLink(); };
+
+function help() {
+  const dialog = byId("help");
+  dialog.replaceChildren(element("h2", {}, "Keys"), element("dl", { className: "facts" }, KEYS.flatMap(([key, what]) => [element("dt", {}, key), element("dd", {}, what)])), element("button", { className: "act", onclick: () => dialog.close() }, "Close"));
+  dialog.showModal();
+}
+
+function fit() {
+  const phone = innerWidth <= 720;
+  view.margins = phone ? [16, 150, 16, 130] : [272, 24, 24, 96];
+  view.fit(page.map.bounds() ?? [-50, -50, 50, 50]);
+  page.redraw();
+  keepLink();
+}
+
+function setTheme(name) {
+  document.documentElement.dataset.theme = name;
+  try { localStorage.setItem("theme", name); } catch { /* a browser that keeps nothing */ }
+  page.ink = inkOf(document.documentElement);
+  page.time.show();
+  if (page.panel && page.cell) openPanel(page.panel, page.cell);
+  page.redraw();
+}
+
+// --- the link to this view
+let linkTimer = 0;
+function keepLink() {
+  clearTimeout(linkTimer);
+  linkTimer = setTimeout(() => history.replaceState(null, "", linkOf()), 250);
+}
+function linkOf() {
+  const parts = { site: page.site, layer: page.layer.id, palette: page.palette, at: `${view.x.toFixed(1)},${view.y.toFixed(1)},${view.scale.toFixed(2)}` };
+  if (page.time.at !== null) parts.time = new Date(page.time.at / 1e6).toISOString();
+  if (page.time.other !== null) parts.other = new Date(page.time.other / 1e6).toISOString();
+  if (page.cell && page.panel === "why") parts.cell = page.cell.join();
+  return `${location.pathname}?${new URLSearchParams(parts)}`;
+}
+
+function restoreLink() {
+  const at = asked.get("at")?.split(",").map(Number), time = Date.parse(asked.get("time")), other = Date.parse(asked.get("other"));
+  if (at?.length === 3 && at.every(Number.isFinite)) { [view.x, view.y, view.scale] = at; view.moved = true; } else fit();
+  if (!Number.isNaN(time)) page.time.go(time * 1e6);
+  if (!Number.isNaN(other)) page.time.compareWith(other * 1e6);
+  const cell = asked.get("cell")?.split(",").map(Number);
+  if (cell?.length === 2 && cell.every(Number.isInteger)) { page.cell = cell; openPanel("why", cell); }
+}
+
+// --- what the door sends
+const on = {
+  state(state) { setState(state); },
+  frame(received) {
+    const first = !page.map.tiles.size && received.tiles.length > 0;
+    page.map.take(received);
+    page.state = "loading"; // so that the state is shown anew: the map may have been empty until now
+    setState("live");
+    if (first && !page.restored) { page.restored = true; restoreLink(); }
+    page.received = performance.now();
+    buildLegend();
+    page.redraw();
+  },
+  poses(poses) {
+    const now_s = performance.now() / 1000;
+    for (const pose of poses) {
+      const machine = page.machines.get(pose.machine) ?? { track: [] }, seen_s = now_s - pose.age_s;
+      machine.track.push({ x_m: pose.x_m, y_m: pose.y_m, seen_s });
+      while (machine.track.length && now_s - machine.track[0].seen_s > 60) machine.track.shift();
+      page.machines.set(pose.machine, { ...machine, ...pose, seen_s });
+    }
+    page.redraw();
+    showStatus();
+  },
+  site(site) {
+    page.info = site;
+    page.changes = site.changes;
+    page.boundaries = site.boundaries;
+    for (const [name, trusted] of Object.entries(site.trusted)) if (page.machines.has(name)) page.machines.get(name).trusted = trusted;
+    if (page.map.store) page.map.stamp_ns = Math.max(page.map.stamp_ns, site.stamp_ns); // time goes on where nobody drives
+    page.time.span(site.first_ns, site.stamp_ns);
+    page.redraw();
+  },
+};
+
+async function start() {
+  let theme = asked.get("theme");
+  try { theme ??= localStorage.getItem("theme"); } catch { /* a browser that keeps nothing */ }
+  document.documentElement.dataset.theme = theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+  page.ink = inkOf(document.documentElement);
+  buildRail();
+  setLayer(page.layer);
+  setTimeout(() => { if (page.state === "loading" && !page.map.tiles.size) { page.state = ""; setState("loading"); } }, QUIET_MS);
+  follow(canvas, view, { changed: () => { page.redraw(); keepLink(); }, rest, choose: explain });
+  addEventListener("keydown", onKey);
+  addEventListener("resize", () => { if (!view.moved) fit(); page.time.drawStrip(); page.redraw(); });
+  byId("fit").onclick = fit;
+  byId("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+  byId("keys").onclick = help;
+  byId("link").onclick = async () => { await navigator.clipboard?.writeText(location.origin + linkOf()); byId("link").classList.add("done"); setTimeout(() => byId("link").classList.remove("done"), 900); };
+  byId("plan").onclick = () => byId("plan-file").click();
+  byId("plan-file").onchange = async (event) => { try { page.picture = await readPlan([...event.target.files]); setShow("plan", true); } catch (error) { alert(error.message); } };
+  byId("drawer").onclick = () => { const open = byId("rail").classList.toggle("full"); byId("drawer").setAttribute("aria-expanded", open); };
+  requestAnimationFrame(frame);
+  setInterval(() => { showStatus(); page.redraw(); }, 1000);
+  await choose();
+}
+
+async function choose() {
+  let sites;
+  try {
+    ({ sites } = await getJson("/api/v1/sites"));
+  } catch (error) {
+    setState(error instanceof Refused && [401, 403].includes(error.status) ? "refused" : "offline");
+    return void setTimeout(choose, 2000);
+  }
+  const names = sites.map((site) => site.name);
+  page.site = names.includes(asked.get("site")) ? asked.get("site") : names[0];
+  document.title = `${page.site} · sitegrid`;
+  byId("site").textContent = page.site;
+  byId("sites").hidden = names.length < 2;
+  byId("choose-site").replaceChildren(...names.map((name) => element("option", { value: name, selected: name === page.site }, name)));
+  byId("choose-site").onchange = (event) => { location.search = new URLSearchParams({ site: event.target.value }); };
+  disconnect?.();
+  disconnect = connect(page.site, page.map, on);
+}
+
+start();

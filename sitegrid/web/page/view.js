@@ -1,0 +1,71 @@
+// The view: where on the screen a place of the site is; and the fingers, wheel and keys that move it.
+
+const CLOSEST = 80, FARTHEST = 0.05; // pixels per metre
+
+export class View {
+  constructor() { Object.assign(this, { x: 0, y: 0, scale: 4, width: 1, height: 1, margins: [0, 0, 0, 0], moved: false }); }
+
+  toScreen(x, y) { return [this.width / 2 + (x - this.x) * this.scale, this.height / 2 - (y - this.y) * this.scale]; }
+  toSite(left, top) { return [this.x + (left - this.width / 2) / this.scale, this.y - (top - this.height / 2) / this.scale]; }
+
+  zoom(factor, left = this.width / 2, top = this.height / 2) {
+    const [x, y] = this.toSite(left, top);
+    this.scale = Math.min(CLOSEST, Math.max(FARTHEST, this.scale * factor));
+    this.x = x - (left - this.width / 2) / this.scale;
+    this.y = y + (top - this.height / 2) / this.scale;
+    this.moved = true;
+  }
+
+  shift(right, down) { this.x -= right / this.scale; this.y += down / this.scale; this.moved = true; }
+
+  // Show a box of the site within the margins (left, top, right, bottom) that cards leave free.
+  fit([west, south, east, north]) {
+    const [left, top, right, bottom] = this.margins;
+    const width = Math.max(50, this.width - left - right), height = Math.max(50, this.height - top - bottom);
+    this.scale = Math.min(20, Math.max(FARTHEST, Math.min(width / (east - west), height / (north - south))));
+    this.x = (west + east) / 2 - (left - right) / 2 / this.scale;
+    this.y = (south + north) / 2 + (top - bottom) / 2 / this.scale;
+    this.moved = false;
+  }
+}
+
+// Pointers on the map: `changed` after it moved, `rest(left, top)` where a mouse is, `choose(left, top)` on a click or tap.
+export function follow(canvas, view, { changed, rest, choose }) {
+  const pointers = new Map();
+  let travelled = 0, spread = 0;
+  const middle = () => { const all = [...pointers.values()]; return [0, 1].map((axis) => all.reduce((sum, p) => sum + p[axis], 0) / all.length); };
+  const apart = () => { const [a, b] = [...pointers.values()]; return b ? Math.hypot(a[0] - b[0], a[1] - b[1]) : 0; };
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    if (!pointers.size) travelled = 0;
+    pointers.set(event.pointerId, [event.clientX, event.clientY]);
+    spread = apart();
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    if (!pointers.has(event.pointerId)) return rest(event.clientX, event.clientY);
+    const before = middle();
+    pointers.set(event.pointerId, [event.clientX, event.clientY]);
+    const after = middle(), right = after[0] - before[0], down = after[1] - before[1];
+    travelled += Math.hypot(right, down);
+    if (travelled < 4 && pointers.size === 1) return;
+    canvas.classList.add("drag");
+    view.shift(right, down);
+    if (pointers.size === 2 && spread) { view.zoom(apart() / spread, ...after); spread = apart(); travelled += 9; }
+    rest(null);
+    changed();
+  });
+  const up = (event) => {
+    if (!pointers.delete(event.pointerId)) return;
+    canvas.classList.remove("drag");
+    spread = apart();
+    if (!pointers.size && travelled < 4 && event.type === "pointerup") choose(event.clientX, event.clientY);
+  };
+  canvas.addEventListener("pointerup", up);
+  canvas.addEventListener("pointercancel", up);
+  canvas.addEventListener("pointerleave", () => rest(null));
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    view.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0016)), event.clientX, event.clientY);
+    changed();
+  }, { passive: false });
+}

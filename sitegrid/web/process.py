@@ -1,0 +1,107 @@
+"""The web server's process: sockets, TLS, and the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from argparse import Namespace
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from protocol.errors import ConfigError
+from protocol.wire.credentials import CERTIFICATE_FILE, KEY_FILE
+from sitegrid.client import connect
+from sitegrid.process.lifetime import say
+from sitegrid.security.tokens import TokenFile
+from sitegrid.web.app import WebApp
+from sitegrid.web.site import SiteFeed
+
+FIRST_S = 10.0  # until a new connection has sent its first request; a slow one holds a place that others need
+CONNECTIONS = 500
+MESSAGE_BYTES = 4096  # of what a page says
+
+
+class PatientProtocol(H11Protocol):
+    """HTTP/1.1 with an end to patience: a connection that does not finish its first headers is closed."""
+
+    def connection_made(self, transport: Any) -> None:
+        """Begin a connection, and the time that it has."""
+        super().connection_made(transport)
+        self.loop.call_later(FIRST_S, self._end_unless_begun)
+
+    def _end_unless_begun(self) -> None:
+        if self.scope is None and not self.transport.is_closing():
+            self.transport.close()
+
+
+def serve(
+    opened: ExitStack,
+    sites: Sequence[tuple[str, str]],
+    address: tuple[str, int],
+    arguments: Namespace,
+    stop: threading.Event,
+) -> int:
+    """Serve sites, each a name and an endpoint, until `stop` is set."""
+    listening = opened.enter_context(_listen(address))
+    person = TokenFile(arguments.tokens).person if arguments.tokens else None
+    clients = [connect(endpoint, name, keys=arguments.keys) for name, endpoint in sites]
+
+    async def run() -> None:
+        web = WebApp([SiteFeed(client) for client in clients], person)
+        config = uvicorn.Config(
+            web.app,
+            http=PatientProtocol,
+            ws="websockets-sansio",
+            ws_max_size=MESSAGE_BYTES,
+            limit_concurrency=CONNECTIONS,
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=1,
+            **_tls(arguments.tls),
+        )
+        server = uvicorn.Server(config)
+        watch = asyncio.create_task(_stop_with(server, stop))
+        scheme, (host, port) = "https" if arguments.tls else "http", listening.getsockname()[:2]
+        url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
+        say({"ready": "web", "url": url, "sites": [name for name, _ in sites]})
+        await server._serve([listening])  # noqa: SLF001 - `serve` would take the signals that stop_flag has
+        stop.set()
+        await watch
+
+    asyncio.run(run())
+    return 0
+
+
+async def _stop_with(server: uvicorn.Server, stop: threading.Event) -> None:
+    while not stop.is_set():
+        await asyncio.sleep(0.2)
+    server.should_exit = True
+
+
+def _listen(address: tuple[str, int]) -> socket.socket:
+    host, port = address[0].strip("[]"), address[1]
+    listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind((host, port))
+        listening.listen(256)
+    except OSError as error:
+        listening.close()
+        raise ConfigError("--listen", f"cannot listen on {host}:{port}: {error.strerror}") from None
+    return listening
+
+
+def _tls(folder: Path | None) -> dict[str, Any]:
+    if folder is None:
+        return {}
+    for name in (CERTIFICATE_FILE, KEY_FILE):
+        if not (folder / name).is_file():
+            raise ConfigError(folder, f"holds no {name}")
+    return {"ssl_certfile": str(folder / CERTIFICATE_FILE), "ssl_keyfile": str(folder / KEY_FILE)}

@@ -1,0 +1,231 @@
+"""Resources of a site: what each answers, from which parameters. A new one: a function and a line in RESOURCES."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from starlette.responses import Response
+
+from protocol.errors import Refusal
+from protocol.queries.answers import MapVersion
+from protocol.site.geometry import Bounds
+from sitegrid.web import features, values
+from sitegrid.web.problems import bad
+from sitegrid.web.site import SiteFeed, frame
+from sitegrid.web.values import Parameters
+
+MAX_CELLS_JSON = 250_000  # of a region as text: 2 MB a layer
+MAX_CELLS_NPZ = 4_000_000
+AGES = ("age_s", "changed_s")  # layers that change with the site's now
+Answer = Callable[[SiteFeed, Parameters], Awaitable[Response]]
+
+PLACE = {"x": "east of the site's origin [m]", "y": "north of it [m]"}
+PLACE |= {"lat": "latitude [deg], with lon in place of x and y", "lon": "longitude [deg]"}
+AS_OF = {"as_of": "the map as of this time, ISO 8601 or nanoseconds since 1970 (UTC)"}
+LAYERS = {"layers": "names, comma-separated; without it all"}
+
+
+@dataclass(frozen=True)
+class Resource:
+    """What a path answers. parameters: name -> meaning. media: what it may answer with."""
+
+    answer: Answer
+    summary: str
+    parameters: Mapping[str, str]
+    media: tuple[str, ...] = ("application/json",)
+    follows_now: bool = False  # whether it changes with the site's now, not with the map alone
+
+
+async def point(feed: SiteFeed, parameters: Parameters) -> Response:
+    """Layers of the cell at a position."""
+    x_m, y_m = values.place(parameters, await feed.projection())
+    as_of_ns = values.stamp(parameters, "as_of")
+    answer = await feed.ask(feed.client.point, x_m, y_m, values.layers(parameters), as_of_ns=as_of_ns)
+    lat_deg, lon_deg, _ = (await feed.projection()).to_geodetic(answer.x_m, answer.y_m)
+    place = {"x_m": answer.x_m, "y_m": answer.y_m, "lat_deg": lat_deg, "lon_deg": lon_deg}
+    return _json({**place, "values": answer.values, **_version(answer.version), "stamp_ns": answer.stamp_ns})
+
+
+async def why(feed: SiteFeed, parameters: Parameters) -> Response:
+    """Everything that is known of the cell at a position."""
+    x_m, y_m = values.place(parameters, await feed.projection())
+    return _json(await feed.ask(feed.client.why, x_m, y_m, as_of_ns=values.stamp(parameters, "as_of")))
+
+
+async def region(feed: SiteFeed, parameters: Parameters) -> Response:
+    """Layers of the cells that a rectangle touches, or that lie in a polygon."""
+    outline = _outline(parameters)
+    bounds = _bounds(parameters) if outline is None else _around(outline)
+    as_npz = parameters.get("format", "json") == "npz"
+    if parameters.get("format", "json") not in ("json", "npz"):
+        raise bad(Refusal.OUT_OF_RANGE, "parameter `format`: json or npz")
+    cell_m = (await feed.info()).site.cell_m
+    cells = (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) / cell_m**2
+    if cells > (most := MAX_CELLS_NPZ if as_npz else MAX_CELLS_JSON):
+        problem = f"a region of about {cells:.0f} cells; at most {most} as {'npz' if as_npz else 'json'}"
+        raise bad(Refusal.TOO_LARGE, problem)
+    as_of_ns = values.stamp(parameters, "as_of")
+    answer = await feed.ask(feed.client.region, bounds, values.layers(parameters), as_of_ns=as_of_ns)
+    layers = dict(answer.layers)
+    if outline is not None:
+        inside = features.inside(outline, answer.x_m, answer.y_m)
+        layers = {name: np.where(inside, layer, np.float32(np.nan)) for name, layer in layers.items()}
+    if as_npz:
+        file = io.BytesIO()
+        version = np.array([answer.version.row, answer.version.fact])
+        np.savez_compressed(file, x_m=answer.x_m, y_m=answer.y_m, version=version, **layers)  # type: ignore[arg-type]
+        return Response(file.getvalue(), media_type="application/x-npz")
+    axes = {"x_m": answer.x_m, "y_m": answer.y_m, "cell_m": answer.cell_m}
+    return _json({**axes, "layers": layers, **_version(answer.version), "stamp_ns": answer.stamp_ns})
+
+
+async def history(feed: SiteFeed, parameters: Parameters) -> Response:
+    """Layers of the cell at a position, span by span."""
+    x_m, y_m = values.place(parameters, await feed.projection())
+    times = {"from_ns": values.stamp(parameters, "from"), "to_ns": values.stamp(parameters, "to")}
+    span_s = values.number(parameters, "span") if "span" in parameters else None
+    spans = await feed.ask(feed.client.history, x_m, y_m, values.layers(parameters), **times, span_s=span_s)
+    return _json({"spans": spans})
+
+
+async def info(feed: SiteFeed, _: Parameters) -> Response:
+    """State of the map and of its server."""
+    return _json(await feed.info(0.0))
+
+
+async def machines(feed: SiteFeed, _: Parameters) -> Response:
+    """What the map server knows of each machine."""
+    return _json({"machines": await feed.ask(feed.client.machines)})
+
+
+async def changes(feed: SiteFeed, parameters: Parameters) -> Response:
+    """Changes of the ground."""
+    after = values.number(parameters, "after", 0.0)
+    if after < 0 or after != int(after):
+        raise bad(Refusal.OUT_OF_RANGE, f"parameter `after`: {after:g} is no whole number from 0 on")
+    return _json({"changes": await feed.ask(feed.client.changes, int(after))})
+
+
+async def tiles(feed: SiteFeed, parameters: Parameters) -> Response:
+    """The map in tiles of 8-bit layers, as the live page reads it: all, those since a version, or as of a time."""
+    as_of_ns = values.stamp(parameters, "as_of")
+    if as_of_ns is not None:
+        answer = await feed.tiles_as_of(as_of_ns)
+    else:
+        known = {"store", "row", "fact"} & set(parameters)
+        numbers = (int(values.number(parameters, name, -1.0)) for name in ("row", "fact"))
+        since = MapVersion(parameters.get("store", ""), *numbers) if known else None
+        answer = await feed.ask(feed.client.tiles, since)
+    return Response(frame(answer), media_type="application/octet-stream")
+
+
+async def zones(feed: SiteFeed, _: Parameters) -> Response:
+    """Areas of one kind of ground, as features."""
+    info_now = await feed.info()
+    answer = await feed.ask(feed.client.tiles)
+    return _geojson(features.zones(answer, info_now.boundaries, await feed.projection()))
+
+
+async def change_features(feed: SiteFeed, _: Parameters) -> Response:
+    """Changes of the ground, as features."""
+    ground_changes = await feed.ask(feed.client.changes)
+    return _geojson(features.changes(ground_changes, await feed.projection()))
+
+
+async def machine_features(feed: SiteFeed, _: Parameters) -> Response:
+    """Where machines are, as features: those that said so while somebody looks."""
+    async with feed.watched():
+        await feed.heard()
+        return _geojson(features.machines(feed.poses(), await feed.projection()))
+
+
+RESOURCES: dict[str, Resource] = {
+    "info": Resource(info, "State of the map and of its server", {}, follows_now=True),
+    "point": Resource(point, "Layers of the cell at a position", {**PLACE, **LAYERS, **AS_OF}),
+    "why": Resource(why, "Why the cell at a position has its value", {**PLACE, **AS_OF}),
+    "region": Resource(
+        region,
+        "Layers of a rectangle or a polygon of cells",
+        {
+            "bounds": "west,south,east,north [m]",
+            "polygon": "in place of bounds: x,y;x,y;... [m]",
+            **LAYERS,
+            **AS_OF,
+            "format": "json or npz",
+        },
+        ("application/json", "application/x-npz"),
+    ),
+    "history": Resource(
+        history,
+        "The cell at a position over time",
+        {**PLACE, **LAYERS, "from": "first time", "to": "last time", "span": "length of a span [s]"},
+        follows_now=True,
+    ),
+    "machines": Resource(machines, "What is known of each machine", {}, follows_now=True),
+    "changes": Resource(changes, "Changes of the ground", {"after": "with a number beyond this one"}, follows_now=True),
+    "tiles": Resource(
+        tiles,
+        "The map in tiles of 8-bit layers",
+        {**AS_OF, "store": "of the version that the asker has", "row": "its row", "fact": "its fact"},
+        ("application/octet-stream",),
+        follows_now=True,
+    ),
+    "features/zones": Resource(zones, "Areas of one kind of ground", {}, ("application/geo+json",)),
+    "features/changes": Resource(
+        change_features, "Changes of the ground as areas", {}, ("application/geo+json",), follows_now=True
+    ),
+    "features/machines": Resource(
+        machine_features, "Positions of machines", {}, ("application/geo+json",), follows_now=True
+    ),
+}
+
+
+def follows_now(resource: Resource, parameters: Parameters) -> bool:
+    """Whether an answer may be another one although the map is not."""
+    names = values.layers(parameters)
+    ages = "layers" in resource.parameters and (not names or any(name in AGES for name in names))
+    return "as_of" not in parameters and (resource.follows_now or ages)
+
+
+def _json(value: Any) -> Response:
+    return Response(json.dumps(values.plain(value), allow_nan=False), media_type="application/json")
+
+
+def _geojson(value: Any) -> Response:
+    return Response(json.dumps(value, allow_nan=False), media_type="application/geo+json")
+
+
+def _version(version: MapVersion) -> dict[str, Any]:
+    return {"store": version.store, "merged": version.row, "fact": version.fact}
+
+
+def _bounds(parameters: Parameters) -> Bounds:
+    parts = parameters.get("bounds", "").split(",")
+    if len(parts) != 4:
+        raise bad(Refusal.MISSING_FIELD, "parameter `bounds` must be west,south,east,north in metres")
+    try:
+        return Bounds(*(values.number({"bounds": part}, "bounds") for part in parts))
+    except ValueError as error:
+        raise bad(Refusal.OUT_OF_RANGE, f"parameter `bounds`: {error}") from None
+
+
+def _outline(parameters: Parameters) -> list[tuple[float, float]] | None:
+    if "polygon" not in parameters:
+        return None
+    corners = [part.split(",") for part in parameters["polygon"].split(";")]
+    if not 3 <= len(corners) <= 1000 or any(len(corner) != 2 for corner in corners):
+        raise bad(Refusal.OUT_OF_RANGE, "parameter `polygon` must be x,y;x,y;... with 3 to 1000 corners, in metres")
+    return [(values.number({"polygon": x}, "polygon"), values.number({"polygon": y}, "polygon")) for x, y in corners]
+
+
+def _around(outline: list[tuple[float, float]]) -> Bounds:
+    xs, ys = zip(*outline, strict=True)
+    try:
+        return Bounds(min(xs), min(ys), max(xs), max(ys))
+    except ValueError as error:
+        raise bad(Refusal.OUT_OF_RANGE, f"parameter `polygon`: {error}") from None

@@ -1,0 +1,107 @@
+"""Parameters of requests to checked values, and values to JSON; a Problem names what is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from protocol.errors import Refusal
+from protocol.machine.readings import MAX_STAMP_NS
+from protocol.site.site_config import Projection
+from sitegrid.web.problems import bad
+
+Parameters = Mapping[str, str]
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def number(parameters: Parameters, name: str, default: float | None = None) -> float:
+    """A finite number."""
+    text = parameters.get(name)
+    if text is None:
+        if default is None:
+            raise bad(Refusal.MISSING_FIELD, f"parameter `{name}` is missing")
+        return default
+    try:
+        value = float(text)
+    except ValueError:
+        raise bad(Refusal.WRONG_TYPE, f"parameter `{name}`: {text[:40]!r} is no number") from None
+    if not math.isfinite(value) or abs(value) > 1e15:
+        raise bad(Refusal.NOT_FINITE, f"parameter `{name}`: {text[:40]} is not usable")
+    return value
+
+
+def place(parameters: Parameters, projection: Projection) -> tuple[float, float]:
+    """A position in `map` [m], given as x and y, or as lat and lon."""
+    if {"lat", "lon"} <= set(parameters):
+        lat_deg, lon_deg = number(parameters, "lat"), number(parameters, "lon")
+        if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+            raise bad(Refusal.OUT_OF_RANGE, f"`lat`, `lon`: {lat_deg:g}, {lon_deg:g} is no place on Earth")
+        x_m, y_m, _ = projection.to_map(lat_deg, lon_deg, 0.0)
+        if not (math.isfinite(x_m) and math.isfinite(y_m)):
+            raise bad(Refusal.OUT_OF_RANGE, "`lat`, `lon`: too far from the site")
+        return x_m, y_m
+    return number(parameters, "x"), number(parameters, "y")
+
+
+def stamp(parameters: Parameters, name: str) -> int | None:
+    """A time as a stamp [ns]: ISO 8601 (UTC where it names no zone) or nanoseconds; None where it is missing."""
+    text = parameters.get(name)
+    if text is None:
+        return None
+    if text.isascii() and text.isdigit() and len(text) <= len(str(MAX_STAMP_NS)):
+        stamp_ns = int(text)
+    else:
+        try:
+            moment = datetime.fromisoformat(text)
+        except ValueError:
+            problem = f"parameter `{name}`: {text[:40]!r} is neither ISO 8601 nor nanoseconds"
+            raise bad(Refusal.WRONG_TYPE, problem) from None
+        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+        stamp_ns = (moment - _EPOCH) // timedelta(microseconds=1) * 1000
+    if not 1 <= stamp_ns <= MAX_STAMP_NS:
+        raise bad(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {text[:40]} is no time from 1970 on")
+    return stamp_ns
+
+
+def layers(parameters: Parameters) -> tuple[str, ...]:
+    """Names of layers, comma-separated; none means all."""
+    return tuple(part for part in parameters.get("layers", "").split(",") if part)
+
+
+def check_known(parameters: Parameters, known: tuple[str, ...]) -> None:
+    """Refuse a parameter that a resource does not take."""
+    if unknown := sorted(set(parameters) - set(known)):
+        takes = ", ".join(known) or "none"
+        raise bad(Refusal.UNKNOWN_PARAMETER, f"parameter `{unknown[0][:40]}` is not known; known: {takes}")
+
+
+def iso(stamp_ns: int) -> str | None:
+    """A stamp as ISO 8601 in UTC; None for 0, which is never."""
+    if not stamp_ns:
+        return None
+    seconds, rest_ns = divmod(stamp_ns, 10**9)
+    return f"{_EPOCH + timedelta(seconds=seconds):%Y-%m-%dT%H:%M:%S}.{rest_ns:09d}Z"
+
+
+def plain(value: Any) -> Any:
+    """Records as tables, arrays as lists, NaN, which JSON does not know, as None; a stamp gets its time beside it."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        table = {str(key): plain(item) for key, item in value.items()}
+        times = {f"{key.removesuffix('_ns')}_time": iso(item) for key, item in value.items() if _is_stamp(key, item)}
+        return table | times
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _is_stamp(key: object, value: object) -> bool:
+    return isinstance(key, str) and key.endswith("_ns") and type(value) is int

@@ -1,0 +1,79 @@
+"""A reader that behaves badly: `python -m tests.chaos.reader KIND ENDPOINT SITE`.
+
+Written against the wire, not the client, so that it can ask for more than the client would. Ends when it is killed.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import msgpack
+import zenoh
+
+from protocol.wire import keys
+from protocol.wire.session import SessionConfig, open_session
+
+LARGEST = "region?bounds=-2000,-2000,1999.5,1999.5"  # 16,000,000 cells: the documented limit
+PIECE = "region?bounds=-128,-128,127.5,127.5;layers=visits,weight,age_s"  # the largest single answer
+AT_ONCE = 20
+WAITING = 300
+BEFORE_SLEEP_S = 0.03  # for questions to leave
+
+Ask = Callable[[str], "zenoh.Handler[zenoh.Reply]"]
+
+
+def sleeping(ask: Ask) -> None:
+    """Ask for the largest region as many others do, and for some pieces, and take no byte of the answers."""
+    held = [ask(LARGEST), *(ask(PIECE) for _ in range(AT_ONCE))]
+    time.sleep(BEFORE_SLEEP_S)
+    os.kill(os.getpid(), signal.SIGSTOP)
+    del held
+
+
+def leaving(ask: Ask) -> None:
+    """Ask, and be gone in mid-answer."""
+    held = [ask(LARGEST), *(ask(PIECE) for _ in range(AT_ONCE))]
+    time.sleep(BEFORE_SLEEP_S)
+    os.kill(os.getpid(), signal.SIGKILL)
+    del held
+
+
+def looping(ask: Ask) -> None:
+    """Ask for large regions without end, some tiles of each, and never pause."""
+    for attempt in itertools.count():
+        for reply in ask(LARGEST):
+            if reply.ok is not None and (tile := msgpack.unpackb(reply.ok.payload.to_bytes()).get("tile")):
+                middle = tile["count"] // 2 + 18  # where machines drive
+                for number in range(middle, middle + attempt % 5):
+                    list(ask(f"tile?cursor={tile['cursor']};number={number}"))
+
+
+def waiting(ask: Ask) -> None:
+    """Wait for a row that never comes, as often as one can, and for the past meanwhile."""
+    held = [ask("info?after=1000000000;wait=60") for _ in range(WAITING)]
+    held += [ask(f"point?x=0;y=0;as_of={1_750_000_000_000_000_000 + n}") for n in range(AT_ONCE)]
+    threading.Event().wait()
+    del held
+
+
+KINDS = {one.__name__: one for one in (sleeping, leaving, looping, waiting)}
+
+
+def main(kind: str, endpoint: str, site: str) -> None:
+    session = open_session(SessionConfig(endpoint))
+
+    def ask(query: str) -> zenoh.Handler[zenoh.Reply]:
+        name, _, parameters = query.partition("?")
+        return session.get(f"{keys.map_query(site, name)}?{parameters}", timeout=60.0)
+
+    KINDS[kind](ask)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,69 @@
+"""Reads answers of the map by another hand: written from docs/protocol.md alone.
+
+Imports nothing of this project: what it knows is what the document says.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import Any
+
+import msgpack
+
+PAUSE_S = 0.1
+Layers = dict[str, list[list[float]]]  # rows from the south, each from west to east
+
+
+class RefusedError(Exception):
+    """The server refuses the question."""
+
+
+def ask(session: Any, site: str, query: str, within_s: float = 10.0, **parameters: object) -> dict[str, Any]:
+    """One answer; asked again while none comes, and where it helps."""
+    selector = f"sitegrid/{site}/map/{query}"
+    if parameters:
+        selector += "?" + ";".join(f"{name}={value}" for name, value in parameters.items())
+    end_s = time.monotonic() + within_s
+    while (left_s := end_s - time.monotonic()) > 0:
+        pause_s = PAUSE_S
+        for reply in session.get(selector, timeout=left_s):
+            if reply.ok is not None:
+                answer: dict[str, Any] = msgpack.unpackb(reply.ok.payload.to_bytes())
+                if answer["v"] != 1:
+                    raise RefusedError("another version")
+                return answer
+            if (text := reply.err.payload.to_bytes()) != b"Timeout":
+                refusal = msgpack.unpackb(text)
+                pause_s = refusal.get("retry_after_s", 0.0)
+                if not pause_s:
+                    raise RefusedError(refusal["reason"])
+        time.sleep(pause_s)
+    raise TimeoutError(selector)
+
+
+def region(
+    session: Any, site: str, bounds: tuple[float, float, float, float], *layers: str
+) -> tuple[dict[str, Any], Layers]:
+    """A rectangle, tile by tile where it comes in tiles: its first answer, and the layers of the whole."""
+    sides = ",".join(map(repr, bounds))
+    first = answer = ask(session, site, "region", bounds=sides, **({"layers": ",".join(layers)} if layers else {}))
+    tile = first.get("tile")
+    if not tile:
+        return first, {name: _rows(first, name) for name in first["layers"]}
+    whole: Layers = {name: [[float("nan")] * tile["columns"] for _ in range(tile["rows"])] for name in first["layers"]}
+    for number in range(tile["count"]):
+        if number:
+            answer = ask(session, site, "tile", cursor=tile["cursor"], number=number)
+        at = answer["tile"]
+        assert (at["number"], answer["store"], answer["merged"]) == (number, first["store"], first["merged"])
+        for name in answer["layers"]:
+            for i, row in enumerate(_rows(answer, name)):
+                whole[name][at["row"] + i][at["column"] : at["column"] + answer["columns"]] = row
+    return first, whole
+
+
+def _rows(answer: dict[str, Any], name: str) -> list[list[float]]:
+    columns, rows = answer["columns"], answer["rows"]
+    values = struct.unpack(f"<{columns * rows}f", answer["layers"][name])
+    return [list(values[i * columns : (i + 1) * columns]) for i in range(rows)]

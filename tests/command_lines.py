@@ -1,0 +1,66 @@
+"""All commands of the parser, and a command line for each: what sweeps over them need."""
+
+from __future__ import annotations
+
+from argparse import Action, ArgumentParser, _SubParsersAction
+from typing import NamedTuple
+
+from sitegrid.door import build_parser
+
+Given = dict[str, str]  # value of each option by its destination
+
+
+class Command(NamedTuple):
+    """One command with its actions: the words, and the parser behind each."""
+
+    words: tuple[str, ...]
+    parsers: tuple[ArgumentParser, ...]
+
+    @property
+    def name(self) -> str:
+        return "-".join(self.words)
+
+    def options(self) -> list[Action]:
+        """What the command takes; of an option that two levels have, the last."""
+        return [a for parser in self.parsers for a in parser._actions if not isinstance(a, _SubParsersAction)]
+
+    def line(self, given: Given) -> list[str]:
+        """A command line with these values, and something for all that is required."""
+        line: list[str] = []
+        for word, parser in zip(self.words, self.parsers, strict=True):
+            line.append(word)
+            for option in parser._actions:
+                if isinstance(option, _SubParsersAction):
+                    continue
+                value = given.get(option.dest)
+                if value is None and (option.required or not option.option_strings) and option.nargs != "?":
+                    value = _anything(option)
+                if value is not None:
+                    line += [*option.option_strings[-1:], value]
+        return line
+
+
+Parsers = tuple[ArgumentParser, ...]
+
+
+def _commands(parser: ArgumentParser, words: tuple[str, ...] = (), above: Parsers = ()) -> list[Command]:
+    """All commands below a parser; the parsers of each, without the topmost."""
+    branches = [a for a in parser._actions if isinstance(a, _SubParsersAction)]
+    if not branches:
+        return [Command(words, (*above, parser))]
+    above = (*above, parser) if words else ()
+    return [
+        command
+        for branch in branches
+        for word, below in branch.choices.items()
+        for command in _commands(below, (*words, word), above)
+    ]
+
+
+def _anything(option: Action) -> str:
+    if option.type is float:
+        return "2" if option.dest in ("east_m", "north_m") else "1"
+    return str(next(iter(option.choices))) if option.choices else "nothing-of-the-sort"
+
+
+COMMANDS = _commands(build_parser())

@@ -1,0 +1,325 @@
+"""The map over HTTP: the same numbers as the client's, and clear refusals; every process is a real one."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection
+from websockets.sync.client import connect as open_socket
+
+from protocol.site.site_config import Projection
+from protocol.site.site_file import load_site
+from sitegrid.process.children import Children, wait_until
+from tests.integration.site_run import kill
+from tests.integration.web_site import NAME, Frame, WebSite
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.fixture(scope="module")
+def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
+    folder = tmp_path_factory.mktemp("web")
+    with Children(folder) as children:
+        site = WebSite(folder, children)
+        site.drive(40)
+        yield site
+
+
+def driven_place(web: WebSite) -> tuple[float, float]:
+    """A place with a value."""
+    region = web.client.region((0, 0, 300, 300), ["resistance"])
+    rows, columns = np.nonzero(~np.isnan(region["resistance"]))
+    return float(region.x_m[columns[7]]), float(region.y_m[rows[7]])
+
+
+def same(ours: object, theirs: float) -> bool:
+    return ours is None if math.isnan(theirs) else ours == pytest.approx(theirs, rel=1e-6)
+
+
+def test_a_point_has_the_clients_numbers(web: WebSite):
+    x_m, y_m = driven_place(web)
+    point = web.client.point(x_m, y_m)
+    answer = web.get("point", {"x": x_m, "y": y_m})
+    assert answer.status == 200
+    assert set(answer.json["values"]) == set(point.values)
+    assert all(same(answer.json["values"][name], value) for name, value in point.values.items())
+    assert (answer.json["store"], answer.json["merged"]) == (point.version.store, point.version.row)
+    lat, lon = answer.json["lat_deg"], answer.json["lon_deg"]
+    assert web.get("point", {"lat": lat, "lon": lon}).json["values"] == answer.json["values"]
+    site = load_site(web.folder / "site.toml")
+    assert Projection(site).to_map(lat, lon, 0)[:2] == pytest.approx((x_m, y_m), abs=1e-6)
+
+
+def test_a_region_is_the_clients_as_text_and_as_arrays(web: WebSite):
+    region = web.client.region((100, 100, 160, 150), ["resistance", "visits"])
+    parameters = {"bounds": "100,100,160,150", "layers": "resistance,visits"}
+    text = web.get("region", parameters).json
+    arrays = np.load(io.BytesIO(web.get("region", {**parameters, "format": "npz"}).body))
+    for name in ("resistance", "visits"):
+        assert np.array_equal(np.array(text["layers"][name], np.float32), region[name], equal_nan=True)
+        assert np.array_equal(arrays[name], region[name], equal_nan=True)
+    assert text["x_m"] == region.x_m.tolist()
+    inside = web.get("region", {"polygon": "100,100;160,100;100,150", "layers": "visits"}).json
+    kept = np.array(inside["layers"]["visits"], np.float32)
+    assert np.isnan(kept[-1, -1])
+    assert np.array_equal(kept[0, :50], region["visits"][0, :50], equal_nan=True)
+
+
+def test_why_history_machines_changes_are_the_clients(web: WebSite):
+    x_m, y_m = driven_place(web)
+    why, answer = web.client.why(x_m, y_m), web.get("why", {"x": x_m, "y": y_m}).json
+    assert answer["resistance"]["votes"] == pytest.approx(list(why.resistance.votes))
+    assert answer["machines"] == list(why.machines)
+    assert answer["newest_time"].startswith("2026-01-01T00:0")
+    spans = web.get("history", {"x": x_m, "y": y_m, "layers": "resistance"}).json["spans"]
+    ours = web.client.history(x_m, y_m, ["resistance"])
+    assert [span["first_ns"] for span in spans] == [span.first_ns for span in ours]
+    assert [m["name"] for m in web.get("machines").json["machines"]] == ["machine-0", "machine-1", "machine-2"]
+    assert web.get("changes").json == {"changes": []}
+    info = web.get("info").json
+    assert info["samples_merged"] == web.client.info().samples_merged
+    assert web.get("/api/v1/sites").json["sites"][0]["name"] == NAME
+
+
+def test_the_past_is_asked_for_by_time_or_stamp(web: WebSite):
+    x_m, y_m = driven_place(web)
+    by_stamp = web.get("point", {"x": x_m, "y": y_m, "as_of": 1_767_225_620_000_000_000}).json
+    by_time = web.get("point", {"x": x_m, "y": y_m, "as_of": "2026-01-01T00:00:20Z"}).json
+    by_zone = web.get("point", {"x": x_m, "y": y_m, "as_of": "2026-01-01T01:00:20+01:00"}).json
+    assert by_stamp["values"] == by_time["values"] == by_zone["values"]
+    assert by_stamp["stamp_ns"] == 1_767_225_620_000_000_000
+    point = web.client.point(x_m, y_m, as_of_ns=1_767_225_620_000_000_000)
+    assert all(same(by_time["values"][name], value) for name, value in point.values.items())
+    frame = Frame.read(web.get("tiles", {"as_of": "2026-01-01T00:00:20Z"}).body)
+    assert frame.head["whole"]
+    assert {(tile.x, tile.y): (tile.newest_ns, tile_planes(tile)) for tile in web.client.tiles(
+        as_of_ns=1_767_225_620_000_000_000
+    ).tiles} == frame.tiles  # fmt: skip
+
+
+def tile_planes(tile) -> bytes:
+    import zlib
+
+    return zlib.decompress(tile.planes)
+
+
+@pytest.mark.parametrize(
+    ("path", "parameters", "status", "reason"),
+    [
+        ("point", {"x": 1}, 400, "missing_field"),
+        ("point", {"x": "nan", "y": 1}, 400, "not_finite"),
+        ("point", {"x": "east", "y": 1}, 400, "wrong_type"),
+        ("point", {"lat": 91, "lon": 8}, 400, "out_of_range"),
+        ("point", {"x": 1, "y": 1, "layers": "colour"}, 400, "unknown_layer"),
+        ("point", {"x": 1, "y": 1, "colour": "red"}, 400, "unknown_parameter"),
+        ("point", {"x": 1, "y": 1, "as_of": "yesterday"}, 400, "wrong_type"),
+        ("point", {"x": 1, "y": 1, "as_of": "1890-01-01"}, 400, "out_of_range"),
+        ("region", {"bounds": "0,0,1"}, 400, "missing_field"),
+        ("region", {"bounds": "5,0,1,9"}, 400, "out_of_range"),
+        ("region", {"bounds": "0,0,9000,9000"}, 413, "too_large"),
+        ("region", {"polygon": "0,0;1,1"}, 400, "out_of_range"),
+        ("region", {"polygon": ";".join(["1,1"] * 1001)}, 400, "out_of_range"),
+        ("region", {"bounds": "0,0,9,9", "format": "xml"}, 400, "out_of_range"),
+        ("history", {"x": 0, "y": 0, "span": 0}, 400, "out_of_range"),
+        ("tiles", {"store": "x", "row": -1, "fact": 0}, 400, "out_of_range"),
+        ("changes", {"after": -1}, 400, "out_of_range"),
+        ("nothing", {}, 404, "not_found"),
+        ("/api/v1/sites/elsewhere/info", {}, 404, "unknown_site"),
+        ("xyz/colour/resistance/30/0/0.png", {}, 400, "out_of_range"),
+        ("xyz/colour/resistance/3/8/0.png", {}, 400, "out_of_range"),
+        ("xyz/colour/mud/3/0/0.png", {}, 404, "unknown_layer"),
+        ("xyz/red/resistance/3/0/0.png", {}, 400, "out_of_range"),
+        ("/../../etc/passwd", {}, 404, "not_found"),
+    ],
+)
+def test_bad_input_is_one_clear_problem(web: WebSite, path, parameters, status, reason):
+    answer = web.get(path, parameters)
+    assert (answer.status, answer.json["reason"]) == (status, reason)
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert answer.json["detail"]
+    assert "\n" not in answer.json["detail"]
+    assert web.get("info").status == 200
+
+
+def test_what_is_no_question_is_refused(web: WebSite):
+    assert web.request("POST", f"/api/v1/sites/{NAME}/info").status == 405
+    assert web.request("POST", f"/api/v1/sites/{NAME}/info", body=b"{" * 100).status == 413
+    assert web.get("/" + "a" * 40_000).status == 414
+    assert web.get("info", Origin="https://elsewhere.example").status == 403
+    assert web.get("info", Origin=web.url.rstrip("/")).status == 200
+    for word in ("refused_wrong_origin", "refused_too_large"):
+        assert f'sitegrid_web_total{{event="{word}"}}' in web.get("/metrics").body.decode()
+    assert web.get("/healthz").body == b"ok\n"
+
+
+def test_the_page_has_strict_headers_and_asks_nobody_else(web: WebSite):
+    answer = web.get("/")
+    assert answer.status == 200
+    assert "script-src 'self'" in answer.headers["content-security-policy"]
+    for name in ("main.js", "style.css", "icon.svg"):
+        text = web.get(f"/{name}").body.decode()
+        assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
+        assert "https://" not in text
+
+
+def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
+    x_m, y_m = driven_place(web)
+    parameters = {"x": x_m, "y": y_m, "layers": "resistance"}
+    first = web.get("point", parameters)
+    again = web.get("point", parameters, If_None_Match=first.headers["etag"])
+    assert (again.status, again.body) == (304, b"")
+    web.drive(4)
+    wait_until(
+        lambda: web.get("point", parameters, If_None_Match=first.headers["etag"]).status == 200, 10, "another map"
+    )
+
+
+def test_slow_headers_do_not_hold_a_place(web: WebSite):
+    with socket.create_connection(("127.0.0.1", web.port)) as slow:
+        slow.sendall(b"GET / HTTP/1.1\r\nHost: x\r\nX-Slow: ")
+        slow.settimeout(30)
+        assert slow.recv(1000) == b""
+
+
+# --- the live connection ---------------------------------------------------------------------------------------------
+
+
+class Page:
+    """A page without a browser. It checks that no tile ever goes back."""
+
+    def __init__(self, web: WebSite) -> None:
+        self.web, self.socket = web, None
+        self.tiles: dict[tuple[int, int], tuple[int, bytes]] = {}
+        self.versions: dict[tuple[int, int], tuple[int, int]] = {}
+        self.store, self.version, self.frames = "", (0, 0), 0
+
+    def open(self) -> ClientConnection:
+        known = {"store": self.store, "row": self.version[0], "fact": self.version[1]} if self.store else {}
+        self.socket = open_socket(self.web.live_url(**known), max_size=2**26, compression=None)
+        return self.socket
+
+    def take(self, until: tuple[int, int], timeout_s: float = 30.0) -> None:
+        """Take in what comes until the map is of a version, or a later one."""
+        end_s = time.monotonic() + timeout_s
+        while self.version < until or not self.frames:
+            data = self.socket.recv(timeout=max(0.1, end_s - time.monotonic()))
+            if isinstance(data, bytes):
+                self.take_in(Frame.read(data))
+                self.socket.send(json.dumps({"row": self.version[0], "fact": self.version[1]}))
+
+    def take_in(self, frame: Frame) -> None:
+        if frame.head["whole"]:
+            self.tiles.clear()
+        same_store = frame.head["store"] == self.store
+        for tile in frame.head["tiles"]:
+            place, version = (tile["x"], tile["y"]), (tile["row"], tile["fact"])
+            if same_store:
+                assert version >= self.versions.get(place, (0, 0)), "a tile went back"
+            self.versions[place] = version
+        assert not same_store or frame.version >= self.version, "the map went back"
+        self.tiles |= frame.tiles
+        self.store, self.version, self.frames = frame.head["store"], frame.version, self.frames + 1
+
+
+def newest(web: WebSite) -> tuple[dict[tuple[int, int], tuple[int, bytes]], tuple[int, int]]:
+    """A fresh snapshot, and its version."""
+    frame = Frame.read(web.get("tiles").body)
+    return frame.tiles, frame.version
+
+
+def test_pages_that_are_fast_slow_or_asleep_end_with_the_map_as_it_is(web: WebSite):
+    fast, slow = Page(web), Page(web)
+    with fast.open(), slow.open():
+        fast.take((1, 0))
+        slow.take((1, 0))
+        for _ in range(4):
+            web.drive(4)
+            fast.take((web.client.info().merged - 2, 0))
+        frames_of_fast = fast.frames
+        tiles, version = newest(web)
+        last = max((tile.row for tile in web.client.tiles().tiles), default=0)
+        fast.take((last, 0))
+        slow.take((last, 0))  # it slept through four drives, and gets them as one or two maps
+        assert fast.tiles == slow.tiles == tiles
+        assert slow.frames < frames_of_fast
+        assert version >= (last, 0)
+
+
+def test_a_page_goes_on_after_web_server_map_server_and_trust_were_others(tmp_path: Path):
+    with Children(tmp_path) as children:
+        web = WebSite(tmp_path, children)
+        web.drive(24)
+        page = Page(web)
+        with page.open():
+            page.take((1, 0))
+        port = web.port
+        kill(web.web)
+        web.drive(8)
+        web.web = web.start_web(port=port)
+        with page.open():
+            page.take((max(tile.row for tile in web.client.tiles().tiles), 0))
+            assert page.tiles == newest(web)[0]
+            web.server.send(signal.SIGKILL)
+            web.server.wait(10)
+            web.server = web.start_server()
+            web.drive(8)
+            page.take((max(tile.row for tile in web.client.tiles().tiles), 0), 60)
+            assert page.tiles == newest(web)[0]
+            trusted = web.client.distrust("machine-1", "test")
+            page.take((trusted.merged, trusted.fact), 60)
+            assert page.tiles == newest(web)[0]
+            assert page.version >= (trusted.merged, trusted.fact)
+
+
+def test_what_a_page_says_wrongly_ends_its_connection_alone(web: WebSite):
+    with open_socket(web.live_url(), compression=None) as wrong:
+        wrong.send("[" * 2000)
+        with pytest.raises(ConnectionClosed):
+            _drain(wrong)
+    page = Page(web)
+    with page.open():
+        page.take((1, 0))
+    assert web.get("info").status == 200
+
+
+def _drain(socket: ClientConnection) -> None:
+    for _ in range(1000):
+        socket.recv(timeout=10)
+
+
+def test_pages_that_sleep_cost_no_memory(web: WebSite):
+    def rss() -> int:
+        return int(Path(f"/proc/{web.web.pid}/statm").read_text().split()[1]) * 4096
+
+    sleepers = [open_socket(web.live_url(), compression=None, max_size=2**26) for _ in range(10)]
+    pages = [Page(web) for _ in range(10)]
+    with contextlib.ExitStack() as opened:
+        for sleeper in sleepers:
+            opened.enter_context(sleeper)
+        for page in pages:
+            opened.enter_context(page.open())
+            page.take((1, 0))
+        before = rss()
+        for _ in range(5):
+            web.drive(4)
+        last = max(tile.row for tile in web.client.tiles().tiles)
+        threads = [threading.Thread(target=page.take, args=((last, 0),)) for page in pages]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+        tiles = newest(web)[0]
+        assert all(page.tiles == tiles for page in pages)
+        assert rss() < before + 40e6, "what sleeps costs no memory"

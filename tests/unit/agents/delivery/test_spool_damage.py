@@ -1,0 +1,188 @@
+"""What a machine's disk has lost of its spool is named, counted, and declared to the server."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from agents.delivery.spool import Spool, SpoolConfig
+from agents.delivery.spool_mark import RunEnd, runs_cut_short
+from protocol.disk.high_water_mark import mark_path
+from protocol.errors import StoreError
+from protocol.machine.samples import content_hash
+from tests.unit.agents.drives import made_up_samples
+
+ROWS = made_up_samples(400)
+
+
+def opened(folder: Path) -> Spool:
+    return Spool(folder / "spool.db", SpoolConfig())
+
+
+def left_by_kill(work: Path, left: Path, use: Callable[[Spool], object]) -> Path:
+    """Use a spool in `work`, and copy its files to `left` before it is closed: as kill -9 leaves them."""
+    with closing(opened(work)) as spool:
+        use(spool)
+        shutil.copytree(work, left)
+    return left
+
+
+def record(spool: Spool) -> None:
+    for i in range(0, 400, 10):
+        spool.record(ROWS[i : i + 10])
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """400 recorded samples, none of them sent."""
+    folder = tmp_path_factory.mktemp("spools")
+    return left_by_kill(folder / "work", folder / "left", record)
+
+
+@pytest.fixture
+def folder(killed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(killed, tmp_path / "spool"))
+
+
+def cut_short(folder: Path, share: float) -> None:
+    log = folder / "spool.db-wal"
+    log.write_bytes(log.read_bytes()[: int(log.stat().st_size * share)])
+
+
+def deliver(spool: Spool) -> tuple[list[str], int, int]:
+    """Send everything to a new server; returns what it takes, what it counts as lost, and the last watermark."""
+    taken: list[str] = []
+    lost, marks = 0, dict[int, int]()
+    while head := spool.head(1000):
+        missing = head.first_seq - 1 - marks.get(head.spool_id, 0)
+        assert missing <= head.lost_before
+        lost += missing
+        taken += [content_hash(row) for row in head.rows]
+        marks[head.spool_id] = head.first_seq - 1 + len(head.rows)
+        spool.acknowledge(head.spool_id, marks[head.spool_id])
+    return taken, lost, max(marks.values(), default=0)
+
+
+def test_a_kill_loses_nothing(folder):
+    with closing(opened(folder)) as spool:
+        assert (spool.damage, spool.counters()["gone"]) == ("", 0)
+        assert deliver(spool) == ([content_hash(row) for row in ROWS], 0, 400)
+
+
+def test_each_flip_in_the_log_is_named_counted_and_declared_to_the_server(killed, tmp_path):
+    rng, size, counted = random.Random(1), (killed / "spool.db-wal").stat().st_size, 0
+    for i in range(60):
+        folder = Path(shutil.copytree(killed, tmp_path / str(i)))
+        content = bytearray((folder / "spool.db-wal").read_bytes())
+        content[rng.randrange(size)] ^= 1 << rng.randrange(8)
+        (folder / "spool.db-wal").write_bytes(content)
+        try:
+            spool = opened(folder)
+        except StoreError as error:
+            assert "spool.db" in str(error)  # noqa: PT017 # most flips leave it usable
+            continue
+        with closing(spool):
+            gone = spool.counters()["gone"]
+            taken, lost, watermark = deliver(spool)
+            assert gone == lost == 400 - len(taken) > 0
+            assert watermark == 400
+            assert f"{gone} recorded samples are gone" in spool.damage
+            counted += 1
+    assert counted > 50
+
+
+def test_what_is_gone_is_counted_once_and_kept(folder):
+    cut_short(folder, 0.5)
+    with closing(opened(folder)) as spool:
+        gone = spool.counters()["gone"]
+        assert 100 < gone < 300
+        assert spool.damage
+    with closing(opened(folder)) as spool:
+        assert (spool.counters()["gone"], spool.damage) == (gone, "")
+        assert len(list(folder.glob("spool.db-wal.damaged-*"))) == 1
+
+
+def test_runs_that_are_gone_with_the_log_are_declared_too(tmp_path):
+    """Two kills without a checkpoint: the log has two runs."""
+
+    def again(spool: Spool) -> None:
+        spool.record(ROWS[300:])
+
+    def first(spool: Spool) -> None:
+        spool.record(ROWS[:300])
+
+    one = left_by_kill(tmp_path / "work", tmp_path / "one", first)
+    two = left_by_kill(one, tmp_path / "two", again)
+    cut_short(two, 0.2)
+    with closing(opened(two)) as spool:
+        taken, lost, _ = deliver(spool)
+        assert (len(taken) + lost, spool.counters()["gone"]) == (400, lost)
+        assert lost >= 100
+
+
+def test_what_was_acknowledged_is_not_gone(tmp_path):
+    def use(spool: Spool) -> None:
+        spool.record(ROWS[:50])
+        spool.record(ROWS[50:60])
+        spool.acknowledge(spool.spool_id, 57)
+
+    left = left_by_kill(tmp_path / "work", tmp_path / "left", use)
+    cut_short(left, 0.1)
+    with closing(opened(left)) as spool:
+        assert spool.counters()["gone"] == 3
+
+
+def test_samples_with_a_new_identity_are_not_gone(tmp_path):
+    def use(spool: Spool) -> None:
+        spool.record(ROWS[:50])
+        spool.acknowledge(spool.spool_id, 20)
+        spool.start_new_run()
+
+    left = left_by_kill(tmp_path / "work", tmp_path / "left", use)
+    with closing(opened(left)) as spool:
+        assert (spool.counters()["gone"], len(deliver(spool)[0])) == (0, 30)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.4, 0.9])
+def test_a_mark_that_is_torn_or_behind_is_no_alarm(folder, kept):
+    mark = mark_path(folder / "spool.db")
+    mark.write_bytes(mark.read_bytes()[: int(mark.stat().st_size * kept)])
+    with closing(opened(folder)) as spool:
+        assert (spool.damage, spool.counters()["gone"]) == ("", 0)
+
+
+def test_without_a_mark_damage_before_the_last_commit_is_named(folder):
+    mark_path(folder / "spool.db").unlink()
+    content = bytearray((folder / "spool.db-wal").read_bytes())
+    content[len(content) // 2] ^= 1
+    (folder / "spool.db-wal").write_bytes(content)
+    with closing(opened(folder)) as spool:
+        assert "spool.db-wal is damaged at byte" in spool.damage
+
+
+def test_a_copy_in_place_of_the_file_is_named_and_declares_nothing(tmp_path):
+    """The other file may still be sent: what it alone has must not be declared lost."""
+    with closing(opened(tmp_path)) as spool:
+        spool.record(ROWS[:20])
+    shutil.copy(tmp_path / "spool.db", tmp_path / "copy.db")
+    with closing(opened(tmp_path)) as spool:
+        spool.record(ROWS[20:90])
+    shutil.copy(tmp_path / "copy.db", tmp_path / "spool.db")
+    with closing(opened(tmp_path)) as spool:
+        assert spool.damage == "70 recorded samples are gone"
+        assert deliver(spool)[1:] == (0, 20)
+    with closing(opened(tmp_path)) as spool:
+        assert (spool.damage, spool.counters()["gone"]) == ("", 70)
+
+
+def test_only_the_last_run_can_be_cut_short():
+    there = [RunEnd(1, 10, 10), RunEnd(2, 5, 0)]
+    mark = {k: v for run in (RunEnd(1, 12, 3), RunEnd(2, 9, 2), RunEnd(3, 4, 1)) for k, v in run.values().items()}
+    assert runs_cut_short(there, mark) == [(RunEnd(2, 9, 2), 4), (RunEnd(3, 4, 1), 3)]
+    assert runs_cut_short(there, {}) == []
+    assert runs_cut_short([], mark)[0] == (RunEnd(1, 12, 3), 9)

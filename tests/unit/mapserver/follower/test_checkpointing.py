@@ -1,0 +1,315 @@
+"""The job that makes checkpoints, on a real writer and store."""
+
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+
+from mapserver.config import ServerConfig, StoreConfig
+from mapserver.evidence.grid import Grid
+from mapserver.follower import checkpointing
+from mapserver.follower.checkpointing import RESERVE_BYTES, Checkpointing
+from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.writer import Writer
+from mapserver.journal.reader import JournalReader
+from mapserver.past.plan import HOUR_NS
+from protocol.arrays import Table
+from tests.unit.mapserver.data import (
+    NOW_NS,
+    SITE,
+    incoming,
+    open_store,
+    past_of,
+    random_samples,
+    same,
+    send,
+)
+
+TURNS = 500
+
+
+class Site:
+    """A writer, the job alone, and what was sent, also to a writer before it."""
+
+    def __init__(self, folder: Path, sent: list[tuple[str, Table]], checkpoints_gb: float = 5.0) -> None:
+        self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0, checkpoints_gb=checkpoints_gb))
+        self.writer = Writer(Store(folder, SITE, self.config, lambda: NOW_NS + 200 * HOUR_NS))
+        self.reader = JournalReader(folder / JOURNAL_FILE)
+        self.past = past_of(self.writer)
+        self.ending = threading.Event()
+        self.job = Checkpointing(self.writer, self.reader, self.past, self.ending)
+        self.sent = sent
+
+    def drive(self, hours: list[float], n: int = 30, machine: str = "a") -> None:
+        """Send samples of half an hour from each of these hours on."""
+        for hour in hours:
+            rows = random_samples(n, len(self.sent), half_m=20.0)
+            rows["stamp_ns"] += round(hour * HOUR_NS)
+            first_seq = 1 + sum(len(table) for name, table in self.sent if name == machine)
+            send(self.writer, [incoming(rows, first_seq, machine)])
+            self.sent.append((machine, rows))
+
+    def exclude(self, *machines: str) -> None:
+        """Have the map without some machines, as after a decision."""
+        grid = self.folded(2**62, frozenset(machines))
+        self.writer.run(lambda store: store.adopt(grid, store.merged, frozenset(machines)))
+
+    def run(self) -> None:
+        """Turns until nothing is left to do."""
+        idle = 0
+        for _ in range(TURNS):
+            self.job.run()
+            idle = 0 if self.job._making else idle + 1
+            if idle > len(self.hours) + 2:  # each is looked at
+                return
+        raise AssertionError("never done")
+
+    @property
+    def hours(self) -> list[float]:
+        """When those that can be used are closed."""
+        facts = self.past.facts(self.reader, self.writer.run(lambda store: store.excluded))
+        entries = self.past.checkpoints.entries(facts, self.reader.last_row)
+        return [(entry.closed_ns - NOW_NS) / HOUR_NS for entry in entries if entry.usable]
+
+    def folded(self, to_ns: int, without: frozenset[str] = frozenset()) -> Grid:
+        grid = Grid(SITE.cell_m, self.config.fold)
+        for machine, rows in self.sent:
+            if machine not in without:
+                grid.fold(rows[rows["stamp_ns"] <= to_ns], machine)
+        return grid
+
+    def is_true(self, hour: float, without: frozenset[str] = frozenset()) -> bool:
+        to_ns = NOW_NS + round(hour * HOUR_NS)
+        return same(self.past.grid_as_of(self.reader, to_ns, without=without), self.folded(to_ns, without))
+
+    def close(self) -> None:
+        self.job.close()
+        self.reader.close()
+        self.writer.close()
+
+
+@pytest.fixture
+def opened(tmp_path):
+    sent: list[tuple[str, Table]] = []
+
+    @contextmanager
+    def open_site(**options: float) -> Iterator[Site]:
+        with closing(Site(tmp_path / "store", sent, **options)) as site:
+            yield site
+
+    return open_site
+
+
+def test_hours_of_the_last_day_are_made_and_days_stay(opened):
+    with opened() as site:
+        for hour in range(8, 12):
+            site.drive([hour])
+            site.run()
+        assert site.hours == [9, 10, 11]  # the twelfth is not over
+        assert all(site.is_true(hour) for hour in (8.2, 9, 10.4, 11.9))
+        site.drive([30, 36.5])
+        site.run()
+        assert site.hours == [12, 31]  # of the first day the last one
+        site.drive([60])
+        site.run()
+        assert site.hours == [12, 37]
+        assert all(site.is_true(hour) for hour in (8.2, 11.9, 12, 30.3, 36.9, 61))
+
+
+def test_a_log_that_is_replayed_at_once_gets_days_then_hours(opened):
+    with opened() as site:
+        site.drive([1, 30, 31, 60, 81, 82, 90])
+        site.run()
+        assert site.hours == [24, 48, 66, 82, 83]
+        assert all(site.is_true(hour) for hour in (1.4, 24, 31.2, 60, 82.2, 90.4))
+
+
+def test_one_that_lacks_many_late_rows_is_made_again(opened, monkeypatch):
+    monkeypatch.setattr(checkpointing, "LATE_ROWS", 3)
+    with opened() as site:
+        site.drive([8, 9, 10])
+        site.run()
+        rows = {entry.closed_ns: entry.header.row for entry in site.past.checkpoints.entries({}, 99)}
+        assert list(rows.values()) == [3, 3]
+        site.drive([8.1, 8.2], machine="late")
+        site.run()
+        assert [entry.header.row for entry in site.past.checkpoints.entries({}, 99)] == [3, 3]
+        assert site.is_true(8.9)
+        site.drive([9.1], machine="late")
+        site.run()
+        assert [entry.header.row for entry in site.past.checkpoints.entries({}, 99)] == [3, 6], "only what lacks three"
+        assert all(site.is_true(hour) for hour in (8.9, 9, 9.9, 10))
+
+
+def test_after_a_decision_about_a_machine_they_are_made_again_and_until_then_not_used(opened):
+    with opened() as site:
+        site.drive([8, 9, 10])
+        site.drive([8.1, 9.1, 10.1], machine="bad")
+        site.run()
+        assert site.hours == [9, 10]
+        site.exclude("bad")
+        assert site.hours == []
+        assert all(site.is_true(hour, frozenset(["bad"])) for hour in (8.9, 9.5, 10.4))
+        site.run()
+        assert site.hours == [9, 10]
+        assert all(site.is_true(hour, frozenset(["bad"])) for hour in (8.9, 9.5, 10.4))
+        site.exclude()
+        assert all(site.is_true(hour) for hour in (8.9, 9.5, 10.4))
+        site.run()
+        assert site.hours == [9, 10]
+        assert all(site.is_true(hour) for hour in (8.9, 9.5, 10.4))
+
+
+def test_a_decision_ends_what_was_in_the_making(opened, monkeypatch):
+    monkeypatch.setattr(checkpointing, "PIECE_S", 0.0)
+    with opened() as site:
+        site.drive([8, 9])
+        site.drive([8.1, 9.1], machine="bad")
+        site.job.run()
+        assert site.job._making.without == frozenset()
+        site.exclude("bad")
+        site.job.run()
+        assert site.job._making.without == {"bad"}
+        site.run()
+        assert site.is_true(9, frozenset(["bad"]))
+
+
+def test_a_turn_is_short_and_the_next_one_goes_on(opened, monkeypatch):
+    monkeypatch.setattr(checkpointing, "PIECE_S", 0.0)
+    with opened() as site:
+        site.drive([8, 8.1, 9])
+        turns = 0
+        while not site.hours:
+            site.job.run()
+            turns += 1
+        assert turns > 2
+        assert site.hours == [9]
+
+
+def test_a_damaged_one_is_made_again(opened, caplog):
+    with opened() as site:
+        site.drive([8, 9, 10])
+        site.run()
+        path = site.past.checkpoints.path(NOW_NS + 9 * HOUR_NS)
+        path.write_bytes(path.read_bytes()[:-1])
+        assert site.is_true(9.5)
+        site.run()
+        assert site.hours == [9, 10]
+        assert site.past.checkpoints.state["passed_over"] == 1
+        assert "checkpoint passed over" in caplog.text
+        assert site.is_true(9.5)
+
+
+def test_those_of_a_wrong_clock_are_removed_once_it_is_known(opened):
+    with opened() as site:
+        site.drive([8, 9, 10])
+        site.run()
+        shutil.copy(site.past.checkpoints.path(NOW_NS + 9 * HOUR_NS), site.past.checkpoints.path(NOW_NS + 99 * HOUR_NS))
+        site.run()
+        assert not site.past.checkpoints.path(NOW_NS + 99 * HOUR_NS).exists()
+        assert site.hours == [9, 10]
+
+
+def test_room_is_kept_to(opened, tmp_path):
+    with opened() as site:
+        site.drive(list(range(8, 16)))
+        site.run()
+        size = site.past.checkpoints.path(NOW_NS + 15 * HOUR_NS).stat().st_size
+        assert site.past.checkpoints.state["bytes"] > 3.5 * size
+    with opened(checkpoints_gb=3.5 * size / 1e9) as site:
+        for hour in range(16, 24):
+            site.drive([hour])
+            site.run()
+            assert sum(path.stat().st_size for path in site.past.checkpoints.folder.iterdir()) <= 3.5 * size
+        assert site.hours[-1] == 23
+        assert site.is_true(23.4)
+
+
+@pytest.mark.parametrize(("gb", "warned"), [(0.0, False), (1e-6, True)])
+def test_without_room_there_are_none_and_maps_of_the_past_are_the_same(opened, gb, warned, caplog, monkeypatch):
+    with opened() as site:
+        site.drive([8, 9])
+        site.run()
+        assert site.hours == [9]
+    with opened(checkpoints_gb=gb) as site:
+        site.drive([10, 11])
+        site.job.run()
+        assert site.hours == []
+        assert site.is_true(9.5)
+        assert ("no room for checkpoints" in caplog.text) == warned
+        assert not list(site.past.checkpoints.folder.iterdir())
+
+
+def test_a_disk_that_is_nearly_full_is_left_to_what_machines_send(opened, monkeypatch):
+    with opened() as site:
+        site.drive([8, 9, 10])
+        site.run()
+        usage = shutil.disk_usage(site.writer.folder)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=RESERVE_BYTES - 10**9))
+        site.drive([11])
+        site.job.run()
+        assert site.hours == []
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=RESERVE_BYTES + 10**9))
+        site.job._due_s = 0.0
+        site.run()
+        assert site.hours[-1] == 11
+
+
+def test_a_disk_that_fails_is_said_and_tried_again_later(opened, monkeypatch):
+    with opened() as site:
+        site.drive([8, 9])
+        site.past.checkpoints.folder.parent.joinpath("checkpoints").write_text("a file in its place")
+        with pytest.raises(OSError, match="checkpoints"):
+            site.run()
+        assert site.job._making is None
+        site.job.run()
+        assert site.job._making is None, "not at once"
+        site.past.checkpoints.folder.unlink()
+        site.job._due_s = 0.0
+        site.run()
+        assert site.hours == [9]
+
+
+def test_what_a_killed_server_left_is_removed_at_the_start(opened, tmp_path):
+    folder = tmp_path / "store" / "checkpoints"
+    folder.mkdir(parents=True)
+    (folder / ".2026-01-01T09.checkpoint.ab.part").write_bytes(b"half")
+    with opened() as site:
+        assert list(folder.iterdir()) == []
+        site.drive([8, 9])
+        site.run()
+        assert [path.name for path in folder.iterdir()] == ["2026-01-01T09.checkpoint"]
+
+
+def test_the_end_of_the_server_leaves_no_half_checkpoint(opened, monkeypatch, tmp_path):
+    monkeypatch.setattr(checkpointing, "PIECE_S", 0.0)
+    with opened() as site:
+        site.drive([8, 9])
+        site.job.run()
+        site.job.run()
+        assert site.job._making
+    assert list((tmp_path / "store" / "checkpoints").glob("*")) == []
+
+
+def test_those_beyond_the_journal_are_removed_when_a_store_is_opened(opened, tmp_path, caplog):
+    """As after a restore of an older journal: once it grew again they would pass for true."""
+    with opened() as site:
+        site.drive([8, 9])
+        shutil.copy(tmp_path / "store" / JOURNAL_FILE, tmp_path / "backup")
+        site.run()
+    with opened() as site:
+        site.drive([10, 11])
+        site.run()
+        assert site.hours == [9, 10, 11]
+    for path in (tmp_path / "store").glob("journal.db*"):
+        path.unlink()
+    for path in (tmp_path / "store").glob("snapshot-*"):
+        path.unlink()
+    shutil.copy(tmp_path / "backup", tmp_path / "store" / JOURNAL_FILE)
+    with closing(open_store(tmp_path / "store")):
+        assert "checkpoint removed" in caplog.text
+        left = [path.name for path in (tmp_path / "store" / "checkpoints").iterdir()]
+        assert "2026-01-01T11.checkpoint" not in left

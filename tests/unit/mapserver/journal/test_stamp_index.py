@@ -1,0 +1,78 @@
+"""An index of stamps: no row with a selected stamp is passed over, and most others are."""
+
+import tempfile
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapserver.journal import stamp_index
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import LAST, JournalReader
+from mapserver.journal.rows import Admission, Selection
+from mapserver.journal.stamp_index import StampIndex
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, samples
+
+S = 10**9
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(stamp_index, "CHUNK", 4)
+
+
+def append(journal: Journal, first_s: int, last_s: int) -> None:
+    journal.begin()
+    stamps = NOW_NS + np.array([first_s, last_s]) * S
+    journal.append(Admission(batch(samples(2, stamp_ns=stamps), 1 + 2 * journal.last_row), 0, 0), NOW_NS)
+    journal.commit()
+
+
+def inside(stretches, last: int) -> list[int]:
+    return [row for first, end in stretches for row in range(first + 1, min(end, last) + 1)]
+
+
+ROWS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 6)), min_size=1, max_size=25)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=ROWS, cut=st.integers(0, 25), archived=st.integers(0, 25), begin=st.integers(-1, 50), length=st.integers(0, 20)
+)
+def test_no_selected_row_is_passed_over(rows, cut, archived, begin, length):
+    selection = Selection(NOW_NS + begin * S, NOW_NS + (begin + length) * S)
+    with tempfile.TemporaryDirectory() as folder:
+        journal = Journal(Path(folder) / "journal.db", SITE.name, SITE.frame)
+        with closing(journal), JournalReader(journal.path) as reader:
+            index = StampIndex()
+            for number, (first, more) in enumerate(rows, start=1):
+                append(journal, first, first + more)
+                if number == cut:
+                    list(index.stretches(reader, 0, LAST, selection))
+                    journal.forget(archived)
+            archived_row = journal.archived_row
+            for after, until in ((0, LAST), (3, 9), (8, 8), (archived_row, len(rows))):
+                got = inside(index.stretches(reader, after, until, selection), len(rows))
+                assert got == sorted(set(got))
+                for number, (first, more) in enumerate(rows, start=1):
+                    wanted = after < number <= until
+                    if number <= archived_row or (first <= begin + length and first + more >= begin):
+                        assert (number in got) == wanted
+                    assert wanted or number not in got
+            left = [(first, first + more) for first, more in rows[archived_row:]]
+            next_s = min((max(first, begin) for first, last in left if last >= begin), default=None)
+            expected = None if next_s is None else NOW_NS + next_s * S
+            assert index.next_stamp(reader, NOW_NS + begin * S) == expected
+
+
+def test_rows_of_other_hours_are_passed_over(tmp_path):
+    with closing(Journal(tmp_path / "journal.db", SITE.name, SITE.frame)) as journal:
+        for number in range(20):
+            append(journal, number * 10, number * 10 + 1)
+        append(journal, 0, 1)  # late
+        with JournalReader(journal.path) as reader:
+            got = list(StampIndex().stretches(reader, 0, LAST, Selection(NOW_NS + 80 * S, NOW_NS + 130 * S)))
+    assert got == [(8, 16), (20, LAST)]

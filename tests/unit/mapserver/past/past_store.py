@@ -1,0 +1,65 @@
+"""A store with samples of the past, without a server: journal, archive, checkpoints."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from mapserver.evidence.fold_config import FoldConfig
+from mapserver.evidence.grid import Grid
+from mapserver.journal.archive import FOLDER, archive
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Admission
+from mapserver.past.making import make
+from mapserver.past.past import Past
+from mapserver.past.plan import HOUR_NS
+from protocol.arrays import Table
+from tests.unit.mapserver.data import NOW_NS, SITE, batch
+
+FOLD = FoldConfig()
+S = 10**9
+NOBODY: frozenset[str] = frozenset()
+
+
+class PastStore:
+    """One machine's batch is one journal row; all rows are received an hour after the one before."""
+
+    def __init__(self, folder: Path, cell_m: float = 1.0, config: FoldConfig = FOLD) -> None:
+        self.folder = folder
+        self.journal = Journal(folder / "journal.db", SITE.name, SITE.frame)
+        self.reader = JournalReader(self.journal.path)
+        self.past = Past.of_store(folder, cell_m, config)
+        self.sent: list[tuple[str, Table]] = []
+
+    def add(self, rows: Table, machine: str = "a") -> None:
+        first_seq = 1 + sum(len(table) for name, table in self.sent if name == machine)
+        self.journal.begin()
+        received_ns = NOW_NS + self.journal.last_row * HOUR_NS
+        self.journal.append(Admission(batch(rows, first_seq, machine), 0, 0), received_ns)
+        self.journal.commit()
+        self.sent.append((machine, rows))
+
+    def archive(self, rows: int) -> None:
+        """Move so many of the first rows."""
+        list(archive(self.folder / FOLDER, self.reader, SITE, NOW_NS + rows * HOUR_NS, self.journal.forget))
+
+    def make(self, closed_ns: int, without: Iterable[str] = ()) -> int:
+        """Make a checkpoint; returns how many steps it took."""
+        return sum(1 for _ in make(self.past, self.reader, closed_ns, frozenset(without)))
+
+    def as_of(self, to_ns: int, without: Iterable[str] = (), **more: object) -> Grid:
+        return self.past.grid_as_of(self.reader, to_ns, without=frozenset(without), **more)
+
+    def folded(self, to_ns: int, without: Iterable[str] = (), from_ns: int = 0) -> Grid:
+        """What the map is by its definition: a fold of the samples in memory, from the start."""
+        grid = Grid(self.past.cell_m, self.past.config)
+        for machine, rows in self.sent:
+            if machine not in without:
+                stamps = rows["stamp_ns"]
+                grid.fold(rows[np.logical_and(stamps >= from_ns, stamps <= to_ns)], machine)
+        return grid
+
+    def close(self) -> None:
+        self.reader.close()
+        self.journal.close()

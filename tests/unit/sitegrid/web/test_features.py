@@ -1,0 +1,64 @@
+from zlib import compress
+
+import numpy as np
+import pytest
+
+from protocol.queries.answers import GroundChange, MapVersion
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer
+from protocol.site.ground_classes import BOUNDARIES
+from protocol.site.site_config import Projection, SiteConfig
+from sitegrid.web import features
+
+SITE = SiteConfig("pit", 49.01, 8.4)
+PROJECTION = Projection(SITE)
+
+
+def answer(c_rr: np.ndarray, x: int = 0, y: int = 0) -> TilesAnswer:
+    planes = np.zeros((len(PLANES), TILE_CELLS, TILE_CELLS), np.uint8)
+    planes[0] = PLANES["resistance"].quantised(c_rr)
+    return TilesAnswer(
+        MapVersion("s", 1, 0), 1, 1.0, whole=True, tiles=(MapTile(x, y, 1, 0, 1, compress(planes.tobytes())),)
+    )
+
+
+def area_m2(ring: list[list[float]]) -> float:
+    xy = np.array([PROJECTION.to_map(lat, lon, 0)[:2] for lon, lat in ring])
+    return float(abs(np.sum(xy[:-1, 0] * xy[1:, 1] - xy[1:, 0] * xy[:-1, 1])) / 2)
+
+
+def test_areas_follow_the_edges_of_cells_with_their_holes():
+    ground = np.full((64, 64), np.nan)
+    ground[10:30, 20:40] = 0.02
+    ground[15:20, 25:30] = 0.25
+    zones = features.zones(answer(ground, -1, 2), BOUNDARIES, PROJECTION)["features"]
+    assert [zone["properties"]["name"] for zone in zones] == ["gravel", "sand"]
+    gravel, sand = (zone["geometry"]["coordinates"] for zone in zones)
+    assert len(gravel) == 2, "an outline and a hole"
+    assert area_m2(gravel[0]) == pytest.approx(400, rel=1e-4)
+    assert area_m2(gravel[1]) == pytest.approx(25, abs=0.6), "the corners of a hole are cut"
+    assert area_m2(sand[0]) == pytest.approx(25, rel=0.01)
+    xs, ys = zip(*[PROJECTION.to_map(lat, lon, 0)[:2] for lon, lat in gravel[0]], strict=True)
+    assert (min(xs), max(xs)) == pytest.approx((-64 + 20, -64 + 40), abs=1e-3)
+    assert (min(ys), max(ys)) == pytest.approx((128 + 10, 128 + 30), abs=1e-3)
+    assert gravel[0][0] == gravel[0][-1], "closed"
+
+
+def test_an_empty_map_has_no_areas():
+    empty = TilesAnswer(MapVersion("s", 0, 0), 0, 1.0, whole=True, tiles=())
+    assert features.zones(empty, BOUNDARIES, PROJECTION) == {"type": "FeatureCollection", "features": []}
+
+
+def test_a_change_is_a_rectangle_with_its_times():
+    change = GroundChange(3, 10**9, 2 * 10**9, (0.0, 0.0, 10.0, 20.0), 200, 0.02, None, None, None)
+    (feature,) = features.changes([change], PROJECTION)["features"]
+    assert area_m2(feature["geometry"]["coordinates"][0]) == pytest.approx(200, rel=1e-4)
+    assert feature["properties"]["first_time"] == "1970-01-01T00:00:01.000000000Z"
+    assert feature["properties"]["resistance_after"] is None
+
+
+def test_cells_in_a_polygon_are_those_with_their_centre_inside():
+    centres = np.arange(4) + 0.5
+    inside = features.inside([(0, 0), (4.2, 0), (0, 4.2)], centres, centres)
+    assert inside.astype(int).tolist() == [[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 0]]
+    ring = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 3), (3, 3), (3, 1), (0, 1)]  # a C, open to the west
+    assert features.inside(ring, centres, centres).sum() == 10
