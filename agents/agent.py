@@ -63,6 +63,8 @@ class Agent:
         self._pipeline = Pipeline(site, machine, config.pipeline, self._calibration_file.read())
         self._holdout = Holdout(site, machine, config.holdout) if withhold else None
         self._spool = Spool(places.spool, config.spool, AuditLog(places.audit) if places.audit else None)
+        if problem := self._calibration_file.problem:
+            log.warning("calibration not used problem=%r", problem)
         if self._spool.damage:
             log.error("recorded samples are gone spool=%s problem=%r", places.spool, self._spool.damage)
         self._presence = Presence(session, site.name, machine.name, owner)

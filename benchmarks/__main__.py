@@ -8,7 +8,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, query, sim
+from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
 from benchmarks.agents import filter as filters
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
@@ -54,6 +54,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         "processor time of a server at work, by thread",
         {"hours": 2.0, "seconds": 120.0},
     ),
+    "past": (past.run, "checkpoints, maps of the past, the history of a point", {"hours": HOURS, "runs": 3}),
     "query": (query.run, "queries of a real server, while samples come in", {"hours": HOURS, "queries": 200}),
     "ingest": (ingest.run, "samples that the server takes, from bytes to the grid", {"runs": 5, "samples": 20_000}),
     "fleet": (
@@ -71,7 +72,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = vars(_parser().parse_args(words))
     run, as_json = arguments.pop("run"), arguments.pop("json")
     result: Report = run(**arguments)
-    tables = [result[name] for name in ("rows", "decisions", "agent") if name in result]
+    tables = [result[name] for name in ("rows", "decisions", "past", "agent") if name in result]
     print(json.dumps(result) if as_json else "\n\n".join(map(table, tables)))
     for variant, remedy in result.get("missing", {}).items():
         print(f"not measured: {variant}; {remedy}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""How long it takes to fold journals again, with one thread and with two, and to follow a decision about a machine.
+"""How long it takes to fold journals again, with one thread and with two, for a decision, and for maps of the past.
 
 Each journal is folded by processes of their own, `python -m benchmarks.fold FOLDER THREADS`, in turn; it was just
 written or read, so that its files are in the system's cache.
@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from benchmarks import past
 from benchmarks.fold_decision import decisions
 from benchmarks.measure import Report, in_child, machine, memory_mb
 from benchmarks.merge_restart import CONFIG, SITE, build
@@ -24,6 +25,7 @@ from mapserver.journal.history import History
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.refold import fold_history
 
+LEAST_PAST_H = 2.0  # checkpoints are hourly: of less work there is none
 GOALS = {
     "day_msamples_per_cpu_s": 0.9,  # with one thread
     "journal_wall_s": 45.0,  # 20 M samples
@@ -39,11 +41,13 @@ def run(hours: float, samples: int, runs: int) -> Report:
 
     Rows: of a journal in rows of so many samples (the last of each leg has fewer), folded by so many threads, wall and
     processor time (medians), the most memory of the process, and `faster`, how many times as fast as one thread.
-    decisions: see `decisions`.
+    decisions: see `decisions`; past: see `benchmarks.past.run`.
     """
     work = (("day", samples_of(hours), BATCH), ("long", samples, A_SECOND), ("long", samples, BATCH))
     rows = [row for name, count, in_row in work for row in _folded(name, count, in_row, runs)]
     _say("a machine is distrusted")
+    decided = list(decisions(hours))
+    _say("maps of the past are read")
     return {
         "benchmark": "fold",
         "hours": hours,
@@ -52,7 +56,8 @@ def run(hours: float, samples: int, runs: int) -> Report:
         **machine(),
         "goals": GOALS,
         "rows": rows,
-        "decisions": list(decisions(hours)),
+        "decisions": decided,
+        "past": past.run(max(hours, LEAST_PAST_H), runs)["rows"],
     }
 
 

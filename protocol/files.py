@@ -4,6 +4,7 @@ import fcntl
 import os
 import secrets
 import tomllib
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,12 +17,41 @@ PRIVATE = 0o600  # what a site's machines sent is nobody else's business on a sh
 
 def load_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; errors name the file and the line."""
+    return _parse_toml(path, _read_text(path))
+
+
+def sealed(text: str) -> str:
+    """A text behind a line with its checksum: for files that programs write, and flipped bits must not change."""
+    return f"{_seal(text)}\n{text}"
+
+
+def load_sealed_toml(path: Path) -> dict[str, Any]:
+    """As `load_toml`, of a file that was `sealed`; one whose checksum is another is refused."""
+    first, _, text = _read_text(path).partition("\n")
+    if first != _seal(text):
+        problem = "is damaged, or was changed by hand; restore it from a backup, or make it anew with `sitegrid keys`"
+        raise ConfigError(path, problem)
+    return _parse_toml(path, text)
+
+
+def _seal(text: str) -> str:
+    return f"# checksum {zlib.crc32(text.encode()):08x}"
+
+
+def _read_text(path: Path) -> str:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return path.read_bytes().decode()
     except FileNotFoundError:
         raise ConfigError(path, "no such file") from None
     except OSError as error:
         raise ConfigError(path, f"cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(path, f"not valid TOML: {error}") from None
+
+
+def _parse_toml(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text.replace("\r\n", "\n"))
     except (ValueError, RecursionError) as error:  # also numbers of thousands of digits, and lists as deep
         raise ConfigError(path, f"not valid TOML: {error}") from None
 

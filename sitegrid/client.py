@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import zenoh
@@ -118,8 +119,18 @@ class Client:
         return answer_codec.decode_history(self._ask(query)).spans
 
     def tiles(self, since: MapVersion | None = None, *, as_of_ns: int | None = None) -> TilesAnswer:
-        """The map in tiles of 8-bit layers, for pages that draw it: those that differ since a version, or all."""
-        return decode_tiles(self._ask(requests.TilesQuery(since, as_of_ns)))
+        """The map in tiles of 8-bit layers, for pages that draw it: those that differ since a version, or all.
+
+        They come in several replies. What changes meanwhile may be in it, and differs since the answer's version.
+        """
+        first = answer = decode_tiles(self._ask(requests.TilesQuery(since, as_of_ns)))
+        tiles = list(first.tiles)
+        while answer.next_place:
+            answer = decode_tiles(self._ask(requests.TilesQuery(since, as_of_ns, answer.next_place)))
+            if answer.version.store != first.version.store or answer.whole != first.whole:
+                return self.tiles(as_of_ns=as_of_ns)  # another store took over in between
+            tiles += answer.tiles
+        return replace(first, tiles=tuple(tiles), next_place=None)
 
     def why(self, x_m: float, y_m: float, *, as_of_ns: int | None = None) -> CellReasons:
         """Everything that is known of the cell at a position in `map`: votes, passes, machines, changes."""

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.config import ServerConfig
+from mapserver.ingest.losses import lacking
 from mapserver.ingest.store import ACCEPTED, JOURNAL_FILE, Store
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.archive_file import ArchiveFile
@@ -25,7 +26,7 @@ from mapserver.journal.journal import Journal
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow, Selection, SpoolKey, Watermark
 from protocol.config import from_table
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, StoreError
 from protocol.files import load_toml
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.site_config import SiteConfig, site_toml
@@ -134,6 +135,9 @@ def _sources(path: Path, selection: Selection, opened: ExitStack) -> Iterator[Sa
 
 
 def _store(path: Path, selection: Selection, opened: ExitStack) -> SampleSource:
+    if shortfall := lacking(path / JOURNAL_FILE):
+        advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
+        raise StoreError(path / JOURNAL_FILE, f"{shortfall}; {advice}")
     journal = opened.enter_context(JournalReader(path / JOURNAL_FILE))
     history, watermarks = History.beside(journal), journal.watermarks()
     first = next(history_rows(history), None)

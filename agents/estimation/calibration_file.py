@@ -2,15 +2,19 @@
 
 import json
 import math
+import zlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from agents.estimation.calibration import Calibration
 from protocol.errors import StoreError
-from protocol.files import write_whole
+from protocol.files import PRIVATE, write_whole
 
-VERSION = 1
+VERSION = 2
+# No accelerometer or drive train that a machine is driven with is further off: more than ten times what is expected
+# before anything is measured (`calibration.py`).
+MOST_ZERO, MOST_SCALE = 0.05, 0.5
 
 
 class CalibrationFile:
@@ -45,9 +49,10 @@ class CalibrationFile:
 
 def save(path: Path, machine: str, calibration: Calibration) -> None:
     """Write whole or not at all; raises StoreError."""
-    text = json.dumps({"version": VERSION, "machine": machine, **asdict(calibration)}, indent=1)
+    table = {"version": VERSION, "machine": machine, **asdict(calibration)}
+    text = json.dumps({**table, "crc32": _checksum(table)}, indent=1)
     try:
-        write_whole(path, f"{text}\n".encode())
+        write_whole(path, f"{text}\n".encode(), PRIVATE)
     except OSError as error:
         raise StoreError(path, f"cannot be written: {error.strerror}") from None
 
@@ -60,11 +65,18 @@ def load(path: Path, machine: str) -> Calibration | None:
         return None
     except (OSError, ValueError, RecursionError) as error:
         raise StoreError(path, f"cannot be read: {error}") from None
-    if not isinstance(table, dict) or table.get("version") != VERSION:
+    if not isinstance(table, dict) or table.pop("crc32", None) != _checksum(table):
+        raise StoreError(path, "is damaged: its checksum is another; it is replaced by the next calibration")
+    if table.get("version") != VERSION:
         raise StoreError(path, f"is no calibration of version {VERSION}")
     if table.get("machine") != machine:
         raise StoreError(path, f"is the calibration of {table.get('machine')!r}, not of {machine!r}")
     return _parse(path, table)
+
+
+def _checksum(table: dict[str, Any]) -> int:
+    """CRC-32 of all values and their names."""
+    return zlib.crc32(json.dumps(table, sort_keys=True).encode())
 
 
 def _parse(path: Path, table: dict[str, Any]) -> Calibration:
@@ -75,6 +87,6 @@ def _parse(path: Path, table: dict[str, Any]) -> Calibration:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StoreError(path, f"is no calibration: {error}") from None
     sound = math.isfinite(zero + scale + zz + zs + ss) and zz > 0 and ss > 0 and zs * zs <= zz * ss and zs == sz
-    if not (sound and abs(zero) < 1 and abs(scale) < 1 and stamp_ns >= 0 and passages >= 0):
+    if not (sound and abs(zero) < MOST_ZERO and abs(scale) < MOST_SCALE and stamp_ns >= 0 and passages >= 0):
         raise StoreError(path, "is no calibration: its numbers make no sense")
     return Calibration(zero, scale, ((zz, zs), (sz, ss)), stamp_ns, passages)

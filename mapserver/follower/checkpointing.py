@@ -16,7 +16,6 @@ from mapserver.past.checkpoints import Entry
 from mapserver.past.making import make, remove_unfinished
 from mapserver.past.past import Past
 from mapserver.past.plan import due, surplus, thinned
-from protocol.errors import StoreError
 
 PIECE_S = 0.3  # of a turn, while other jobs wait; with ten machines, an hour takes a second in all
 LATE_ROWS = 5000  # so many that came in late are read for a map of the past, in 50 ms, before they are folded in
@@ -57,7 +56,7 @@ class Checkpointing:
             return
         try:
             self._turn()
-        except (StoreError, OSError):
+        except Exception:  # for the follower to log; whatever it is, it is not tried again at once
             self.close()
             self._due_s = time.monotonic() + LATER_S
             raise

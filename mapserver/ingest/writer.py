@@ -143,7 +143,7 @@ class Writer:
 
     def _refuse_all(self) -> None:
         """Leave nobody waiting."""
-        while self._group:
+        while self._group or self._backlog:
             for _, reply in self._group:
                 reply(Refused(Refusal.STORE, self._ended))
             self._group = self._backlog.take()

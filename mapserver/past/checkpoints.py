@@ -50,7 +50,9 @@ class Checkpoints:
     def entries(self, facts: Mapping[str, Any], last_row: int) -> list[Entry]:
         """All that there are, oldest first; usable are those made with these facts, of rows that there are."""
         with self._lock:
-            known = [entry for path in self.folder.glob("*.checkpoint") if (entry := self._look(path))]
+            paths = list(self.folder.glob("*.checkpoint"))
+            known = [entry for path in paths if (entry := self._look(path))]
+            self._seen = {path: self._seen[path] for path in paths if path in self._seen}
         entries = []
         for entry in sorted(known, key=lambda entry: entry.closed_ns):
             head = entry.header
@@ -81,9 +83,9 @@ class Checkpoints:
     def pass_over(self, checkpoint: Checkpoint, error: Exception) -> None:
         """Use one no more in which damage was found, until it is made again."""
         with self._lock:
-            state, entry = self._seen[checkpoint.path]
-            if state == checkpoint.state:
-                self._seen[checkpoint.path] = state, replace(entry, header=None)
+            seen = self._seen.get(checkpoint.path)
+            if seen and seen[0] == checkpoint.state:
+                self._seen[checkpoint.path] = seen[0], replace(seen[1], header=None)
                 self._count(checkpoint.path, error)
 
     def _look(self, path: Path) -> Entry | None:

@@ -21,7 +21,7 @@ from mapserver.journal.rows import Selection
 from mapserver.past.checkpoint_file import Checkpoint, CheckpointWriter, DamagedError, Header
 from mapserver.past.checkpoints import Checkpoints
 from mapserver.past.past import Past
-from protocol.files import whole_file
+from protocol.files import PRIVATE, whole_file
 
 FOLDED_AT_ONCE = 32_768  # samples: 30 ms
 MERGED_AT_ONCE = 32  # blocks: 10 ms
@@ -79,7 +79,7 @@ def _write(path: Path, base: Checkpoint | None, part: Grid, header: Header) -> I
     numbers = _numbers(base)
     places = sorted(fresh.keys() | numbers.keys())
     path.parent.mkdir(exist_ok=True)
-    with whole_file(path, 0o600) as file:
+    with whole_file(path, PRIVATE) as file:
         writer = CheckpointWriter(file)
         for first in range(0, len(places), MERGED_AT_ONCE):
             some = places[first : first + MERGED_AT_ONCE]

@@ -69,7 +69,7 @@ class Past:
     ) -> Iterator[NamedSamples]:
         """The selected samples of rows up to `until` that are not in a checkpoint: all of them without one.
 
-        selection: has its end after the checkpoint's, and no beginning.
+        selection: without a beginning, and with an end that is not before that of the checkpoint.
         """
         if base is None:
             yield from self.samples(reader, selection, until=until)

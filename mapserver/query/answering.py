@@ -17,7 +17,7 @@ from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
 from mapserver.past.past import Past
-from mapserver.query.map_tiles import Tiles, tiles_of
+from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.tiles import TILE_BYTES, OpenRegions, Reading, TileGrid
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
 from mapserver.query.why import reasons
@@ -52,6 +52,7 @@ class Answers:
         self._site, self._config = writer.site, writer.config
         self._open = OpenRegions()
         self._tiles = Tiles(writer)
+        self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
         self._past = PastMaps(writer.folder / JOURNAL_FILE, past, self._config)
 
     def size(self, query: MapQuery) -> int:
@@ -139,11 +140,18 @@ class Answers:
         """Tiles of the map as it is, or of all of it as of a time."""
         if query.as_of_ns is None:
             return self._tiles.answer(query)
+        fact = self._writer.run(lambda store: store.fact)
+        kept = self._past_tiles
+        if query.place is None or kept is None or (kept.stamp_ns, kept.version.fact) != (query.as_of_ns, fact):
+            self._past_tiles = kept = self._tiles_as_of(query.as_of_ns)
+        return cut(kept, query.place)
+
+    def _tiles_as_of(self, as_of_ns: int) -> TilesAnswer:
         bounds, version = self._writer.run(lambda store: (store.grid.bounds(), store.version))
         if bounds is None:
-            return TilesAnswer(version, query.as_of_ns, self._site.cell_m, whole=True, tiles=())
+            return TilesAnswer(version, as_of_ns, self._site.cell_m, whole=True, tiles=())
         west, south, east, north = bounds
-        view = self._view(CellWindow(west, south, east - west, north - south), query.as_of_ns)
+        view = self._view(CellWindow(west, south, east - west, north - south), as_of_ns)
         return tiles_of(view, MapVersion(version.store, view.merged, view.fact), self._site.cell_m, self._config)
 
     def why(self, query: WhyQuery) -> CellReasons:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import zlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from mapserver.evidence.timeline import Block, evidence
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.layers import cell_layers
+from mapserver.query.tiles import TILE_BYTES
 from mapserver.query.views import View
 from protocol.arrays import AnyArray, Ints
 from protocol.queries.answers import MapVersion
@@ -31,6 +32,7 @@ from protocol.site.geometry import BLOCK_CELLS
 BLOCKS = TILE_CELLS // BLOCK_CELLS  # of a tile, along one side
 LEVEL = 6  # of deflate: 9 takes three times as long for 1 % less
 LAYERS = ("resistance", "confidence", "grade", "grade_std", "visits")  # as in PLANES; `since` is of the evidence
+TILE_HEAD_BYTES = 64  # of a tile beside its planes, at most
 Place = tuple[int, int]  # column and row of a tile
 
 
@@ -73,8 +75,8 @@ class Tiles:
             whole = (
                 since is None or since.store != version.store or since.row > version.row or since.fact > version.fact
             )
-            tiles = (tile for tile in self._tiles.values() if whole or _is_newer(tile, since))
-            return TilesAnswer(version, stamp_ns, self._cell_m, whole, tuple(tiles))
+            tiles = tuple(tile for tile in self._tiles.values() if whole or _is_newer(tile, since))
+            return cut(TilesAnswer(version, stamp_ns, self._cell_m, whole, tiles), query.place)
 
     def _update(self) -> tuple[MapVersion, int]:
         """Make anew what evidence came into, and what lies so near that a change of the ground there counts for it."""
@@ -101,6 +103,19 @@ class Tiles:
 
 def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:
     return since is None or tile.row > since.row or tile.fact > since.fact
+
+
+def cut(answer: TilesAnswer, place: Place | None) -> TilesAnswer:
+    """What of an answer fits into one reply, from a place on: readers are never sent more than they ask for."""
+    tiles = sorted((tile for tile in answer.tiles if place is None or (tile.x, tile.y) >= place), key=_place)
+    ends = np.cumsum([len(tile.planes) + TILE_HEAD_BYTES for tile in tiles])
+    fit = max(1, int(np.searchsorted(ends, TILE_BYTES, side="right")))
+    next_place = _place(tiles[fit]) if fit < len(tiles) else None
+    return replace(answer, tiles=tuple(tiles[:fit]), next_place=next_place)
+
+
+def _place(tile: MapTile) -> Place:
+    return tile.x, tile.y
 
 
 def tiles_of(view: View, version: MapVersion, cell_m: float, config: ServerConfig) -> TilesAnswer:

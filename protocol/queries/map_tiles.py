@@ -102,13 +102,17 @@ class MapTile:
 
 @dataclass(frozen=True)
 class TilesAnswer:
-    """Tiles of one version of the map. whole: all that there are; else those that differ since a version."""
+    """Tiles of one version of the map. whole: all that there are; else those that differ since a version.
+
+    next_place: where the rest begins, column and row of a tile; None where this is all.
+    """
 
     version: MapVersion
     stamp_ns: int
     cell_m: float
     whole: bool
     tiles: tuple[MapTile, ...]
+    next_place: tuple[int, int] | None = None
 
 
 def encode_tiles(answer: TilesAnswer) -> bytes:
@@ -116,7 +120,8 @@ def encode_tiles(answer: TilesAnswer) -> bytes:
     version = {"store": answer.version.store, "merged": answer.version.row, "fact": answer.version.fact}
     rows = [[tile.x, tile.y, tile.row, tile.fact, tile.newest_ns, tile.planes] for tile in answer.tiles]
     state = {"stamp_ns": answer.stamp_ns, "cell_m": answer.cell_m, "whole": answer.whole}
-    return pack({**version, **state, "planes": list(PLANES), "tiles": rows})
+    rest = {"next": list(answer.next_place)} if answer.next_place else {}
+    return pack({**version, **state, "planes": list(PLANES), "tiles": rows, **rest})
 
 
 def decode_tiles(data: bytes) -> TilesAnswer:
@@ -127,7 +132,11 @@ def decode_tiles(data: bytes) -> TilesAnswer:
     tiles = tuple(_tile(row, index) for index, row in enumerate(take(table, "tiles", list)))
     version = MapVersion(take(table, "store", str), take(table, "merged", int), take(table, "fact", int))
     stamp_ns, cell_m = take(table, "stamp_ns", int), take(table, "cell_m", float)
-    return TilesAnswer(version, stamp_ns, cell_m, take(table, "whole", bool), tiles)
+    rest: list[Any] = take(table, "next", list, [])
+    if [type(number) for number in rest] not in ([], [int, int]) or any(abs(number) > MAX_SEQ for number in rest):
+        raise MessageError(Refusal.WRONG_TYPE, "two whole numbers are expected", field="next")
+    next_place = (rest[0], rest[1]) if rest else None
+    return TilesAnswer(version, stamp_ns, cell_m, take(table, "whole", bool), tiles, next_place)
 
 
 def _tile(row: Any, index: int) -> MapTile:

@@ -130,10 +130,14 @@ class ChangesQuery:
 
 @dataclass(frozen=True)
 class TilesQuery:
-    """Tiles of the map: all, or those that differ since a version of it; or all as of a time [ns]."""
+    """Tiles of the map: all, or those that differ since a version of it; or all as of a time [ns].
+
+    place: column and row of the tile from which on they are answered, in this order; None for the first answer.
+    """
 
     since: MapVersion | None = None
     as_of_ns: int | None = None
+    place: tuple[int, int] | None = None
     fresh = Freshness()
 
     name = "tiles"
@@ -173,10 +177,8 @@ def encode_query(query: MapQuery) -> dict[str, str]:
             return {"after": str(query.after)} if query.after else {}
         case TileQuery():
             return {"cursor": str(query.cursor), "number": str(query.number)}
-        case TilesQuery(None):
-            return _stamps({"as_of": query.as_of_ns})
-        case TilesQuery(MapVersion() as since):
-            return {"store": since.store, "row": str(since.row), "fact": str(since.fact)}
+        case TilesQuery():
+            return _of_tiles(query)
         case WhyQuery():
             return {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m), **_stamps({"as_of": query.as_of_ns})}
     parameters = _of_map(query) if isinstance(query, PointQuery | RegionQuery | HistoryQuery) else {}
@@ -192,6 +194,13 @@ def reads_past(query: MapQuery) -> bool:
     if isinstance(query, PointQuery | RegionQuery):
         return query.when != NOW
     return isinstance(query, HistoryQuery)
+
+
+def _of_tiles(query: TilesQuery) -> dict[str, str]:
+    parameters = _stamps({"as_of": query.as_of_ns})
+    if query.since:
+        parameters |= {"store": query.since.store, "row": str(query.since.row), "fact": str(query.since.fact)}
+    return parameters | ({"place": f"{query.place[0]},{query.place[1]}"} if query.place else {})
 
 
 def _of_map(query: PointQuery | RegionQuery | HistoryQuery) -> dict[str, str]:
@@ -248,14 +257,19 @@ def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
 
 
 def _parse_tiles(parameters: ps.Parameters) -> TilesQuery:
-    as_of_ns = ps.stamp(parameters, "as_of")
+    as_of_ns, place = ps.stamp(parameters, "as_of"), None
+    if "place" in parameters:
+        numbers = [ps.number({"place": part}, "place") for part in parameters["place"].split(",")]
+        if len(numbers) != 2 or any(n != int(n) for n in numbers):
+            raise QueryError(Refusal.OUT_OF_RANGE, "parameter `place` must be column,row of a tile")
+        place = int(numbers[0]), int(numbers[1])
     if "store" not in parameters and not {"row", "fact"} & set(parameters):
-        return TilesQuery(None, as_of_ns)
+        return TilesQuery(None, as_of_ns, place)
     if as_of_ns is not None:
         raise QueryError(Refusal.OUT_OF_RANGE, "`as_of` with a version: the tiles of a time do not change, ask for all")
     store = ps.required(parameters, "store")
     row, fact = (ps.count({name: ps.required(parameters, name)}, name) for name in ("row", "fact"))
-    return TilesQuery(MapVersion(store, row, fact))
+    return TilesQuery(MapVersion(store, row, fact), place=place)
 
 
 def _parse_why(parameters: ps.Parameters) -> WhyQuery:
@@ -270,7 +284,7 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
-    "tiles": (("store", "row", "fact", "as_of"), _parse_tiles),
+    "tiles": (("store", "row", "fact", "as_of", "place"), _parse_tiles),
     "why": (("x", "y", "as_of"), _parse_why),
     "alive": ((), lambda _: AliveQuery()),
     "info": (_FRESH, lambda parameters: InfoQuery(_freshness(parameters))),

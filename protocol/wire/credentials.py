@@ -11,7 +11,7 @@ from pathlib import Path
 
 from protocol.config import from_table
 from protocol.errors import ConfigError
-from protocol.files import load_toml
+from protocol.files import load_sealed_toml
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, IDENTITY_FILE = "ca.pem", "cert.pem", "key.pem", "identity.toml"
 SIGNING_FILE = "sign.pem"  # machines and map servers only
@@ -54,7 +54,7 @@ def load_credentials(folder: Path) -> Credentials:
         if not (folder / name).is_file():
             raise ConfigError(folder, f"holds no {name}; name the folder of one certificate, as KEYS/loader-1")
     where = folder / IDENTITY_FILE
-    identity = from_table(Identity, load_toml(where), str(where))
+    identity = from_table(Identity, load_sealed_toml(where), str(where))
     if identity.expires.tzinfo is None:
         raise ConfigError(where, "expires: no time zone is given")
     return Credentials(folder, identity)

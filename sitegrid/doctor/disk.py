@@ -7,7 +7,7 @@ import shutil
 import sqlite3
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
 from agents.delivery.spool_file import run_ends_in
 from agents.delivery.spool_mark import runs_cut_short
 from protocol.disk.traces import Traces, look_beside
-from protocol.disk.write_ahead_log import LogScan
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
@@ -162,30 +161,25 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     """The state of a store, also while a server uses it; StoreError where it cannot be used."""
     # imported here: needs the `server` extra, which a machine's host does not have
     from mapserver.evidence import snapshot
+    from mapserver.ingest.losses import lacking
     from mapserver.ingest.store import JOURNAL_FILE
-    from mapserver.ingest.store_folder import is_in_use
     from mapserver.journal import shortfall as short
     from mapserver.journal.reader import SCHEMA, JournalReader
     from mapserver.past.checkpoints import Checkpoints
 
     if not (folder / JOURNAL_FILE).is_file():
         raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")
-    traces = look_beside(folder / JOURNAL_FILE)  # the mark first: it is never ahead of the journal
-    if is_in_use(folder):
-        traces = replace(traces, log=LogScan())  # it is being written; the server has looked at it when it started
+    lacks = lacking(folder / JOURNAL_FILE)
     with JournalReader(folder / JOURNAL_FILE) as journal:
         journal.check()
         last_row, archived = journal.last_row, journal.archived_row
         watermarks, events = journal.watermarks(), journal.events()
         machines = {machine for machine, _ in watermarks}
         site, frame = journal.site, journal.frame
-    lacks = short.compare(traces, short.marked(last_row, len(events), watermarks))
     known = [short.Shortfall.from_event(event) for event in events if event.kind == short.KIND]
     missing = short.missing(known, watermarks)
     newest = next(iter(snapshot.rows_on_disk(folder)), 0)
     age_s = now_s - (folder / f"snapshot-{newest}.npz").stat().st_mtime if newest else math.inf
-    if newest > last_row:
-        lacks = lacks or short.beyond(last_row, newest)
     text = str(lacks) if lacks else ""
     past = Checkpoints(folder).entries({}, last_row)
     sizes, damaged = sum(entry.bytes for entry in past), sum(entry.header is None for entry in past)

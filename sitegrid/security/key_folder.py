@@ -11,6 +11,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from protocol.errors import ConfigError
+from protocol.files import sealed
 from protocol.wire.credentials import (
     AUTHORITY_FILE,
     CERTIFICATE_FILE,
@@ -52,7 +53,7 @@ def certify(folder: Path, register: Register, name: str, role: str, expires: dat
     if role == "machine":
         files[SERVERS_FILE] = "".join(f"{key}\n" for key in register.server_keys()).encode()
     _private_folder(folder / name)
-    for file, data in {**files, IDENTITY_FILE: identity.encode()}.items():
+    for file, data in {**files, IDENTITY_FILE: sealed(identity).encode()}.items():
         write_private(folder / name / file, data)
     register = register.with_entry(name, entry)
     save_register(folder, register)

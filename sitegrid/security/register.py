@@ -13,7 +13,7 @@ from pathlib import Path
 
 from protocol.config import from_table, toml_lines
 from protocol.errors import ConfigError
-from protocol.files import load_toml, write_whole
+from protocol.files import load_sealed_toml, sealed, write_whole
 from protocol.wire.keys import check_name
 
 REGISTER_FILE = "register.toml"
@@ -95,7 +95,7 @@ def load_register(folder: Path) -> Register:
     path = folder / REGISTER_FILE
     if not path.is_file():
         raise ConfigError(folder, f"holds no {REGISTER_FILE}: make the folder with `sitegrid keys init --dir {folder}`")
-    register = from_table(Register, load_toml(path), str(path))
+    register = from_table(Register, load_sealed_toml(path), str(path))
     for name in (register.site, *register.names):
         check_name(name, str(path))
     return register
@@ -115,11 +115,11 @@ def write_private(path: Path, data: bytes) -> None:
 
 
 def register_toml(register: Register) -> str:
-    """The register as TOML."""
+    """The register as TOML, with a checksum: a flipped bit must let nobody in."""
     lines = ["# Who is let in. Written by `sitegrid keys`."]
     lines += toml_lines({"site": register.site, "hosts": list(register.hosts)})
     for name, entry in sorted(register.names.items()):
         lines += ["", f"[names.{name}]", *toml_lines({"role": entry.role, "serial": entry.serial})]
         lines += [f"expires = {entry.expires.astimezone(UTC):%Y-%m-%dT%H:%M:%SZ}"]
         lines += toml_lines({"issue": entry.issue, "revoked": entry.revoked, "signing": entry.signing})
-    return "\n".join(lines) + "\n"
+    return sealed("\n".join(lines) + "\n")

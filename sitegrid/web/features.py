@@ -89,7 +89,8 @@ def _resistance(answer: TilesAnswer) -> tuple[Floats, int, int]:
 def _polygons(mask: AnyArray) -> Iterable[list[list[Corner]]]:
     """Areas of a mask as lists of rings along the cells' edges: the outline, then holes.
 
-    OpenCV follows the centres of pixels; of a mask twice as fine, one pixel wider, these are the cells' edges.
+    OpenCV follows the centres of pixels; of a mask twice as fine, one pixel wider, these are the cells' edges. It cuts
+    the corners of holes.
     """
     fine = np.zeros((2 * mask.shape[0] + 1, 2 * mask.shape[1] + 1), np.uint8)
     for dy in range(3):

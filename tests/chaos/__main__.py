@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.chaos import bit_flips, disk_faults, reader_faults, site_faults
+from tests.chaos import bit_flips, damage_faults, disk_faults, reader_faults, site_faults, store_faults
 from tests.chaos.outcome import Console, FaultOutcome, InterruptError, table
 from tests.chaos.recordings import make
 from tests.chaos.scenario import FaultRun
@@ -47,9 +47,15 @@ FAULTS = (
     ChaosFault("freezes", site_faults.freezes, 0.08),
     ChaosFault("disks", site_faults.disks, 0.08),
     ChaosFault("clocks", site_faults.clocks, 0.08),
+    ChaosFault("second_server", store_faults.second_server),
+    ChaosFault("far_future", store_faults.far_future),
+    ChaosFault("archive_clock", store_faults.archive_clock),
+    ChaosFault("wal_flip", damage_faults.wal_flip, 0.03),
     ChaosFault("sleeping_reader", reader_faults.sleeping_reader, 0.06),
     ChaosFault("waiting_reader", reader_faults.waiting_reader, 0.02),
     ChaosFault("flips", bit_flips.flips, 0.02),
+    ChaosFault("restored_store", damage_faults.restored_store, 0.01),
+    ChaosFault("calibration_flip", damage_faults.calibration_flip, 0.01),
 )
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from mapserver.config import ServerConfig
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
+from mapserver.journal.rows import Watermark
 from protocol.errors import StoreError
 from protocol.machine.log_folder import open_log
 from protocol.site.site_config import site_toml
@@ -27,7 +29,7 @@ from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings
 
 READY_S = 40.0
 RESUME_S = 60.0
-ROUTER, SERVER = "router", "server"
+ROUTER, SERVER, SECOND = "router", "server", "second"  # the last: a map server with a store of its own
 COMMAND = ("-m", "sitegrid.cli")
 HOUR_S = 3600
 # Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
@@ -58,7 +60,7 @@ class ChaosSite:
             (folder / name).mkdir(parents=True)
         self.folder, self.console = folder, console
         self.machines = recordings.machines
-        self.endpoints = dict.fromkeys((ROUTER, SERVER, *self.machines), free_endpoint())
+        self.endpoints = dict.fromkeys((ROUTER, SERVER, SECOND, *self.machines), free_endpoint())
         self.prefix: dict[str, tuple[str, ...]] = {}
         self.env: dict[str, dict[str, str]] = {}
         self.options: dict[str, tuple[str, ...]] = {}
@@ -70,7 +72,7 @@ class ChaosSite:
         self._ack_ms: list[int] = []
         self._recordings, self._first_ns = recordings, first_ns
         self._running: dict[str, Process] = {}
-        self._starts = 0
+        self._starts, self._starts_of = 0, Counter[str]()
         site = replace(open_log(recordings.data(self.machines[0])).site, clock=clock)
         self.name = site.name
         (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
@@ -100,6 +102,7 @@ class ChaosSite:
     def start(self, role: str, *, idle: bool = False) -> Process:
         """Start a router, a server, or a machine's agent; idle: one that only delivers what is left."""
         self._starts += 1
+        self._starts_of[role] += 1
         words = self._words(role, idle)
         env = {"PYTHONUNBUFFERED": "1", **self.env.get(role, {})}
         log = self.folder / "log" / f"{self._starts:04d}-{role}"
@@ -126,6 +129,27 @@ class ChaosSite:
             self._running[role].end(signal.SIGKILL)
             self.start(role)
 
+    def put_down(self, role: str) -> None:
+        """End a process with SIGKILL, and leave it so."""
+        self._running.pop(role).end(signal.SIGKILL)
+
+    def words_of_refusal(self, role: str) -> str | None:
+        """Wait until a process that was started works, None, or has refused to: its last words."""
+        process = self._running[role]
+        self._wait(lambda: process.said("ready") or process.code is not None, READY_S, f"{role} is not ready")
+        return process.last_words() if process.code is not None and not process.said("ready") else None
+
+    def deliver_rest(self, machine: str) -> None:
+        """Have a machine that is not running deliver what its spool has, and nothing new."""
+        process = self.start(machine, idle=True)
+        self._wait(lambda: process.code is not None, RESUME_S, "left-over samples are not delivered")
+        self._running.pop(machine).end()
+
+    def log_of(self, role: str) -> str:
+        """What all processes of a role have logged."""
+        paths = sorted((self.folder / "log").glob(f"*-{role}.err"))
+        return "".join(path.read_text(encoding="utf-8", errors="replace") for path in paths)
+
     def stop(self, role: str) -> None:
         """End a process with SIGTERM; it is to obey within a few seconds."""
         process, began_s = self._running.pop(role), time.monotonic()
@@ -139,12 +163,27 @@ class ChaosSite:
 
     def expect_end(self, role: str) -> tuple[int | None, str]:
         """Start what cannot run; returns its exit code, None if it does run, and its last words."""
-        process = self.start(role)
+        self.start(role)
+        return self.wait_end(role)
+
+    def wait_end(self, role: str) -> tuple[int | None, str]:
+        """Wait for a process to end by itself; returns its exit code, None if it runs on, and its last words."""
+        process = self._running[role]
         self._wait(lambda: process.code is not None, READY_S, f"{role} runs on")
         return self._running.pop(role).code, process.last_words()
 
     def wait_ready(self, role: str) -> None:
         self._wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
+
+    def wait_runs(self) -> None:
+        """Wait until there are samples of every start of every agent in the journal."""
+
+        def are_there() -> bool:
+            self.tend()
+            runs = Counter(machine for machine, _ in self._marks())
+            return all(runs[machine] >= self._starts_of[machine] for machine in self.machines)
+
+        self._wait(are_there, READY_S, "some runs have no samples")
 
     def tend(self) -> None:
         """Start again what has ended by itself; only the end of a drive, or one with an excuse, is no problem."""
@@ -203,14 +242,18 @@ class ChaosSite:
 
     def progress(self) -> dict[str, int]:
         """How many samples of each machine are in the journal."""
-        counts: dict[str, int] = {}
+        counts: Counter[str] = Counter()
+        for (machine, _), mark in self._marks().items():
+            counts[machine] += mark.seq
+        return counts
+
+    def _marks(self) -> Mapping[tuple[str, int], Watermark]:
+        """Progress of every run in the journal; nothing while it is being made, or recovered."""
         try:
             with JournalReader(self.folder / "store" / JOURNAL_FILE) as reader:
-                for (machine, _), mark in reader.watermarks().items():
-                    counts[machine] = counts.get(machine, 0) + mark.seq
-        except StoreError:  # being made, or recovered
+                return reader.watermarks()
+        except StoreError:
             return {}
-        return counts
 
     def _note_report(self, process: Process) -> None:
         """Take what an agent reported when it ended."""
@@ -262,9 +305,10 @@ class ChaosSite:
         where, site = ("--endpoint", self.endpoints[role]), ("--site-file", str(self.folder / "site.toml"))
         if role == ROUTER:
             return ["router", "--listen", self.endpoints[role], *self.options.get(role, ())]
-        if role == SERVER:
-            store = ("--store", str(self.folder / "store"), "--config", str(self.folder / "server.toml"))
-            return ["server", *where, *site, *store]
+        if role in (SERVER, SECOND):
+            folder = self.folder / ("store" if role == SERVER else SECOND)
+            store = ("--store", str(folder), "--config", str(self.folder / "server.toml"))
+            return ["server", *where, *site, *store, *self.options.get(role, ())]
         first_ns = self._first_ns + self._starts * SECONDS * 10**9
         manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, first_ns, idle=idle)
         replay = ("--driver", "replay", "--log", manifest, "--data", self._recordings.data(role), "--speed", SPEED)

@@ -10,6 +10,7 @@ import json
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import cache, partial
@@ -30,7 +31,7 @@ from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Admission, JournalRow
 from protocol.config import from_table
 from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
-from protocol.files import load_toml
+from protocol.files import load_toml, sealed
 from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu
@@ -79,14 +80,14 @@ def _messages() -> Iterator[Decoder]:
     batches = ("batch.bin", "batch_lost.bin", "batch_empty.bin", NEWER)
     golden = {name: ((FOLDER / f"{name}.bin").read_bytes(),) for name in _SINGLE}
     several = {"batch": tuple((FOLDER / name).read_bytes() for name in batches)}
-    several["reply"] = tuple((FOLDER / name).read_bytes() for name in ("ack.bin", "refused.bin"))
+    several["reply"] = tuple((FOLDER / name).read_bytes() for name in ("ack.bin", "refused.bin", "refused_later.bin"))
     for name, seeds in {**golden, **several}.items():
         file = {"batch": "batch.bin", "reply": "ack.bin"}.get(name, f"{name}.bin")
         encode, decode = GOLDEN[file].encode, GOLDEN[file].decode
         yield Decoder(name, seeds, partial(_again, name, encode, decode), (MessageError,), messages)
 
 
-_SINGLE = ("bundle", "pose", "health", "point", "region", "history", "tiles", "why", *PLAIN[1:], "error")
+_SINGLE = ("bundle", "pose", "health", "point", "region", "history", "tiles", "why", "alive", *PLAIN[1:], "error")
 
 
 def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], Any], data: bytes) -> None:
@@ -115,11 +116,12 @@ def _selectors() -> Iterator[Decoder]:
         requests.RegionQuery(Bounds(0.0, 0.0, 200.0, 150.0), ("resistance",), fresh, when),
         requests.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
         requests.TilesQuery(MapVersion("0123456789abcdef", 17, 3)),
-        requests.TilesQuery(as_of_ns=T0),
+        requests.TilesQuery(as_of_ns=T0, place=(-3, 12)),
         requests.WhyQuery(12.0, 40.5, T0),
         requests.MachinesQuery(fresh),
         requests.ChangesQuery(3),
         requests.InfoQuery(fresh),
+        requests.AliveQuery(),
     )
     seeds = tuple(f"{query.name}?{selector_of(requests.encode_query(query))}".encode() for query in asked)
     yield Decoder("query", seeds, _query, (QueryError,), texts)
@@ -166,9 +168,9 @@ def _configs() -> Iterator[Decoder]:
     yield _config("sim", (shipped["sim"],), load_sim)
     entry = RegisterEntry("machine", "1f", NOW, signing="A" * 43 + "=")
     register = register_toml(Register("paper", ("localhost",), {"loader-1": entry, "router": entry}))
-    yield _config("register", (register.encode(),), _register, "register.toml")
+    yield _config("register", (_text_of(register).encode(),), _sealed(_register), "register.toml")
     identity = b'site = "paper"\nname = "loader-1"\nrole = "machine"\nexpires = 2030-01-01T00:00:00Z\n'
-    yield _config("identity", (identity,), _identity, "identity.toml", place="")
+    yield _config("identity", (identity,), _sealed(_identity), "identity.toml", place="")
 
 
 def _config(
@@ -182,6 +184,21 @@ def _config(
         load(path)
 
     return Decoder(name, seeds, decode, (ConfigError,), texts, path.name if place is None else place)
+
+
+def _text_of(sealed_text: str) -> str:
+    return sealed_text.partition("\n")[2]
+
+
+def _sealed(load: Callable[[Path], object]) -> Callable[[Path], object]:
+    """Load a text behind a checksum that is right: else nothing but that would be tried."""
+
+    def seal_and_load(path: Path) -> None:
+        with suppress(UnicodeDecodeError):
+            path.write_bytes(sealed(path.read_bytes().decode()).encode())
+        load(path)
+
+    return seal_and_load
 
 
 def _register(path: Path) -> None:

@@ -144,7 +144,7 @@ def test_a_key_with_a_wildcard_names_no_machine(probe: Probe):
 def test_a_sequence_that_goes_back_is_acknowledged_and_changes_nothing(probe: Probe):
     before = probe.client.info()
     reply = probe.send(encode_batch(probe.batch(first_seq=1)))
-    assert reply == Ack(probe.seq, before.journalled, 3), probe.where
+    assert reply == Ack(probe.seq, before.journalled, 3, before.store), probe.where
     after = probe.client.info()
     assert (after.journalled, after.samples_merged) == (before.journalled, before.samples_merged)
 

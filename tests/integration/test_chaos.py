@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,15 @@ from agents.delivery.spool import Spool, SpoolConfig
 from protocol.machine.samples import empty
 from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
-from tests.chaos import bit_flips, disk_faults, reader_faults, site_faults, stepped_clock
+from tests.chaos import (
+    bit_flips,
+    damage_faults,
+    disk_faults,
+    reader_faults,
+    site_faults,
+    stepped_clock,
+    store_faults,
+)
 from tests.chaos.__main__ import ChaosFault, run_suite, totals
 from tests.chaos.disk_model import Disk, Kind, Operation
 from tests.chaos.disk_shim import build
@@ -53,6 +62,50 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
     assert 0 < outcome.ack_ms_max < 60_000
     assert len(set(outcome.pids)) >= 4 + 4 + 2, "a process of its own for every start"
     assert not any(Path(f"/proc/{pid}").exists() for pid in outcome.pids)
+
+
+def harmless(tmp_path: Path, fault: Callable[[FaultRun], FaultOutcome]) -> FaultOutcome:
+    """The outcome of a fault that strikes a site of two machines and takes nothing."""
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=80)
+    outcome = fault(scenario(tmp_path / "run", recordings=recordings))
+    assert (outcome.lost, outcome.double, outcome.silent, outcome.problems) == (0, 0, 0, [])
+    assert outcome.merged + outcome.declared == outcome.recorded > 30
+    return outcome
+
+
+@pytest.mark.processes
+def test_a_second_map_server_takes_nothing_from_the_first(tmp_path):
+    assert harmless(tmp_path, store_faults.second_server).declared == 0
+
+
+@pytest.mark.processes
+def test_the_year_2099_shifts_no_clock_and_blocks_no_spool(tmp_path):
+    outcome = harmless(tmp_path, store_faults.far_future)
+    assert outcome.declared == outcome.notes["quarantined"] > 0
+
+
+@pytest.mark.processes
+def test_the_archive_goes_on_after_a_wrong_clock(tmp_path):
+    outcome = harmless(tmp_path, store_faults.archive_clock)
+    assert (outcome.declared, outcome.notes["archived"] > 0) == (0, True)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("fault", [damage_faults.wal_flip, damage_faults.restored_store])
+def test_what_damage_takes_is_declared_and_named(tmp_path, fault):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=40)
+    outcome = fault(scenario(tmp_path / "run", recordings=recordings, seconds=3.0))
+    assert (outcome.lost, outcome.double, outcome.silent, outcome.problems) == (0, 0, 0, [])
+    assert outcome.declared > 0
+    assert outcome.recorded == outcome.merged + outcome.declared
+
+
+@pytest.mark.processes
+def test_agents_name_a_damaged_calibration_and_go_on(tmp_path):
+    recordings = make(tmp_path / "recordings", machines=1, seed=3, seconds=40)
+    outcome = damage_faults.calibration_flip(scenario(tmp_path / "run", recordings=recordings, seconds=1.0))
+    assert (outcome.lost, outcome.silent, outcome.problems) == (0, 0, [])
+    assert outcome.count > 1000
 
 
 @pytest.mark.processes

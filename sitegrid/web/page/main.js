@@ -29,6 +29,7 @@ const page = {
   asOf: () => page.time.at ?? undefined,
   redraw: () => { page.dirty = true; },
   compareWith: (ns) => page.time.compareWith(ns),
+  timeMoved: () => { if (page.site) { showStatus(); keepLink(); } },
 };
 window.sitegrid = page; // for tests, and for people with a console
 const canvas = byId("map"), view = new View();

@@ -103,6 +103,7 @@ export class TimeBar {
     play.setAttribute("aria-label", this.playing ? "Pause" : "Play");
     play.querySelector("path").setAttribute("d", this.playing ? "M5 4h4v12H5zM11 4h4v12h-4z" : "M6 4l10 6-10 6z");
     this.drawStrip();
+    this.page.timeMoved();
   }
 
   // A line from the first sample to now, ticks of time, a diamond for each change of the ground.

@@ -14,6 +14,7 @@ pytestmark = pytest.mark.processes
 
 def test_fold_measures_journals_with_one_thread_and_two_and_a_decision(capsys, monkeypatch):
     monkeypatch.setattr("benchmarks.fold_decision.QUIET_S", 0.5)
+    monkeypatch.setattr("benchmarks.past.HISTORY_ROWS", 50)
     assert main(["fold", "--json", "--hours", "0.05", "--samples", "3000", "--runs", "1"]) == 0
     printed = capsys.readouterr()
     result = json.loads(printed.out)
@@ -30,6 +31,8 @@ def test_fold_measures_journals_with_one_thread_and_two_and_a_decision(capsys, m
     assert 0 < nothing["point_ms_median"] <= nothing["point_ms_p99"] <= nothing["point_ms_most"]
     assert nothing["ack_ms_median"] > 0
     assert all(row["wall_s"] > 0 and 50 < row["server_mb"] <= row["peak_mb"] for row in (nothing, distrust, trust))
+    asked = ["point, last day", "whole map, last day", "whole map, last month", "history of a point"]
+    assert [row["asked"] for row in result["past"]] == asked
     assert "is folded with 2 threads, run 1 of 1" in printed.err
 
 

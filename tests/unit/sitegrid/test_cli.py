@@ -75,7 +75,7 @@ def test_errors_are_one_line_or_json(monkeypatch, capsys):
     ("command", "words", "missing", "extras"),
     [
         ("agent", ["--spool", "x.db"], "scipy.linalg", "agent"),
-        ("demo", ["--out", "x"], "pybullet", "agent,server,sim"),
+        ("demo", ["--out", "x"], "pybullet", "agent,server,sim,web"),
         ("eval", ["physics"], "pybullet", "eval"),
         ("keys", ["list"], "cryptography", "security"),
         ("query", ["info"], "cryptography", "security"),

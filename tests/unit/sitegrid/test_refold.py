@@ -21,6 +21,7 @@ from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow
 from protocol.arrays import Table
 from protocol.config import from_table
+from protocol.disk.high_water_mark import HighWaterMark, mark_path
 from protocol.files import load_toml
 from protocol.machine.samples import COLUMNS, empty
 from protocol.site.site_config import KnownGround, SiteConfig, site_toml
@@ -132,6 +133,18 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert again.identity.id != old.id
     assert again.identity.descends == (old.id,)
     again.close()
+
+
+def test_a_store_that_lacks_what_was_acknowledged_is_not_folded_without_a_word(tmp_path: Path, capsys):
+    source = make_store(tmp_path / "source")
+    mark = HighWaterMark(mark_path(source / JOURNAL_FILE))
+    mark.write({f"a {7:016x}": 150})
+    mark.close()
+    assert run(source, "--out", tmp_path / "new") == 1
+    assert "30 acknowledged samples of a are gone; restore a backup, or start a map server" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+    Store(source, SITE, ServerConfig(), time.time_ns).close()
+    assert run(source, "--out", tmp_path / "new") == 0
 
 
 def test_a_store_lists_all_that_it_descends_from(store: Path, tmp_path: Path):

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from agents.estimation.calibration import Calibration
-from agents.estimation.calibration_file import load, save
+from agents.estimation.calibration_file import _checksum, load, save
 from protocol.errors import StoreError
 
 KNOWN = Calibration(0.0031, -0.02, ((1e-6, -2e-7), (-2e-7, 1e-4)), 1_767_225_600_000_000_000, 41)
@@ -34,8 +34,8 @@ def test_anything_else_is_refused_with_its_path(tmp_path: Path, text: str) -> No
         {"machine": "loader-2"},
         {"zero": "a"},
         {"zero": float("nan")},
-        {"zero": 3.0},
-        {"scale": -2.0},
+        {"zero": 0.06},
+        {"scale": -0.6},
         {"covariance": [[1e-6, 1.0], [1.0, 1e-4]]},
         {"covariance": [[-1e-6, 0.0], [0.0, 1e-4]]},
         {"covariance": [[1e-6, 0.0]]},
@@ -46,9 +46,34 @@ def test_anything_else_is_refused_with_its_path(tmp_path: Path, text: str) -> No
 def test_senseless_numbers_are_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
     path = tmp_path / "c.json"
     save(path, "loader-1", KNOWN)
-    path.write_text(json.dumps({**json.loads(path.read_text()), **wrong}))
-    with pytest.raises(StoreError, match=r"c\.json"):
+    table = {**json.loads(path.read_text()), **wrong}
+    del table["crc32"]
+    path.write_text(json.dumps({**table, "crc32": _checksum(table)}))
+    with pytest.raises(StoreError, match=r"c\.json: is (no|the) calibration"):
         load(path, "loader-1")
+
+
+@pytest.mark.slow
+def test_no_flipped_bit_is_used(tmp_path: Path) -> None:
+    """Each bit of the file: the calibration is the one that was saved, or an error that names the file."""
+    path = tmp_path / "c.json"
+    save(path, "loader-1", KNOWN)
+    whole, refused = path.read_bytes(), 0
+    for at in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[at // 8] ^= 1 << at % 8
+        path.write_bytes(damaged)
+        try:
+            assert load(path, "loader-1") == KNOWN
+        except StoreError as error:
+            assert "c.json" in str(error)  # noqa: PT017 # blanks between values may be anything that is blank
+            refused += 1
+    assert refused > 0.9 * 8 * len(whole)
+
+
+def test_only_its_owner_reads_it(tmp_path: Path) -> None:
+    save(tmp_path / "c.json", "loader-1", KNOWN)
+    assert (tmp_path / "c.json").stat().st_mode & 0o777 == 0o600
 
 
 def test_a_folder_that_is_not_there_is_an_error_of_ours(tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+import os
 import shutil
 import signal
 import sqlite3
@@ -422,3 +423,53 @@ def test_a_server_whose_clock_went_back_says_so_until_it_is_right_again(tmp_path
         assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
         clock[0] += 303 * DAY
         assert isinstance(store.commit([monday])[0], Ack)
+
+
+def test_only_its_owner_reads_the_files_of_a_store(tmp_path):
+    before = os.umask(0)
+    try:
+        store = open_store(tmp_path)
+        store.commit([incoming(samples(3))])
+        store.save_snapshot()
+        modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.rglob("*") if path.is_file()}
+        store.close()
+    finally:
+        os.umask(before)
+    assert {"journal.db", "journal.db-wal", "journal.db-mark", "lock", "snapshot-1.npz"} <= modes.keys()
+    assert set(modes.values()) == {0o600}
+
+
+def test_a_snapshot_beyond_the_journal_is_named_before_it_is_removed(tmp_path, caplog):
+    store = open_store(tmp_path)
+    store.commit([incoming(samples(3))])
+    store.save_snapshot()
+    store.close()
+    (tmp_path / "snapshot-1.npz").rename(tmp_path / "snapshot-7.npz")
+    store = open_store(tmp_path)
+    assert store.info()["shortfalls"] == [
+        "a snapshot of row 7 lies beyond the journal; 6 journal rows after row 1 are gone"
+    ]
+    assert "acknowledged samples are missing" in caplog.text
+    assert "snapshot removed row=7" in caplog.text
+    assert not (tmp_path / "snapshot-7.npz").exists()
+    store.close()
+    store = open_store(tmp_path)
+    assert len(store.info()["shortfalls"]) == 1, "it is kept, and not said again"
+    store.close()
+
+
+def test_samples_that_are_missing_are_counted_until_they_are_declared_lost(tmp_path, caplog):
+    store = open_store(tmp_path)
+    store.commit([incoming(samples(3))])
+    store.journal._mark.write({f"a {7:016x}": 5, f"b {8:016x}": 2})  # as a journal that was longer had
+    store.close()
+    store = open_store(tmp_path)
+    assert {name: entry["missing"] for name, entry in store.machines().items()} == {"a": 2, "b": 2}
+    assert store.machines()["b"] == {"spools": 0, "samples": 0, "lost": 0, "newest_ns": 0, "missing": 2}
+    answers = store.commit([incoming(samples(2), 6)])
+    assert (answers[0].reason, answers[0].expected) == ("gap", 4)
+    store.commit([incoming(samples(2), 6, lost_before=2)])
+    assert store.machines()["a"]["missing"] == 0
+    assert store.machines()["a"]["lost"] == 2
+    assert "declared lost machine=a samples=2" in caplog.text
+    store.close()

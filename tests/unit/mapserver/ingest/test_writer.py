@@ -464,6 +464,19 @@ def test_a_bug_in_the_writer_shows_and_leaves_nobody_waiting(start, monkeypatch)
     writer.close()
 
 
+def test_a_bug_between_two_groups_leaves_nobody_waiting_either(start, monkeypatch):
+    clock = Clock()
+    writer, replies = start(clock=clock), Replies()
+    monkeypatch.setattr(Store, "snapshot", lambda _: 1 // 0)
+    with held(writer):
+        clock.now_s += 60.0  # a snapshot is due after this turn
+        for i in range(3):
+            writer.submit(incoming(samples(1), machine=f"m-{i}"), replies[i])
+    wait_for(lambda: writer.failed)
+    assert [answer.reason for answer in replies.wait(3)] == [Refusal.STORE] * 3
+    writer.close()
+
+
 def test_closing_after_a_bug_in_the_last_group_ends(start, monkeypatch):
     writer = start()
     monkeypatch.setattr(Store, "_fold", lambda *_: 1 // 0)

@@ -38,7 +38,8 @@ def inside(stretches, last: int) -> list[int]:
 ROWS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 6)), min_size=1, max_size=25)
 
 
-@settings(max_examples=60, deadline=None)
+@pytest.mark.slow
+@settings(max_examples=50, deadline=None)
 @given(
     rows=ROWS, cut=st.integers(0, 25), archived=st.integers(0, 25), begin=st.integers(-1, 50), length=st.integers(0, 20)
 )

@@ -139,6 +139,8 @@ def test_tiles_as_of_a_time_are_those_of_that_time(tmp_path):
         ({"store": "a", "row": "x", "fact": "0"}, Refusal.WRONG_TYPE),
         ({"store": "a", "row": "1", "fact": "0", "as_of": "5"}, Refusal.OUT_OF_RANGE),
         ({"bounds": "1"}, Refusal.UNKNOWN_PARAMETER),
+        ({"place": "1"}, Refusal.OUT_OF_RANGE),
+        ({"place": "1,2.5"}, Refusal.OUT_OF_RANGE),
     ],
 )
 def test_a_wrong_version_is_refused_by_name(parameters, reason):
@@ -172,6 +174,28 @@ def test_reasons_are_those_of_the_cell(tmp_path):
         assert not any(why.resistance.before)
         assert not why.changed_ns
         assert why.newest_ns == NOW_NS + 9 * 10**9
+
+
+def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
+    monkeypatch.setattr("mapserver.query.map_tiles.TILE_BYTES", 3000)
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(random_samples(3000, 4, half_m=200.0))])
+        answers = Answers(writer, FakeFollower(), past_of(writer))
+        for as_of_ns in (None, NOW_NS + 1800 * 10**9):
+            pieces = [answers.tiles(TilesQuery(as_of_ns=as_of_ns))]
+            while (place := pieces[-1].next_place) is not None:
+                pieces.append(answers.tiles(TilesQuery(as_of_ns=as_of_ns, place=place)))
+            assert len(pieces) > 3
+            assert all(
+                sum(len(tile.planes) for tile in piece.tiles) <= 3000 or len(piece.tiles) == 1 for piece in pieces
+            )
+            together = [(tile.x, tile.y) for piece in pieces for tile in piece.tiles]
+            assert together == sorted(set(together))
+            monkeypatch.setattr("mapserver.query.map_tiles.TILE_BYTES", 10**9)
+            whole = answers.tiles(TilesQuery(as_of_ns=as_of_ns))
+            assert whole.next_place is None
+            assert [tile for piece in pieces for tile in piece.tiles] == list(whole.tiles)
+            monkeypatch.setattr("mapserver.query.map_tiles.TILE_BYTES", 3000)
 
 
 def test_every_plane_keeps_its_values_to_half_a_step():

@@ -44,6 +44,7 @@ def same(a: Region, b: Region) -> bool:
 
 @pytest.mark.parametrize("when", [When(), When(minus_ns=NOW_NS + 900 * 10**9)])
 @pytest.mark.parametrize("bounds", [(-100, -100, 100, 100), (-93.5, 7, 61, 51.2), (-100, 3, 100, 4), (2, -80, 3, 90)])
+@pytest.mark.slow
 def test_tiles_make_up_the_region(served, monkeypatch, bounds, when):
     _, answers = served
     query = RegionQuery(Bounds(*bounds), NAMES, when=when)

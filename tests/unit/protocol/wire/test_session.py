@@ -1,11 +1,13 @@
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from mapserver.query.tiles import TILE_BYTES
 from protocol.errors import LinkError
 from protocol.wire.credentials import Credentials, Identity
-from protocol.wire.session import SessionConfig, _settings, free_endpoint, open_session
+from protocol.wire.session import SessionConfig, _settings, free_endpoint, open_session, use_many_threads
 
 CREDENTIALS = Credentials(Path("/keys/a"), Identity("paper", "a", "machine", datetime(2100, 1, 1, tzinfo=UTC)))
 
@@ -21,6 +23,22 @@ def test_nothing_bypasses_the_router(mode):
 def test_client_listens_nowhere_and_router_at_its_endpoint():
     assert _settings(SessionConfig("tcp/127.0.0.1:1"))["listen/endpoints"] == []
     assert _settings(SessionConfig("tcp/127.0.0.1:1", mode="router"))["listen/endpoints"] == ["tcp/127.0.0.1:1"]
+
+
+def test_a_whole_answer_fits_into_what_a_router_keeps_for_a_link():
+    batches = _settings(SessionConfig(mode="router"))["transport/link/tx/queue/size/data"]
+    assert batches * 65_000 >= TILE_BYTES + 2**14  # the rest of the answer, and headers
+    assert "transport/link/tx/queue/size/data" not in _settings(SessionConfig())
+
+
+def test_threads_that_were_asked_for_from_outside_stay(monkeypatch):
+    monkeypatch.setenv("ZENOH_RUNTIME", "(rx: (worker_threads: 3))")
+    use_many_threads()
+    assert os.environ["ZENOH_RUNTIME"] == "(rx: (worker_threads: 3))"
+    monkeypatch.delenv("ZENOH_RUNTIME")
+    use_many_threads()
+    assert "worker_threads: 64" in os.environ["ZENOH_RUNTIME"]
+    monkeypatch.delenv("ZENOH_RUNTIME")
 
 
 def test_negative_wait_is_for_ever():

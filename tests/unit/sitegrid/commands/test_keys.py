@@ -14,6 +14,7 @@ import pytest
 import zenoh
 
 from protocol.errors import ConfigError
+from protocol.files import sealed
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES
 from protocol.wire.credentials import check_valid, load_credentials
@@ -244,6 +245,28 @@ def test_the_register_is_read_as_it_was_written(tmp_path: Path):
     assert load_register(tmp_path) == register
 
 
+def change(path: Path, old: str, new: str) -> None:
+    """Write another text behind a checksum that is right."""
+    _, _, text = path.read_text().partition("\n")
+    path.write_text(sealed(text.replace(old, new)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["register.toml", "server/identity.toml"])
+def test_no_flipped_bit_lets_anybody_in(folder: Path, place: str):
+    """Each bit of what `sitegrid keys` writes as text: it is refused, with the file's name."""
+    path = folder / place
+    load = (lambda: load_register(folder)) if place == "register.toml" else (lambda: load_credentials(path.parent))
+    load()
+    whole = path.read_bytes()
+    for at in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[at // 8] ^= 1 << at % 8
+        path.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=path.name):
+            load()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
@@ -258,7 +281,7 @@ def test_the_register_is_read_as_it_was_written(tmp_path: Path):
 )
 def test_a_wrong_register_is_refused(folder: Path, old: str, new: str, problem: str):
     path = folder / "register.toml"
-    path.write_text(path.read_text().replace(old, new))
+    change(path, old, new)
     with pytest.raises(ConfigError, match=r"register\.toml") as caught:
         load_register(folder)
     assert problem in str(caught.value)
@@ -433,10 +456,10 @@ def test_an_expired_certificate_is_named_before_the_router_refuses_it(folder: Pa
     with pytest.raises(ConfigError, match=r"expired on .*; make a new one with `sitegrid keys add server --renew`"):
         check_valid(credentials, credentials.identity.expires + timedelta(seconds=1))
     identity = folder / "server" / "identity.toml"
-    identity.write_text(identity.read_text().replace(str(credentials.identity.expires.year), "2020"))
+    change(identity, str(credentials.identity.expires.year), "2020")
     with pytest.raises(ConfigError, match="expired on 2020"):
         join(DEFAULT_ENDPOINT, folder / "server")
-    identity.write_text(identity.read_text().replace("+00:00", ""))
+    change(identity, "+00:00", "")
     with pytest.raises(ConfigError, match="no time zone"):
         load_credentials(folder / "server")
 

@@ -1,0 +1,326 @@
+"""The live page in a browser: what people click, on a running site. Needs Chromium (Debian: `chromium`)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sitegrid.process.children import Children, wait_until
+from tests.integration.site_run import kill
+from tests.integration.web_site import START_NS, WebSite
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+NO_BROWSER = "no Chromium: install it, for example with `apt-get install chromium`"
+pytestmark = [pytest.mark.processes, pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)]
+WAIT_MS = 20_000
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
+    folder = tmp_path_factory.mktemp("page")
+    with Children(folder) as children:
+        site = WebSite(folder, children)
+        site.drive(60)
+        yield site
+
+
+class Tab:
+    """A page, and what its browser complained of."""
+
+    def __init__(self, browser: Any, url: str, **options: Any) -> None:
+        self.complaints: list[str] = []
+        self.asked: list[str] = []
+        self.context = browser.new_context(**({"viewport": {"width": 1280, "height": 800}} | options))
+        self.page = self.context.new_page()
+        self.page.on("console", lambda message: self._note(message.type, message.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.goto(url)
+
+    def _note(self, kind: str, text: str) -> None:
+        if kind in ("error", "warning"):
+            self.complaints.append(text)
+
+    def js(self, expression: str) -> Any:
+        return self.page.evaluate(expression)
+
+    def until(self, expression: str, timeout_ms: float = WAIT_MS) -> None:
+        """Wait until an expression holds; the page's own rules forbid the browser's way to wait."""
+        for _ in range(int(timeout_ms / 50)):
+            if self.js(expression):
+                return
+            self.page.wait_for_timeout(50)
+        raise AssertionError(f"did not come true: {expression}; {self.complaints}")
+
+    def loaded(self) -> Tab:
+        self.until(
+            "window.sitegrid && sitegrid.map.tiles.size > 0 && sitegrid.state === 'live' && sitegrid.time.step_ns > 0"
+        )
+        return self
+
+    def pixel_of(self, x_m: float, y_m: float) -> tuple[float, float]:
+        left, top = self.js(f"sitegrid.view.toScreen({x_m}, {y_m})")
+        return left, top
+
+    def close(self) -> None:
+        self.context.close()
+
+
+@pytest.fixture
+def tab(browser, web: WebSite) -> Iterator[Tab]:
+    tab = Tab(browser, web.url).loaded()
+    yield tab
+    assert tab.complaints == []
+    assert all(url.startswith((web.url, "data:")) for url in tab.asked), "nobody else was asked"
+    tab.close()
+
+
+def known_place(web: WebSite) -> tuple[float, float]:
+    """The centre of a well known cell."""
+    region = web.client.region((0, 0, 300, 300), ["resistance", "visits", "confidence"])
+    sure = np.nan_to_num(region["visits"]) * np.nan_to_num(region["confidence"])
+    row, column = np.unravel_index(int(sure.argmax()), sure.shape)
+    return float(region.x_m[column]), float(region.y_m[row])
+
+
+def test_the_value_under_the_pointer_is_the_querys(tab: Tab, web: WebSite):
+    x_m, y_m = known_place(web)
+    value = web.client.point(x_m, y_m, ["resistance", "grade", "visits"])
+    for key, name in (("1", "resistance"), ("2", "grade"), ("3", "visits")):
+        tab.page.keyboard.press(key)
+        tab.page.mouse.move(5, 795)
+        tab.page.mouse.move(*tab.pixel_of(x_m, y_m))
+        tab.until("document.getElementById('readout').classList.contains('on')")
+        tab.until(f"Math.abs(Number(document.getElementById('readout').dataset.value) - {value.values[name]}) < 1e-6")
+
+
+def test_the_colours_on_the_map_are_those_of_its_cells(tab: Tab, web: WebSite):
+    x_m, y_m = known_place(web)
+    tab.js("(sitegrid.shows.unsure = false, sitegrid.shows.machines = false, sitegrid.redraw())")
+    left, top = tab.pixel_of(x_m, y_m)
+    tab.page.wait_for_timeout(300)
+    red, green, blue, _ = tab.js(
+        f"[...document.getElementById('map').getContext('2d').getImageData({left:.0f}, {top:.0f}, 1, 1).data]"
+    )
+    resistance = web.client.point(x_m, y_m, ["resistance"]).values["resistance"]
+    expected = tab.js(f"sitegrid.layer.colour({resistance})")
+    shown = (red << 16) | (green << 8) | blue
+    assert all(abs((shown >> s & 255) - (expected >> s & 255)) <= 6 for s in (0, 8, 16))
+
+
+def test_a_click_says_why(tab: Tab, web: WebSite):
+    x_m, y_m = known_place(web)
+    tab.page.mouse.click(*tab.pixel_of(x_m, y_m))
+    panel = tab.page.locator("#panel")
+    panel.locator(".big b").wait_for(timeout=WAIT_MS)
+    why = web.client.why(x_m, y_m)
+    assert panel.locator(".big b").inner_text() == f"{100 * why.values['resistance']:.1f} %"
+    text = panel.inner_text()
+    assert all(name in text for name in why.machines)
+    assert f"{x_m - 0.5:.0f} to {x_m + 0.5:.0f} m E" in text
+    assert "cell=" in tab.page.url or tab.until("location.search.includes('cell=')") is None
+    tab.page.keyboard.press("Escape")
+    assert panel.is_hidden()
+
+
+def test_ground_where_nobody_was_says_so(tab: Tab):
+    tab.page.mouse.click(*tab.pixel_of(*tab.js("[sitegrid.map.bounds()[0] - 3.5, sitegrid.map.bounds()[1] - 3.5]")))
+    tab.page.locator("#panel .say").wait_for(timeout=WAIT_MS)
+    assert "Nobody has driven" in tab.page.locator("#panel").inner_text()
+
+
+def test_the_slider_shows_the_map_of_its_time(tab: Tab, web: WebSite):
+    tab.page.locator("#slider").focus()
+    for _ in range(3):
+        tab.page.keyboard.press("ArrowLeft")
+    tab.until("sitegrid.time.map !== null && sitegrid.time.at !== null")
+    at_ns = int(tab.js("String(BigInt(sitegrid.time.at))"))
+    tab.until(f"sitegrid.time.map.stamp_ns === {at_ns}")
+    tiles = {(tile.x, tile.y) for tile in web.client.tiles(as_of_ns=at_ns).tiles}
+    assert {tuple(map(int, key.split(","))) for key in tab.js("[...sitegrid.time.map.tiles.keys()]")} == tiles
+    assert START_NS < at_ns < web.now_ns
+    assert "earlier time" in tab.page.locator("#status").inner_text()
+    tab.page.keyboard.press("l")
+    tab.until("sitegrid.time.at === null && sitegrid.time.map === null")
+
+
+def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab):
+    tab.page.keyboard.press("c")
+    tab.until("sitegrid.time.mode === 'beside' && sitegrid.time.otherMap !== null")
+    tab.page.keyboard.press("c")
+    tab.until("sitegrid.time.mode === 'difference' && sitegrid.difference !== undefined")
+    tab.page.keyboard.press("c")
+    tab.until("sitegrid.time.mode === 'one'")
+
+
+def test_play_back_runs_to_now(tab: Tab):
+    tab.page.locator("#play").click()
+    tab.until("sitegrid.time.playing !== 0 && sitegrid.time.at !== null")
+    tab.page.locator("#play").click()
+    tab.until("sitegrid.time.playing === 0")
+    tab.page.locator("#live").click()
+    tab.until("sitegrid.time.at === null")
+
+
+def test_layers_palettes_and_fading_cost_no_traffic(tab: Tab):
+    tab.page.wait_for_timeout(500)
+    before = len(tab.asked)
+    for key in ("2", "3", "4", "5", "1", "u", "o", "u", "o"):
+        tab.page.keyboard.press(key)
+        tab.page.wait_for_timeout(60)
+    tab.page.get_by_role("button", name="Kinds of ground").click()
+    tab.until("sitegrid.palette === 'kinds'")
+    assert len(tab.asked) == before
+    assert "dry concrete" in tab.page.locator("#legend").inner_text()
+
+
+def test_the_keyboard_alone_is_enough(tab: Tab):
+    tab.page.keyboard.press("Tab")
+    assert tab.js("document.activeElement.className") == "skip"
+    tab.page.keyboard.press("Enter")
+    tab.page.locator("#map").focus()
+    x = tab.js("sitegrid.view.x")
+    tab.page.keyboard.press("ArrowRight")
+    assert tab.js("sitegrid.view.x") > x
+    scale = tab.js("sitegrid.view.scale")
+    tab.page.keyboard.press("+")
+    assert tab.js("sitegrid.view.scale") > scale
+    tab.page.keyboard.press("Enter")
+    tab.page.locator("#panel h2").wait_for(timeout=WAIT_MS)
+    tab.page.keyboard.press("Escape")
+    tab.page.keyboard.press("?")
+    assert tab.page.locator("#help").is_visible()
+    tab.page.keyboard.press("Escape")
+    seen = set()
+    for _ in range(40):
+        tab.page.keyboard.press("Tab")
+        seen.add(
+            tab.js("document.activeElement.id || document.activeElement.name || document.activeElement.textContent")
+        )
+    assert {"map", "fit", "link", "theme", "play", "slider", "compare", "live"} <= seen
+
+
+def test_a_link_holds_view_layer_and_time(tab: Tab, browser):
+    tab.page.keyboard.press("2")
+    tab.page.mouse.wheel(0, -400)
+    tab.page.keyboard.press("[")
+    tab.until(
+        "sitegrid.time.map !== null && location.search.includes('layer=grade') && location.search.includes('time=')"
+    )
+    other = Tab(browser, tab.page.url)
+    other.until("window.sitegrid && sitegrid.time.map !== null")
+    for value in ("sitegrid.layer.id", "sitegrid.view.scale.toFixed(2)", "String(sitegrid.time.at)"):
+        assert other.js(value) == tab.js(value)
+    other.close()
+
+
+def test_a_phone_shows_map_legend_and_panel(browser, web: WebSite):
+    tab = Tab(browser, web.url, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True).loaded()
+    for name in ("#map", "#legend", "#time", "#slider"):
+        assert tab.page.locator(name).is_visible(), name
+    assert tab.page.get_by_role("radio", name="Slope").is_hidden()
+    tab.page.locator("#drawer").tap()
+    tab.page.get_by_text("Slope", exact=True).tap()
+    tab.until("sitegrid.layer.id === 'grade'")
+    tab.page.locator("#drawer").tap()
+    x_m, y_m = known_place(web)
+    tab.page.touchscreen.tap(*tab.pixel_of(x_m, y_m))
+    tab.page.locator("#panel .big b, #panel .say").first.wait_for(timeout=WAIT_MS)
+    small = tab.js(
+        "[...document.querySelectorAll('button')].filter((b) => b.offsetParent && b.offsetHeight < 44).map((b) => b.id)"
+    )
+    assert small == []
+    assert tab.js("document.documentElement.scrollWidth") <= 390
+    assert tab.complaints == []
+    tab.close()
+
+
+def test_dark_is_dark_and_is_kept(browser, web: WebSite):
+    tab = Tab(browser, web.url, color_scheme="dark").loaded()
+    assert tab.js("document.documentElement.dataset.theme") == "dark"
+    tab.page.locator("#theme").click()
+    assert tab.js("document.documentElement.dataset.theme") == "light"
+    tab.page.reload()
+    tab.loaded()
+    assert tab.js("document.documentElement.dataset.theme") == "light"
+    tab.close()
+
+
+def test_a_server_that_is_gone_is_named_and_comes_back(browser, web: WebSite):
+    tab = Tab(browser, web.url).loaded()
+    kill(web.server)
+    tab.until("document.getElementById('notice').textContent.includes('No map server answers')", 40_000)
+    assert tab.js("sitegrid.map.tiles.size") > 0, "what it said last stays"
+    web.server = web.start_server()
+    tab.until("sitegrid.state === 'live' && document.getElementById('notice').hidden", 40_000)
+    tab.close()
+
+
+def test_an_empty_map_says_what_to_do(browser, tmp_path: Path):
+    with Children(tmp_path) as children:
+        web = WebSite(tmp_path, children)
+        tab = Tab(browser, web.url)
+        tab.until("document.getElementById('notice').textContent.includes('No ground known yet')")
+        assert "sitegrid agent" in tab.page.locator("#notice code").inner_text()
+        web.drive(8)
+        tab.until("document.getElementById('notice').hidden && sitegrid.map.tiles.size > 0")
+        tab.close()
+
+
+def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
+    keys = tmp_path / "keys"
+    with Children(tmp_path) as children:
+        children.start("init", "keys", "init", "--site", "soak", "--dir", keys).wait(30)
+        token = children.start("token", "keys", "token", "anna", "--dir", keys, "--json").expect("token", 30)["token"]
+        web = WebSite(tmp_path, children, "--tokens", keys)
+        web.drive(4)
+        assert web.get("info").status == 401
+        assert web.get("/healthz").status == 200
+        assert web.get("info", Authorization=f"Bearer {token}").status == 200
+        assert web.get("info", {"token": token}).status == 200
+        tab = Tab(browser, f"{web.url}?token={token}").loaded()
+        assert "token" not in tab.page.url, "it stays in no history"
+        tab.page.reload()
+        tab.loaded()
+        tab.close()
+        children.start("revoke", "keys", "token", "anna", "--revoke", "--dir", keys).wait(30)
+        wait_until(lambda: web.get("info", {"token": token}).status == 401, 10, "the token is revoked")
+
+
+def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("no npm: axe-core is installed by it")
+    command = [npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(tmp_path), "axe-core"]
+    if subprocess.run(command, capture_output=True, timeout=120, check=False).returncode:
+        pytest.skip("axe-core cannot be installed here")
+    axe = (tmp_path / "node_modules" / "axe-core" / "axe.min.js").read_text()
+    for theme in ("light", "dark"):
+        tab = Tab(browser, f"{web.url}?theme={theme}", bypass_csp=True).loaded()
+        tab.page.mouse.click(*tab.pixel_of(*known_place(web)))
+        tab.page.locator("#panel .big b").wait_for(timeout=WAIT_MS)
+        tab.page.wait_for_timeout(400)
+        tab.page.evaluate(axe)
+        faults = tab.page.evaluate(
+            "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
+        )
+        serious = [violation for violation in faults if violation[1] in ("serious", "critical")]
+        assert not serious, json.dumps(serious, indent=1)
+        tab.close()
