@@ -12,7 +12,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.buffers import Buffers
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.fold_kernels import BUCKET_BITS, fold_sorted
-from mapserver.evidence.pages import CELL, RAW_CELL, PackedPages
+from mapserver.evidence.pages import CELL, RAW_CELL, PackedPages, copied
 from mapserver.evidence.sample_kernels import locate, split, weigh
 from protocol.arrays import AnyArray, Bools, Ints, Table
 
@@ -109,5 +109,5 @@ def _by_block(
     raw = cells.view(RAW_CELL)
     places = np.column_stack([pages[firsts][:, [0, 1, 3, 5]], pages[ends - 1][:, [4, 6]], firsts, ends])
     for x, y, vote, cell, end_vote, end_cell, first, end in places.tolist():
-        own_cells = raw[cell:end_cell].copy().view(CELL)
-        yield x, y, PackedPages(tables[first:end].copy(), few[vote:end_vote].copy(), own_cells)
+        own_cells = copied(raw[cell:end_cell]).view(CELL)
+        yield x, y, PackedPages(copied(tables[first:end]), copied(few[vote:end_vote]), own_cells)
