@@ -8,7 +8,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
+from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim, web
 from benchmarks.agents import filter as filters
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
@@ -61,6 +61,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         fleet.run,
         "a fleet at a real server: acknowledgements, and what they cost",
         {"machines": 500, "seconds": 70.0, "hours": HOURS},
+    ),
+    "web": (
+        web.run,
+        "the web server: what open pages cost, how soon they show what came in, tiles for other tools",
+        {"hours": HOURS, "seconds": 20.0},
     ),
     "sim": (sim.run, "simulated time of small and large fleets, sensors on", {"runs": 5, "seconds": 20.0}),
     "filter": (filters.run, "steps of the filters, and a whole agent's CPU and memory", {"runs": 5, "steps": 1000}),

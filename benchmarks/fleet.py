@@ -7,7 +7,6 @@ and the next when it is due, or at once to see how many batches the server takes
 from __future__ import annotations
 
 import heapq
-import os
 import queue
 import tempfile
 import time
@@ -22,7 +21,7 @@ import zenoh
 from benchmarks.measure import Report, machine
 from benchmarks.merge_restart import SITE, build
 from benchmarks.merge_work import BATCH, DAY_NS, drive, samples_of
-from benchmarks.processes import served, session
+from benchmarks.processes import processor_s, served, session, settle
 from protocol.arrays import Table
 from protocol.errors import Refusal
 from protocol.wire import keys
@@ -34,7 +33,6 @@ PERIOD_S = 1.0  # from batch to batch of one machine
 SESSIONS = 50  # at most: machines share them
 TIMEOUT_S = 10.0  # for an acknowledgement
 RETRY_S = 0.2  # after a refusal that does not say when to come again
-SETTLED_CORES, SETTLE_S = 0.1, 300.0  # a server that has just come looks for changes everywhere
 GOALS = {"refused": 0, "ack_ms_p99": 150.0, "server_cores": 0.6, "disk_mb_per_s": 7.0, "saturation_per_s": 25_000}
 
 
@@ -72,7 +70,7 @@ def run(machines: int, seconds: float, hours: float) -> Report:
         endpoint, server = opened.enter_context(served(Path(path), SITE))
         links = [opened.enter_context(session(endpoint)) for _ in range(min(machines, SESSIONS))]
         fleet = [Machine(f"loader-{i:04d}", links[i % len(links)], _samples(i)) for i in range(machines)]
-        _settle(server)
+        settle(server)
         rows = [
             {"load": name, "machines": machines, **_measured(server, fleet, seconds, period_s)}
             for name, period_s in (("paced", PERIOD_S), ("saturated", 0.0))
@@ -89,7 +87,7 @@ def _samples(seed: int) -> Iterator[Table]:
 
 
 def _measured(server: int, fleet: Sequence[Machine], seconds: float, period_s: float) -> dict[str, float]:
-    cpu_s, written, start_s = _cpu_s(server), _written_bytes(server), time.monotonic()
+    cpu_s, written, start_s = processor_s(server), _written_bytes(server), time.monotonic()
     result = _send(fleet, seconds, period_s)
     took_s = time.monotonic() - start_s
     return {
@@ -97,7 +95,7 @@ def _measured(server: int, fleet: Sequence[Machine], seconds: float, period_s: f
         "refused": result.refused,
         "ack_ms_p50": round(float(np.percentile(result.ms, 50)), 1),
         "ack_ms_p99": round(float(np.percentile(result.ms, 99)), 1),
-        "server_cores": round((_cpu_s(server) - cpu_s) / took_s, 3),
+        "server_cores": round((processor_s(server) - cpu_s) / took_s, 3),
         "disk_mb_per_s": round((_written_bytes(server) - written) / took_s / 1e6, 2),
     }
 
@@ -160,23 +158,6 @@ def _take(one: Machine, answer: Ack | Refused, at_s: float, period_s: float, res
         one.due_s = at_s + (answer.retry_after_s or RETRY_S)
     else:
         raise RuntimeError(f"the server refused a batch: {answer}")
-
-
-def _settle(server: int) -> None:
-    """Wait until the server has little to do."""
-    end_s = time.monotonic() + SETTLE_S
-    while time.monotonic() < end_s:
-        cpu_s, start_s = _cpu_s(server), time.monotonic()
-        time.sleep(1.0)
-        if _cpu_s(server) - cpu_s < SETTLED_CORES * (time.monotonic() - start_s):
-            return
-    raise RuntimeError(f"the server was still busy after {SETTLE_S:g} s: nothing was measured")
-
-
-def _cpu_s(process: int) -> float:
-    """Processor time of a process."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _written_bytes(process: int) -> int:

@@ -6,9 +6,11 @@ The latter is this module, `python -m benchmarks.processes ENDPOINT`: it replies
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
@@ -26,6 +28,7 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 EMPTY_KEY = "bench/empty"
 OPTIONS = "[store]\narchive_after_h = 0.0\n"  # samples of a benchmark are older than what a server keeps in its journal
 END_S, ANSWER_S = 30.0, 120.0
+SETTLED_CORES, SETTLE_S = 0.1, 300.0  # a server that has just come looks for changes everywhere
 
 
 @contextmanager
@@ -85,6 +88,23 @@ def send(link: zenoh.Session, site: SiteConfig, batch: SampleBatch) -> None:
     (reply,) = ask(link, keys.ingest(site.name, batch.machine), encode_batch(batch))
     if not isinstance(answer := decode_reply(reply), Ack):
         raise RuntimeError(f"the server refused a batch: {answer}")
+
+
+def settle(server: int) -> None:
+    """Wait until the server has little to do."""
+    end_s = time.monotonic() + SETTLE_S
+    while time.monotonic() < end_s:
+        cpu_s, start_s = processor_s(server), time.monotonic()
+        time.sleep(1.0)
+        if processor_s(server) - cpu_s < SETTLED_CORES * (time.monotonic() - start_s):
+            return
+    raise RuntimeError(f"the server was still busy after {SETTLE_S:g} s: nothing was measured")
+
+
+def processor_s(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,6 +65,7 @@ class Tiles:
         self._lock = threading.Lock()
         self._squares: dict[Place, _Square] = {}
         self._tiles: dict[Place, MapTile] = {}
+        self._holding: dict[Block, bytes] = {}  # the pages of blocks that hold, where not all do
         self._turn, self._fact = -1, -1
 
     def answer(self, query: TilesQuery) -> TilesAnswer:
@@ -80,10 +81,16 @@ class Tiles:
 
     def _update(self) -> tuple[MapVersion, int]:
         """Make anew what evidence came into, and what lies so near that a change of the ground there counts for it."""
-        blocks, pages, turn, version, stamp_ns = self._writer.run(self._folded)
+        blocks, folded, pages, turn, version, stamp_ns = self._writer.run(self._folded)
         whole = version.fact != self._fact
         squares: dict[Place, _Square] = {} if whole else self._squares
-        changed = fill(squares, pages, blocks, self._cell_m, self._config)
+        first = valid_pages(pages, self._cell_m, self._config.change)
+        holding = {block: first[block].tobytes() if first[block].any() else b"" for block in blocks}
+        others = [
+            block for block in blocks if block in folded or holding[block] != self._holding.get(block, b"") or whole
+        ]
+        changed = fill(squares, pages, first, others, self._config)
+        self._holding = ({} if whole else self._holding) | holding
         for place in changed | (self._tiles.keys() - squares.keys()):
             tile = squares.setdefault(place, _Square.empty()).tile(place, version.row, version.fact)
             known = self._tiles.get(place)
@@ -92,13 +99,15 @@ class Tiles:
         self._squares, self._turn, self._fact = squares, turn, version.fact
         return version, stamp_ns
 
-    def _folded(self, store: Store) -> tuple[list[Block], Pages, int, MapVersion, int]:
+    def _folded(self, store: Store) -> tuple[list[Block], set[Block], Pages, int, MapVersion, int]:
+        """Blocks that may be others, those of them that evidence came into, and pages of all that lies around them."""
         grid, whole = store.grid, store.fact != self._fact  # after a fact, the map may be another grid
         folded, turn = grid.folded_since(-1 if whole else self._turn)
         blocks = folded if whole else sorted({near for one in folded for near in around(one, self._reach)})
         wide = sorted({near for block in blocks for near in around(block, self._reach)})
         pages = {block: pages for block, pages in zip(wide, grid.pages(wide), strict=True) if pages}
-        return [block for block in blocks if block in pages], pages, turn, store.version, store.newest_ns
+        known = [block for block in blocks if block in pages]
+        return known, set(folded), pages, turn, store.version, store.newest_ns
 
 
 def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:
@@ -121,16 +130,19 @@ def _place(tile: MapTile) -> Place:
 def tiles_of(view: View, version: MapVersion, cell_m: float, config: ServerConfig) -> TilesAnswer:
     """All tiles of a view."""
     squares: dict[Place, _Square] = {}
-    fill(squares, view.pages, list(view.pages), cell_m, config)
+    fill(squares, view.pages, valid_pages(view.pages, cell_m, config.change), view.pages, config)
     tiles = tuple(square.tile(place, version.row, version.fact) for place, square in sorted(squares.items()))
     return TilesAnswer(version, view.stamp_ns, cell_m, whole=True, tiles=tiles)
 
 
 def fill(
-    squares: dict[Place, _Square], pages: Pages, blocks: Iterable[Block], cell_m: float, config: ServerConfig
+    squares: dict[Place, _Square],
+    pages: Pages,
+    first: Mapping[Block, Ints],
+    blocks: Iterable[Block],
+    config: ServerConfig,
 ) -> set[Place]:
-    """Write blocks into their squares, with pages of all that lies around them; returns which squares these are."""
-    first = valid_pages(pages, cell_m, config.change)
+    """Write blocks into their squares, each from its first page that holds on; returns which squares these are."""
     places = set()
     for some in chunks(list(blocks)):
         sums = evidence([pages[block] for block in some], [first[block] for block in some])

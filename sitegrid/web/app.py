@@ -14,7 +14,7 @@ from typing import Any
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
-from starlette.middleware.gzip import GZipMiddleware
+from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -35,6 +35,7 @@ from sitegrid.web.site import SiteFeed
 PAGE = Path(__file__).parent / "page"
 FRESH_S = 1.0  # how old the version may be that a tile, or a copy that the asker has, is compared with
 PNG_KEPT = 4000  # some 20 MB
+SMALL_ALREADY = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/x-npz")  # deflated inside
 MARGIN_M = 100.0  # around the map's bounds, which are of what is folded: a tile shows samples that still wait for it
 log = logging.getLogger("sitegrid.web")
 MAX_TILE_CELLS = 4_000_000  # of one XYZ tile; a lower zoom shows less than a site, and is empty
@@ -60,7 +61,7 @@ class WebApp:
         ]
         handlers: dict[Any, Any] = {HTTPException: _not_there, Exception: _failed}
         app = Starlette(routes=routes, exception_handlers=handlers, lifespan=self._lifespan)
-        app.add_middleware(GZipMiddleware, minimum_size=1000, compresslevel=5)
+        app.add_middleware(GZipMiddleware, minimum_size=1000, compresslevel=5, exclude_content_types=SMALL_ALREADY)
         self.guard = Guard(app, person)
         self.app: ASGIApp = self.guard
 

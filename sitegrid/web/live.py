@@ -75,7 +75,7 @@ class _Page:
 
     async def _send_news(self, now_s: float) -> None:
         feed, socket = self._door, self._socket
-        state = (feed.is_away, json.dumps(feed.state))
+        state = (feed.is_away, feed.state_text)
         if state != self._state:
             self._state = state
             news = {"state": "away"} if feed.is_away else {"state": "live", "site": feed.state}

@@ -26,7 +26,7 @@ from sitegrid.listener import Listener
 from sitegrid.web.values import plain
 
 T = TypeVar("T")
-PERIOD_S = 0.25  # between two questions for what changed, while somebody looks
+PERIOD_S = 0.1  # between two questions for what changed, while somebody looks: what did not change costs little
 STATE_S = 2.0  # between two questions for machines, changes and times
 LINGER_S = 10.0  # the map is followed so much longer than somebody looks: GIS ask every few seconds
 HEARD_S = 1.5  # machines publish their poses several times a second
@@ -46,6 +46,7 @@ class SiteFeed:
         self.tiles: dict[tuple[int, int], MapTile] = {}
         self.answer: TilesAnswer | None = None
         self.state: dict[str, Any] = {}
+        self.state_text = "{}"
         self.is_away = False
         self.moved = asyncio.Condition()  # notified when tiles, poses or the state may be others
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=f"ask-{client.site}")
@@ -151,18 +152,23 @@ class SiteFeed:
         while idle_s < LINGER_S:
             began_s = time.monotonic()
             try:
+                self._take(await self.ask(self.client.tiles, self.answer.version if self.answer else None))
+                await self._notify()  # the map first
                 if began_s >= next_state_s:
                     next_state_s = began_s + STATE_S
                     self.state = await self._ask_state()
-                self._take(await self.ask(self.client.tiles, self.answer.version if self.answer else None))
+                    self.state_text = json.dumps(self.state)
                 self.is_away = False
             except (LinkError, QueryError, MessageError):
                 self.is_away, next_state_s = True, 0.0
-            async with self.moved:
-                self.moved.notify_all()
+            await self._notify()
             await asyncio.sleep(max(0.05, PERIOD_S - (time.monotonic() - began_s)))
             idle_s = 0.0 if self.watchers else idle_s + PERIOD_S
         self._task = None
+
+    async def _notify(self) -> None:
+        async with self.moved:
+            self.moved.notify_all()
 
     def _take(self, answer: TilesAnswer) -> None:
         if answer.whole:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import subprocess
 import sys
@@ -149,6 +150,15 @@ def test_gdal_opens_zones_that_are_valid_and_hold_what_they_name(web: WebSite, p
         assert set(kinds_here) <= kinds
         seen |= set(kinds_here)
     assert len(seen) > 1
+
+
+def test_text_is_deflated_for_who_takes_it_and_tiles_are_not_deflated_twice(web: WebSite):
+    plain, deflated = (web.get("features/zones", **words) for words in ({}, {"Accept_Encoding": "gzip"}))
+    assert deflated.headers["content-encoding"] == "gzip"
+    assert gzip.decompress(deflated.body) == plain.body
+    for path in ("tiles", "xyz/value/resistance/18/137194/90017.png", "region?bounds=0,0,200,200&format=npz"):
+        answer = web.get(path, Accept_Encoding="gzip")
+        assert (answer.status, answer.headers.get("content-encoding")) == (200, None)
 
 
 def test_a_fuzzer_that_reads_the_description_makes_nothing_fail(web: WebSite, tmp_path: Path):
