@@ -39,6 +39,8 @@ soak: venv
 
 bench: venv
 	$(BIN)/python -m benchmarks merge
+	$(BIN)/python -m benchmarks live
+	$(BIN)/python -m benchmarks query
 	$(BIN)/python -m benchmarks memory
 	$(BIN)/python -m benchmarks ingest
 	$(BIN)/python -m benchmarks sim

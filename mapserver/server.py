@@ -35,7 +35,7 @@ from protocol.wire.codec import encode_reply
 from protocol.wire.messages import Ack, Refused
 
 COMMAND_THREADS = 8  # a command waits for its map; those given meanwhile are kept at once, and folded together
-ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 tiles, or 2000 points
+ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 pieces, or 2000 points
 MOST_PAST, MOST_COMMANDS = 16, 16  # that wait or are in work
 MAX_QUESTION = 4096  # bytes of a query's parameters
 SignReply = Callable[[str, bytes, bytes], bytes]  # key expression, batch and reply to signature

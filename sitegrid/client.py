@@ -25,8 +25,8 @@ from protocol.queries.answers import (
 from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command
 from protocol.queries.map_tiles import TilesAnswer, decode_tiles
 from protocol.queries.parameters import selector_of
+from protocol.queries.pieces import Progress, joined
 from protocol.queries.reasons import CellReasons, decode_why
-from protocol.queries.tiles import Progress, joined
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
@@ -85,18 +85,18 @@ class Client:
     ) -> Region:
         """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates.
 
-        A large region comes in tiles, all of one version of the map; progress is called with each, as (here, of all).
+        A large region comes in pieces, all of one version of the map; progress is called with each, as (here, of all).
         """
         box = bounds if isinstance(bounds, Bounds) else Bounds(*(float(v) for v in bounds))
         when, fresh = requests.When(as_of_ns, minus_ns), requests.Freshness(after, wait_s)
         query = requests.RegionQuery(box, tuple(layers), fresh, when)
         for _ in range(REGION_ATTEMPTS - 1):
             try:
-                return joined(self._tiles(query), progress)
+                return joined(self._pieces(query), progress)
             except QueryError as error:
                 if error.reason != Refusal.EXPIRED:  # else that version of the map is not kept any more: begin again
                     raise
-        return joined(self._tiles(query), progress)
+        return joined(self._pieces(query), progress)
 
     def history(
         self,
@@ -202,12 +202,12 @@ class Client:
         wait_s += PAST_S if requests.reads_past(query) else 0.0
         return self._get(keys.map_query(self.site, query.name), requests.encode_query(query), wait_s)
 
-    def _tiles(self, query: requests.RegionQuery) -> Iterator[Region]:
-        """The region, or tile after tile of it."""
+    def _pieces(self, query: requests.RegionQuery) -> Iterator[Region]:
+        """The region, or piece after piece of it."""
         yield (first := answer_codec.decode_region(self._ask(query)))
-        if first.tile:
-            for number in range(1, first.tile.count):
-                yield answer_codec.decode_region(self._ask(requests.TileQuery(first.tile.cursor, number)))
+        if first.piece:
+            for number in range(1, first.piece.count):
+                yield answer_codec.decode_region(self._ask(requests.PieceQuery(first.piece.cursor, number)))
 
     def _command(self, command: TrustCommand) -> TrustAnswer:
         key = keys.admin(self.site, command.name)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.change.kernels import differ, histograms, likeliest_cuts
+from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums
 from mapserver.evidence import cells as ev
 from mapserver.evidence.timeline import TimedPage, packed_votes
 from protocol.arrays import Bools, Floats, Ints
@@ -91,12 +91,8 @@ def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
 def kinds(pages: Sequence[TimedPage]) -> Floats:
     """Median (256,) of all c_rr votes of each cell, in bins; NaN where there are none."""
     packed, _ = packed_votes(pages)
-    places, counts = packed & np.uint64(0xFFFF), packed >> np.uint64(16)
-    here = places < ev.RESISTANCE.stop * ev.CELLS  # the first of the bins
-    sums = np.bincount(places[here].astype(np.int64), counts[here], ev.RESISTANCE.stop * ev.CELLS)
-    votes = sums.reshape(ev.RESISTANCE_BINS, ev.CELLS) / ev.WEIGHT_UNITS_PER_M
-    weight = votes.sum(axis=0)
-    return np.where(weight > 0, _median(votes / np.maximum(weight, 1e-9)), np.nan)
+    kinds_of_cells: Floats = medians(sums(packed, ev.RESISTANCE.start, ev.RESISTANCE.stop) / ev.WEIGHT_UNITS_PER_M)
+    return kinds_of_cells
 
 
 def credible(changed: Bools, kind: Floats, now: Floats, cell_m: float, config: ChangeConfig) -> Bools:
@@ -150,19 +146,6 @@ def _best_cut(votes: Floats, first: Ints) -> tuple[Ints, Floats]:
 
     votes: (pages, bins, cells); pages before `first` do not count. Also returns the median (cells,) after it.
     """
-    best, before, after = likeliest_cuts(votes, first, WEIGHT_M)
-    share_before, share_after = (part / np.maximum(part.sum(axis=0), 1e-9) for part in (before, after))
-    variation = np.abs(share_before - share_after).sum(axis=0) / 2
-    kind = _median(share_after)
-    apart = np.abs(_median(share_before) - kind)
-    changed = (best > 0) & (variation > VARIATION) & (apart >= BINS)
-    return np.where(changed, best, first), kind
-
-
-def _median(shares: Floats) -> Floats:
-    """Median (cells,) of histograms (bins, cells) in bins, between the bins where it lies between."""
-    until = shares.cumsum(axis=0)
-    bin_ = (until >= 0.5).argmax(axis=0)
-    cells = np.arange(shares.shape[1])
-    inside = np.maximum(shares[bin_, cells], 1e-9)
-    return np.asarray(bin_ + 0.5 - (until[bin_, cells] - 0.5) / inside, np.float64)
+    best, variation, before, after = likeliest_cuts(votes, first, WEIGHT_M)
+    changed = (best > 0) & (variation > VARIATION) & (np.abs(before - after) >= BINS)
+    return np.where(changed, best, first), after

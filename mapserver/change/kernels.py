@@ -12,6 +12,8 @@ import numpy as np
 
 from mapserver.evidence.cells import CELLS
 
+LEAST = 1e-9  # instead of nothing, where one divides
+
 
 @numba.njit(cache=True, nogil=True)
 def differ(votes: Any, ends: Any, start: int, stop: int, least: float, most: float) -> Any:
@@ -57,34 +59,90 @@ def histograms(votes: Any, ends: Any, start: int, stop: int, columns: Any, out: 
 
 
 @numba.njit(cache=True, nogil=True)
-def likeliest_cuts(votes: Any, first: Any, least: float) -> tuple[Any, Any, Any]:
+def sums(votes: Any, start: int, stop: int) -> Any:
+    """Votes (bins, 256) of all pages together."""
+    out = np.zeros((stop - start, CELLS))
+    for i in range(np.uint64(len(votes))):
+        place = votes[i] & np.uint64(0xFFFF)
+        bin_ = np.int64(place >> np.uint64(8)) - start
+        if 0 <= bin_ < stop - start:
+            out[bin_, place & np.uint64(CELLS - 1)] += float(votes[i] >> np.uint64(16))
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def medians(votes: Any) -> Any:
+    """Median (cells,) of histograms (bins, cells), in bins, between two where it lies there; NaN without votes."""
+    bins, cells = votes.shape
+    out = np.full(cells, np.nan)
+    for cell in range(cells):
+        weight = 0.0
+        for i in range(bins):
+            weight += votes[i, cell]
+        if weight > 0:
+            out[cell] = _median(votes[:, cell] / max(weight, LEAST))
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def likeliest_cuts(votes: Any, first: Any, least: float) -> tuple[Any, Any, Any, Any]:
     """Page (cells,) before which the votes of each cell are best cut in two kinds of ground; 0 where they cannot be.
 
     votes (pages, bins, cells) in metres; pages before first (cells,) do not count. Either side has at least `least`
     metres. The best cut has the largest log-likelihood ratio: the entropy of all votes, less that of both sides, each
-    times its weight. Also returns the histograms (bins, cells) before and after it.
+    times its weight. Also returns, for each cell, the total variation of the histograms before and after it, and their
+    medians.
     """
     pages, bins, cells = votes.shape
     best = np.zeros(cells, np.int64)
-    before, after = np.zeros((bins, cells)), np.zeros((bins, cells))
-    old, every = np.empty(bins), np.empty(bins)
+    variation, medians_before, medians_after = np.zeros(cells), np.zeros(cells), np.zeros(cells)
+    before, old, every = np.empty(bins), np.empty(bins), np.empty(bins)
     for cell in range(cells):
         every[:] = 0.0
         for page in range(first[cell], pages):
             for i in range(bins):
                 every[i] += votes[page, i, cell]
-        old[:] = 0.0
+        old[:] = before[:] = 0.0
         most = -np.inf
         for page in range(first[cell] + 1, pages):
+            is_more = False
             for i in range(bins):
                 old[i] += votes[page - 1, i, cell]
+                is_more |= votes[page - 1, i, cell] > 0
+            if not is_more:  # the same cut as one page earlier
+                continue
             gain = _both_sides(old, every, least)
             if gain > most:
                 most, best[cell] = gain, page
-                for i in range(bins):
-                    before[i, cell] = old[i]
-                    after[i, cell] = every[i] - old[i]
-    return best, before, after
+                before[:] = old
+        if best[cell]:
+            after = every - before
+            before /= max(_sum(before), LEAST)
+            after /= max(_sum(after), LEAST)
+            for i in range(bins):
+                variation[cell] += abs(before[i] - after[i])
+            variation[cell] /= 2
+            medians_before[cell], medians_after[cell] = _median(before), _median(after)
+    return best, variation, medians_before, medians_after
+
+
+@numba.njit(cache=True, nogil=True)
+def _median(shares: Any) -> float:
+    """Median of shares (bins,), in bins."""
+    until, bin_ = shares[0], 0
+    while until < 0.5 and bin_ < len(shares) - 1:
+        bin_ += 1
+        until += shares[bin_]
+    median: float = bin_ + 0.5 - (until - 0.5) / max(shares[bin_], LEAST)
+    return median
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum(values: Any) -> float:
+    total = 0.0
+    for value in values:
+        total += value
+    return total
 
 
 @numba.njit(cache=True, nogil=True)

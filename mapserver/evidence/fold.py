@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence.buffers import Buffers
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.fold_kernels import BUCKET_BITS, fold_sorted
-from mapserver.evidence.pages import CELL, PackedPages, frozen
+from mapserver.evidence.pages import CELL, RAW_CELL, PackedPages, copied
 from mapserver.evidence.sample_kernels import locate, split, weigh
 from protocol.arrays import AnyArray, Bools, Ints, Table
 
@@ -21,13 +22,14 @@ MOST_PAGES = 1 << 14  # likewise
 _VOTES_OF_CELL = 7  # two bins of each of three values, and one sector
 
 
-Scratch = tuple[AnyArray, ...]
+class Scratch(Buffers):
+    """Where one thread folds. block: one block unpacked, where kernels sum, zero between folds."""
 
-
-def scratch_block() -> Scratch:
-    """One block unpacked, where kernels sum (counts, lines, visits, machines, newest stamps); zero between folds."""
-    counts, lines = np.zeros(ev.COUNTS * ev.CELLS, np.uint32), np.zeros(ev.COUNTS, np.int32)
-    return counts, lines, *(np.zeros(ev.CELLS, kind) for kind in (np.uint64, np.uint64, np.int64))
+    def __init__(self) -> None:
+        super().__init__()
+        counts, lines = np.zeros(ev.COUNTS * ev.CELLS, np.uint32), np.zeros(ev.COUNTS, np.int32)
+        bits, newest = (np.zeros(ev.CELLS, np.uint64) for _ in range(2)), np.zeros(ev.CELLS, np.int64)
+        self.block: tuple[AnyArray, ...] = (counts, lines, *bits, newest)
 
 
 def fold(
@@ -46,8 +48,13 @@ def fold(
     """
     limits = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2)
     n = len(rows)
-    places, stencils = np.empty((n, 5)), np.empty((n, 3), np.int64)
-    keys, touching, area = locate(rows, limits, config.bucket_ns, places, stencils)
+    array = scratch.array
+    places, stencils = array("places", n, np.float64, 5), array("stencils", n, np.int64, 3)
+    keys, touching = array("keys", 3 * n + 16, np.int64), array("touching", 3 * n + 16, np.int32)
+    pairs, area = locate(rows, limits, config.bucket_ns, places, stencils, keys, touching)
+    if pairs > len(keys):
+        keys, touching = array("keys", pairs, np.int64), array("touching", pairs, np.int32)
+        locate(rows, limits, config.bucket_ns, places, stencils, keys, touching)
     if area > MOST_SHARES and n > 1:  # tiny cells under unsure positions
         for part in (slice(n // 2), slice(n // 2, None)):
             yield from fold(
@@ -55,15 +62,17 @@ def fold(
             )
         return
     if spans is not None:
-        keys = keys >> BUCKET_BITS << BUCKET_BITS | spans[touching]
-    starts, shares = np.empty(n, np.int64), np.empty(area, np.uint32)
+        keys[:pairs] = keys[:pairs] >> BUCKET_BITS << BUCKET_BITS | spans[touching[:pairs]]
+    starts, shares = array("starts", n, np.int64), array("shares", area, np.uint32)
     weigh(rows, places, stencils, starts, shares)
-    bins, bin_shares = np.empty((n, 4), np.int64), np.empty((n, 3), np.uint32)
-    bits, stamps = np.empty((n, 2), np.uint64), np.empty(n, np.int64)
+    bins, bin_shares = array("bins", n, np.int64, 4), array("bin_shares", n, np.uint32, 3)
+    bits, stamps = array("bits", n, np.uint64, 2), array("stamps", n, np.int64)
     split(rows, names, bins, bin_shares, bits, stamps)
-    order = np.argsort(keys, kind="stable")
+    order = np.argsort(keys[:pairs], kind="stable")
+    keys = np.take(keys, order, out=array("sorted keys", pairs, np.int64))
+    touching = np.take(touching, order, out=array("sorted touching", pairs, np.int32))
     samples = (stencils, starts, shares, bins, bin_shares, bits, stamps)
-    yield from _pages(keys[order], touching[order], samples, area, scratch)
+    yield from _pages(keys, touching, samples, area, scratch)
 
 
 def _pages(
@@ -71,31 +80,34 @@ def _pages(
 ) -> Iterator[tuple[int, int, PackedPages]]:
     """Fold sorted pairs, as many at a time as there is space for."""
     block = ev.COUNTS * ev.CELLS
-    pages: Ints = np.empty((min(len(keys), MOST_PAGES), 7), np.int64)
-    votes = np.empty(min(_VOTES_OF_CELL * area, MOST_VOTES) + block, np.uint64)
-    cells: Table = np.empty(min(area, len(pages) * ev.CELLS) + ev.CELLS, CELL)
+    pages = scratch.array("pages", min(len(keys), MOST_PAGES), np.int64, 7)
+    votes = scratch.array("votes", min(_VOTES_OF_CELL * area, MOST_VOTES) + block, np.uint64)
+    cells = scratch.array("cells", min(area, len(pages) * ev.CELLS) + ev.CELLS, CELL)
     done = 0
     while done < len(keys):
-        done, n, used, filled = fold_sorted(done, keys, touching, samples, scratch, pages, votes, cells)
-        yield from _by_block(pages[:n], votes[:used], cells[:filled])
+        done, n, used, filled = fold_sorted(done, keys, touching, samples, scratch.block, pages, votes, cells)
+        yield from _by_block(pages[:n], votes[:used], cells[:filled], scratch)
 
 
-def _by_block(pages: Ints, votes: NDArray[np.uint64], cells: Table) -> Iterator[tuple[int, int, PackedPages]]:
+def _by_block(
+    pages: Ints, votes: NDArray[np.uint64], cells: Table, scratch: Scratch
+) -> Iterator[tuple[int, int, PackedPages]]:
     """Cut pages into those of each block; copies, which keep nothing else alive."""
     if not len(pages):
         return
-    dtype: type[np.unsignedinteger[Any]] = np.uint32 if int(votes.max()) < 2**32 else np.uint64
     begins: Bools = np.ones(len(pages), np.bool_)
     begins[1:] = (pages[1:, :2] != pages[:-1, :2]).any(axis=1)
     firsts = np.flatnonzero(begins)
-    ends = [*firsts[1:].tolist(), len(pages)]
+    ends = np.append(firsts[1:], len(pages))
     tables = np.zeros((len(pages), 6), np.int64)
     tables[:, 1:] = pages[:, 2:]
-    at = np.repeat(firsts, np.diff(firsts, append=len(pages)))
-    tables[:, 2:4] -= pages[at, 3, None]
-    tables[:, 4:6] -= pages[at, 5, None]
-    for first, end in zip(firsts.tolist(), ends, strict=True):
-        x, y, _, first_vote, _, first_cell, _ = pages[first].tolist()
-        _, _, _, _, end_vote, _, end_cell = pages[end - 1].tolist()
-        few = votes[first_vote:end_vote].astype(dtype)
-        yield x, y, PackedPages(tables[first:end].copy(), few, frozen(cells[first_cell:end_cell]))
+    tables[:, 2:] -= np.repeat(pages[firsts][:, [3, 3, 5, 5]], ends - firsts, axis=0)
+    few: AnyArray = votes
+    if int(votes.max()) < 2**32:
+        few = scratch.array("few", len(votes), np.uint32)
+        few[:] = votes
+    raw = cells.view(RAW_CELL)
+    places = np.column_stack([pages[firsts][:, [0, 1, 3, 5]], pages[ends - 1][:, [4, 6]], firsts, ends])
+    for x, y, vote, cell, end_vote, end_cell, first, end in places.tolist():
+        own_cells = copied(raw[cell:end_cell]).view(CELL)
+        yield x, y, PackedPages(copied(tables[first:end]), copied(few[vote:end_vote]), own_cells)

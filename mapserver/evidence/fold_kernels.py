@@ -18,6 +18,7 @@ from mapserver.evidence import cells as ev
 
 _RESISTANCE, _EAST, _NORTH = ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start
 _HEADING, _COUNTS, _CELLS = ev.HEADING.start, ev.COUNTS, ev.CELLS
+_ONE, _PLANE = np.uint64(1), np.uint64(ev.CELLS)
 
 # Keys sort by block column, block row and bucket: 18, 18 and 27 bits, enough for 5 cm cells 100 km away, and for
 # minutes until the year 2100.
@@ -65,14 +66,14 @@ def fold_sorted(
             _lay_out(shares, starts[k] + (y - first_y) * n + x - first_x, n, end_x - x, x - left, part)
             top, end = y - bottom, end_y - bottom
             low, high = min(low, top), max(high, end)
-            _vote_all(counts, lines, top, end, part, bins, bin_shares, k)
+            _vote(counts, lines, top, end, part, bins, bin_shares, k)
             if before >= 0 and not (
                 bits[before, 0] == bits[k, 0] and bits[before, 1] == bits[k, 1] and stamps[before] <= stamps[k]
             ):
                 _mark(bits, stamps, last, run_low, run_high, visits, machines, newest)
                 run_low, run_high = 16, 0
             run_low, run_high, before = min(run_low, top), max(run_high, end), k
-            _touch(last, top * 16, part, np.uint32(k + 1))
+            _touch(last, top, part, np.uint32(k + 1))
         _mark(bits, stamps, last, run_low, run_high, visits, machines, newest)
         end_votes = _pack_votes(counts, lines, low, high, out_votes, votes)
         end_cells = _pack_cells(visits, machines, newest, low, high, out_cells, cells)
@@ -97,63 +98,57 @@ def _lay_out(shares: Any, first: int, edge: int, width: int, column: int, lane: 
         target += np.uint64(16)
 
 
+# Indices below are unsigned: the compiler then need not look for negative ones, which count from the end.
+
+
 @numba.njit(cache=True, nogil=True)
-def _vote_all(counts: Any, lines: Any, top: int, end: int, part: Any, bins: Any, bin_shares: Any, k: int) -> None:
+def _vote(counts: Any, lines: Any, top: int, end: int, part: Any, bins: Any, bin_shares: Any, k: int) -> None:
     """Add the votes of one row for some rows of cells, top <= row < end."""
     touched = np.int32((1 << end) - (1 << top))
+    first, n = np.uint64(top * 16), np.uint64(len(part))
     for value in range(3):
         if bins[k, value] >= 0:
-            plane = bins[k, value] + (_RESISTANCE if value == 0 else _EAST if value == 1 else _NORTH)
-            _vote(counts, plane * _CELLS + top * 16, part, bin_shares[k, value])
+            plane = np.uint64(bins[k, value] + (_RESISTANCE if value == 0 else _EAST if value == 1 else _NORTH))
+            lower = plane * _PLANE + first
+            upper = lower + _PLANE
+            share = bin_shares[k, value]
+            for i in range(n):
+                above = np.uint32(np.uint32(part[i] * share) >> np.uint32(8))
+                counts[lower + i] += np.uint32(part[i] - above)
+                counts[upper + i] += above
             lines[plane] |= touched
-            lines[plane + 1] |= touched
-    sector = _HEADING + bins[k, 3]
-    _add(counts, sector * _CELLS + top * 16, part)
+            lines[plane + _ONE] |= touched
+    sector = np.uint64(_HEADING + bins[k, 3])
+    at = sector * _PLANE + first
+    for i in range(n):
+        counts[at + i] += part[i]
     lines[sector] |= touched
 
 
-# The loops below run over slices from 0 on: the compiler sees that no index is negative, and vectorises.
-
-
 @numba.njit(cache=True, nogil=True)
-def _vote(counts: Any, at: int, lane: Any, share: Any) -> None:
-    lower, upper = counts[at:][: len(lane)], counts[at + _CELLS :][: len(lane)]
-    for i in range(len(lane)):
-        above = np.uint32(np.uint32(lane[i] * share) >> np.uint32(8))
-        lower[i] += np.uint32(lane[i] - above)
-        upper[i] += above
-
-
-@numba.njit(cache=True, nogil=True)
-def _add(counts: Any, at: int, lane: Any) -> None:
-    cells = counts[at:][: len(lane)]
-    for i in range(len(lane)):
-        cells[i] += lane[i]
-
-
-@numba.njit(cache=True, nogil=True)
-def _touch(last: Any, at: int, lane: Any, number: Any) -> None:
+def _touch(last: Any, top: int, part: Any, number: Any) -> None:
     """Note the number of the row that touched cells last."""
-    cells = last[at:][: len(lane)]
-    for i in range(len(lane)):
-        cells[i] = number if lane[i] else cells[i]
+    at = np.uint64(top * 16)
+    for i in range(np.uint64(len(part))):
+        last[at + i] = number if part[i] else last[at + i]
 
 
 @numba.njit(cache=True, nogil=True)
 def _mark(bits: Any, stamps: Any, last: Any, low: int, high: int, visits: Any, machines: Any, newest: Any) -> None:
     """Set the bits and the newest stamp of the cells that a run touched, and forget the run."""
-    for i in range(low * 16, high * 16):
+    for i in range(np.uint64(low * 16), np.uint64(high * 16)):
         if last[i]:
-            k = last[i] - 1
-            visits[i] |= bits[k, 0]
-            machines[i] |= bits[k, 1]
+            k = np.uint64(last[i]) - _ONE
+            visits[i] |= bits[k, np.uint64(0)]
+            machines[i] |= bits[k, _ONE]
             newest[i] = max(newest[i], stamps[k])
             last[i] = 0
 
 
 @numba.njit(cache=True, nogil=True)
-def _pack_votes(counts: Any, lines: Any, low: int, high: int, out: Any, used: int) -> int:
+def _pack_votes(counts: Any, lines: Any, low: int, high: int, out: Any, used: int) -> Any:
     """Move what is not zero in the scratch block to votes; returns where they end."""
+    end = np.uint64(used)
     for plane in range(_COUNTS):
         touched = lines[plane]
         if not touched:
@@ -161,13 +156,13 @@ def _pack_votes(counts: Any, lines: Any, low: int, high: int, out: Any, used: in
         lines[plane] = 0
         for line in range(low, high):
             if touched >> line & 1:
-                at = plane * _CELLS + line * 16
-                cells = counts[at:][:16]
-                for i in range(16):
-                    out[used] = (np.uint64(cells[i]) << np.uint64(16)) | np.uint64(at + i)
-                    used += 1 if cells[i] else 0
-                    cells[i] = 0
-    return used
+                at = np.uint64(plane * _CELLS + line * 16)
+                for i in range(np.uint64(16)):
+                    count = counts[at + i]
+                    out[end] = (np.uint64(count) << np.uint64(16)) | (at + i)
+                    end += np.uint64(count != 0)
+                counts[at : at + np.uint64(16)] = 0
+    return np.int64(end)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold import fold, scratch_block
-from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
+from mapserver.evidence.fold import Scratch, fold
+from mapserver.evidence.fold_config import FoldConfig, name_hash
 from mapserver.evidence.grid_state import GridCounts, GridState
 from mapserver.evidence.pages import PackedPages
-from mapserver.evidence.timeline import Block, Space, Tiers, TimedPage, Timeline, evidence
+from mapserver.evidence.sample_kernels import count_foldable, extent
+from mapserver.evidence.settling import Space, Tiers
+from mapserver.evidence.timeline import PATIENCE, Block, TimedPage, Timeline, evidence, settle_all
 from mapserver.evidence.workers import ALONE, Workers
 from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
@@ -40,7 +42,7 @@ class Grid:
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
         self._turn, self._turns = 0, dict[Block, int]()  # how often anything was folded; the last turn of each block
-        self._workers, self._scratch, self._spaces = ALONE, [scratch_block()], [Space()]
+        self._workers, self._scratch, self._spaces = ALONE, [Scratch()], [Space()]
         self._rows: AnyArray = np.empty(waiting_rows, RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
         self._waiting, self._weight = 0, 0
@@ -63,9 +65,6 @@ class Grid:
 
     def fold_all(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Fold samples of several machines; names (n,): hash of each one's name."""
-        if not len(rows):
-            return
-        self._widen(int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max()))
         for first in range(0, len(rows), PIECE):
             self._take(np.ascontiguousarray(rows[first : first + PIECE]), names[first : first + PIECE])
 
@@ -115,7 +114,9 @@ class Grid:
     def pages(self, blocks: Iterable[Block]) -> list[Sequence[TimedPage]]:
         """Pages of each of these blocks in the order of time, none for a block without evidence."""
         self._drain()
-        return [self._timelines[block].timed() if block in self._timelines else () for block in blocks]
+        timelines = [self._timelines.get(block) for block in blocks]
+        settle_all(timeline for timeline in timelines if timeline)
+        return [timeline.timed() if timeline else () for timeline in timelines]
 
     def touch_all(self) -> None:
         """Count all blocks as touched."""
@@ -148,8 +149,8 @@ class Grid:
 
     def counts(self) -> GridCounts:
         """What is there, from counters: nothing is folded or looked through for it."""
-        waiting = is_foldable(self._rows[: self._waiting].view(SAMPLE_DTYPE), self.config)
-        voting, n = int(np.count_nonzero(waiting)), BLOCK_CELLS
+        waiting = self._rows[: self._waiting].view(SAMPLE_DTYPE)
+        voting, n = count_foldable(waiting, self.config.std_cap_m**2), BLOCK_CELLS
         bounds = None
         if self._blocks:
             west, south, east, north = self._blocks
@@ -159,7 +160,8 @@ class Grid:
     def state(self) -> GridState:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()
-        blocks = ((x, y, self._timelines[x, y].settled()) for x, y in sorted(self._timelines))
+        settle_all(self._timelines.values())
+        blocks = ((x, y, self._timelines[x, y].kept) for x, y in sorted(self._timelines))
         return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns, self.oldest_ns)
 
     @classmethod
@@ -182,7 +184,9 @@ class Grid:
 
     def _take(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Let rows wait; what waits is folded before its weight could exceed a count."""
-        weight = int(rows["distance_m"].sum(dtype=np.float64) * ev.WEIGHT_UNITS_PER_M) + len(rows)
+        oldest_ns, newest_ns, driven_m = extent(rows)
+        self._widen(oldest_ns, newest_ns)
+        weight = int(driven_m * ev.WEIGHT_UNITS_PER_M) + len(rows)
         if self._weight + weight > ev.COUNT_MAX:
             self._drain()
         self._weight += weight
@@ -218,13 +222,14 @@ class Grid:
                 cells[worker] += timeline.add(packed)
                 self._touched.add(block)
                 self._turns[block] = self._turn
+            settle_all({self._timelines[block] for block, _ in pages[worker]}, PATIENCE)
 
         self._turn += 1
         self._workers.each(fold_share)
         self._workers.each(add_share)
         self._cells += sum(cells)
         self._extend({block for share in pages for block, _ in share})
-        voting = int(is_foldable(rows, self.config).sum())
+        voting = count_foldable(rows, self.config.std_cap_m**2)
         self._folded += voting
         self._skipped += len(rows) - voting
         self._waiting, self._weight = 0, 0
@@ -243,18 +248,18 @@ class Grid:
 
     def _settle(self, worker: int) -> None:
         """Settle a worker's own blocks."""
-        for block, timeline in self._timelines.items():
-            if _worker_of(block, self._workers.count) == worker:
-                timeline.space = self._spaces[worker]
-                timeline.settled()
+        own = [line for block, line in self._timelines.items() if _worker_of(block, self._workers.count) == worker]
+        for timeline in own:
+            timeline.space = self._spaces[worker]
+        settle_all(own)
 
     def _engage(self, workers: Workers, waiting_rows: int) -> None:
         """Go on with other workers, each with space of its own."""
         self._drain()
         self._workers = workers
         self._rows, self._names = np.empty(waiting_rows, RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
-        self._scratch = [*self._scratch, *(scratch_block() for _ in range(workers.count))][: workers.count]
-        self._spaces = [*self._spaces, *(Space() for _ in range(workers.count))][: workers.count]
+        self._scratch = [Scratch() for _ in range(workers.count)]
+        self._spaces = [Space() for _ in range(workers.count)]
         for timeline in self._timelines.values():
             timeline.space = self._spaces[0]
 

@@ -11,9 +11,11 @@ import numba
 import numpy as np
 
 from mapserver.evidence.cells import CELLS, COUNTS
+from mapserver.evidence.fold_config import HASH
 
 _PLANE, _CELL = np.uint64(0xFF00), np.uint64(CELLS - 1)  # of a place
 _LOW = np.uint64(0xFFFF)  # of a count
+_ONE, _HASH = np.uint64(1), np.uint64(HASH)  # unsigned, as indices below: the compiler need not look for negative ones
 
 
 @numba.njit(cache=True, nogil=True)
@@ -45,57 +47,60 @@ def compact_votes(table: Any, votes: Any, runs: Any, cells: Any, counts: Any, hi
 @numba.njit(cache=True, nogil=True)
 def expand_votes(table: Any, runs: Any, cells: Any, counts: Any, high: Any, out: Any) -> None:
     """Undo `compact_votes`; out (k,) votes. high may be empty. The table (n, 6) is put right again."""
-    run, at = 0, 0
+    run, at = 0, np.uint64(0)
     for p in range(len(table)):
         end_run = table[p, 2]
         table[p, 2] = at
         while run < end_run:
             plane = np.uint64(runs[run, 0]) << np.uint64(8)
-            for _ in range(np.int64(runs[run, 1]) + 1):
-                count = np.uint64(counts[at])
-                if len(high):
-                    count |= np.uint64(high[at]) << np.uint64(16)
-                out[at] = (count << np.uint64(16)) | plane | np.uint64(cells[at])
-                at += 1
+            end = at + np.uint64(runs[run, 1]) + _ONE
+            for i in range(at, end):
+                out[i] = (np.uint64(counts[i]) << np.uint64(16)) | plane | np.uint64(cells[i])
+            at = end
             run += 1
         table[p, 3] = at
+    for i in range(np.uint64(len(high))):
+        out[i] |= np.uint64(high[i]) << np.uint64(32)
 
 
 @numba.njit(cache=True, nogil=True)
-def compact_cells(table: Any, cells: Any, out: Any, words: Any) -> int:
+def compact_cells(table: Any, cells: Any, out: Any, words: Any, ends: Any) -> None:
     """Replace bitmaps and stamps of cells by numbers of words: each page has its own, all different, in one list.
 
     Fills out (k, 4): cell, and numbers of its visits, its machines and its stamp among the page's words; words (m,)
-    uint64: for each page how many of the three there are, packed in 9 bits each, then the words. Returns how many.
+    uint64: for each page how many of the three there are, packed in 9 bits each, then the words; ends (n,) of the words
+    of each page.
     """
-    used = 0
+    used = np.uint64(0)
+    slots, list_number = np.zeros(1024, np.int64), 0  # of a hash table: number of the list, and of a word in it
     for p in range(len(table)):
-        first, end = table[p, 4], table[p, 5]
+        cells_of_page = range(np.uint64(table[p, 4]), np.uint64(table[p, 5]))
         header = used
-        used += 1
+        used += _ONE
         sizes = np.uint64(0)
         for part in range(3):
             begin = used
-            for j in range(first, end):
+            list_number += 1
+            for j in cells_of_page:
                 if part == 0:
                     word = cells[j].visits
                 elif part == 1:
                     word = cells[j].machines
                 else:
                     word = np.uint64(cells[j].newest_ns)
-                number = used - 1
-                while number >= begin and words[number] != word:
-                    number -= 1
-                if number < begin:
+                slot = (word * _HASH) >> np.uint64(54)
+                while slots[slot] >> 16 == list_number and words[begin + np.uint64(slots[slot] & 0xFFFF)] != word:
+                    slot = (slot + _ONE) & np.uint64(1023)
+                if slots[slot] >> 16 != list_number:
+                    slots[slot] = list_number << 16 | np.int64(used - begin)
                     words[used] = word
-                    number = used
-                    used += 1
-                out[j, 1 + part] = number - begin
-            sizes |= np.uint64(used - begin) << np.uint64(9 * part)
+                    used += _ONE
+                out[j, np.uint64(1 + part)] = slots[slot] & 0xFFFF
+            sizes |= (used - begin) << np.uint64(9 * part)
         words[header] = sizes
-        for j in range(first, end):
+        for j in cells_of_page:
             out[j, 0] = cells[j].cell
-    return used
+        ends[p] = used
 
 
 @numba.njit(cache=True, nogil=True)
@@ -113,6 +118,36 @@ def expand_cells(table: Any, compact: Any, words: Any, out: Any) -> None:
             out[j].visits = words[visits + compact[j, 1]]
             out[j].machines = words[machines + compact[j, 2]]
             out[j].newest_ns = np.int64(words[stamps + compact[j, 3]])
+
+
+@numba.njit(cache=True, nogil=True)
+def sum_pages(table: Any, votes: Any, cells: Any, start: Any, counts: Any, bitmaps: Any, newest_ns: Any) -> None:
+    """Add pages, in the order of their table, to counts (256, COUNTS), bitmaps (256, 2) and newest_ns (256,).
+
+    start (256,): the place in that order of the first page that counts in each cell.
+    """
+    for p in range(len(table)):
+        for j in range(table[p, 2], table[p, 3]):
+            place = votes[j] & _LOW
+            cell = place & _CELL
+            if start[cell] <= p:
+                counts[cell, place >> np.uint64(8)] += votes[j] >> np.uint64(16)
+        for j in range(table[p, 4], table[p, 5]):
+            cell = np.uint64(cells[j].cell)
+            if start[cell] <= p:
+                bitmaps[cell, 0] |= cells[j].visits
+                bitmaps[cell, 1] |= cells[j].machines
+                newest_ns[cell] = max(newest_ns[cell], cells[j].newest_ns)
+
+
+@numba.njit(cache=True, nogil=True)
+def note(known: Any, cells: Any) -> int:
+    """Set known (256,) for cells (k,) CELL; returns for how many it was not set."""
+    more = 0
+    for cell in cells:
+        more += not known[cell.cell]
+        known[cell.cell] = True
+    return more
 
 
 @numba.njit(cache=True, nogil=True)

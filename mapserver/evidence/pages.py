@@ -7,22 +7,25 @@ and snapshots take them without a copy.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence import page_kernels
-from protocol.arrays import Bools, Ints, Table
+from mapserver.evidence.buffers import Buffers
+from protocol.arrays import AnyArray, Bools, Ints, Table
 
 # place: bin * 256 + cell. Counts of a few passes fit into 16 bits; where one does not, all of a block are wide.
 TIERS = 4  # of a timeline: buckets, hours, days, all before
 NARROW = np.dtype([("place", "<u2"), ("count", "<u2")])
 WIDE = np.dtype([("place", "<u2"), ("count", "<u4")])
 CELL = np.dtype([("cell", "u1"), ("visits", "<u8"), ("machines", "<u8"), ("newest_ns", "<i8")])
+NO_HIGH = np.empty(0, np.uint16)
 RAW_CELL = np.dtype((np.void, CELL.itemsize))  # numpy copies records field by field, and these at once
 
 
@@ -42,8 +45,7 @@ class Page:
         newest_ns[cells] = np.maximum(newest_ns[cells], self.cells["newest_ns"])
 
 
-@dataclass(frozen=True, slots=True)
-class PackedPages:
+class PackedPages(NamedTuple):
     """Pages of one block end to end: few long arrays instead of many short ones.
 
     table (n, 6): tier, index, first and end of the votes and of the cells of each page. votes (m,), uint32 or,
@@ -81,14 +83,25 @@ class CompactPages:
 
     @classmethod
     def from_packed(cls, table: Ints, votes: NDArray[np.uint64], cells: Table) -> CompactPages:
-        """Pages in the order of their rows in the table, whose first end where the next begin. The table is changed."""
-        n = len(votes)
-        runs, of_cells, counts = np.empty((n, 2), np.uint8), np.empty(n, np.uint8), np.empty(n, np.uint16)
-        high = np.empty(0 if int(votes.max(initial=0)) < 2**32 else n, np.uint16)
-        marks, words = np.empty((len(cells), 4), np.uint8), np.empty(len(table) + 3 * len(cells), np.uint64)
-        used = page_kernels.compact_cells(table, cells, marks, words)
-        used_runs = page_kernels.compact_votes(table, votes, runs, of_cells, counts, high)
-        return cls(table.astype(np.int32), runs[:used_runs].copy(), of_cells, counts, high, marks, words[:used].copy())
+        """Pages in the order of their rows in the table, whose first end where the next begin."""
+        return compact(np.array([len(table)]), table, votes, cells, Buffers())[0]
+
+    @classmethod
+    def joined(cls, parts: Sequence[CompactPages]) -> CompactPages:
+        """Pages of several blocks end to end."""
+        table = np.concatenate([part.table for part in parts])
+        table[:, 2:] += _repeated(
+            [(len(part.runs), len(part.cells), len(part.marks), len(part.marks)) for part in parts],
+            [len(part.table) for part in parts],
+        )
+        runs, cells, counts, marks, words = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("runs", "cells", "counts", "marks", "words")
+        )
+        high = NO_HIGH
+        if any(len(part.high) for part in parts):
+            high = np.concatenate([part.high if len(part.high) else np.zeros_like(part.counts) for part in parts])
+        return cls(table, runs, cells, counts, high, marks, words)
 
     @property
     def nbytes(self) -> int:
@@ -117,9 +130,55 @@ class CompactPages:
         page_kernels.expand_cells(pages.table, self.marks, self.words, pages.cells)
 
 
-def frozen(records: Table) -> Table:
-    """A copy that cannot be written to; much quicker than `copy`, which goes through records field by field."""
-    return np.frombuffer(records.tobytes(), records.dtype)
+def copied(part: AnyArray) -> AnyArray:
+    """A copy that keeps nothing else alive. Not numpy's: that lets go of Python's lock where it is long.
+
+    Two threads that fold would wait for each other longer than a copy takes.
+    """
+    return np.frombuffer(part.tobytes(), part.dtype).reshape(part.shape)
+
+
+def compact(ends: Ints, table: Ints, votes: NDArray[np.uint64], cells: Table, buffers: Buffers) -> list[CompactPages]:
+    """Pages of several blocks, each whole and by itself.
+
+    ends (b,): of the pages of each block. table (n, 6), votes, cells: as of PackedPages, pages end to end.
+    """
+    n, array = len(votes), buffers.array
+    runs, of_cells, counts = array("runs", n, np.uint8, 2), array("places", n, np.uint8), array("counts", n, np.uint16)
+    high = NO_HIGH if int(votes.max(initial=0)) < 2**32 else np.empty(n, np.uint16)
+    marks, words = array("marks", len(cells), np.uint8, 4), array("words", len(table) + 3 * len(cells), np.uint64)
+    word_ends = np.empty(len(table), np.int64)
+    table = table.copy()
+    page_kernels.compact_cells(table, cells, marks, words, word_ends)
+    page_kernels.compact_votes(table, votes, runs, of_cells, counts, high)
+    # where the parts of each block end: pages, runs, votes, marks, words
+    until = np.zeros((len(ends) + 1, 5), np.int64)
+    has_pages = ends > 0
+    until[1:, 0] = ends
+    until[1:, 1:4][has_pages] = table[ends[has_pages] - 1][:, [2, 3, 5]]
+    until[1:, 4][has_pages] = word_ends[ends[has_pages] - 1]
+    table[:, 2:] -= np.repeat(until[:-1, [1, 2, 3, 3]], np.diff(until[:, 0]), axis=0)
+    small = table.astype(np.int32)
+    blocks = []
+    for (page, run, vote, mark, word), (page_, run_, vote_, mark_, word_) in pairwise(until.tolist()):
+        blocks.append(
+            CompactPages(
+                copied(small[page:page_]),
+                copied(runs[run:run_]),
+                copied(of_cells[vote:vote_]),
+                copied(counts[vote:vote_]),
+                copied(high[vote:vote_]) if len(high) and high[vote:vote_].any() else NO_HIGH,
+                copied(marks[mark:mark_]),
+                copied(words[word:word_]),
+            )
+        )
+    return blocks
+
+
+def _repeated(lengths: Sequence[tuple[int, ...]], times: Sequence[int]) -> Ints:
+    """Where the parts of each block begin, once for each of its pages."""
+    begins = np.cumsum([(0,) * len(lengths[0]), *lengths[:-1]], axis=0)
+    return np.repeat(begins, times, axis=0)
 
 
 def pick(page: Page, wanted: Bools) -> Page:

@@ -32,17 +32,46 @@ _TABLE = TABLE.astype(np.uint32)
 
 
 @numba.njit(cache=True, nogil=True)
+def extent(rows: Any) -> tuple[int, int, float]:
+    """Oldest and newest stamp of rows, and how far they were driven [m]."""
+    oldest_ns, newest_ns, driven_m = rows[0].stamp_ns, rows[0].stamp_ns, 0.0
+    for k in range(len(rows)):
+        oldest_ns = min(oldest_ns, rows[k].stamp_ns)
+        newest_ns = max(newest_ns, rows[k].stamp_ns)
+        driven_m += np.float64(rows[k].distance_m)
+    return oldest_ns, newest_ns, driven_m
+
+
+@numba.njit(cache=True, nogil=True)
+def count_foldable(rows: Any, cap_m2: float) -> int:
+    """How many rows `is_foldable` lets vote."""
+    count = 0
+    for k in range(len(rows)):
+        row = rows[k]
+        largest_m2 = _largest(np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2))
+        count += largest_m2 <= cap_m2
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _largest(xx: float, xy: float, yy: float) -> float:
+    """Larger eigenvalue of a covariance."""
+    half = (xx - yy) / 2
+    largest: float = (xx + yy) / 2 + np.sqrt(half * half + xy * xy)
+    return largest
+
+
+@numba.njit(cache=True, nogil=True)
 def locate(
-    rows: Any, limits: tuple[float, float, float], bucket_ns: int, places: Any, stencils: Any
-) -> tuple[Any, Any, int]:
+    rows: Any, limits: tuple[float, float, float], bucket_ns: int, places: Any, stencils: Any, keys: Any, touching: Any
+) -> tuple[int, int]:
     """Where rows lie, and which blocks their stencils touch.
 
     limits: cell size [m], variance added to every position, largest variance of one that votes [m2]. Fills places
     (n, 5): position in cells, inverse covariance xx, 2 xy, yy; and stencils (n, 3): first column and row, and edge in
-    cells, 0 where a row has no vote. Returns keys and row numbers, one each for every block that a row touches, and the
-    cells of all stencils together.
+    cells, 0 where a row has no vote; keys and touching with keys and row numbers, one each for every block that a row
+    touches, as long as there is room. Returns how many of these, and the cells of all stencils together.
     """
-    keys, touching = np.empty(3 * len(rows) + 16, np.int64), np.empty(3 * len(rows) + 16, np.int32)
     used, area = 0, 0
     for k in range(len(rows)):
         reach = _place(rows[k], limits, places[k])
@@ -56,13 +85,11 @@ def locate(
         bucket = rows[k].stamp_ns // bucket_ns
         for y in range(row >> 4, ((row + n - 1) >> 4) + 1):
             for x in range(column >> 4, ((column + n - 1) >> 4) + 1):
-                if used == len(keys):
-                    keys = np.concatenate((keys, np.empty_like(keys)))
-                    touching = np.concatenate((touching, np.empty_like(touching)))
-                keys[used] = ((x + HALF) << (BLOCK_BITS + BUCKET_BITS)) | ((y + HALF) << BUCKET_BITS) | bucket
-                touching[used] = k
+                if used < len(keys):
+                    keys[used] = ((x + HALF) << (BLOCK_BITS + BUCKET_BITS)) | ((y + HALF) << BUCKET_BITS) | bucket
+                    touching[used] = k
                 used += 1
-    return keys[:used], touching[:used], area
+    return used, area
 
 
 @numba.njit(cache=True, nogil=True)
@@ -70,8 +97,7 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
     """Position and inverse covariance of one row in cells; returns its reach in cells, -1 where it has no vote."""
     cell_m, floor_m2, cap_m2 = limits
     cov_xx, cov_xy, cov_yy = np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2)
-    half = (cov_xx - cov_yy) / 2
-    if not (cov_xx + cov_yy) / 2 + np.sqrt(half * half + cov_xy * cov_xy) <= cap_m2:
+    if not _largest(cov_xx, cov_xy, cov_yy) <= cap_m2:
         return -1
     per_m2 = 1 / (cell_m * cell_m)
     most = np.sqrt(cov_xx * cov_yy)
@@ -114,15 +140,16 @@ def _weights(place: Any, stencil: Any, shares: Any, used: int) -> int:
     """Fill a stencil with weights from the table; returns their sum."""
     n = stencil[2]
     total = 0
+    first, px, xx = stencil[0] + 0.5, place[0], place[2]
     for dy in range(n):
         y = (stencil[1] + dy + 0.5) - place[1]
         b, c = place[3] * y, place[4] * y * y
-        line = shares[used + dy * n :][:n]
-        for dx in range(n):
-            x = (stencil[0] + dx + 0.5) - place[0]
-            d2 = (place[2] * x + b) * x + c
-            weight = _TABLE[int(min(d2 * TABLE_PER_UNIT, TABLE_LAST))]
-            line[dx] = weight
+        at = np.uint64(used + dy * n)
+        for dx in range(np.uint64(n)):  # unsigned: the compiler need not look for negative indices
+            x = (first + np.float64(dx)) - px
+            d2 = (xx * x + b) * x + c
+            weight = _TABLE[np.uint32(min(d2 * TABLE_PER_UNIT, TABLE_LAST))]
+            shares[at + dx] = weight
             total += int(weight)
     return total
 

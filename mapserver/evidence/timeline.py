@@ -8,7 +8,7 @@ samples alone. That is why it may be settled late, and why the timelines of two 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, overload
 
@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold_config import FoldConfig
-from mapserver.evidence.pages import CELL, EMPTY, RAW_CELL, CompactPages, PackedPages, Page, pick
-from mapserver.evidence.timeline_kernel import settle
-from protocol.arrays import AnyArray, Bools, Ints
+from mapserver.evidence.page_kernels import note, sum_pages
+from mapserver.evidence.pages import EMPTY, CompactPages, PackedPages, Page, pick
+from mapserver.evidence.settling import Space, Tiers, settled
+from protocol.arrays import Bools, Ints
 
-HOUR_S, DAY_S = 3600, 86_400
 PATIENCE = 24  # pages that wait before a timeline is settled: fewer cost time, more cost memory
 Block = tuple[int, int]  # column and row
 
@@ -59,11 +58,19 @@ class TimedPages(Sequence[TimedPage]):
 
     def packed_votes(self) -> tuple[NDArray[np.uint64], Ints]:
         """As the function of this name, without a page by itself."""
+        pages, table = self._in_order()
+        parts = [pages.votes[first:end] for first, end in table[:, 2:4].tolist()]
+        return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(table[:, 3] - table[:, 2])
+
+    def add_to(self, start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints) -> None:
+        """Add what counts from page `start` (256,) of each cell on, as `sum_pages` does."""
+        pages, table = self._in_order()
+        sum_pages(table, pages.votes, pages.cells, start, counts, bitmaps, newest_ns)
+
+    def _in_order(self) -> tuple[PackedPages, Ints]:
+        """The pages, and their table in the order of time."""
         pages = self._pages.expanded()
-        order = np.lexsort((pages.table[:, 1], -pages.table[:, 0]))
-        parts = [pages.votes[first:end] for first, end in pages.table[order, 2:4].tolist()]
-        lengths = pages.table[order, 3] - pages.table[order, 2]
-        return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(lengths)
+        return pages, pages.table[np.lexsort((pages.table[:, 1], -pages.table[:, 0]))]
 
     @overload
     def __getitem__(self, index: int) -> TimedPage: ...
@@ -71,20 +78,6 @@ class TimedPages(Sequence[TimedPage]):
     def __getitem__(self, index: slice) -> list[TimedPage]: ...
     def __getitem__(self, index: int | slice) -> TimedPage | list[TimedPage]:
         return list(self)[index]
-
-
-@dataclass(frozen=True)
-class Tiers:
-    """Spans of growing lengths [ns], of which the newest `keeps` of each cell stay apart; the last one has no end."""
-
-    spans_ns: Ints
-    keeps: Ints
-
-    @classmethod
-    def from_config(cls, config: FoldConfig) -> Tiers:
-        """Buckets, hours, days, and everything before them."""
-        spans = (config.bucket_ns, HOUR_S * 10**9, DAY_S * 10**9, 0)
-        return cls(np.array(spans), np.array((config.keep_buckets, config.keep_hours, config.keep_days, 0)))
 
 
 def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
@@ -96,58 +89,43 @@ def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
     return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum([len(part) for part in parts], dtype=np.int64)
 
 
-class Space:
-    """Where timelines are settled, one at a time: the pages that there are, those that come of them, and their sums."""
-
-    def __init__(self) -> None:
-        self.counts = np.zeros(ev.COUNTS * ev.CELLS, np.uint64)
-        self.votes, self.out_votes = np.empty(0, np.uint64), np.empty(0, np.uint64)
-        self.cells: AnyArray = np.empty(0, RAW_CELL)
-        self.out_cells: AnyArray = np.empty(0, RAW_CELL)
-
-    def grow(self, votes: int, cells: int) -> None:
-        """Have space for so many votes and cells, and one more of each for the kernel, which writes one place ahead."""
-        if votes >= len(self.votes):
-            self.votes, self.out_votes = (np.empty(2 * votes + 1, np.uint64) for _ in range(2))
-        if cells >= len(self.cells):
-            self.cells, self.out_cells = (np.empty(2 * cells + 1, RAW_CELL) for _ in range(2))
-
-
 class Timeline:
-    """Pages of one block: settled ones, and those that came since.
+    """Pages of one block: kept are those that are settled, fresh those that came since, waiting is how many.
 
     known_cells: how many cells have evidence. space: where it is settled, that of the thread which adds or reads.
     """
 
-    __slots__ = ("_fresh", "_known", "_settled", "_tiers", "_timed", "_waiting", "known_cells", "space")
+    __slots__ = ("_known", "_timed", "fresh", "kept", "known_cells", "space", "tiers", "waiting")
 
     def __init__(self, tiers: Tiers, space: Space, settled: CompactPages = EMPTY) -> None:
-        self._tiers, self.space = tiers, space
-        self._settled = settled
-        self._fresh: list[PackedPages] = []
-        self._waiting = 0
+        self.tiers, self.space = tiers, space
+        self.kept = settled
+        self.fresh: list[PackedPages] = []
+        self.waiting = 0
         self._timed: TimedPages | None = None
         self._known: Bools = np.zeros(ev.CELLS, np.bool_)
         self._known[settled.marks[:, 0]] = True
         self.known_cells = int(np.count_nonzero(self._known))
 
     def add(self, pages: PackedPages) -> int:
-        """Add evidence of any tiers and spans, also of those that are there; returns how many cells are new."""
-        known_before = self.known_cells
-        self._fresh.append(pages)
-        self._known[pages.cells["cell"]] = True
-        self.known_cells = int(np.count_nonzero(self._known))
-        self._waiting += len(pages.table)
-        if self._waiting >= PATIENCE:
-            self.settled()
-        return self.known_cells - known_before
+        """Add evidence of any tiers and spans, also of those that are there; returns how many cells are new.
+
+        It waits to be settled; see `settle_all`.
+        """
+        self.fresh.append(pages)
+        self.waiting += len(pages.table)
+        more = note(self._known, pages.cells)
+        self.known_cells += more
+        return more
+
+    def keep(self, pages: CompactPages) -> None:
+        """Go on with these pages, which hold the fresh ones as well."""
+        self.kept, self.fresh, self.waiting, self._timed = pages, [], 0, None
 
     def settled(self) -> CompactPages:
         """All pages, in the order of tier and index, each cell's newest spans apart."""
-        if self._fresh:
-            self._settled = _settled(self._settled, self._fresh, self._tiers, self.space)
-            self._fresh, self._waiting, self._timed = [], 0, None
-        return self._settled
+        settle_all([self])
+        return self.kept
 
     def items(self) -> Iterator[tuple[int, int, Page]]:
         """Tier, index on it, and page, sorted."""
@@ -155,10 +133,19 @@ class Timeline:
 
     def timed(self) -> TimedPages:
         """Pages in the order of time; the same object until something is added."""
-        self.settled()
+        settle_all([self])
         if self._timed is None:
-            self._timed = TimedPages(self._settled, self._tiers)
+            self._timed = TimedPages(self.kept, self.tiers)
         return self._timed
+
+
+def settle_all(timelines: Iterable[Timeline], least: int = 1) -> None:
+    """Settle those timelines, of one grid, on which at least so many pages wait: quicker than one by one."""
+    some = [timeline for timeline in timelines if timeline.waiting >= least]
+    if some:
+        blocks = [(timeline.kept, timeline.fresh) for timeline in some]
+        for timeline, pages in zip(some, settled(blocks, some[0].tiers, some[0].space), strict=True):
+            timeline.keep(pages)
 
 
 def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
@@ -166,55 +153,35 @@ def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
     return index * span_ns, (index + 1) * span_ns if span_ns else int(page.cells["newest_ns"].max()) + 1
 
 
-def _settled(settled: CompactPages, fresh: list[PackedPages], tiers: Tiers, space: Space) -> CompactPages:
-    votes, cells = len(settled.cells), len(settled.marks)
-    if not cells and len(fresh) == 1 and len(fresh[0].table) <= tiers.keeps[0] and not fresh[0].table[:, 0].any():
-        (only,) = fresh  # few buckets, in order and each once, as the fold or another timeline gives them: all are kept
-        return CompactPages.from_packed(only.table.copy(), only.votes.astype(np.uint64), only.cells)
-    table = np.concatenate([settled.table.astype(np.int64), *(pages.table for pages in fresh)])
-    space.grow(votes + sum(len(pages.votes) for pages in fresh), cells + sum(len(pages.cells) for pages in fresh))
-    row = len(settled.table)
-    if cells:
-        settled.expand_into(PackedPages(table[:row], space.votes[:votes], space.cells[:cells].view(CELL)))
-    for pages in fresh:
-        table[row : row + len(pages.table), 2:4] += votes
-        table[row : row + len(pages.table), 4:6] += cells
-        space.votes[votes : votes + len(pages.votes)] = pages.votes
-        space.cells[cells : cells + len(pages.cells)] = pages.cells.view(RAW_CELL)
-        row, votes, cells = row + len(pages.table), votes + len(pages.votes), cells + len(pages.cells)
-    out_table: Ints = np.empty((len(table) * len(tiers.keeps), 6), np.int64)
-    out_cells = space.out_cells.view(CELL)
-    before = space.votes, space.cells.view(CELL)
-    n, used, filled = settle(
-        table, *before, tiers.spans_ns, tiers.keeps, space.counts, out_table, space.out_votes, out_cells
-    )
-    return CompactPages.from_packed(out_table[:n], space.out_votes[:used], out_cells[:filled])
-
-
 def evidence(pages: Sequence[Sequence[TimedPage]], first: Sequence[Ints] | None = None) -> ev.Evidence:
     """Sum the pages of blocks, in the order of time.
 
     first: for each block, index (256,) of the first page that counts in each of its cells; without it all pages count.
     """
-    counts = np.zeros((len(pages), ev.COUNTS, ev.CELLS), np.uint64)
+    counts = np.zeros((len(pages), ev.CELLS, ev.COUNTS), np.uint64)
     bitmaps = np.zeros((len(pages), ev.CELLS, 2), np.uint64)
     newest_ns = np.zeros((len(pages), ev.CELLS), np.int64)
     changed_ns = np.zeros((len(pages), ev.CELLS), np.int64)
     for i, block_pages in enumerate(pages):
         start = first[i] if first else np.zeros(ev.CELLS, np.int64)
-        _sum(block_pages, start, counts[i].reshape(-1), bitmaps[i], newest_ns[i])
+        if isinstance(block_pages, TimedPages):
+            block_pages.add_to(start, counts[i], bitmaps[i], newest_ns[i])
+        else:
+            _sum(block_pages, start, counts[i], bitmaps[i], newest_ns[i])
         if start.any():
             changed_ns[i] = _changed_ns(block_pages, start)
-    return ev.Evidence(counts.transpose(0, 2, 1), bitmaps, newest_ns, changed_ns)
+    return ev.Evidence(counts, bitmaps, newest_ns, changed_ns)
 
 
 def _sum(
     pages: Sequence[TimedPage], start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints
 ) -> None:
     last = int(start.max(initial=0))
+    planes = np.zeros(ev.COUNTS * ev.CELLS, np.uint64)
     for index, timed in enumerate(pages):
         page = timed.page if index >= last else pick(timed.page, start <= index)
-        page.add_to(counts, bitmaps, newest_ns)
+        page.add_to(planes, bitmaps, newest_ns)
+    counts += planes.reshape(ev.COUNTS, ev.CELLS).T
 
 
 def _changed_ns(pages: Sequence[TimedPage], start: Ints) -> Ints:

@@ -1,4 +1,4 @@
-"""The timeline of one block, compiled: all of its pages at once into those that are kept apart.
+"""Timelines compiled: all pages of a block at once into those that are kept apart.
 
 Votes are packed in 64 bits: the place (bin * 256 + cell) in the lower 16, the count above them.
 """
@@ -13,37 +13,65 @@ import numpy as np
 from mapserver.evidence.cells import CELLS, COUNT_MAX, COUNTS
 
 _INDEX_BITS = 40  # of a span, below its tier
+# Indices of long loops are unsigned: the compiler then need not look for negative ones, which count from the end.
 
 
 @numba.njit(cache=True, nogil=True)
-def settle(
-    table: Any,
-    votes: Any,
-    cells: Any,
-    spans: Any,
-    keeps: Any,
-    counts: Any,
-    out_table: Any,
-    out_votes: Any,
-    out_cells: Any,
-) -> tuple[int, int, int]:
-    """Sum the pages of a block, so that each cell keeps its newest spans of each tier apart.
+def settle_blocks(
+    ends: Any, table: Any, votes: Any, cells: Any, spans: Any, keeps: Any, counts: Any, tiers: Any,
+    out_ends: Any, out_table: Any, out_votes: Any, out_cells: Any,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Sum the pages of blocks, so that each cell keeps its newest spans of each tier apart.
 
-    table (n, 6): tier, index, first and end of the votes and of the cells of each page, in any order. spans, keeps:
-    length [ns] and number of the spans of each tier; the last tier is everything before, its span 0. counts: scratch
-    (COUNTS * 256,) uint64, zero before and after. Fills pages, votes and cells in the order of tier and index, and
-    returns how many of each.
+    ends (b,): of the pages of each block. table (n, 6): tier, index, first and end of the votes and of the cells of
+    each page, those of a block in any order. spans, keeps: length [ns] and number of the spans of each tier; the last
+    tier is everything before, its span 0. Scratch: counts (COUNTS * 256,) uint64, zero before and after; tiers, an int8
+    each cell. Fills pages, votes and cells in the order of block, tier and index, and where the pages of
+    each block end, and returns how many of each.
     """
+    pages, used, filled, first = 0, 0, 0, 0
+    for block in range(len(ends)):
+        rows = table[first : ends[block]]
+        if _is_settled(rows, keeps[0]):
+            for p in range(len(rows)):
+                row = out_table[pages]
+                row[0], row[1], row[2], row[4] = rows[p, 0], rows[p, 1], used, filled
+                used = _copy(votes, rows[p, 2], rows[p, 3], out_votes, used)
+                filled = _copy(cells, rows[p, 4], rows[p, 5], out_cells, filled)
+                row[3], row[5] = used, filled
+                pages += 1
+        else:
+            pages, used, filled = _settle(
+                rows, votes, cells, spans, keeps, counts, tiers, out_table, out_votes, out_cells, pages, used, filled
+            )
+        out_ends[block] = pages
+        first = ends[block]
+    return pages, used, filled
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_settled(table: Any, keep: int) -> bool:
+    """Whether these are few buckets, in order and each once, as one fold gives them: all are kept apart."""
+    last, p = -1, 0
+    while p < len(table) and table[p, 0] == 0 and table[p, 1] > last:
+        last, p = table[p, 1], p + 1
+    return len(table) == p <= keep
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(
+    table: Any, votes: Any, cells: Any, spans: Any, keeps: Any, counts: Any, tiers: Any,
+    out_table: Any, out_votes: Any, out_cells: Any, pages: int, used: int, filled: int,
+) -> tuple[int, int, int]:  # fmt: skip
+    """The pages of one block; pages, used, filled: how many pages, votes and cells there are already."""
     indices = _indices(table, spans)
-    tiers = _tiers(table, indices, cells, keeps)
+    _find_tiers(table, indices, cells, keeps, tiers)
     held = _held(table, tiers, len(spans))
     spread = held.sum(axis=1) > 1  # pages whose cells are on several tiers
-    keys = _keys(indices, held)
     wanted: Any = np.zeros(CELLS, np.bool_)
     planes = np.zeros(COUNTS, np.bool_)
     visits, machines, newest = np.zeros(CELLS, np.uint64), np.zeros(CELLS, np.uint64), np.zeros(CELLS, np.int64)
-    pages, used, filled = 0, 0, 0
-    for key in keys:
+    for key in _keys(indices, held):
         tier, index = key >> _INDEX_BITS, key & ((1 << _INDEX_BITS) - 1)
         row = out_table[pages]
         row[0], row[1], row[2], row[4] = tier, index, used, filled
@@ -57,7 +85,8 @@ def settle(
         else:
             for p in range(len(table)):
                 if held[p, tier] and indices[p, tier] == index:
-                    _add(table[p], tier, tiers, votes, cells, wanted, counts, planes, visits, machines, newest)
+                    every = not spread[p]
+                    _add(table[p], tier, tiers, votes, cells, wanted, counts, planes, visits, machines, newest, every)
             used = _emit_votes(counts, planes, newest, out_votes, used)
             filled = _emit_cells(visits, machines, newest, out_cells, filled)
         row[3], row[5] = used, filled
@@ -68,21 +97,27 @@ def settle(
 @numba.njit(cache=True, nogil=True)
 def _add(
     page: Any, tier: int, tiers: Any, votes: Any, cells: Any, wanted: Any,
-    counts: Any, planes: Any, visits: Any, machines: Any, newest: Any,
+    counts: Any, planes: Any, visits: Any, machines: Any, newest: Any, all_wanted: Any,
 ) -> None:  # fmt: skip
-    """Add the cells of a page that are on a tier, and their votes."""
-    for j in range(page[4], page[5]):
-        cell = cells[j]
-        wanted[cell.cell] = tiers[j] == tier
+    """Add the cells of a page that are on a tier, and their votes; all_wanted: whether those are all of its cells."""
+    for j in range(np.uint64(page[4]), np.uint64(page[5])):
+        cell = np.uint64(cells[j].cell)
+        wanted[cell] = tiers[j] == tier
         if tiers[j] == tier:
-            visits[cell.cell] |= cell.visits
-            machines[cell.cell] |= cell.machines
-            newest[cell.cell] = max(newest[cell.cell], cell.newest_ns)
-    for j in range(page[2], page[3]):
-        place = votes[j] & np.uint64(0xFFFF)
-        if wanted[place & np.uint64(CELLS - 1)]:
+            visits[cell] |= cells[j].visits
+            machines[cell] |= cells[j].machines
+            newest[cell] = max(newest[cell], cells[j].newest_ns)
+    if all_wanted:
+        for j in range(np.uint64(page[2]), np.uint64(page[3])):
+            place = votes[j] & np.uint64(0xFFFF)
             counts[place] += votes[j] >> np.uint64(16)
             planes[place >> np.uint64(8)] = True
+    else:
+        for j in range(np.uint64(page[2]), np.uint64(page[3])):
+            place = votes[j] & np.uint64(0xFFFF)
+            if wanted[place & np.uint64(CELLS - 1)]:
+                counts[place] += votes[j] >> np.uint64(16)
+                planes[place >> np.uint64(8)] = True
 
 
 @numba.njit(cache=True, nogil=True)
@@ -99,9 +134,8 @@ def _indices(table: Any, spans: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _tiers(table: Any, indices: Any, cells: Any, keeps: Any) -> Any:
+def _find_tiers(table: Any, indices: Any, cells: Any, keeps: Any, tiers: Any) -> None:
     """Tier of each cell of each page: cell by cell, what is older than the newest spans of a tier is handed on."""
-    tiers = np.empty(table[:, 5].max() if len(table) else 0, np.int8)
     for p in range(len(table)):
         tiers[table[p, 4] : table[p, 5]] = table[p, 0]
     kept, last = np.empty(CELLS, np.int64), np.empty(CELLS, np.int64)
@@ -111,15 +145,14 @@ def _tiers(table: Any, indices: Any, cells: Any, keeps: Any) -> Any:
             index = indices[p, tier]
             if index < 0:
                 break
-            for j in range(table[p, 4], table[p, 5]):
+            for j in range(np.uint64(table[p, 4]), np.uint64(table[p, 5])):
                 if tiers[j] == tier:
-                    cell = cells[j].cell
+                    cell = np.uint64(cells[j].cell)
                     if last[cell] != index:
                         last[cell] = index
                         kept[cell] += 1
                     if kept[cell] > keeps[tier]:
                         tiers[j] = tier + 1
-    return tiers
 
 
 @numba.njit(cache=True, nogil=True)
@@ -127,8 +160,8 @@ def _held(table: Any, tiers: Any, count: int) -> Any:
     """Whether a page has cells on each tier (n, count)."""
     held = np.zeros((len(table), count), np.bool_)
     for p in range(len(table)):
-        for j in range(table[p, 4], table[p, 5]):
-            held[p, tiers[j]] = True
+        for j in range(np.uint64(table[p, 4]), np.uint64(table[p, 5])):
+            held[p, np.uint8(tiers[j])] = True
     return held
 
 
@@ -146,28 +179,31 @@ def _keys(indices: Any, held: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _copy(source: Any, first: int, end: int, out: Any, used: int) -> int:
-    for i in range(end - first):
-        out[used + i] = source[first + i]
+    source_at, at = np.uint64(first), np.uint64(used)
+    for i in range(np.uint64(end - first)):
+        out[at + i] = source[source_at + i]
     return used + end - first
 
 
 @numba.njit(cache=True, nogil=True)
-def _emit_votes(counts: Any, planes: Any, newest: Any, out: Any, used: int) -> int:
+def _emit_votes(counts: Any, planes: Any, newest: Any, out: Any, used: int) -> Any:
     """Move counts to votes in the order of their places, saturated; returns where they end."""
     low, high = 0, CELLS
     while not newest[low]:
         low += 1
     while not newest[high - 1]:
         high -= 1
+    end = np.uint64(used)
+    most = np.uint64(COUNT_MAX)
     for plane in range(COUNTS):
         if planes[plane]:
             planes[plane] = False
-            for at in range(plane * CELLS + low, plane * CELLS + high):
-                count = min(counts[at], np.uint64(COUNT_MAX))
-                out[used] = (count << np.uint64(16)) | np.uint64(at)
-                used += 1 if count else 0
-                counts[at] = 0
-    return used
+            for at in range(np.uint64(plane * CELLS + low), np.uint64(plane * CELLS + high)):
+                count = min(counts[at], most)
+                out[end] = (count << np.uint64(16)) | at
+                end += np.uint64(count != 0)
+            counts[plane * CELLS + low : plane * CELLS + high] = 0
+    return np.int64(end)
 
 
 @numba.njit(cache=True, nogil=True)

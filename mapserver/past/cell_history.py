@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.fold import Scratch, fold, scratch_block
+from mapserver.evidence.fold import Scratch, fold
 from mapserver.evidence.fold_config import STD_FLOOR_M
 from mapserver.evidence.grid import PIECE
 from mapserver.evidence.pages import PackedPages
@@ -45,7 +45,7 @@ def cell_history(
     selection: time and machines; its bounds are not used.
     """
     selection = replace(selection, bounds=reach_of(CellWindow(*cell, 1, 1), past.cell_m, past.config))
-    scratch = scratch_block()
+    scratch = Scratch()
     parts = [
         part
         for samples in past.samples(reader, selection)

@@ -18,7 +18,7 @@ from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
 from mapserver.past.past import Past
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
-from mapserver.query.tiles import TILE_BYTES, OpenRegions, Reading, TileGrid
+from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
 from mapserver.query.why import reasons
 from protocol.errors import QueryError, Refusal
@@ -57,12 +57,12 @@ class Answers:
 
     def size(self, query: MapQuery) -> int:
         """About how many bytes the answer has."""
-        if isinstance(query, requests.TileQuery | TilesQuery):
-            return TILE_BYTES
+        if isinstance(query, requests.PieceQuery | TilesQuery):
+            return PIECE_BYTES
         if not isinstance(query, RegionQuery):
             return SMALL_BYTES
-        window = self._site.geometry.window(query.bounds)
-        return min(TILE_BYTES, 4 * window.columns * window.rows * len(query.layers or cell_layers.LAYERS) + SMALL_BYTES)
+        window, layers = self._site.geometry.window(query.bounds), len(query.layers or cell_layers.LAYERS)
+        return min(PIECE_BYTES, 4 * window.columns * window.rows * layers + SMALL_BYTES)
 
     def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and carry out one command; QueryError says what is wrong with it."""
@@ -79,8 +79,8 @@ class Answers:
                 return codec.encode_point(self.point(query))
             case RegionQuery():
                 return codec.encode_region(self.region(query))
-            case requests.TileQuery():
-                return codec.encode_region(self.tile(query))
+            case requests.PieceQuery():
+                return codec.encode_region(self.piece(query))
             case requests.TilesQuery():
                 return encode_tiles(self.tiles(query))
             case requests.WhyQuery():
@@ -109,19 +109,19 @@ class Answers:
         return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.version, region.stamp_ns)
 
     def region(self, query: RegionQuery) -> Region:
-        """Layers of all cells that a rectangle touches, or of the first tile of them: `tile` has the others."""
+        """Layers of all cells that a rectangle touches, or of the first piece of them: `piece` has the others."""
         window, names = self._site.geometry.window(query.bounds), _names(query)
         requests.check_size(window.columns, window.rows)
-        tiles = TileGrid.of_layers(window, len(names))
-        if tiles.count == 1:
+        pieces = PieceGrid.of_layers(window, len(names))
+        if pieces.count == 1:
             return self._read(self._reading(window, names, query.when), window)
         self._open.make_room()
         reading = self._reading(window, names, query.when)
-        return self._tile(reading, tiles, 0, self._open.open(reading))
+        return self._piece(reading, pieces, 0, self._open.open(reading))
 
-    def tile(self, query: requests.TileQuery) -> Region:
-        """One more tile of a region that is open."""
-        return self._tile(*self._open.reading(query.cursor, query.number), query.number, query.cursor)
+    def piece(self, query: requests.PieceQuery) -> Region:
+        """One more piece of a region that is open."""
+        return self._piece(*self._open.reading(query.cursor, query.number), query.number, query.cursor)
 
     def history(self, query: HistoryQuery) -> HistoryAnswer:
         """Layers of the cell that a position lies in, span by span."""
@@ -181,8 +181,8 @@ class Answers:
         times = [when.as_of_ns] if when.minus_ns is None else [when.as_of_ns, when.minus_ns]
         return Reading(window, names, tuple(self._view(wide, as_of_ns) for as_of_ns in times))
 
-    def _tile(self, reading: Reading, tiles: TileGrid, number: int, cursor: int) -> Region:
-        return replace(self._read(reading, tiles.tile(number)), tile=tiles.place(number, cursor))
+    def _piece(self, reading: Reading, pieces: PieceGrid, number: int, cursor: int) -> Region:
+        return replace(self._read(reading, pieces.piece(number)), piece=pieces.place(number, cursor))
 
     def _read(self, reading: Reading, window: CellWindow) -> Region:
         """Layers of a window in that of the reading."""

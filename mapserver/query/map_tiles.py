@@ -21,7 +21,7 @@ from mapserver.evidence.timeline import Block, evidence
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.layers import cell_layers
-from mapserver.query.tiles import TILE_BYTES
+from mapserver.query.region_pieces import PIECE_BYTES
 from mapserver.query.views import View
 from protocol.arrays import AnyArray, Ints
 from protocol.queries.answers import MapVersion
@@ -109,7 +109,7 @@ def cut(answer: TilesAnswer, place: Place | None) -> TilesAnswer:
     """What of an answer fits into one reply, from a place on: readers are never sent more than they ask for."""
     tiles = sorted((tile for tile in answer.tiles if place is None or (tile.x, tile.y) >= place), key=_place)
     ends = np.cumsum([len(tile.planes) + TILE_HEAD_BYTES for tile in tiles])
-    fit = max(1, int(np.searchsorted(ends, TILE_BYTES, side="right")))
+    fit = max(1, int(np.searchsorted(ends, PIECE_BYTES, side="right")))
     next_place = _place(tiles[fit]) if fit < len(tiles) else None
     return replace(answer, tiles=tuple(tiles[:fit]), next_place=next_place)
 

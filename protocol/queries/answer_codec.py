@@ -19,7 +19,7 @@ from protocol.queries import answers
 from protocol.site.geometry import MAX_CELLS
 from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_store, unpack
 
-MAX_REPLY_BYTES = 2**23  # a tile has 0.8 MB, a history of 2000 spans 1 MB
+MAX_REPLY_BYTES = 2**23  # a piece has 0.8 MB, a history of 2000 spans 1 MB
 MAX_CHANGES = 1000  # of one answer
 MAX_CELL_M = 1e4
 MAX_PLACE_M = 1e7  # from the origin
@@ -45,7 +45,7 @@ def decode_point(data: bytes) -> answers.PointAnswer:
 
 
 def encode_region(region: answers.Region) -> bytes:
-    """Answer of `region` and `tile`: layers as float32 little-endian, row by row from the south."""
+    """Answer of `region` and `piece`: layers as float32 little-endian, row by row from the south."""
     layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in region.layers.items()}
     return pack(
         {
@@ -57,7 +57,7 @@ def encode_region(region: answers.Region) -> bytes:
             "layers": layers,
             **_version(region.version),
             "stamp_ns": region.stamp_ns,
-            **({"tile": asdict(region.tile)} if region.tile else {}),
+            **({"piece": asdict(region.piece)} if region.piece else {}),
         }
     )
 
@@ -79,19 +79,19 @@ def decode_region(data: bytes) -> answers.Region:
         layers=layers,
         version=_take_version(table),
         stamp_ns=take(table, "stamp_ns", int),
-        tile=_take_tile(table, columns, rows),
+        piece=_take_piece(table, columns, rows),
     )
 
 
-def _take_tile(table: dict[str, Any], columns: int, rows: int) -> answers.Tile | None:
-    """Where a tile of columns x rows cells lies, if that is said; it has to lie within its region."""
-    if table.get("tile") is None:
+def _take_piece(table: dict[str, Any], columns: int, rows: int) -> answers.Piece | None:
+    """Where a piece of columns x rows cells lies, if that is said; it has to lie within its region."""
+    if table.get("piece") is None:
         return None
-    tile = take_record(answers.Tile, table, "tile")
-    inside = 0 <= tile.column <= tile.columns - columns and 0 <= tile.row <= tile.rows - rows
-    if not (inside and 0 <= tile.number < tile.count and tile.columns * tile.rows <= MAX_CELLS):
-        raise MessageError(Refusal.OUT_OF_RANGE, f"{tile} of {columns} x {rows} cells", field="tile")
-    return tile
+    piece = take_record(answers.Piece, table, "piece")
+    inside = 0 <= piece.column <= piece.columns - columns and 0 <= piece.row <= piece.rows - rows
+    if not (inside and 0 <= piece.number < piece.count and piece.columns * piece.rows <= MAX_CELLS):
+        raise MessageError(Refusal.OUT_OF_RANGE, f"{piece} of {columns} x {rows} cells", field="piece")
+    return piece
 
 
 def _take_place(table: dict[str, Any], name: str) -> float:

@@ -48,10 +48,10 @@ class PointAnswer(_OfVersion):
 
 
 @dataclass(frozen=True)
-class Tile:
-    """Where a tile lies in the region that was asked for.
+class Piece:
+    """Where a piece lies in the region that was asked for.
 
-    cursor: names the version of the map that the region is read from. number: of this tile, 0 to count - 1. column,
+    cursor: names the version of the map that the region is read from. number: of this piece, 0 to count - 1. column,
     row: its south-western cell in the region, which has columns x rows cells.
     """
 
@@ -69,7 +69,7 @@ class Region(_OfVersion):
     """A rectangle of cells.
 
     x_m (columns,), y_m (rows,): cell centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
-    NaN where unknown; row 0 is the southernmost. tile: where this is a tile of a larger region; None for all of it.
+    NaN where unknown; row 0 is the southernmost. piece: where this is a piece of a larger region; None for all of it.
     """
 
     x_m: Floats
@@ -78,7 +78,7 @@ class Region(_OfVersion):
     layers: Mapping[str, Floats32]
     version: MapVersion
     stamp_ns: int
-    tile: Tile | None = None
+    piece: Piece | None = None
 
     def __getitem__(self, layer: str) -> Floats32:
         return self.layers[layer]

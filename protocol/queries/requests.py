@@ -62,14 +62,14 @@ class RegionQuery:
 
 
 @dataclass(frozen=True)
-class TileQuery:
-    """One more tile of a region that is answered in tiles; cursor: from its first tile. number: from 0 on."""
+class PieceQuery:
+    """One more piece of a region that is answered in pieces; cursor: from its first piece. number: from 0 on."""
 
     cursor: int
     number: int
     fresh = Freshness()
 
-    name = "tile"
+    name = "piece"
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class WhyQuery:
     name = "why"
 
 
-CellQuery = PointQuery | RegionQuery | TileQuery | HistoryQuery | WhyQuery
+CellQuery = PointQuery | RegionQuery | PieceQuery | HistoryQuery | WhyQuery
 MapQuery = CellQuery | TilesQuery | InfoQuery | AliveQuery | MachinesQuery | ChangesQuery
 
 
@@ -175,7 +175,7 @@ def encode_query(query: MapQuery) -> dict[str, str]:
             return {}
         case ChangesQuery():
             return {"after": str(query.after)} if query.after else {}
-        case TileQuery():
+        case PieceQuery():
             return {"cursor": str(query.cursor), "number": str(query.number)}
         case TilesQuery():
             return _of_tiles(query)
@@ -240,8 +240,8 @@ def _parse_region(parameters: ps.Parameters) -> RegionQuery:
     return RegionQuery(_bounds(parameters), _layers(parameters), _freshness(parameters), _when(parameters))
 
 
-def _parse_tile(parameters: ps.Parameters) -> TileQuery:
-    return TileQuery(*(ps.count({name: ps.required(parameters, name)}, name) for name in ("cursor", "number")))
+def _parse_piece(parameters: ps.Parameters) -> PieceQuery:
+    return PieceQuery(*(ps.count({name: ps.required(parameters, name)}, name) for name in ("cursor", "number")))
 
 
 def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
@@ -280,7 +280,7 @@ _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
     "point": (("x", "y", "layers", "as_of", "minus", *_FRESH), _parse_point),
     "region": (("bounds", "layers", "as_of", "minus", *_FRESH), _parse_region),
-    "tile": (("cursor", "number"), _parse_tile),
+    "piece": (("cursor", "number"), _parse_piece),
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),

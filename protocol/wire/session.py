@@ -17,7 +17,7 @@ DEFAULT_TLS_ENDPOINT = "tls/127.0.0.1:7447"
 _SYSTEM_ERROR = re.compile(r"([^:\[\]()]+) \(os error \d+\)")
 # What keeps a router from stopping for one link:
 ROUTER = {
-    # What waits for a link that does not read [batches of 64 kB]: a whole tile of a region, so that it stops no other.
+    # What waits for a link that does not read [batches of 64 kB]: a whole piece of a region, so that it stops no other.
     "transport/link/tx/queue/size/data": 16,
     # Beyond that, everything else that comes from the same sender stands still, until the link is closed [us]. Zenoh's
     # 5 s are longer than an agent waits for its acknowledgement.

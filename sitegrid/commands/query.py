@@ -15,7 +15,7 @@ from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.files import whole_file
 from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, Region
-from protocol.queries.tiles import Progress
+from protocol.queries.pieces import Progress
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.outputs import OutputFile
@@ -104,7 +104,7 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     sides = (arguments.west_m, arguments.south_m, arguments.east_m, arguments.north_m)
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
     try:
-        region = client.region(sides, layers, **when, after=arguments.after, progress=_tiles_shown())
+        region = client.region(sides, layers, **when, after=arguments.after, progress=_pieces_shown())
     except ValueError as error:
         raise ConfigError("sitegrid query region", str(error)) from None
     if arguments.out:
@@ -131,7 +131,7 @@ def _version(answer: PointAnswer | Region) -> dict[str, Any]:
     return {"store": version.store, "merged": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
 
 
-def _tiles_shown() -> Progress:
+def _pieces_shown() -> Progress:
     """What shows on standard error, now and then, how much of a large region is here."""
     next_s = time.monotonic() + EVERY_S
 
@@ -139,7 +139,7 @@ def _tiles_shown() -> Progress:
         nonlocal next_s
         if time.monotonic() >= next_s:
             next_s = time.monotonic() + EVERY_S
-            note(f"{here} of {count} tiles")
+            note(f"{here} of {count} pieces")
 
     return show
 

@@ -45,13 +45,13 @@ def leaving(ask: Ask) -> None:
 
 
 def looping(ask: Ask) -> None:
-    """Ask for large regions without end, some tiles of each, and never pause."""
+    """Ask for large regions without end, some pieces of each, and never pause."""
     for attempt in itertools.count():
         for reply in ask(LARGEST):
-            if reply.ok is not None and (tile := msgpack.unpackb(reply.ok.payload.to_bytes()).get("tile")):
-                middle = tile["count"] // 2 + 18  # where machines drive
+            if reply.ok is not None and (piece := msgpack.unpackb(reply.ok.payload.to_bytes()).get("piece")):
+                middle = piece["count"] // 2 + 18  # where machines drive
                 for number in range(middle, middle + attempt % 5):
-                    list(ask(f"tile?cursor={tile['cursor']};number={number}"))
+                    list(ask(f"piece?cursor={piece['cursor']};number={number}"))
 
 
 def waiting(ask: Ask) -> None:

@@ -45,17 +45,19 @@ def ask(session: Any, site: str, query: str, within_s: float = 10.0, **parameter
 def region(
     session: Any, site: str, bounds: tuple[float, float, float, float], *layers: str
 ) -> tuple[dict[str, Any], Layers]:
-    """A rectangle, tile by tile where it comes in tiles: its first answer, and the layers of the whole."""
+    """A rectangle, piece by piece where it comes in pieces: its first answer, and the layers of the whole."""
     sides = ",".join(map(repr, bounds))
     first = answer = ask(session, site, "region", bounds=sides, **({"layers": ",".join(layers)} if layers else {}))
-    tile = first.get("tile")
-    if not tile:
+    piece = first.get("piece")
+    if not piece:
         return first, {name: _rows(first, name) for name in first["layers"]}
-    whole: Layers = {name: [[float("nan")] * tile["columns"] for _ in range(tile["rows"])] for name in first["layers"]}
-    for number in range(tile["count"]):
+    whole: Layers = {
+        name: [[float("nan")] * piece["columns"] for _ in range(piece["rows"])] for name in first["layers"]
+    }
+    for number in range(piece["count"]):
         if number:
-            answer = ask(session, site, "tile", cursor=tile["cursor"], number=number)
-        at = answer["tile"]
+            answer = ask(session, site, "piece", cursor=piece["cursor"], number=number)
+        at = answer["piece"]
         assert (at["number"], answer["store"], answer["merged"]) == (number, first["store"], first["merged"])
         for name in answer["layers"]:
             for i, row in enumerate(_rows(answer, name)):

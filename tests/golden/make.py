@@ -80,9 +80,9 @@ def region() -> records.Region:
     )
 
 
-def tile() -> records.Region:
-    """The region as the second of two tiles, two columns to the east."""
-    return replace(region(), tile=records.Tile(123_456_789, 1, 2, 2, 0, 5, 2))
+def piece() -> records.Region:
+    """The region as the second of two pieces, two columns to the east."""
+    return replace(region(), piece=records.Piece(123_456_789, 1, 2, 2, 0, 5, 2))
 
 
 def decode_batch(data: bytes) -> SampleBatch:
@@ -176,7 +176,7 @@ GOLDEN: dict[str, Golden] = {
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
     "why.bin": Golden(WHY, encode_why, decode_why),
-    "tile.bin": Golden(tile(), answers.encode_region, answers.decode_region),
+    "piece.bin": Golden(piece(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
     "machines.bin": Golden(
         records.MachinesAnswer((MACHINE,), VERSION),

@@ -190,7 +190,7 @@ def compare_answers(client: Any) -> None:
     assert info["machines"].keys() == {*MACHINES}
     bounds = (0.0, 0.0, 400.0, 300.0)
     first, layers = plain_asker.region(session, SITE, bounds, "resistance", "visits")
-    assert first["tile"]["count"] > 1, "large enough for tiles"
+    assert first["piece"]["count"] > 1, "large enough for pieces"
     theirs = client.region(bounds, ["resistance", "visits"])
     for name in ("resistance", "visits"):
         np.testing.assert_array_equal(np.array(layers[name], np.float32), theirs[name])

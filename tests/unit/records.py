@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 from protocol.queries.answers import (
@@ -22,11 +23,16 @@ def version(row: int = 0, fact: int = 0) -> MapVersion:
     return MapVersion(STORE, row, fact)
 
 
+def site_info(site: SiteConfig) -> SiteInfo:
+    values = {item.name: getattr(site, item.name) for item in fields(site)}
+    return SiteInfo(**values, frame=site.frame, crs=site.crs)
+
+
 def map_info(site: SiteConfig, **values: Any) -> MapInfo:
     rows = ("fact", "journalled", "merged", "snapshot")
     zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "first_ns", "stamp_ns", "wall_ns")
     defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
-    defaults |= {"site": SiteInfo(**vars(site), frame=site.frame, crs=site.crs), "version": "1.0", "bounds": None}
+    defaults |= {"site": site_info(site), "version": "1.0", "bounds": None}
     defaults |= {"store": STORE, "descends": (), "accepted": (), "server": ServerProcess("office", 7)}
     defaults |= {"checkpoints": CheckpointCounts(0, 0, 0, 0)}
     defaults |= {"machines": {}, "distrusted": (), "shortfalls": (), "counters": {}, "layers": (), "boundaries": ()}

@@ -1,5 +1,6 @@
 import shutil
 import sqlite3
+import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -45,7 +46,7 @@ def recorded_rows(seed: int) -> Table:
 def clean(tmp_path_factory) -> tuple[Path, dict[str, Path]]:
     """The store and the audit files of a run in which nothing went wrong."""
     folder = tmp_path_factory.mktemp("run")
-    store, audits = Store(folder / "store", SITE, CONFIG, lambda: 1), {}
+    store, audits = Store(folder / "store", SITE, CONFIG, time.time_ns), {}
     for seed, (machine, spool) in enumerate(SPOOLS.items()):
         rows, audits[machine] = recorded_rows(seed), folder / f"{machine}.audit"
         log = AuditLog(audits[machine])
@@ -187,7 +188,7 @@ def test_renumbered_samples_count_once_under_their_new_identity(clean, journal, 
 
 
 def test_an_empty_store_has_lost_everything(clean, tmp_path):
-    Store(tmp_path / "store", SITE, CONFIG, lambda: 1).close()
+    Store(tmp_path / "store", SITE, CONFIG, time.time_ns).close()
     result = audit_store(clean[1], tmp_path / "store", SITE, CONFIG)
     assert result == AuditResult(recorded=2 * N, merged=0, lost=2 * N, double=0, unrecorded=0)
 
@@ -214,10 +215,10 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
 
 
 def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, folder):
-    store = Store(folder, SITE, CONFIG, lambda: 1)
+    store = Store(folder, SITE, CONFIG, time.time_ns)
     store.journal.append_event(KIND, 1, asdict(TrustDecision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1)))
     store.close()
-    store = Store(folder, SITE, CONFIG, lambda: 1)
+    store = Store(folder, SITE, CONFIG, time.time_ns)
     assert store.excluded == {"b"}
     store.save_snapshot()
     store.close()

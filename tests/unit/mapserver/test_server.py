@@ -7,7 +7,7 @@ import pytest
 import zenoh
 
 from mapserver import server as server_module
-from mapserver.query import tiles
+from mapserver.query import region_pieces
 from mapserver.query.answering import SMALL_BYTES
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
@@ -15,17 +15,17 @@ from protocol.queries import answer_codec as codec
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
+from protocol.queries.pieces import joined
 from protocol.queries.requests import (
     AliveQuery,
     Freshness,
     HistoryQuery,
     InfoQuery,
+    PieceQuery,
     PointQuery,
     RegionQuery,
-    TileQuery,
     encode_query,
 )
-from protocol.queries.tiles import joined
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
@@ -239,20 +239,20 @@ def test_a_query_that_would_fill_memory_while_it_waits_is_refused(served, asked)
     assert codec.decode_error(reply.err.payload.to_bytes()).reason == Refusal.TOO_LARGE
 
 
-def test_a_large_region_comes_in_tiles_and_is_forgotten_after_a_while(served, monkeypatch):
+def test_a_large_region_comes_in_pieces_and_is_forgotten_after_a_while(served, monkeypatch):
     _, client = served
     deliver(client, batch(samples(5, c_rr=0.25)))
     first = codec.decode_region(ask(client, RegionQuery(Bounds(0, 0, 600, 400), ("resistance",))))
-    count = first.tile.count
-    parts = [codec.decode_region(ask(client, TileQuery(first.tile.cursor, n))) for n in range(count)]
+    count = first.piece.count
+    parts = [codec.decode_region(ask(client, PieceQuery(first.piece.cursor, n))) for n in range(count)]
     region = joined(parts)
     assert count > 1
     assert region["resistance"].shape == (400, 600)
     assert region["resistance"][8, 8] == pytest.approx(0.25, rel=1e-3)
     assert np.isfinite(region["resistance"]).sum() == 1
-    monkeypatch.setattr(tiles, "IDLE_S", -1.0)
-    tile = {"cursor": str(first.tile.cursor), "number": "0"}
-    assert refusal(client, "tile", tile).reason == Refusal.EXPIRED
+    monkeypatch.setattr(region_pieces, "IDLE_S", -1.0)
+    piece = {"cursor": str(first.piece.cursor), "number": "0"}
+    assert refusal(client, "piece", piece).reason == Refusal.EXPIRED
 
 
 # --- changes, commands, the past --------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
-from protocol.queries.answers import GroundChange, PointAnswer, Region, Tile
+from protocol.queries.answers import GroundChange, Piece, PointAnswer, Region
 from sitegrid.client import REGION_ATTEMPTS, Client
 from tests.unit.records import version
 
@@ -40,9 +40,9 @@ def client(*answers: bytes | QueryError, timeout_s: float = 10.0) -> tuple[Clien
     return Client(session, "tcp/localhost:1", "pit", timeout_s), session  # type: ignore[arg-type]
 
 
-def tile(number: int, merged: int = 7) -> bytes:
-    """One of two tiles of 1 x 2 cells."""
-    place = Tile(9, number, 2, 0, number, 1, 2)
+def piece(number: int, merged: int = 7) -> bytes:
+    """One of two pieces of 1 x 2 cells."""
+    place = Piece(9, number, 2, 0, number, 1, 2)
     layers = {"visits": np.full((1, 1), number, np.float32)}
     return codec.encode_region(
         Region(np.array([0.5]), np.array([0.5 + number]), 1.0, layers, version(merged, 0), 5, place)
@@ -71,23 +71,23 @@ def test_a_refusal_that_says_nothing_of_later_is_not_asked_again():
     assert len(session.asked) == 1
 
 
-def test_tiles_are_asked_for_one_after_the_other():
-    asking, session = client(tile(0), tile(1))
+def test_pieces_are_asked_for_one_after_the_other():
+    asking, session = client(piece(0), piece(1))
     shown: list[tuple[int, int]] = []
     region = asking.region((0, 0, 1, 2), progress=lambda here, count: shown.append((here, count)))
     assert region["visits"].tolist() == [[0], [1]]
-    assert session.asked[1].endswith("map/tile?cursor=9;number=1")
+    assert session.asked[1].endswith("map/piece?cursor=9;number=1")
     assert shown == [(1, 2), (2, 2)]
 
 
-def test_a_region_that_expired_is_asked_for_again_from_its_first_tile():
-    asking, session = client(tile(0), EXPIRED, tile(0, 8), tile(1, 8))
+def test_a_region_that_expired_is_asked_for_again_from_its_first_piece():
+    asking, session = client(piece(0), EXPIRED, piece(0, 8), piece(1, 8))
     assert asking.region((0, 0, 1, 2)).merged == 8
     assert len(session.asked) == 4
 
 
 def test_a_region_that_always_expires_is_an_error():
-    asking, session = client(*[tile(0), EXPIRED] * REGION_ATTEMPTS)
+    asking, session = client(*[piece(0), EXPIRED] * REGION_ATTEMPTS)
     with pytest.raises(QueryError, match="gone"):
         asking.region((0, 0, 1, 2))
     assert len(session.asked) == 2 * REGION_ATTEMPTS

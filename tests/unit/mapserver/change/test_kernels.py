@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapserver.change.kernels import differ, histograms, likeliest_cuts
+from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums
 from mapserver.evidence import cells as ev
 
 PARTS = [ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH]
@@ -65,17 +65,38 @@ def test_the_best_cut_is_the_likeliest(seed):
     old, new = until[:-1], until[-1] - until[:-1]
     likelihood = entropy(until[-1])[None] - entropy(old) - entropy(new)
     likelihood[np.minimum(old.sum(axis=1), new.sum(axis=1)) < 1.0] = -np.inf
-    best, before, after = likeliest_cuts(votes, first, 1.0)
+    best, variation, medians_before, medians_after = likeliest_cuts(votes, first, 1.0)
     known = np.isfinite(likelihood).any(axis=0)
     assert np.array_equal(best[known], likelihood.argmax(axis=0)[known] + 1)
     assert not best[~known].any()
     cells = np.flatnonzero(known)
-    np.testing.assert_allclose(before[:, cells].T, old[best[cells] - 1, :, cells])
-    np.testing.assert_allclose(after[:, cells].T, new[best[cells] - 1, :, cells], atol=1e-12)
+    before, after = (part[best[cells] - 1, :, cells].T for part in (old, new))
+    shares = [part / part.sum(axis=0) for part in (before, after)]
+    np.testing.assert_allclose(variation[cells], np.abs(shares[0] - shares[1]).sum(axis=0) / 2, atol=1e-9)
+    np.testing.assert_allclose(medians_before[cells], median(before), atol=1e-9)
+    np.testing.assert_allclose(medians_after[cells], median(after), atol=1e-9)
+
+
+def median(votes: np.ndarray) -> np.ndarray:
+    """Where half of the votes (bins, cells) lie below, each bin's spread evenly around it."""
+    until = np.vstack([np.zeros(votes.shape[1]), (votes / votes.sum(axis=0)).cumsum(axis=0)])
+    return np.array([np.interp(0.5, column, np.arange(len(column)) - 0.5) for column in until.T])
+
+
+def test_all_pages_together_have_their_sums_and_medians():
+    votes, _, counts = made_up(3)
+    part = ev.RESISTANCE
+    together = sums(votes, part.start, part.stop)
+    assert np.array_equal(together, counts[:, part].sum(axis=0))
+    known = together.any(axis=0)
+    of_all = medians(together)
+    np.testing.assert_allclose(of_all[known], median(together[:, known]), atol=1e-9)
+    assert np.isnan(medians(np.zeros((24, 2)))).all()
+    assert known.any()
 
 
 def test_a_side_with_too_little_evidence_is_no_side():
     votes = np.zeros((3, 24, 1))
     votes[0, 3], votes[2, 20] = 5.0, 0.2
-    best, _, _ = likeliest_cuts(votes, np.zeros(1, np.int64), 0.3)
+    best, *_ = likeliest_cuts(votes, np.zeros(1, np.int64), 0.3)
     assert best.tolist() == [0]

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.pages import CELL, PackedPages
-from mapserver.evidence.timeline import DAY_S, HOUR_S, PATIENCE, Space, Tiers, Timeline
+from mapserver.evidence.settling import DAY_S, HOUR_S, Space, Tiers
+from mapserver.evidence.timeline import Timeline, settle_all
 from tests.unit.mapserver.data import same_page
 
 S = 10**9
@@ -86,10 +87,29 @@ def test_what_stays_apart_is_decided_cell_by_cell(driven, keeps, random):
     assert same(line, again)
 
 
-def test_a_timeline_that_nobody_reads_does_not_grow():
-    line = timeline(START + 3 * i for i in range(1003))
-    assert 2 < len(line._fresh) < PATIENCE, "it is settled now and then, not with each page"
-    assert len(line._settled.table) <= 2 + 2 + 2 + 1
+def test_many_timelines_are_settled_as_each_by_itself():
+    spans = [range(1), range(3), range(0, 500, 7), range(2), range(40, 0, -1)]
+    alone, together = ([timeline(START + np.array(buckets)) for buckets in spans] for _ in range(2))
+    for _ in range(2):  # first from nothing, then beside what is kept
+        settle_all(together[:-1], least=3)
+        assert [line.waiting for line in together] == [1, 0, 0, 2, 40]
+        settle_all(together)
+        assert not any(line.waiting for line in together)
+        assert all(same(one, other) for one, other in zip(alone, together, strict=True))
+        for line, buckets in zip([*alone, *together], 2 * spans, strict=True):
+            for bucket_ in START + 600 + np.array(buckets):
+                line.add(page(bucket_, cells=(5, 9)))
+
+
+def test_blocks_of_wide_counts_are_settled_beside_others():
+    lines = [empty_timeline(FoldConfig()) for _ in range(3)]
+    for line, weight in zip(lines, (1, 2**16, 2), strict=True):
+        line.add(page(START, weight))
+    settle_all(lines)
+    assert [len(line.kept.high) for line in lines] == [0, 1, 0]
+    for line in lines:
+        line.add(page(START))
+    assert [next(line.items())[2].votes["count"].tolist() for line in lines] == [[2], [2**16 + 1], [3]]
 
 
 @pytest.mark.parametrize("keeps", [(1, 2, 4), (4, 1, 2), (2, 4, 1)])
@@ -112,7 +132,7 @@ def test_no_evidence_is_lost_or_doubled(buckets):
 
 def test_a_timeline_goes_on_from_its_pages():
     one = timeline(START + np.arange(0, 3 * PER_DAY, 7))
-    again = Timeline(one._tiers, SPACE, one.settled())
+    again = Timeline(one.tiers, SPACE, one.settled())
     assert same(one, again)
     one.add(page(START + 3 * PER_DAY)), again.add(page(START + 3 * PER_DAY))
     assert same(one, again)

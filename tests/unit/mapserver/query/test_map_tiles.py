@@ -177,7 +177,7 @@ def test_reasons_are_those_of_the_cell(tmp_path):
 
 
 def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.query.map_tiles.TILE_BYTES", 3000)
+    monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 3000)
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(random_samples(3000, 4, half_m=200.0))])
         answers = Answers(writer, FakeFollower(), past_of(writer))
@@ -191,11 +191,11 @@ def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
             )
             together = [(tile.x, tile.y) for piece in pieces for tile in piece.tiles]
             assert together == sorted(set(together))
-            monkeypatch.setattr("mapserver.query.map_tiles.TILE_BYTES", 10**9)
+            monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 10**9)
             whole = answers.tiles(TilesQuery(as_of_ns=as_of_ns))
             assert whole.next_place is None
             assert [tile for piece in pieces for tile in piece.tiles] == list(whole.tiles)
-            monkeypatch.setattr("mapserver.query.map_tiles.TILE_BYTES", 3000)
+            monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 3000)
 
 
 def test_every_plane_keeps_its_values_to_half_a_step():

@@ -29,7 +29,7 @@ from protocol.queries.requests import (
 from protocol.site.geometry import MAX_CELLS, Bounds
 from protocol.site.site_config import KnownGround, SiteConfig
 from protocol.wire.codec import pack
-from tests.unit.records import STORE, version
+from tests.unit.records import STORE, site_info, version
 
 positions = st.floats(-1e15, 1e15)
 layers = st.lists(st.sampled_from(["resistance", "grade_east", "age_s"]), max_size=3).map(tuple)
@@ -313,7 +313,7 @@ MACHINE = answers.MachineState("a", True, "", "", 0, False, ("gain",), {"shift_m
 CHANGE = answers.GroundChange(1, 5, 6, (0.0, 0.0, 1.0, 2.0), 7, 0.25, None, None, None)
 SITE = SiteConfig("pit", 48.0, 11.0, known_ground=(KnownGround("pad", 0.01, ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))),))
 INFO = answers.MapInfo(
-    site=answers.SiteInfo(**vars(SITE), frame=SITE.frame, crs=SITE.crs),
+    site=site_info(SITE),
     store=STORE,
     descends=("f" * 16,),
     accepted=(),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mapserver.query.tiles import TILE_BYTES
+from mapserver.query.region_pieces import PIECE_BYTES
 from protocol.errors import LinkError
 from protocol.wire.credentials import Credentials, Identity
 from protocol.wire.session import SessionConfig, _settings, free_endpoint, open_session, use_many_threads
@@ -27,7 +27,7 @@ def test_client_listens_nowhere_and_router_at_its_endpoint():
 
 def test_a_whole_answer_fits_into_what_a_router_keeps_for_a_link():
     batches = _settings(SessionConfig(mode="router"))["transport/link/tx/queue/size/data"]
-    assert batches * 65_000 >= TILE_BYTES + 2**14  # the rest of the answer, and headers
+    assert batches * 65_000 >= PIECE_BYTES + 2**14  # the rest of the answer, and headers
     assert "transport/link/tx/queue/size/data" not in _settings(SessionConfig())
 
 

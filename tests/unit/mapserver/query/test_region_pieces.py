@@ -1,4 +1,4 @@
-"""Regions in tiles: the same values as in one piece, all of one version of the map."""
+"""Regions in pieces: the same values as in one piece, all of one version of the map."""
 
 from contextlib import closing
 from itertools import pairwise
@@ -6,14 +6,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.query import tiles
+from mapserver.query import region_pieces
 from mapserver.query.answering import Answers
-from mapserver.query.tiles import TILE_BYTES, OpenRegions, Reading, TileGrid
+from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_region, encode_region
 from protocol.queries.answers import Region
-from protocol.queries.requests import RegionQuery, TileQuery, When
-from protocol.queries.tiles import joined
+from protocol.queries.pieces import joined
+from protocol.queries.requests import PieceQuery, RegionQuery, When
 from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, past_of, random_samples, send
 from tests.unit.mapserver.query.fake_follower import FakeFollower
@@ -30,11 +30,11 @@ def served(tmp_path):
 
 
 def read(answers: Answers, query: RegionQuery) -> list[Region]:
-    """All tiles, as they travel."""
+    """All pieces, as they travel."""
     first = answers.region(query)
-    numbers = range(1, first.tile.count) if first.tile else ()
-    others = [answers.tile(TileQuery(first.tile.cursor, number)) for number in numbers]
-    return [decode_region(encode_region(tile)) for tile in (first, *others)]
+    numbers = range(1, first.piece.count) if first.piece else ()
+    others = [answers.piece(PieceQuery(first.piece.cursor, number)) for number in numbers]
+    return [decode_region(encode_region(piece)) for piece in (first, *others)]
 
 
 def same(a: Region, b: Region) -> bool:
@@ -45,12 +45,12 @@ def same(a: Region, b: Region) -> bool:
 @pytest.mark.parametrize("when", [When(), When(minus_ns=NOW_NS + 900 * 10**9)])
 @pytest.mark.parametrize("bounds", [(-100, -100, 100, 100), (-93.5, 7, 61, 51.2), (-100, 3, 100, 4), (2, -80, 3, 90)])
 @pytest.mark.slow
-def test_tiles_make_up_the_region(served, monkeypatch, bounds, when):
+def test_pieces_make_up_the_region(served, monkeypatch, bounds, when):
     _, answers = served
     query = RegionQuery(Bounds(*bounds), NAMES, when=when)
     whole = answers.region(query)
-    assert whole.tile is None
-    monkeypatch.setattr(tiles, "TILE_BYTES", 16 * len(NAMES) * BLOCK_CELLS)
+    assert whole.piece is None
+    monkeypatch.setattr(region_pieces, "PIECE_BYTES", 16 * len(NAMES) * BLOCK_CELLS)
     parts = read(answers, query)
     assert len(parts) > 1
     counted = []
@@ -58,41 +58,41 @@ def test_tiles_make_up_the_region(served, monkeypatch, bounds, when):
     assert counted == [(n + 1, len(parts)) for n in range(len(parts))]
 
 
-def test_tiles_are_of_one_version_while_samples_come_in(served, monkeypatch):
+def test_pieces_are_of_one_version_while_samples_come_in(served, monkeypatch):
     writer, answers = served
     query = RegionQuery(Bounds(-100, -100, 100, 100), NAMES)
     before = answers.region(query)
-    monkeypatch.setattr(tiles, "TILE_BYTES", 2**15)
+    monkeypatch.setattr(region_pieces, "PIECE_BYTES", 2**15)
     first = answers.region(query)
     send(writer, [incoming(random_samples(3000, 9, std_m=1.0), len(ROWS) + 1)])
-    others = [answers.tile(TileQuery(first.tile.cursor, n)) for n in range(1, first.tile.count)]
+    others = [answers.piece(PieceQuery(first.piece.cursor, n)) for n in range(1, first.piece.count)]
     assert same(joined([first, *others]), before)
     assert not same(joined(read(answers, query)), before)
-    repeated = answers.tile(TileQuery(first.tile.cursor, 1))
+    repeated = answers.piece(PieceQuery(first.piece.cursor, 1))
     assert same(repeated, others[0])
 
 
 @pytest.mark.parametrize("layers", [1, 3, 13])
-def test_tiles_cover_every_cell_once_and_stay_small(layers):
+def test_pieces_cover_every_cell_once_and_stay_small(layers):
     rng = np.random.default_rng(5)
     for limits in [(1000, 1000), (40, 3000), (3000, 40), (100_000, 2), (2, 100_000), (20, 20)] * 4:
         sizes = rng.integers(1, limits)
         window = CellWindow(*(int(v) for v in (*rng.integers(-5000, 5000, 2), *sizes)))
-        grid = TileGrid.of_layers(window, layers)
-        whole = [grid.tile(number) for number in range(grid.count)]
-        assert sum(tile.columns * tile.rows for tile in whole) == window.columns * window.rows
-        assert max(tile.columns * tile.rows for tile in whole) * 4 * layers <= TILE_BYTES, window
-        columns = sorted({(tile.column, tile.column + tile.columns) for tile in whole})
-        rows = sorted({(tile.row, tile.row + tile.rows) for tile in whole})
+        grid = PieceGrid.of_layers(window, layers)
+        whole = [grid.piece(number) for number in range(grid.count)]
+        assert sum(piece.columns * piece.rows for piece in whole) == window.columns * window.rows
+        assert max(piece.columns * piece.rows for piece in whole) * 4 * layers <= PIECE_BYTES, window
+        columns = sorted({(piece.column, piece.column + piece.columns) for piece in whole})
+        rows = sorted({(piece.row, piece.row + piece.rows) for piece in whole})
         assert len(columns) * len(rows) == grid.count
         for spans, first, count in ((columns, window.column, window.columns), (rows, window.row, window.rows)):
             assert (spans[0][0], spans[-1][1]) == (first, first + count)
             assert all(end == begin and end % BLOCK_CELLS == 0 for (_, end), (begin, _) in pairwise(spans))
 
 
-def test_three_layers_of_256_x_256_cells_are_one_tile():
-    assert TileGrid.of_layers(CellWindow(5, -7, 256, 256), 3).count == 1
-    assert TileGrid.of_layers(CellWindow(5, -7, 256, 257), 3).count > 1
+def test_three_layers_of_256_x_256_cells_are_one_piece():
+    assert PieceGrid.of_layers(CellWindow(5, -7, 256, 256), 3).count == 1
+    assert PieceGrid.of_layers(CellWindow(5, -7, 256, 257), 3).count > 1
 
 
 # --- how long a region is kept ----------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ LARGE = Reading(CellWindow(0, 0, 4000, 4000), ("visits",), ())
 @pytest.fixture
 def clock(monkeypatch):
     now_s = [100.0]
-    monkeypatch.setattr(tiles.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(region_pieces.time, "monotonic", lambda: now_s[0])
     return now_s
 
 
@@ -111,9 +111,9 @@ def test_a_region_that_nobody_reads_on_expires(clock):
     regions = OpenRegions()
     cursor = regions.open(LARGE)
     for _ in range(4):
-        clock[0] += tiles.IDLE_S - 1
+        clock[0] += region_pieces.IDLE_S - 1
         assert regions.reading(cursor, 1)[0] is LARGE
-    clock[0] += tiles.IDLE_S + 1
+    clock[0] += region_pieces.IDLE_S + 1
     with pytest.raises(QueryError, match="ask for it again") as caught:
         regions.reading(cursor, 1)
     assert caught.value.reason == Refusal.EXPIRED
@@ -122,19 +122,19 @@ def test_a_region_that_nobody_reads_on_expires(clock):
 def test_a_region_is_not_kept_for_ever(clock):
     regions = OpenRegions()
     cursor = regions.open(LARGE)
-    while clock[0] < 100 + tiles.OPEN_S - tiles.IDLE_S:
-        clock[0] += tiles.IDLE_S / 2
+    while clock[0] < 100 + region_pieces.OPEN_S - region_pieces.IDLE_S:
+        clock[0] += region_pieces.IDLE_S / 2
         regions.reading(cursor, 1)
-    clock[0] += tiles.IDLE_S
+    clock[0] += region_pieces.IDLE_S
     regions.reading(cursor, 1)
-    clock[0] += tiles.IDLE_S / 2
+    clock[0] += region_pieces.IDLE_S / 2
     with pytest.raises(QueryError):
         regions.reading(cursor, 1)
 
 
 def test_so_many_regions_are_read_at_once_and_one_that_is_read_makes_room(clock):
     regions = OpenRegions()
-    cursors = [regions.open(LARGE) for _ in range(tiles.MOST_OPEN)]
+    cursors = [regions.open(LARGE) for _ in range(region_pieces.MOST_OPEN)]
     with pytest.raises(QueryError) as caught:
         regions.open(LARGE)
     assert caught.value.reason == Refusal.OVERLOADED
@@ -146,11 +146,11 @@ def test_so_many_regions_are_read_at_once_and_one_that_is_read_makes_room(clock)
     with pytest.raises(QueryError):
         regions.reading(cursors[3], 0)
     assert regions.reading(cursors[0], 0)[0] is LARGE
-    clock[0] += tiles.IDLE_S + 1
-    assert len({regions.open(LARGE) for _ in range(tiles.MOST_OPEN)}) == tiles.MOST_OPEN
+    clock[0] += region_pieces.IDLE_S + 1
+    assert len({regions.open(LARGE) for _ in range(region_pieces.MOST_OPEN)}) == region_pieces.MOST_OPEN
 
 
-def test_a_tile_that_does_not_exist_is_refused():
+def test_a_piece_that_does_not_exist_is_refused():
     regions = OpenRegions()
     cursor = regions.open(LARGE)
     with pytest.raises(QueryError, match="from 0") as caught:

@@ -1,7 +1,7 @@
-"""Regions in tiles: how they are cut, and the views that are kept while a reader takes tile after tile.
+"""Regions in pieces: how they are cut, and the views that are kept while a reader takes piece after piece.
 
 One answer is so small that the router can hold it for a reader that does not read (protocol/wire/session.py): nobody
-else waits for that one. All tiles are of one version of the map, so the pages that they are read from are kept, which
+else waits for that one. All pieces are of one version of the map, so the pages that they are read from are kept, which
 costs little: pages never change, and the grid shares them.
 """
 
@@ -17,12 +17,12 @@ from itertools import pairwise
 
 from mapserver.query.views import View
 from protocol.errors import QueryError, Refusal
-from protocol.queries.answers import Tile
+from protocol.queries.answers import Piece
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-TILE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
+PIECE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
 MOST_OPEN = 16  # regions that are read at the same time
-IDLE_S = 30.0  # a region of which nobody takes a tile for so long makes room; one tile takes 20 s at 300 kbit/s
+IDLE_S = 30.0  # a region of which nobody takes a piece for so long makes room; one piece takes 20 s at 300 kbit/s
 OPEN_S = 600.0  # ... and one that is open for so long, since its pages leave the grid one by one
 RETRY_AFTER_S = 2.0
 
@@ -37,10 +37,10 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class TileGrid:
-    """Tiles of a window, row by row from its south-western corner; edges lie between blocks, where they can.
+class PieceGrid:
+    """Pieces of a window, row by row from its south-western corner; edges lie between blocks, where they can.
 
-    width, height: of a tile [cells].
+    width, height: of a piece [cells].
     """
 
     window: CellWindow
@@ -48,9 +48,9 @@ class TileGrid:
     height: int
 
     @classmethod
-    def of_layers(cls, window: CellWindow, layers: int) -> TileGrid:
-        """Tiles with at most TILE_BYTES each: square, unless the window is narrow."""
-        cells = TILE_BYTES // (4 * layers)
+    def of_layers(cls, window: CellWindow, layers: int) -> PieceGrid:
+        """Pieces with at most PIECE_BYTES each: square, unless the window is narrow."""
+        cells = PIECE_BYTES // (4 * layers)
         if window.columns * window.rows <= cells:
             return cls(window, window.columns + BLOCK_CELLS, window.rows + BLOCK_CELLS)
         side = math.isqrt(cells)
@@ -62,20 +62,20 @@ class TileGrid:
 
     @property
     def count(self) -> int:
-        """How many tiles there are."""
+        """How many pieces there are."""
         return len(self._columns) * len(self._rows)
 
-    def tile(self, number: int) -> CellWindow:
+    def piece(self, number: int) -> CellWindow:
         """One of them."""
         left, right = self._columns[number % len(self._columns)]
         bottom, top = self._rows[number // len(self._columns)]
         return CellWindow(left, bottom, right - left, top - bottom)
 
-    def place(self, number: int, cursor: int) -> Tile:
+    def place(self, number: int, cursor: int) -> Piece:
         """Where one of them lies."""
-        tile, whole = self.tile(number), self.window
-        corner = (tile.column - whole.column, tile.row - whole.row)
-        return Tile(cursor, number, self.count, *corner, whole.columns, whole.rows)
+        piece, whole = self.piece(number), self.window
+        corner = (piece.column - whole.column, piece.row - whole.row)
+        return Piece(cursor, number, self.count, *corner, whole.columns, whole.rows)
 
     @cached_property
     def _columns(self) -> list[tuple[int, int]]:
@@ -101,11 +101,11 @@ class _Open:
     reading: Reading
     opened_s: float
     used_s: float
-    is_read: bool = False  # to its last tile
+    is_read: bool = False  # to its last piece
 
 
 class OpenRegions:
-    """Regions of which readers take tiles, by cursor."""
+    """Regions of which readers take pieces, by cursor."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -130,18 +130,18 @@ class OpenRegions:
             self._open[cursor] = _Open(reading, now_s, now_s)
         return cursor
 
-    def reading(self, cursor: int, number: int) -> tuple[Reading, TileGrid]:
-        """What a tile is read from; QueryError if that is not kept any more, or there is no such tile."""
+    def reading(self, cursor: int, number: int) -> tuple[Reading, PieceGrid]:
+        """What a piece is read from; QueryError if that is not kept any more, or there is no such piece."""
         with self._lock:
             self._forget()
             one = self._open.get(cursor)
             if one is None:
                 raise QueryError(Refusal.EXPIRED, f"no region is open under cursor {cursor}: ask for it again")
-            tiles = TileGrid.of_layers(one.reading.window, len(one.reading.layers))
-            if number >= tiles.count:
-                raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `number`: {number} of {tiles.count} tiles, from 0")
-            one.used_s, one.is_read = time.monotonic(), one.is_read or number == tiles.count - 1
-            return one.reading, tiles
+            pieces = PieceGrid.of_layers(one.reading.window, len(one.reading.layers))
+            if number >= pieces.count:
+                raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `number`: {number} of {pieces.count} pieces, from 0")
+            one.used_s, one.is_read = time.monotonic(), one.is_read or number == pieces.count - 1
+            return one.reading, pieces
 
     def _forget(self) -> None:
         now_s = time.monotonic()

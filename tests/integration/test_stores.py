@@ -1,0 +1,60 @@
+"""Runs of real agents that go on in another store: one folded from the first, and one that a person accepts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from mapserver.ingest.store import JOURNAL_FILE
+from mapserver.ingest.store_folder import store_id
+from sitegrid.cli import main
+from sitegrid.process.children import wait_until
+from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
+
+SOME = 20  # samples
+
+
+def cut_short(site_run: SiteRun) -> str:
+    """A site at work, whose server dies once it has taken samples; returns the id of its store."""
+    _, server, _ = site_run.start()
+    with site_run.connect() as client:
+        site_run.wait_merged(client, SOME)
+    kill(server)
+    return store_id(site_run.folder / "store" / JOURNAL_FILE)
+
+
+@pytest.mark.processes
+def test_a_run_goes_on_in_a_store_that_was_folded_from_the_first(site_run: SiteRun, capsys: pytest.CaptureFixture[str]):
+    first = cut_short(site_run)
+    (site_run.folder / "store").rename(site_run.folder / "old")
+    paths = (site_run.folder / "old", "--out", site_run.folder / "store", "--site-file", site_run.site_file)
+    words = ["fold", *map(str, paths), "--json"]
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["descends"] == [first]
+    site_run.start_server()
+    reports = site_run.delivered()
+    with site_run.connect() as client:
+        info = client.info()
+    assert sum(counts.lost for counts in info.machines.values()) == 0
+    assert sum(counts.samples for counts in info.machines.values()) == sum(r["samples"] for r in reports.values())
+
+
+@pytest.mark.processes
+def test_a_run_goes_on_in_a_store_that_a_person_accepts_and_what_it_lacks_is_counted(site_run: SiteRun):
+    first = cut_short(site_run)
+    shutil.move(site_run.folder / "store", site_run.folder / "gone")
+    site_run.start_server()
+    with site_run.connect() as client:
+        wait_until(lambda: client.info().counters.get("refused_other_store", 0) > 0, READY_S, "a machine is refused")
+        assert client.info().machines == {}
+        words = ["accept", first, "--reason", "its disk died", "--site", site_run.site, "--endpoint", site_run.endpoint]
+        assert main(words) == 0
+        reports = site_run.delivered()
+        info = client.info()
+    recorded = sum(report["samples"] for report in reports.values())
+    lost = sum(counts.lost for counts in info.machines.values())
+    assert info.accepted == (first,)
+    assert lost >= SOME
+    assert sum(counts.samples for counts in info.machines.values()) + lost == recorded
