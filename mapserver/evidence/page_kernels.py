@@ -121,6 +121,26 @@ def expand_cells(table: Any, compact: Any, words: Any, out: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
+def sum_pages(table: Any, votes: Any, cells: Any, start: Any, counts: Any, bitmaps: Any, newest_ns: Any) -> None:
+    """Add pages, in the order of their table, to counts (256, COUNTS), bitmaps (256, 2) and newest_ns (256,).
+
+    start (256,): the place in that order of the first page that counts in each cell.
+    """
+    for p in range(len(table)):
+        for j in range(table[p, 2], table[p, 3]):
+            place = votes[j] & _LOW
+            cell = place & _CELL
+            if start[cell] <= p:
+                counts[cell, place >> np.uint64(8)] += votes[j] >> np.uint64(16)
+        for j in range(table[p, 4], table[p, 5]):
+            cell = np.uint64(cells[j].cell)
+            if start[cell] <= p:
+                bitmaps[cell, 0] |= cells[j].visits
+                bitmaps[cell, 1] |= cells[j].machines
+                newest_ns[cell] = max(newest_ns[cell], cells[j].newest_ns)
+
+
+@numba.njit(cache=True, nogil=True)
 def note(known: Any, cells: Any) -> int:
     """Set known (256,) for cells (k,) CELL; returns for how many it was not set."""
     more = 0

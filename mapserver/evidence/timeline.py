@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.page_kernels import note
+from mapserver.evidence.page_kernels import note, sum_pages
 from mapserver.evidence.pages import EMPTY, CompactPages, PackedPages, Page, pick
 from mapserver.evidence.settling import Space, Tiers, settled
 from protocol.arrays import Bools, Ints
@@ -58,11 +58,15 @@ class TimedPages(Sequence[TimedPage]):
 
     def packed_votes(self) -> tuple[NDArray[np.uint64], Ints]:
         """As the function of this name, without a page by itself."""
+        table, votes = self._pages.expanded_votes()
+        table = _in_order(table)
+        parts = [votes[first:end] for first, end in table[:, 2:4].tolist()]
+        return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(table[:, 3] - table[:, 2])
+
+    def add_to(self, start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints) -> None:
+        """Add what counts from page `start` (256,) of each cell on, as `sum_pages` does."""
         pages = self._pages.expanded()
-        order = np.lexsort((pages.table[:, 1], -pages.table[:, 0]))
-        parts = [pages.votes[first:end] for first, end in pages.table[order, 2:4].tolist()]
-        lengths = pages.table[order, 3] - pages.table[order, 2]
-        return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(lengths)
+        sum_pages(_in_order(pages.table), pages.votes, pages.cells, start, counts, bitmaps, newest_ns)
 
     @overload
     def __getitem__(self, index: int) -> TimedPage: ...
@@ -70,6 +74,11 @@ class TimedPages(Sequence[TimedPage]):
     def __getitem__(self, index: slice) -> list[TimedPage]: ...
     def __getitem__(self, index: int | slice) -> TimedPage | list[TimedPage]:
         return list(self)[index]
+
+
+def _in_order(table: Ints) -> Ints:
+    """The table of PackedPages in the order of time."""
+    return np.asarray(table[np.lexsort((table[:, 1], -table[:, 0]))])
 
 
 def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
@@ -150,25 +159,30 @@ def evidence(pages: Sequence[Sequence[TimedPage]], first: Sequence[Ints] | None 
 
     first: for each block, index (256,) of the first page that counts in each of its cells; without it all pages count.
     """
-    counts = np.zeros((len(pages), ev.COUNTS, ev.CELLS), np.uint64)
+    counts = np.zeros((len(pages), ev.CELLS, ev.COUNTS), np.uint64)
     bitmaps = np.zeros((len(pages), ev.CELLS, 2), np.uint64)
     newest_ns = np.zeros((len(pages), ev.CELLS), np.int64)
     changed_ns = np.zeros((len(pages), ev.CELLS), np.int64)
     for i, block_pages in enumerate(pages):
         start = first[i] if first else np.zeros(ev.CELLS, np.int64)
-        _sum(block_pages, start, counts[i].reshape(-1), bitmaps[i], newest_ns[i])
+        if isinstance(block_pages, TimedPages):
+            block_pages.add_to(start, counts[i], bitmaps[i], newest_ns[i])
+        else:
+            _sum(block_pages, start, counts[i], bitmaps[i], newest_ns[i])
         if start.any():
             changed_ns[i] = _changed_ns(block_pages, start)
-    return ev.Evidence(counts.transpose(0, 2, 1), bitmaps, newest_ns, changed_ns)
+    return ev.Evidence(counts, bitmaps, newest_ns, changed_ns)
 
 
 def _sum(
     pages: Sequence[TimedPage], start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints
 ) -> None:
     last = int(start.max(initial=0))
+    planes = np.zeros(ev.COUNTS * ev.CELLS, np.uint64)
     for index, timed in enumerate(pages):
         page = timed.page if index >= last else pick(timed.page, start <= index)
-        page.add_to(counts, bitmaps, newest_ns)
+        page.add_to(planes, bitmaps, newest_ns)
+    counts += planes.reshape(ev.COUNTS, ev.CELLS).T
 
 
 def _changed_ns(pages: Sequence[TimedPage], start: Ints) -> Ints:

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -114,11 +115,13 @@ class WebApp:
             kind = _parameters(request).get("kind", "colour")
             info = await feed.info(FRESH_S)
             _check_layer(kind, layer, info)
+            token = request.query_params.get("token")  # who can send it in addresses alone needs it in these too
+            end = f"?{urlencode({'token': token})}" if token else ""
             base = f"{request.url.scheme}://{request.url.netloc}{PREFIX}/sites/{feed.name}/xyz/{kind}/{layer}"
             table: dict[str, Any] = {
                 "tilejson": "3.0.0",
                 "name": f"{feed.name}: {layer}",
-                "tiles": [f"{base}/{{z}}/{{x}}/{{y}}.png"],
+                "tiles": [f"{base}/{{z}}/{{x}}/{{y}}.png{end}"],
                 "minzoom": 10,
                 "maxzoom": mercator.MAX_ZOOM,
             }

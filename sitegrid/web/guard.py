@@ -74,7 +74,10 @@ class Guard:
         if (origin := headers.get("origin")) and urlsplit(origin).netloc != headers.get("host"):
             raise Problem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
         self._count_rate(scope)
-        if self._person and scope["path"] not in OPEN_PATHS and not self._person(_token(scope, headers)):
+        if self._person and scope["path"] not in OPEN_PATHS:
+            person, token = self._person, _token(scope, headers)
+            scope["may_stay"] = lambda: person(token) is not None
+        if not scope.get("may_stay", _always)():
             detail = "a visitor's token is needed: ask the office for one, and open the link with it"
             raise Problem(HTTPStatus.UNAUTHORIZED, "no_permission", detail, {"WWW-Authenticate": "Bearer"})
 
@@ -109,6 +112,10 @@ class Guard:
         await send({"type": "websocket.accept"})
         code = 4401 if problem.status == HTTPStatus.UNAUTHORIZED else 4403
         await send({"type": "websocket.close", "code": code, "reason": problem.reason})
+
+
+def _always() -> bool:
+    return True
 
 
 def _token(scope: Scope, headers: Headers) -> str:

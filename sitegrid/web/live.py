@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+from collections.abc import Callable
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -40,6 +41,7 @@ class _Page:
 
     def __init__(self, socket: WebSocket, feed: SiteFeed, version: MapVersion | None) -> None:
         self._socket, self._door, self._version = socket, feed, version
+        self._may_stay: Callable[[], bool] = socket.scope.get("may_stay", lambda: True)  # see Guard
         self._sent: MapVersion | None = None  # on its way
         self._sent_s = 0.0
         self._state: Any = None
@@ -67,6 +69,9 @@ class _Page:
             now_s = loop.time()
             if self._sent and now_s - self._sent_s > TAKEN_S:
                 await self._socket.close(TOO_SLOW, "nothing was taken in")
+                return
+            if not self._may_stay():
+                await self._socket.close(NO_PERMISSION, "the token no longer counts")
                 return
             await self._send_news(now_s)
             async with feed.moved:

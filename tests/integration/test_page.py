@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -156,16 +157,35 @@ def test_the_slider_shows_the_map_of_its_time(tab: Tab, web: WebSite):
     tiles = {(tile.x, tile.y) for tile in web.client.tiles(as_of_ns=at_ns).tiles}
     assert {tuple(map(int, key.split(","))) for key in tab.js("[...sitegrid.time.map.tiles.keys()]")} == tiles
     assert START_NS < at_ns < web.now_ns
-    assert "earlier time" in tab.page.locator("#status").inner_text()
+    assert "The map as of" in tab.page.locator("#status").inner_text()
     tab.page.keyboard.press("l")
     tab.until("sitegrid.time.at === null && sitegrid.time.map === null")
 
 
-def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab):
+def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab, web: WebSite):
     tab.page.keyboard.press("c")
     tab.until("sitegrid.time.mode === 'beside' && sitegrid.time.otherMap !== null")
+    assert tab.page.locator("#sides").inner_text().endswith("now")
+    tab.page.mouse.move(640, 300)  # the line is in the middle
+    tab.page.mouse.down()
+    tab.page.mouse.move(900, 300, steps=4)
+    tab.page.mouse.up()
+    assert tab.js("sitegrid.time.split") == pytest.approx(900 / 1280, abs=0.01)
+    assert tab.page.locator("#panel").is_hidden(), "who drags asks no why"
     tab.page.keyboard.press("c")
     tab.until("sitegrid.time.mode === 'difference' && sitegrid.difference !== undefined")
+    legend = tab.page.locator("#legend").inner_text()
+    assert all(word in legend for word in ("Difference", "a quarter", "four times", "to now", "at one of the times"))
+    x_m, y_m = known_place(web)
+    column, row = math.floor(x_m), math.floor(y_m)
+    other_ns = int(tab.js("String(BigInt(sitegrid.time.other))"))
+    then, now = (
+        web.client.point(x_m, y_m, ["resistance"], as_of_ns=ns).values["resistance"] for ns in (other_ns, None)
+    )
+    shown = tab.js(f"sitegrid.difference.at({column}, {row}, 'difference')")
+    assert shown == pytest.approx(math.log(now / then) / math.log(4), abs=0.03)
+    tab.page.mouse.move(*tab.pixel_of(x_m, y_m))
+    tab.until(f"document.getElementById('readout').textContent.startsWith('{100 * then:.1f} % → {100 * now:.1f} %')")
     tab.page.keyboard.press("c")
     tab.until("sitegrid.time.mode === 'one'")
 
@@ -299,9 +319,15 @@ def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
         assert "token" not in tab.page.url, "it stays in no history"
         tab.page.reload()
         tab.loaded()
-        tab.close()
+        tiles = web.get("xyz/resistance.json", {"token": token}).json["tiles"]
+        assert tiles[0].endswith(f"/{{z}}/{{x}}/{{y}}.png?token={token}"), (
+            "whoever has a token in addresses needs it there"
+        )
         children.start("revoke", "keys", "token", "anna", "--revoke", "--dir", keys).wait(30)
         wait_until(lambda: web.get("info", {"token": token}).status == 401, 10, "the token is revoked")
+        tab.until("sitegrid.state === 'refused'")
+        assert "Ask the office" in tab.page.locator("#notice").inner_text()
+        tab.close()
 
 
 def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):

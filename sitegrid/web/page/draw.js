@@ -1,4 +1,5 @@
 // Everything on the map that is not a tile: ground, plan, machines, changed areas, cross, scale.
+import { span } from "./palette.js";
 
 const SILENT_S = 8, TRACK_S = 60;
 
@@ -47,7 +48,8 @@ export function drawChanges(context, view, changes, ink) {
   }
 }
 
-export function drawMachine(context, view, machine, now_s, shows, ink) {
+// labels: rectangles of those that are drawn already; a label keeps off them.
+export function drawMachine(context, view, machine, now_s, shows, ink, labels) {
   const silent = now_s - machine.seen_s > SILENT_S, grey = silent || machine.trusted === false;
   const [x, y] = view.toScreen(machine.x_m, machine.y_m);
   if (shows.tracks) drawTrack(context, view, machine, now_s, grey ? ink.faint : ink.text, ink);
@@ -79,8 +81,8 @@ export function drawMachine(context, view, machine, now_s, shows, ink) {
   context.fillStyle = grey ? ink.faint : ink.text;
   context.fill();
   context.restore();
-  const state = machine.trusted === false ? " · not used" : silent ? ` · silent ${Math.round(now_s - machine.seen_s)} s` : "";
-  drawLabel(context, machine.machine + state, x, y - 20, ink, grey);
+  const state = machine.trusted === false ? " · not used" : silent ? ` · silent ${span(now_s - machine.seen_s)}` : "";
+  drawLabel(context, machine.machine + state, x, y, ink, grey, labels);
 }
 
 function drawTrack(context, view, machine, now_s, colour, ink) {
@@ -96,9 +98,12 @@ function drawTrack(context, view, machine, now_s, colour, ink) {
   }
 }
 
-function drawLabel(context, text, x, y, ink, grey) {
+function drawLabel(context, text, x, middle, ink, grey, labels) {
   context.font = `600 12px ${getComputedStyle(document.body).fontFamily}`;
   const width = context.measureText(text).width + 14;
+  const free = (at) => labels.every((other) => Math.abs(at - other.y) > 21 || Math.abs(x - other.x) > (width + other.width) / 2);
+  const y = [-20, 22, -42, 44, -64].map((away) => middle + away).find(free) ?? middle - 20;
+  labels.push({ x, y, width });
   context.globalAlpha = 0.94;
   context.fillStyle = ink.surface;
   context.beginPath();

@@ -1,7 +1,7 @@
 // The page: what is shown, how it is chosen, and a link that holds it.
 import { drawCell, drawChanges, drawCross, drawGround, drawMachine, drawPlan, inkOf, roundLength } from "./draw.js";
 import { Refused, connect, getJson } from "./live.js";
-import { KINDS, LAYERS, css, diverging, kindOf, layerOf, percent } from "./palette.js";
+import { KINDS, LAYERS, css, differenceOf, kindOf, layerOf, percent } from "./palette.js";
 import { PANELS } from "./panels.js";
 import { byId, element } from "./parts.js";
 import { readPlan } from "./plan.js";
@@ -18,6 +18,9 @@ const NOTICES = {
   refused: ["This link has no permission", "Ask the office for a visitor's token, then open the new link."],
 };
 const QUIET_MS = 400; // a page that loads faster than this says nothing about it
+const PANEL_PX = 420; // of the window's right that the panel covers
+const HOLD_PX = 14; // beside the line between two times, where it can be taken
+const SAID_MS = 6000; // how long what just failed is shown
 const REST_MS = 120; // a pointer that stays so long asks for the value
 
 const asked = new URLSearchParams(location.search);
@@ -26,8 +29,10 @@ const page = {
   layer: layerOf(asked.get("layer")), shows: { machines: true, tracks: true, changes: true, plan: true, unsure: true, old: false },
   state: "loading", panel: null, cell: null, keyboard: false, picture: null, info: null, frames: 0,
   path: (name) => `/api/v1/sites/${page.site}/${name}`,
-  asOf: () => page.time.at ?? undefined,
+  asOf: () => page.cellTime ?? page.time.at ?? undefined,
   redraw: () => { page.dirty = true; },
+  mapChanged: () => { buildLegend(); page.redraw(); },
+  say: (title, text) => say(title, text),
   compareWith: (ns) => page.time.compareWith(ns),
   timeMoved: () => { if (page.site) { showStatus(); keepLink(); } },
 };
@@ -35,12 +40,15 @@ window.sitegrid = page; // for tests, and for people with a console
 const canvas = byId("map"), view = new View();
 page.view = view;
 page.time = new TimeBar(page);
-let disconnect = null, clockOffset_s = 0, restTimer = 0;
+let disconnect = null, restTimer = 0;
 const nowSite_ns = () => (page.time.at ?? page.map.stamp_ns);
 
 // --- what is drawn
+function frames() {
+  requestAnimationFrame(frames);
+  frame();
+}
 function frame() {
-  requestAnimationFrame(frame);
   if (!page.dirty && !page.machines.size) return;
   page.dirty = false;
   const ratio = Math.min(2, devicePixelRatio || 1), [width, height] = [innerWidth, innerHeight];
@@ -56,7 +64,9 @@ function frame() {
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   if (page.shows.changes) drawChanges(context, view, page.changes.filter((change) => change.first_ns <= nowSite_ns()), page.ink);
   if (page.cell) drawCell(context, view, page.cell, page.map.cell_m, page.ink);
-  if (page.shows.machines && page.time.at === null) for (const machine of page.machines.values()) drawMachine(context, view, machine, performance.now() / 1000, page.shows, page.ink);
+  const labels = [];
+  if (page.shows.machines && page.time.at === null) for (const machine of page.machines.values()) drawMachine(context, view, { ...machine, trusted: page.info?.trusted[machine.machine] }, performance.now() / 1000, page.shows, page.ink, labels);
+  showSides();
   if (page.keyboard && document.activeElement === canvas) drawCross(context, view, page.ink);
   const metres = roundLength(view.scale, 120), scale = byId("scale");
   scale.lastElementChild.style.width = `${metres * view.scale}px`;
@@ -64,19 +74,38 @@ function frame() {
   page.frames++;
 }
 
+const subtracts = () => page.time.mode === "difference" && page.time.otherMap !== null;
+const besides = () => page.time.mode === "beside" && page.time.otherMap !== null;
+const divider = () => Math.round(innerWidth * page.time.split);
+
+// The map on the page, and the layer that its colours show.
+function shownMap() {
+  const { time, layer } = page, map = time.map ?? page.map;
+  if (!subtracts()) return { map, layer };
+  const key = [map.stamp_ns, map.row, map.fact, time.otherMap.stamp_ns, time.otherMap.row, layer.id].join();
+  if (page.differenceOf !== key) { page.difference = difference(map, time.otherMap, layer); page.differenceOf = key; }
+  return { map: page.difference, layer: differenceOf(layer) };
+}
+
+// Which time is which half's.
+function showSides() {
+  const sides = byId("sides"), [then, now] = sides.children;
+  sides.hidden = !besides();
+  if (sides.hidden) return;
+  sides.style.left = `${divider()}px`;
+  then.textContent = page.time.words(page.time.other);
+  now.textContent = page.time.words(page.time.at);
+}
+
 function drawTiles(context, ratio) {
-  const { time } = page, shown = time.map ?? page.map;
-  if (time.mode === "difference" && time.otherMap) {
-    if (page.differenceOf !== `${time.at}|${time.other}|${page.layer.id}|${shown.row}`) {
-      page.difference = difference(shown, time.otherMap, page.layer);
-      page.differenceOf = `${time.at}|${time.other}|${page.layer.id}|${shown.row}`;
-    }
-    page.difference.paint({ ...styleOf(page.difference), layer: { id: "difference", fades: null }, colour: diverging, key: "difference" });
-    return page.difference.draw(context, view, ratio);
+  const { time } = page, { map: shown, layer } = shownMap();
+  if (layer !== page.layer) {
+    shown.paint({ layer, colour: layer.colour, now_ns: 0, driven: 0, key: "difference" });
+    return shown.draw(context, view, ratio);
   }
   shown.paint(styleOf(shown));
-  if (time.mode !== "beside" || !time.otherMap) return shown.draw(context, view, ratio);
-  const middle = Math.round(context.canvas.width * time.split);
+  if (!besides()) return shown.draw(context, view, ratio);
+  const middle = divider() * ratio;
   time.otherMap.paint(styleOf(time.otherMap));
   for (const [map, left, width] of [[time.otherMap, 0, middle], [shown, middle, context.canvas.width - middle]]) {
     context.save();
@@ -128,8 +157,8 @@ function setShow(name, on) {
 }
 
 function buildLegend() {
-  const { layer } = page, bins = 48, kinds = layer.id === "resistance" && page.palette === "kinds";
-  const { counts, known } = page.map.values ? page.map.histogram(layer, bins, nowSite_ns()) : { counts: [], known: 0 };
+  const { map, layer } = shownMap(), bins = 48, kinds = layer.id === "resistance" && page.palette === "kinds", differs = layer.id === "difference";
+  const { counts, known } = map.values ? map.histogram(layer, bins, nowSite_ns()) : { counts: [], known: 0 };
   const most = Math.max(1, ...counts), strip = element("canvas", { width: 400, height: 72 });
   strip.setAttribute("role", "img");
   strip.setAttribute("aria-label", `${layer.name}: how many cells have which value`);
@@ -141,19 +170,20 @@ function buildLegend() {
     const tall = 46 * Math.sqrt((counts[i] ?? 0) / most);
     pen.fillRect(i * one + 1, 50 - tall, one - 2, tall);
   }
-  const ticks = element("div", { className: "ticks" }, layer.ticks.map(([at, text]) => { const tick = element("span", {}, text); tick.style.left = `${100 * Math.min(0.94, Math.max(0.05, at))}%`; return tick; }));
+  const ticks = element("div", { className: "ticks" }, layer.ticks.map(([at, text]) => { const tick = element("span", {}, text); tick.style.left = `${100 * at}%`; tick.className = at < 0.08 ? "first" : at > 0.92 ? "last" : ""; return tick; }));
   const swap = element("div", { className: "swap", hidden: layer.id !== "resistance" }, ["ordered", "kinds"].map((name) => {
     const button = element("button", { onclick: () => { page.palette = name; buildLegend(); page.redraw(); keepLink(); } }, name === "ordered" ? "Ordered" : "Kinds of ground");
     button.setAttribute("aria-pressed", page.palette === name);
     return button;
   }));
   const names = kinds ? element("ul", { className: "kinds" }, KINDS.map((kind) => { const swatch = element("i"); swatch.style.background = css(kind.rgb); return element("li", {}, swatch, kind.name, element("span", {}, percent(kind.value, kind.value < 0.01 ? 1 : 0))); })) : null;
-  const unknown = element("p", { className: "unknown" }, element("i", {}), "Unknown", element("i", { className: "driven" }), "Driven only");
-  byId("legend").replaceChildren(element("h2", { className: "cap" }, layer.name, element("b", {}, layer.unit)), strip, ticks, ...[names].filter(Boolean), unknown, swap);
-  byId("known").textContent = known ? `${Math.round(known * page.map.cell_m ** 2).toLocaleString("en")} m² known` : "";
+  const unknown = element("p", { className: "unknown" }, element("i", {}), "Unknown", ...(differs ? [" at one of the times"] : [element("i", { className: "driven" }), "Driven only"]));
+  byId("legend").replaceChildren(element("h2", { className: "cap" }, differs ? "Difference" : layer.name, element("b", {}, differs ? `${page.time.words(page.time.other)} to ${page.time.words(page.time.at)}` : layer.unit)), strip, ticks, ...[names].filter(Boolean), unknown, swap);
+  byId("known").textContent = known ? `${Math.round(known * page.map.cell_m ** 2).toLocaleString("en")} m² known${differs ? " at both times" : ""}` : "";
 }
 
 function inverse(layer, u) { // the value at a place of the palette, by halving
+  if (layer.id === "difference") return 2 * u - 1;
   let [low, high] = layer.id === "resistance" ? [0.001, 1] : layer.id === "age" ? [0, 1e7] : [0, 1000];
   for (let i = 0; i < 60; i++) { const middle = (low + high) / 2; if (layer.at(middle) < u) low = middle; else high = middle; }
   return (low + high) / 2;
@@ -178,9 +208,20 @@ function showStatus() {
   const status = byId("status"), at = page.time.at, silent = [...page.machines.values()].filter((m) => performance.now() / 1000 - m.seen_s > 8).length;
   const machines = `${page.machines.size} machine${page.machines.size === 1 ? "" : "s"}`;
   const text = { loading: "Loading", away: "No map server", offline: "Not connected", refused: "No permission" }[page.state]
-    ?? (at !== null ? "The map as of an earlier time" : `Live, ${machines}${silent ? `, ${silent} silent` : ""}`);
+    ?? (at !== null ? `The map as of ${page.time.words(at)}` : `Live, ${machines}${silent ? `, ${silent} silent` : ""}`);
   status.lastElementChild.textContent = text;
   status.className = ["away", "offline", "refused"].includes(page.state) ? "bad" : page.state === "live" && at === null ? "" : "off";
+}
+
+// One line about what just failed; it goes by itself.
+let sayTimer = 0;
+function say(title, text) {
+  const notice = byId("notice");
+  clearTimeout(sayTimer);
+  notice.replaceChildren(element("h2", {}, title), element("p", {}, text));
+  notice.classList.add("small");
+  notice.hidden = false;
+  sayTimer = setTimeout(() => { const { state } = page; page.state = ""; setState(state); }, SAID_MS);
 }
 
 // --- choosing
@@ -207,36 +248,45 @@ async function openPanel(name, subject) {
 function closePanel() {
   byId("panel").hidden = true;
   document.body.classList.remove("open");
-  page.panel = page.cell = null;
+  page.panel = page.cell = page.cellTime = null;
   page.redraw();
   keepLink();
   canvas.focus({ preventScroll: true });
 }
 
 const cellAt = (left, top) => view.toSite(left, top).map((v) => Math.floor(v / page.map.cell_m));
+// Where two times are beside each other, a place belongs to the time of its half.
+const timeAt = (left) => (besides() && left < divider() ? page.time.other : page.time.at) ?? undefined;
+const mapAt = (left) => (besides() && left < divider() ? page.time.otherMap : page.time.map ?? page.map);
+
 function explain(left, top) {
+  page.cellTime = timeAt(left);
   page.cell = cellAt(left, top);
   if (innerWidth <= 720) { view.shift(view.width / 2 - left, view.height * 0.28 - top); page.redraw(); } // above the panel
+  else if (left > innerWidth - PANEL_PX) { view.shift(innerWidth - PANEL_PX - left, 0); page.redraw(); } // beside it
   openPanel("why", page.cell);
 }
 
 function rest(left, top) {
   clearTimeout(restTimer);
   const readout = byId("readout");
-  if (left === null || page.time.mode === "difference") { readout.classList.remove("on"); return; }
+  if (left === null) { readout.classList.remove("on"); return; }
   restTimer = setTimeout(() => showValue(left, top), REST_MS);
 }
 
 async function showValue(left, top) {
-  const [column, row] = cellAt(left, top), shown = page.time.map ?? page.map, readout = byId("readout");
+  const [column, row] = cellAt(left, top), shown = mapAt(left), readout = byId("readout");
   if (!shown.values || Number.isNaN(shown.at(column, row, "visits"))) { readout.classList.remove("on"); return; }
   const name = { age: "age_s" }[page.layer.id] ?? page.layer.id, std = { resistance: "resistance_std", grade: "grade_std" }[page.layer.id];
   const layers = [name, "resistance_class", ...(std ? [std] : [])];
   try {
-    const { values } = await getJson(page.path("point"), { x: (column + 0.5) * shown.cell_m, y: (row + 0.5) * shown.cell_m, layers: layers.join(), as_of: page.asOf() });
+    const at = { x: (column + 0.5) * shown.cell_m, y: (row + 0.5) * shown.cell_m, layers: layers.join() };
+    const ask = async (as_of) => (await getJson(page.path("point"), { ...at, as_of })).values;
+    const [values, then] = await Promise.all([ask(timeAt(left)), subtracts() ? ask(page.time.other) : null]);
+    const was = then && `${then[name] === null ? "not measured" : page.layer.text(then[name])} → `;
     const value = values[name], kind = KINDS[values.resistance_class];
     const spread = std && values[std] !== null ? ` ± ${(100 * values[std]).toFixed(1)}` : "";
-    readout.replaceChildren(element("b", {}, value === null ? "not measured" : page.layer.text(value) + spread), element("small", {}, `${kind ? `${kind.name} · ` : ""}${(column * shown.cell_m).toFixed(0)} m E, ${(row * shown.cell_m).toFixed(0)} m N`));
+    readout.replaceChildren(element("b", {}, was ?? "", value === null ? "not measured" : page.layer.text(value) + spread), element("small", {}, `${kind ? `${kind.name} · ` : ""}${(column * shown.cell_m).toFixed(0)} m E, ${(row * shown.cell_m).toFixed(0)} m N`));
     readout.dataset.value = value ?? "";
     readout.style.left = `${Math.min(innerWidth - 200, left + 14)}px`;
     readout.style.top = `${Math.max(8, top - 46)}px`;
@@ -279,7 +329,7 @@ function help() {
 
 function fit() {
   const phone = innerWidth <= 720;
-  view.margins = phone ? [16, 150, 16, 130] : [272, 24, 24, 96];
+  view.margins = phone ? [16, 150, 16, 130] : [272, 66, 24, 96];
   view.fit(page.map.bounds() ?? [-50, -50, 50, 50]);
   page.redraw();
   keepLink();
@@ -294,6 +344,16 @@ function setTheme(name) {
   page.redraw();
 }
 
+// On paper: light, whatever the screen is.
+let screenTheme = null;
+function printed(on) {
+  if (on) screenTheme = document.documentElement.dataset.theme;
+  document.documentElement.dataset.theme = on ? "light" : screenTheme;
+  page.ink = inkOf(document.documentElement);
+  page.dirty = true;
+  frame(); // the paper does not wait for the next picture
+}
+
 // --- the link to this view
 let linkTimer = 0;
 function keepLink() {
@@ -303,7 +363,7 @@ function keepLink() {
 function linkOf() {
   const parts = { site: page.site, layer: page.layer.id, palette: page.palette, at: `${view.x.toFixed(1)},${view.y.toFixed(1)},${view.scale.toFixed(2)}` };
   if (page.time.at !== null) parts.time = new Date(page.time.at / 1e6).toISOString();
-  if (page.time.other !== null) parts.other = new Date(page.time.other / 1e6).toISOString();
+  if (page.time.other !== null) Object.assign(parts, { other: new Date(page.time.other / 1e6).toISOString(), mode: page.time.mode });
   if (page.cell && page.panel === "why") parts.cell = page.cell.join();
   return `${location.pathname}?${new URLSearchParams(parts)}`;
 }
@@ -312,7 +372,7 @@ function restoreLink() {
   const at = asked.get("at")?.split(",").map(Number), time = Date.parse(asked.get("time")), other = Date.parse(asked.get("other"));
   if (at?.length === 3 && at.every(Number.isFinite)) { [view.x, view.y, view.scale] = at; view.moved = true; } else fit();
   if (!Number.isNaN(time)) page.time.go(time * 1e6);
-  if (!Number.isNaN(other)) page.time.compareWith(other * 1e6);
+  if (!Number.isNaN(other)) { page.time.mode = asked.get("mode") === "difference" ? "difference" : "beside"; page.time.compareWith(other * 1e6); }
   const cell = asked.get("cell")?.split(",").map(Number);
   if (cell?.length === 2 && cell.every(Number.isInteger)) { page.cell = cell; openPanel("why", cell); }
 }
@@ -345,7 +405,6 @@ const on = {
     page.info = site;
     page.changes = site.changes;
     page.boundaries = site.boundaries;
-    for (const [name, trusted] of Object.entries(site.trusted)) if (page.machines.has(name)) page.machines.get(name).trusted = trusted;
     if (page.map.store) page.map.stamp_ns = Math.max(page.map.stamp_ns, site.stamp_ns); // time goes on where nobody drives
     page.time.span(site.first_ns, site.stamp_ns);
     page.redraw();
@@ -360,7 +419,11 @@ async function start() {
   buildRail();
   setLayer(page.layer);
   setTimeout(() => { if (page.state === "loading" && !page.map.tiles.size) { page.state = ""; setState("loading"); } }, QUIET_MS);
-  follow(canvas, view, { changed: () => { page.redraw(); keepLink(); }, rest, choose: explain });
+  follow(canvas, view, { changed: () => { page.redraw(); keepLink(); }, rest, choose: explain,
+    holds: (left) => besides() && Math.abs(left - divider()) < HOLD_PX,
+    divide: (left) => { page.time.split = Math.min(0.98, Math.max(0.02, left / innerWidth)); page.redraw(); } });
+  addEventListener("beforeprint", () => printed(true));
+  addEventListener("afterprint", () => printed(false));
   addEventListener("keydown", onKey);
   addEventListener("resize", () => { if (!view.moved) fit(); page.time.drawStrip(); page.redraw(); });
   byId("fit").onclick = fit;
@@ -368,9 +431,9 @@ async function start() {
   byId("keys").onclick = help;
   byId("link").onclick = async () => { await navigator.clipboard?.writeText(location.origin + linkOf()); byId("link").classList.add("done"); setTimeout(() => byId("link").classList.remove("done"), 900); };
   byId("plan").onclick = () => byId("plan-file").click();
-  byId("plan-file").onchange = async (event) => { try { page.picture = await readPlan([...event.target.files]); setShow("plan", true); } catch (error) { alert(error.message); } };
+  byId("plan-file").onchange = async (event) => { try { page.picture = await readPlan([...event.target.files]); setShow("plan", true); } catch (error) { say("This picture cannot be shown", error.message); } event.target.value = ""; };
   byId("drawer").onclick = () => { const open = byId("rail").classList.toggle("full"); byId("drawer").setAttribute("aria-expanded", open); };
-  requestAnimationFrame(frame);
+  requestAnimationFrame(frames);
   setInterval(() => { showStatus(); page.redraw(); }, 1000);
   await choose();
 }

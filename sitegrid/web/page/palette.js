@@ -49,22 +49,30 @@ export const kindOf = (value, boundaries) => boundaries.filter((boundary) => val
 const SHOWN = { low: 0.006, high: 0.3 }; // ends of the ordered palette
 export const place = (value) => Math.log(value / SHOWN.low) / Math.log(SHOWN.high / SHOWN.low);
 export const percent = (value, digits = 1) => `${(100 * value).toFixed(digits)} %`;
-const span = (s) => (s < 90 ? `${Math.round(s)} s` : s < 5400 ? `${Math.round(s / 60)} min` : s < 172800 ? `${Math.round(s / 3600)} h` : `${Math.round(s / 86400)} d`);
+export const span = (s) => (s < 90 ? `${Math.round(s)} s` : s < 5400 ? `${Math.round(s / 60)} min` : s < 172800 ? `${Math.round(s / 3600)} h` : `${Math.round(s / 86400)} d`);
 export const ago = (s) => (s < 5 ? "just now" : `${span(s)} ago`);
 
-// ticks: [place along the palette 0..1, text]. colour: value -> rgb. `by` names the plane that fades a cell.
+// ticks: [place along the palette 0..1, text]. colour: value -> rgb. `fades` names the plane that fades a cell.
+// change: [what two values differ by, -1..1; the words for -1 and 1].
 export const LAYERS = [
   { id: "resistance", name: "Rolling resistance", unit: "% of weight", key: "1", fades: "confidence",
     colour: (v) => ordered(place(v)), at: place, text: (v) => percent(v),
-    ticks: [0.008, 0.02, 0.06, 0.25].map((v) => [place(v), percent(v, v < 0.01 ? 1 : 0)]) },
+    ticks: [0.008, 0.02, 0.06, 0.25].map((v) => [place(v), percent(v, v < 0.01 ? 1 : 0)]),
+    change: [(now, then) => Math.log(now / then) / Math.log(4), "a quarter", "four times"] },
   { id: "grade", name: "Slope", unit: "rise per length", key: "2", fades: "grade_std",
-    colour: (v) => ink(v / 0.3), at: (v) => v / 0.3, text: (v) => percent(v), ticks: [[0, "level"], [0.333, "10 %"], [0.667, "20 %"], [1, "30 %"]] },
+    colour: (v) => ink(v / 0.3), at: (v) => v / 0.3, text: (v) => percent(v), ticks: [[0, "level"], [0.333, "10 %"], [0.667, "20 %"], [1, "30 %"]],
+    change: [(now, then) => (now - then) / 0.2, "−20 %", "+20 %"] },
   { id: "visits", name: "Passes", unit: "visits of machines", key: "3", fades: null,
-    colour: (v) => ink(Math.log(v) / Math.log(60)), at: (v) => Math.log(v) / Math.log(60), text: (v) => `${Math.round(v)}`, ticks: [[0, "1"], [0.39, "5"], [0.73, "20"], [1, "60"]] },
+    colour: (v) => ink(Math.log(v) / Math.log(60)), at: (v) => Math.log(v) / Math.log(60), text: (v) => `${Math.round(v)}`, ticks: [[0, "1"], [0.39, "5"], [0.73, "20"], [1, "60"]],
+    change: [(now, then) => (now - then) / 20, "20 fewer", "20 more"] },
   { id: "age", name: "Age", unit: "newest sample", key: "4", fades: null,
     colour: (v) => ink(1 - Math.log(1 + v / 10) / Math.log(8641)), at: (v) => Math.log(1 + v / 10) / Math.log(8641), text: ago,
-    ticks: [[0, "now"], [0.215, "1 min"], [0.65, "1 h"], [1, "1 d"]], reversed: true },
+    ticks: [[0, "now"], [0.215, "1 min"], [0.65, "1 h"], [1, "1 d"]],
+    change: [(now, then) => Math.sign(now - then) * Math.log(1 + Math.abs(now - then) / 10) / Math.log(361), "1 h fresher", "1 h older"] },
   { id: "confidence", name: "Confidence", unit: "agreeing votes", key: "5", fades: null,
-    colour: (v) => ink((v - 0.3) / 0.7), at: (v) => (v - 0.3) / 0.7, text: (v) => percent(v, 0), ticks: [[0, "30 %"], [0.43, "60 %"], [1, "100 %"]] },
+    colour: (v) => ink((v - 0.3) / 0.7), at: (v) => (v - 0.3) / 0.7, text: (v) => percent(v, 0), ticks: [[0, "30 %"], [0.43, "60 %"], [1, "100 %"]],
+    change: [(now, then) => (now - then) / 0.5, "−50 %", "+50 %"] },
 ];
+// How a layer differs between two times, as a layer of its own.
+export const differenceOf = ({ name, change: [, less, more] }) => ({ id: "difference", name, unit: "then to now", fades: null, colour: diverging, at: (v) => (v + 1) / 2, ticks: [[0, less], [0.5, "same"], [1, more]] });
 export const layerOf = (id) => LAYERS.find((layer) => layer.id === id) ?? LAYERS[0];

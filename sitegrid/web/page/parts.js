@@ -118,4 +118,5 @@ export function timeChart(spans, changed_ns, ink) {
 }
 
 export const clock = (ns, seconds = false) => new Date(ns / 1e6).toISOString().slice(11, seconds ? 19 : 16);
+export const dayShort = (ns) => new Date(ns / 1e6).toLocaleDateString("en-GB", { day: "numeric", month: "short", timeZone: "UTC" });
 export const day = (ns) => new Date(ns / 1e6).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric", timeZone: "UTC" });

@@ -139,13 +139,16 @@ export function difference(newer, older, layer) {
   const result = new TileMap();
   Object.assign(result, { planes: ["difference", "visits"], cell_m: newer.cell_m, stamp_ns: newer.stamp_ns });
   result.values = { difference: valuesOf({ kind: "linear", low: -1, high: 1 }), visits: valuesOf({ kind: "count" }) };
-  const full = layer.id === "resistance" ? (a, b) => Math.log(a / b) / Math.log(4) : layer.id === "visits" ? (a, b) => (a - b) / 20 : (a, b) => (a - b) / 0.2;
   for (const [key, tile] of newer.tiles) {
     const planes = new Uint8Array(2 * AREA), other = older.tiles.get(key);
-    const now = newer.plane(tile, planeOf(layer.id)), then = other && older.plane(other, planeOf(layer.id));
-    for (let i = 0; i < AREA; i++) if (now[i] && then?.[i]) {
-      const u = full(newer.values[planeOf(layer.id)][now[i]], older.values[planeOf(layer.id)][then[i]]);
-      planes[i] = 1 + Math.round(127 * (Math.min(1, Math.max(-1, u)) + 1));
+    if (other) {
+      const now = newer.plane(tile, planeOf(layer.id)), then = older.plane(other, planeOf(layer.id));
+      const nowValues = newer.table(tile, layer, newer.stamp_ns), thenValues = older.table(other, layer, older.stamp_ns);
+      for (let i = 0; i < AREA; i++) if (now[i] && then[i]) {
+        const u = layer.change[0](nowValues[now[i]], thenValues[then[i]]);
+        planes[i] = 1 + Math.round(127 * (Math.min(1, Math.max(-1, u)) + 1));
+        planes[AREA + i] = 1;
+      }
     }
     result.tiles.set(key, { ...tile, planes, canvas: null, painted: "" });
   }

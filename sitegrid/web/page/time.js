@@ -1,16 +1,17 @@
 // The time bar: the map as of another time, play-back, and two times beside each other or subtracted.
 import { getFrame } from "./live.js";
-import { byId, clock, day } from "./parts.js";
+import { byId, clock, day, dayShort } from "./parts.js";
 import { TileMap } from "./tiles.js";
 
-const MOST_STEPS = 240, KEPT = 96, FRAME_MS = 250;
-const STEPS_S = [10, 60, 300, 900, 3600, 21600, 86400, 604800];
+const MOST_STEPS = 240, KEPT = 96, FRAME_MS = 250, TICK_PX = 84;
+const STEPS_S = [10, 60, 300, 900, 3600, 21600, 86400, 604800], DAY_S = 86400;
+const TICKS_S = [10, 30, 60, 120, 180, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, DAY_S, 2 * DAY_S, 7 * DAY_S, 14 * DAY_S, 28 * DAY_S, 91 * DAY_S, 364 * DAY_S];
 export const MODES = ["one", "beside", "difference"];
 
 export class TimeBar {
   // page: path(name), redraw(), changes. shown: called with the map of the chosen time, null for the live one.
   constructor(page) {
-    Object.assign(this, { page, first_ns: 0, last_ns: 0, at: null, other: null, mode: "one", playing: 0, cache: new Map(), map: null, otherMap: null, split: 0.5 });
+    Object.assign(this, { page, first_ns: 0, last_ns: 0, at: null, other: null, mode: "one", playing: 0, asking: new Map(), cache: new Map(), map: null, otherMap: null, split: 0.5 });
     this.slider = byId("slider");
     this.second = byId("slider-two");
     this.slider.addEventListener("input", () => this.go(this.timeOf(this.slider.value)));
@@ -33,21 +34,43 @@ export class TimeBar {
   timeOf(step) { return Number(step) >= Number(this.slider.max) ? null : (Math.floor(this.first_ns / this.step_ns) + 1 + Number(step)) * this.step_ns; }
   stepOf(ns) { return ns === null ? Number(this.slider.max) : Math.round(ns / this.step_ns) - Math.floor(this.first_ns / this.step_ns) - 1; }
 
+  // A thumb that is dragged passes many times: one is asked for at once, and then the newest that is wanted.
   async go(ns) {
     this.at = ns;
     this.show();
-    const map = ns === null ? null : await this.fetch(ns);
-    if (this.at === ns) { this.map = map; this.page.redraw(); }
+    if (ns === null) this.take("map", null);
+    else await this.want("map", () => this.at);
   }
 
-  goLive() { this.stop(); this.mode = "one"; this.other = this.otherMap = null; this.go(null); }
+  async want(name, wanted) {
+    if (this.asking.has(name)) return this.asking.get(name);
+    const ask = async () => {
+      for (let ns = null; ns !== wanted() && wanted() !== null;) {
+        ns = wanted();
+        let map;
+        try { map = await this.fetch(ns); } catch (error) { this.failed(error); return; }
+        if (wanted() === ns) this.take(name, map);
+      }
+    };
+    this.asking.set(name, ask().finally(() => this.asking.delete(name)));
+    return this.asking.get(name);
+  }
+
+  take(name, map) { this[name] = map; this.page.mapChanged(); }
+
+  // No map of that time: say so, and show what is known, the newest one.
+  failed(error) {
+    this.goLive();
+    this.page.say("The map of that time could not be read", error.message);
+  }
+
+  goLive() { this.mode = "one"; this.other = this.otherMap = null; this.go(null); this.stop(); }
 
   async compareWith(ns) {
     this.other = ns ?? this.timeOf(this.slider.max - 1);
     if (this.mode === "one") this.mode = "beside";
     this.show();
-    this.otherMap = await this.fetch(this.other);
-    this.page.redraw();
+    await this.want("otherMap", () => this.other);
   }
 
   nextMode() {
@@ -55,7 +78,7 @@ export class TimeBar {
     if (this.mode === "one") this.other = this.otherMap = null;
     else if (this.other === null) return this.compareWith(this.timeOf(Math.floor(this.slider.max / 2)));
     this.show();
-    this.page.redraw();
+    this.page.mapChanged();
   }
 
   step(by) { if (this.step_ns) this.go(this.timeOf(Math.min(Number(this.slider.max), Math.max(0, this.stepOf(this.at) + by)))); }
@@ -87,6 +110,9 @@ export class TimeBar {
     }
     return this.cache.get(key);
   }
+
+  // A time in as many words as the site's span needs.
+  words(ns) { return ns === null ? "now" : this.last_ns - this.first_ns > DAY_S * 1e9 ? `${dayShort(ns)} ${clock(ns)}` : clock(ns, true); }
 
   show() {
     const [time, date] = byId("clock").children, ns = this.at ?? this.last_ns;
@@ -122,9 +148,13 @@ export class TimeBar {
     context.font = `11px ${getComputedStyle(document.body).fontFamily}`;
     context.fillStyle = ink.soft;
     context.textAlign = "center";
-    const ticks = Math.max(2, Math.floor(width / 130));
-    const short = this.last_ns - this.first_ns < 3600e9;
-    for (let i = 1; i < ticks; i++) context.fillText(clock(this.first_ns + i * (this.last_ns - this.first_ns) / ticks, short), i * width / ticks, height - 1);
+    const span_ns = this.last_ns - this.first_ns, most = Math.max(1, Math.floor(width / TICK_PX));
+    const tick_ns = 1e9 * (TICKS_S.find((s) => span_ns / 1e9 / s <= most) ?? TICKS_S.at(-1));
+    for (let ns = Math.ceil(this.first_ns / tick_ns) * tick_ns; ns < this.last_ns; ns += tick_ns) {
+      if (x(ns) < 24 || x(ns) > width - 24) continue;
+      const midnight = ns % (DAY_S * 1e9) === 0;
+      context.fillText(midnight || tick_ns >= DAY_S * 1e9 ? dayShort(ns) : clock(ns, tick_ns < 60e9), x(ns), height - 1);
+    }
     context.fillStyle = ink.alarm;
     for (const change of this.page.changes) {
       const at = x(change.first_ns);

@@ -29,20 +29,22 @@ export class View {
   }
 }
 
-// Pointers on the map: `changed` after it moved, `rest(left, top)` where a mouse is, `choose(left, top)` on a click or tap.
-export function follow(canvas, view, { changed, rest, choose }) {
+// Pointers on the map: `changed` after it moved, `rest(left, top)` where a mouse is, `choose(left, top)` on a click or tap;
+// what begins where `holds(left)` goes to `divide(left)` and moves no map.
+export function follow(canvas, view, { changed, rest, choose, holds, divide }) {
   const pointers = new Map();
-  let travelled = 0, spread = 0;
+  let travelled = 0, spread = 0, held = false;
   const middle = () => { const all = [...pointers.values()]; return [0, 1].map((axis) => all.reduce((sum, p) => sum + p[axis], 0) / all.length); };
   const apart = () => { const [a, b] = [...pointers.values()]; return b ? Math.hypot(a[0] - b[0], a[1] - b[1]) : 0; };
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
-    if (!pointers.size) travelled = 0;
+    if (!pointers.size) { travelled = 0; held = holds(event.clientX); }
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
     spread = apart();
   });
   canvas.addEventListener("pointermove", (event) => {
-    if (!pointers.has(event.pointerId)) return rest(event.clientX, event.clientY);
+    if (!pointers.has(event.pointerId)) { canvas.classList.toggle("divides", holds(event.clientX)); return rest(event.clientX, event.clientY); }
+    if (held) { travelled += 9; rest(null); return divide(event.clientX); }
     const before = middle();
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
     const after = middle(), right = after[0] - before[0], down = after[1] - before[1];
