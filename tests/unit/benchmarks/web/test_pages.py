@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from benchmarks import web
 from benchmarks.__main__ import main
+from benchmarks.web import pages as web
 
 IN_BROWSERS = {"change to paint, 95 % [ms]", "first paint [ms]", "first paint [kB]"}
 

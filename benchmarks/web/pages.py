@@ -1,7 +1,8 @@
 """The web server with pages open, tiles asked for and ten machines at work: what it costs, and how soon people see it.
 
-Router, map server and web server are processes of their own. Pages are plain WebSocket clients, which take in what they
-get as the live page does; one is the page itself, in Chromium where there is one.
+It is one module because each figure is of the same site. Router, map server and web server are processes of their own.
+Pages are plain WebSocket clients, which take in what they get as the live page does; one is the page itself, in
+Chromium where there is one.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import math
 import shutil
 import struct
 import tempfile
@@ -38,8 +40,6 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_pose
 from protocol.wire.messages import Pose, SampleBatch
 from protocol.wire.session import free_endpoint
-from sitegrid.client import Client, connect
-from sitegrid.web.mercator import tile_at
 
 GOALS = {
     "web server, five pages [% of a core]": 10.0,
@@ -84,8 +84,7 @@ def run(hours: float, seconds: float) -> Report:
         endpoint, server = opened.enter_context(served(Path(path), SITE))
         port = int(free_endpoint().rpartition(":")[2])
         words = ("sitegrid.cli", "web", "--endpoint", endpoint, "--site", SITE.name, "--listen", str(port))
-        client = opened.enter_context(connect(endpoint, SITE.name))
-        site = _Site(port, server, opened.enter_context(process(*words)), client, samples_of(hours) // MACHINES)
+        site = _Site(port, server, opened.enter_context(process(*words)), samples_of(hours) // MACHINES)
         settle(server)
         figures = {**dict(_asked(site)), **dict(_browsed(site, _first_paint))}
         with _working(endpoint, site, seconds_of(work)):
@@ -109,7 +108,6 @@ class _Site:
     port: int
     server: int
     web: int
-    client: Client
     sent: int
     acknowledged: list[tuple[float, int]] = field(default_factory=list)
 
@@ -124,6 +122,10 @@ class _Site:
         if answer.status != HTTPStatus.OK:
             raise RuntimeError(f"{path}: {answer.status} {body[:200]!r}: nothing was measured")
         return body
+
+    def info(self) -> Report:
+        table: Report = json.loads(self.get("info"))
+        return table
 
     def cost(self, seconds: float) -> tuple[float, float]:
         """Processor time of the web server and of the map server over so many seconds, in seconds per second."""
@@ -192,7 +194,7 @@ def _working(endpoint: str, site: _Site, seconds: Iterator[Batches]) -> Iterator
                         for name, rows in second:
                             send(link, SITE, SampleBatch(name, 1, sent[name] + 1, rows, SITE.frame))
                             sent[name] += len(rows)
-                        row = site.client.info().journalled
+                        row = site.info()["journalled"]
                         site.acknowledged.append((1e3 * time.time(), row))
                     left_s = began_s + number + (quarter + 1) / POSES - time.monotonic()
                     if stop.wait(max(0.0, left_s)):
@@ -246,17 +248,23 @@ def _behind(changes: Sequence[tuple[float, int]], seen: Sequence[tuple[float, in
 
 def _asked(site: _Site) -> Figures:
     """Maps of past hours, and XYZ tiles, each asked for twice."""
-    info = site.client.info()
-    hours = range(info.first_ns + HOUR_NS // 12, info.stamp_ns - HOUR_NS // 60, HOUR_NS)
+    info = site.info()
+    hours = range(info["first_ns"] + HOUR_NS // 12, info["stamp_ns"] - HOUR_NS // 60, HOUR_NS)
     _, slider = (_ms(site, [f"tiles?as_of={stamp_ns}" for stamp_ns in hours]) for _ in range(2))
     yield "slider, cached hour, 95 % [ms]", slider
-    west, south, east, north = (edge * SITE.cell_m for edge in info.bounds or (0, 0, 1, 1))
+    west, south, east, north = (edge * SITE.cell_m for edge in info["bounds"] or (0, 0, 1, 1))
     draw, projection = np.random.default_rng(0), Projection(SITE)
     places = zip(draw.uniform(west, east, TILES), draw.uniform(south, north, TILES), strict=True)
-    tiles = {tile_at(*projection.to_geodetic(x, y)[:2], ZOOM) for x, y in places}
+    tiles = {_tile(*projection.to_geodetic(x, y)[:2]) for x, y in places}
     paths = [f"xyz/colour/resistance/{ZOOM}/{x}/{y}.png" for x, y in sorted(tiles)]
     yield "XYZ tile, fresh, 95 % [ms]", _ms(site, paths)
     yield "XYZ tile, cached, 95 % [ms]", _ms(site, paths)
+
+
+def _tile(lat_deg: float, lon_deg: float) -> tuple[int, int]:
+    """Column and row of the XYZ tile that a place lies in."""
+    north = 1 - math.asinh(math.tan(math.radians(lat_deg))) / math.pi
+    return int((lon_deg + 180.0) / 360.0 * 2**ZOOM), int(north / 2 * 2**ZOOM)
 
 
 def _ms(site: _Site, paths: Sequence[str]) -> float:

@@ -1,0 +1,1 @@
+"""The web server, as people and tools meet it."""
