@@ -124,6 +124,12 @@ class CompactPages:
         self.expand_into(pages)
         return pages
 
+    def expanded_votes(self) -> tuple[Ints, NDArray[np.uint64]]:
+        """The table and the votes alone, as in PackedPages."""
+        table, votes = self.table.astype(np.int64), np.empty(len(self.cells), np.uint64)
+        page_kernels.expand_votes(table, self.runs, self.cells, self.counts, self.high, votes)
+        return table, votes
+
     def expand_into(self, pages: PackedPages) -> None:
         """Write into arrays of the right lengths; their table is a copy of this one."""
         page_kernels.expand_votes(pages.table, self.runs, self.cells, self.counts, self.high, pages.votes)

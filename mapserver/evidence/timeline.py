@@ -58,19 +58,15 @@ class TimedPages(Sequence[TimedPage]):
 
     def packed_votes(self) -> tuple[NDArray[np.uint64], Ints]:
         """As the function of this name, without a page by itself."""
-        pages, table = self._in_order()
-        parts = [pages.votes[first:end] for first, end in table[:, 2:4].tolist()]
+        table, votes = self._pages.expanded_votes()
+        table = _in_order(table)
+        parts = [votes[first:end] for first, end in table[:, 2:4].tolist()]
         return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(table[:, 3] - table[:, 2])
 
     def add_to(self, start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints) -> None:
         """Add what counts from page `start` (256,) of each cell on, as `sum_pages` does."""
-        pages, table = self._in_order()
-        sum_pages(table, pages.votes, pages.cells, start, counts, bitmaps, newest_ns)
-
-    def _in_order(self) -> tuple[PackedPages, Ints]:
-        """The pages, and their table in the order of time."""
         pages = self._pages.expanded()
-        return pages, pages.table[np.lexsort((pages.table[:, 1], -pages.table[:, 0]))]
+        sum_pages(_in_order(pages.table), pages.votes, pages.cells, start, counts, bitmaps, newest_ns)
 
     @overload
     def __getitem__(self, index: int) -> TimedPage: ...
@@ -78,6 +74,11 @@ class TimedPages(Sequence[TimedPage]):
     def __getitem__(self, index: slice) -> list[TimedPage]: ...
     def __getitem__(self, index: int | slice) -> TimedPage | list[TimedPage]:
         return list(self)[index]
+
+
+def _in_order(table: Ints) -> Ints:
+    """The table of PackedPages in the order of time."""
+    return np.asarray(table[np.lexsort((table[:, 1], -table[:, 0]))])
 
 
 def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:

@@ -36,6 +36,7 @@ from sitegrid.web.site import SiteFeed
 PAGE = Path(__file__).parent / "page"
 FRESH_S = 1.0  # how old the version may be that a tile, or a copy that the asker has, is compared with
 PNG_KEPT = 4000  # some 20 MB
+MARGIN_M = 100.0  # around the map's bounds, which are of what is folded: a tile shows samples that still wait for it
 log = logging.getLogger("sitegrid.web")
 MAX_TILE_CELLS = 4_000_000  # of one XYZ tile; a lower zoom shows less than a site, and is empty
 
@@ -129,7 +130,7 @@ class WebApp:
                 scale, offset = mercator.coding(layer)
                 coding = "value = offset + scale * (65536 * red + 256 * green + blue); red = green = blue = 0: unknown"
                 table |= {"encoding": coding, "scale": scale, "offset": offset, "unknown": 0}
-            return _json(table)
+            return _json(table, {"ETag": _tag(info, with_now=False), "Cache-Control": "private, no-cache"})
         except Exception as error:
             return _failed(request, error)
 
@@ -177,7 +178,7 @@ async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tupl
     cell_m = info.site.cell_m
     bounds = _common(pixels.bounds(cell_m), info)
     if bounds is None:
-        return mercator.EMPTY
+        return mercator.empty_png(kind)
     if (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) > MAX_TILE_CELLS * cell_m**2:
         raise bad(Refusal.TOO_LARGE, "too many cells in one tile; zoom in")
     region = await feed.ask(feed.client.region, bounds, (layer,))
@@ -189,10 +190,10 @@ async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tupl
 def _common(bounds: Bounds, info: MapInfo) -> Bounds | None:
     """What of a rectangle the map may know; None for nothing."""
     if not info.bounds:
-        return None
+        return bounds if info.merged else None
     known = [edge * info.site.cell_m for edge in info.bounds]
-    west, south = max(bounds.west_m, known[0]), max(bounds.south_m, known[1])
-    east, north = min(bounds.east_m, known[2]), min(bounds.north_m, known[3])
+    west, south = max(bounds.west_m, known[0] - MARGIN_M), max(bounds.south_m, known[1] - MARGIN_M)
+    east, north = min(bounds.east_m, known[2] + MARGIN_M), min(bounds.north_m, known[3] + MARGIN_M)
     return Bounds(west, south, east, north) if west < east and south < north else None
 
 
@@ -222,8 +223,8 @@ def _tag(info: MapInfo, *, with_now: bool) -> str:
     return f'"{info.store}-{info.merged}-{info.fact}{now}"'
 
 
-def _json(value: Any) -> Response:
-    return Response(json.dumps(value), media_type="application/json")
+def _json(value: Any, headers: dict[str, str] | None = None) -> Response:
+    return Response(json.dumps(value), headers=headers, media_type="application/json")
 
 
 def _not_there(_: Request, error: Exception) -> Response:

@@ -85,7 +85,10 @@ def colour_png(values: Floats, layer: str) -> bytes:
     return _png(np.concatenate([colours, alpha], axis=-1).astype(np.uint8))
 
 
-EMPTY = cv2.imencode(".png", np.zeros((SIDE_PX, SIDE_PX, 4), np.uint8))[1].tobytes()
+def empty_png(kind: str) -> bytes:
+    """A tile of either kind in which nothing is known."""
+    return EMPTY_VALUES if kind == "value" else EMPTY_COLOURS
+
 
 # Ends of a layer's palette; what is not here takes those of a share. Ages and counts are seen by their logarithm.
 ENDS = {"grade": (0.0, 0.3), "grade_std": (0.0, 0.2), "grade_east": (-0.3, 0.3), "grade_north": (-0.3, 0.3)}
@@ -114,3 +117,6 @@ def _colours(values: Floats, layer: str) -> AnyArray:
 
 def _png(image: AnyArray) -> bytes:
     return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
+
+
+EMPTY_VALUES, EMPTY_COLOURS = (_png(np.zeros((SIDE_PX, SIDE_PX, bands), np.uint8)) for bands in (3, 4))

@@ -52,7 +52,8 @@ def test_unknown_is_transparent_and_colours_grow_lighter():
     image = decoded(colour_png(values, "resistance"))
     assert (image[..., 3] > 0).sum() == 3
     assert image[0, 0, 1] < image[0, 1, 1] < image[0, 2, 1]
-    assert decoded(mercator.EMPTY)[..., 3].max() == 0
+    assert decoded(mercator.empty_png("colour"))[..., 3].max() == 0
+    assert decoded(mercator.empty_png("value")).shape == decoded(value_png(values, "resistance")).shape
 
 
 @pytest.mark.parametrize("layer", ["resistance_class", "grade", "confidence", "age_s", "visits", "heading"])
