@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -13,6 +13,7 @@ from protocol.queries.answers import GroundChange
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, TilesAnswer
 from protocol.site.ground_classes import ZONES
 from protocol.site.site_config import Projection
+from protocol.wire.messages import Pose
 from sitegrid.web.values import iso
 
 LEAST_CELLS = 4  # smaller areas of one kind are noise to the eye
@@ -58,6 +59,17 @@ def machines(poses: Iterable[dict[str, Any]], projection: Projection) -> dict[st
     for pose in poses:
         properties = {name: pose[name] for name in ("machine", "heading_rad", "speed_mps", "stamp_time", "age_s")}
         out.append(_feature("Point", _corner(pose["x_m"], pose["y_m"], 1.0, projection), properties))
+    return _collection(out)
+
+
+def tracks(tracks_of: Mapping[str, Sequence[Pose]], projection: Projection) -> dict[str, Any]:
+    """Lines that machines drove."""
+    out = []
+    for name, poses in tracks_of.items():
+        if len(poses) > 1:
+            line = [_corner(pose.x_m, pose.y_m, 1.0, projection) for pose in poses]
+            times = {"first_time": iso(poses[0].stamp_ns), "last_time": iso(poses[-1].stamp_ns)}
+            out.append(_feature("LineString", line, {"machine": name, **times}))
     return _collection(out)
 
 

@@ -144,6 +144,13 @@ async def machine_features(feed: SiteFeed, _: Parameters) -> Response:
         return _geojson(features.machines(feed.poses(), await feed.projection()))
 
 
+async def track_features(feed: SiteFeed, _: Parameters) -> Response:
+    """Where machines drove while somebody looked, as features."""
+    async with feed.watched():
+        await feed.heard()
+        return _geojson(features.tracks(feed.tracks(), await feed.projection()))
+
+
 RESOURCES: dict[str, Resource] = {
     "info": Resource(info, "State of the map and of its server", {}, follows_now=True),
     "point": Resource(point, "Layers of the cell at a position", {**PLACE, **LAYERS, **AS_OF}),
@@ -181,6 +188,9 @@ RESOURCES: dict[str, Resource] = {
     ),
     "features/machines": Resource(
         machine_features, "Positions of machines", {}, ("application/geo+json",), follows_now=True
+    ),
+    "features/tracks": Resource(
+        track_features, "Lines that machines drove", {}, ("application/geo+json",), follows_now=True
     ),
 }
 

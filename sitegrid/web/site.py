@@ -8,7 +8,7 @@ import json
 import struct
 import threading
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
@@ -30,6 +30,7 @@ PERIOD_S = 0.25  # between two questions for what changed, while somebody looks
 STATE_S = 2.0  # between two questions for machines, changes and times
 LINGER_S = 10.0  # the map is followed so much longer than somebody looks: GIS ask every few seconds
 HEARD_S = 1.5  # machines publish their poses several times a second
+MOST_POSES, TRACK_STEP_NS = 600, 10**9  # of a track: ten minutes of site time
 SILENT_S = 120.0  # a machine that said nothing for so long is left out
 THREADS = 8  # questions at once: more visitors wait for each other, not on the map server
 PAST_KEPT = 128  # maps of the past that are kept ready: a day by minutes has more, a slider moves by fewer
@@ -52,6 +53,7 @@ class SiteFeed:
         self.watchers = 0
         self._task: asyncio.Task[None] | None = None
         self._poses: dict[str, tuple[Pose, float]] = {}
+        self._tracks: dict[str, deque[Pose]] = {}
         self._poses_lock = threading.Lock()
         self._listener: Listener[Pose] | None = None
         self._info: tuple[float, MapInfo] | None = None
@@ -182,9 +184,17 @@ class SiteFeed:
             "changes": [plain(change) for change in changes],
         }
 
+    def tracks(self) -> dict[str, list[Pose]]:
+        """Where each machine was while somebody looked, oldest first: some MOST_POSES poses."""
+        with self._poses_lock:
+            return {name: list(track) for name, track in self._tracks.items()}
+
     def _on_pose(self, pose: Pose) -> None:
         with self._poses_lock:
             self._poses[pose.machine] = pose, time.monotonic()
+            track = self._tracks.setdefault(pose.machine, deque(maxlen=MOST_POSES))
+            if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
+                track.append(pose)
 
 
 def frame(answer: TilesAnswer) -> bytes:

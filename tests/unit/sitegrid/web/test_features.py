@@ -7,6 +7,7 @@ from protocol.queries.answers import GroundChange, MapVersion
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer
 from protocol.site.ground_classes import BOUNDARIES
 from protocol.site.site_config import Projection, SiteConfig
+from protocol.wire.messages import Pose
 from sitegrid.web import features
 
 SITE = SiteConfig("pit", 49.01, 8.4)
@@ -62,3 +63,12 @@ def test_cells_in_a_polygon_are_those_with_their_centre_inside():
     assert inside.astype(int).tolist() == [[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 0]]
     ring = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 3), (3, 3), (3, 1), (0, 1)]  # a C, open to the west
     assert features.inside(ring, centres, centres).sum() == 10
+
+
+def test_a_track_is_a_line_in_the_order_of_time():
+    poses = [Pose("loader-1", 10**9 * i, 10.0 * i, 0.0, 0.0, 3.0, 1.0, 0.0, 1.0) for i in range(1, 4)]
+    (feature,) = features.tracks({"loader-1": poses, "loader-2": poses[:1]}, PROJECTION)["features"]
+    line = [PROJECTION.to_map(lat, lon, 0)[0] for lon, lat in feature["geometry"]["coordinates"]]
+    assert line == pytest.approx([10.0, 20.0, 30.0], abs=1e-3)
+    assert feature["properties"]["machine"] == "loader-1"
+    assert feature["properties"]["last_time"] == "1970-01-01T00:00:03.000000000Z"
