@@ -16,6 +16,10 @@ from hypothesis import settings
 from sitegrid.process.lifetime import SIGNALS
 from tests.paths import ROOT, SHARED_DATA
 
+# A shell starts what it runs in the background with SIGINT ignored, and so would be all processes of the tests.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 # Repeatable on every machine, and no complaint about a slow one.
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, print_blob=True)
 settings.load_profile("repeatable")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import logging
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,6 +20,7 @@ from protocol.files import load_toml
 from sitegrid.security.register import write_private
 
 TOKENS_FILE = "tokens.toml"
+log = logging.getLogger("sitegrid.security.tokens")
 
 
 @dataclass(frozen=True)
@@ -75,12 +77,18 @@ def save_tokens(folder: Path, tokens: Tokens) -> None:
 
 
 class TokenFile:
-    """Tokens of a folder as they are now: the file is read again when it changes, so a revoked one counts no more."""
+    """Tokens of a folder as they are now: the file is read again when it changes, so a revoked one counts no more.
+
+    ConfigError where there is no file that can be read. One that is damaged later lets nobody in, and is logged.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        if not (folder / TOKENS_FILE).is_file():
+            problem = f"holds no {TOKENS_FILE}: make a token with `sitegrid keys token NAME --dir {folder}`"
+            raise ConfigError(folder, problem)
         self._stamp: tuple[int, int] | None = None
-        self._tokens = Tokens()
+        self._tokens = load_tokens(folder)
 
     def person(self, token: str) -> str | None:
         """Whose token this is; None where it is nobody's."""
@@ -88,7 +96,12 @@ class TokenFile:
         status = path.stat() if path.is_file() else None
         stamp = (status.st_mtime_ns, status.st_ino) if status else None
         if stamp != self._stamp:
-            self._tokens, self._stamp = load_tokens(self._folder), stamp
+            self._stamp = stamp
+            try:
+                self._tokens = load_tokens(self._folder)
+            except ConfigError as error:
+                log.error("nobody is let in: %s", error)
+                self._tokens = Tokens()
         return self._tokens.person(token, datetime.now(UTC))
 
 

@@ -22,6 +22,8 @@ from sitegrid import Client
 from sitegrid.process.children import Child, wait_until
 from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
 
+pytestmark = pytest.mark.processes
+
 START_NS, HOUR_NS, SIZE = 1_767_225_600 * 10**9, 3600 * 10**9, 48
 BAD, OLD, NEW = 1.6, 0.06, 0.02
 CONFIG = "[store]\narchive_after_h = 0\n[trust]\njudge_s = 0.2\n"

@@ -13,9 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.wire.codec import encode_batch
+from protocol.wire.messages import SampleBatch
 from sitegrid.process.children import Children, wait_until
 from tests.integration.site_run import kill
 from tests.integration.web_site import START_NS, WebSite
+from tests.soak import BATCH_S
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 NO_BROWSER = "no Chromium: install it, for example with `apt-get install chromium`"
@@ -25,10 +29,14 @@ WAIT_MS = 20_000
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import Error, sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        try:  # in containers: no user namespaces, little shared memory
+            arguments = ["--no-sandbox", "--disable-dev-shm-usage"]
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        except Error as error:
+            pytest.skip(f"Chromium does not start here: {str(error).splitlines()[0]}")
         yield browser
         browser.close()
 
@@ -288,6 +296,9 @@ def test_a_server_that_is_gone_is_named_and_comes_back(browser, web: WebSite):
     kill(web.server)
     tab.until("document.getElementById('notice').textContent.includes('No map server answers')", 40_000)
     assert tab.js("sitegrid.map.tiles.size") > 0, "what it said last stays"
+    tab.page.keyboard.press("[")
+    tab.until("document.getElementById('notice').textContent.includes('map of that time could not be read')")
+    assert tab.js("[sitegrid.time.at, sitegrid.time.map, sitegrid.time.playing]") == [None, None, 0]
     web.server = web.start_server()
     tab.until("sitegrid.state === 'live' && document.getElementById('notice').hidden", 40_000)
     tab.close()
@@ -349,4 +360,51 @@ def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
         )
         serious = [violation for violation in faults if violation[1] in ("serious", "critical")]
         assert not serious, json.dumps(serious, indent=1)
+        tab.close()
+
+
+class Sweeper:
+    """A machine that drives lanes over an area, once an hour; one half of it is paved between."""
+
+    name = "sweeper"
+
+    def __init__(self) -> None:
+        self._seq = 0
+
+    def drive(self, from_s: float, frame: str) -> bytes:
+        """The batch of an hour, which begins 900 times as late as the others' seconds."""
+        hour = from_s / BATCH_S
+        x, y = np.meshgrid(np.arange(20.5, 80), np.arange(20.5, 50))
+        rows = np.zeros(x.size, SAMPLE_DTYPE)
+        rows["x_m"], rows["y_m"] = x.ravel(), y.ravel()
+        rows["stamp_ns"] = START_NS + round(hour * 3600e9) + np.arange(len(rows)) * 400_000_000
+        rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.04
+        rows["speed_mps"], rows["distance_m"] = 2.5, 1.0
+        rows["c_rr"] = np.where((rows["x_m"] > 50) & (hour >= 3), 0.009, 0.04)
+        rows["c_rr_var"], rows["grade_var"] = 1e-6, 1e-4
+        batch = SampleBatch(self.name, 7, self._seq + 1, rows, frame)
+        self._seq += len(rows)
+        return encode_batch(batch)
+
+
+def test_changed_ground_is_outlined_and_says_what_it_was(browser, tmp_path: Path):
+    with Children(tmp_path) as children:
+        web = WebSite(tmp_path, children)
+        web.machines = [Sweeper()]
+        web.drive(5 * BATCH_S)
+        tab = Tab(browser, web.url).loaded()
+        tab.until("sitegrid.changes.length === 1")
+        west, south, east, north = tab.js("sitegrid.changes[0].bounds")
+        assert (round(west / 5), round(east / 5)) == (10, 16), "the half that was paved"
+        tab.page.mouse.click(*tab.pixel_of((west + east) / 2, (south + north) / 2))
+        tab.page.locator("#panel .change").wait_for(timeout=WAIT_MS)
+        text = tab.page.locator("#panel .change").inner_text()
+        assert "Was 4.0 % (dry dirt)" in text
+        tab.page.get_by_role("button", name="Compare with before").click()
+        tab.until("sitegrid.time.mode === 'beside' && sitegrid.time.otherMap !== null")
+        shown = tab.js(f"sitegrid.time.otherMap.at({(west + east) // 2}, {(south + north) // 2}, 'resistance')")
+        assert shown == pytest.approx(0.04, rel=0.1), "the map of before the change"
+        tab.js(f"sitegrid.time.go({START_NS + 2 * 3600 * 10**9})")
+        tab.until("document.querySelector('#panel .big b').textContent === '4.0 %'")  # the panel is of the time shown
+        assert tab.complaints == []
         tab.close()

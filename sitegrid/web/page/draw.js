@@ -82,7 +82,7 @@ export function drawMachine(context, view, machine, now_s, shows, ink, labels) {
   context.fill();
   context.restore();
   const state = machine.trusted === false ? " · not used" : silent ? ` · silent ${span(now_s - machine.seen_s)}` : "";
-  drawLabel(context, machine.machine + state, x, y, ink, grey, labels);
+  drawLabel(context, machine.machine + state, x, y, ink, grey, labels, view.margins[0] - 16);
 }
 
 function drawTrack(context, view, machine, now_s, colour, ink) {
@@ -98,9 +98,10 @@ function drawTrack(context, view, machine, now_s, colour, ink) {
   }
 }
 
-function drawLabel(context, text, x, middle, ink, grey, labels) {
+// A label stays right of `edge`, where the rail ends, if its machine is.
+function drawLabel(context, text, place, middle, ink, grey, labels, edge) {
   context.font = `600 12px ${getComputedStyle(document.body).fontFamily}`;
-  const width = context.measureText(text).width + 14;
+  const width = context.measureText(text).width + 14, x = place > edge ? Math.max(place, edge + width / 2) : place;
   const free = (at) => labels.every((other) => Math.abs(at - other.y) > 21 || Math.abs(x - other.x) > (width + other.width) / 2);
   const y = [-20, 22, -42, 44, -64].map((away) => middle + away).find(free) ?? middle - 20;
   labels.push({ x, y, width });

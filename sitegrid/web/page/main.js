@@ -31,7 +31,7 @@ const page = {
   path: (name) => `/api/v1/sites/${page.site}/${name}`,
   asOf: () => page.cellTime ?? page.time.at ?? undefined,
   redraw: () => { page.dirty = true; },
-  mapChanged: () => { buildLegend(); page.redraw(); },
+  mapChanged: () => { buildLegend(); page.redraw(); panelFollows(); },
   say: (title, text) => say(title, text),
   compareWith: (ns) => page.time.compareWith(ns),
   timeMoved: () => { if (page.site) { showStatus(); keepLink(); } },
@@ -226,13 +226,15 @@ function say(title, text) {
 
 // --- choosing
 async function openPanel(name, subject) {
-  const panel = byId("panel"), body = element("div", {}, element("p", { className: "part note" }, "One moment."));
+  const panel = byId("panel"), again = page.panel === name;
+  const body = again ? panel.lastElementChild : element("div", {}, element("p", { className: "part note" }, "One moment."));
   const close = element("button", { className: "icon", onclick: closePanel, ariaLabel: "Close" }, "×");
   close.setAttribute("aria-label", "Close");
-  panel.replaceChildren(element("header", {}, element("h2", {}, PANELS[name].title), close), body);
+  if (!again) panel.replaceChildren(element("header", {}, element("h2", {}, PANELS[name].title), close), body);
+  body.classList.add("asking");
   panel.hidden = false;
   document.body.classList.add("open");
-  page.panel = name;
+  Object.assign(page, { panel: name, panelAt: page.time.at });
   keepLink();
   const mine = Symbol(name);
   page.opening = mine;
@@ -242,7 +244,15 @@ async function openPanel(name, subject) {
   } catch (error) {
     if (page.opening === mine) body.replaceChildren(element("p", { className: "part note" }, error instanceof Refused ? error.message : `This could not be read: ${error.message}`));
   }
+  if (page.opening === mine) body.classList.remove("asking");
   page.redraw();
+}
+
+// The panel is of the time that is shown, once that stands still.
+function panelFollows() {
+  if (!page.panel || page.time.playing || page.panelAt === page.time.at) return;
+  page.cellTime = null;
+  openPanel(page.panel, page.cell);
 }
 
 function closePanel() {
@@ -261,6 +271,7 @@ const mapAt = (left) => (besides() && left < divider() ? page.time.otherMap : pa
 
 function explain(left, top) {
   page.cellTime = timeAt(left);
+  rest(null);
   page.cell = cellAt(left, top);
   if (innerWidth <= 720) { view.shift(view.width / 2 - left, view.height * 0.28 - top); page.redraw(); } // above the panel
   else if (left > innerWidth - PANEL_PX) { view.shift(innerWidth - PANEL_PX - left, 0); page.redraw(); } // beside it

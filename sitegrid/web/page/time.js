@@ -5,7 +5,7 @@ import { TileMap } from "./tiles.js";
 
 const MOST_STEPS = 240, KEPT = 96, FRAME_MS = 250, TICK_PX = 84;
 const STEPS_S = [10, 60, 300, 900, 3600, 21600, 86400, 604800], DAY_S = 86400;
-const TICKS_S = [10, 30, 60, 120, 180, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, DAY_S, 2 * DAY_S, 7 * DAY_S, 14 * DAY_S, 28 * DAY_S, 91 * DAY_S, 364 * DAY_S];
+const TICKS_S = [10, 30, 60, 120, 180, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, DAY_S, 2 * DAY_S, 7 * DAY_S, 14 * DAY_S, 28 * DAY_S, 56 * DAY_S, 91 * DAY_S, 364 * DAY_S];
 export const MODES = ["one", "beside", "difference"];
 
 export class TimeBar {

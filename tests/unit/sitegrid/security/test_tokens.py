@@ -40,13 +40,27 @@ def test_a_new_token_replaces_the_old_one_and_revoked_ones_count_no_more(tmp_pat
 
 
 def test_a_file_is_read_again_when_it_changes(tmp_path: Path):
-    file = TokenFile(tmp_path)
-    assert file.person("x") is None, "nobody has one yet"
+    with pytest.raises(ConfigError, match="sitegrid keys token NAME"):
+        TokenFile(tmp_path)  # nobody has one yet
     tokens, token = Tokens().with_new("anna", datetime.now(UTC) + timedelta(days=1))
     save_tokens(tmp_path, tokens)
+    file = TokenFile(tmp_path)
+    assert file.person("x") is None
     assert file.person(token) == "anna"
     save_tokens(tmp_path, tokens.without("anna"))
     assert file.person(token) is None
+
+
+def test_a_file_that_is_damaged_later_lets_nobody_in_and_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    tokens, token = Tokens().with_new("anna", datetime.now(UTC) + timedelta(days=1))
+    save_tokens(tmp_path, tokens)
+    file = TokenFile(tmp_path)
+    (tmp_path / TOKENS_FILE).write_text("[")
+    assert file.person(token) is None
+    assert file.person(token) is None
+    assert [TOKENS_FILE in record.getMessage() for record in caplog.records] == [True], "logged once"
+    save_tokens(tmp_path, tokens)
+    assert file.person(token) == "anna"
 
 
 @pytest.mark.parametrize(
