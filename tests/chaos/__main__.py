@@ -139,7 +139,7 @@ def _run(fault: ChaosFault, scenario: FaultRun) -> FaultOutcome:
 def totals(outcomes: Sequence[FaultOutcome], seed: int) -> dict[str, Any]:
     """Sums for machines. kills: of the fault of that name."""
     table: dict[str, Any] = {"kills": sum(outcome.count for outcome in outcomes if outcome.fault == "kills")}
-    for name in ("recorded", "merged", "declared", "lost", "double", "silent"):
+    for name in ("recorded", "merged", "declared", "lost", "named", "double", "silent"):
         table[name] = sum(getattr(outcome, name) for outcome in outcomes)
     table["ack_ms_max"] = max((outcome.ack_ms_max or 0 for outcome in outcomes), default=0)
     table["ok"] = all(outcome.is_good for outcome in outcomes)

@@ -18,6 +18,7 @@ from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Watermark
+from mapserver.journal.shortfall import KIND, Shortfall, missing
 from protocol.errors import StoreError
 from protocol.machine.log_folder import open_log
 from protocol.site.site_config import site_toml
@@ -27,7 +28,7 @@ from tests.chaos.leashed import Process
 from tests.chaos.outcome import Console, FaultOutcome, TimeSpan, longest_pause
 from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings
 
-READY_S = 40.0
+READY_S = 120.0  # a server's first start in a new folder compiles its kernels
 RESUME_S = 60.0
 ROUTER, SERVER, SECOND = "router", "server", "second"  # the last: a map server with a store of its own
 COMMAND = ("-m", "sitegrid.cli")
@@ -68,7 +69,6 @@ class ChaosSite:
         self.excuses: tuple[str, ...] = ()  # last words with which a process may end, to be started again
         self.outcome = FaultOutcome("")
         self.faults: list[TimeSpan] = []
-        self.named = 0  # lost samples that were not declared, but that some log, health or metric told of
         self._ack_ms: list[int] = []
         self._recordings, self._first_ns = recordings, first_ns
         self._running: dict[str, Process] = {}
@@ -277,11 +277,14 @@ class ChaosSite:
         with JournalReader(store / JOURNAL_FILE) as reader:
             rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(History.beside(reader))]
             declared = sum(mark.lost for mark in reader.watermarks().values())
+            shortfalls = [Shortfall.from_event(event) for event in reader.events(KIND)]
+            named = missing(shortfalls, reader.watermarks()).total()  # as `info`, metrics and the doctor have it
         out = self.outcome
         out.recorded, out.merged, out.double = result.recorded, result.merged, result.double
         out.declared = min(declared, result.lost)
         out.lost = result.lost - out.declared
-        out.silent = max(0, out.lost - self.named)
+        out.named = min(out.lost, named)
+        out.silent = out.lost - out.named
         out.ack_ms_max = max(self._ack_ms, default=0)
         out.notes |= {"declared in all": declared, "unrecorded": result.unrecorded, "rows": len(rows)}
         if result.unrecorded:

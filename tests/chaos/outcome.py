@@ -12,7 +12,19 @@ from typing import Any
 TimeSpan = tuple[float, float]  # [s] of one clock
 
 COLUMNS = (
-    *("fault", "count", "recorded", "merged", "declared", "lost", "double", "silent", "longest ack", "longest pause"),
+    *(
+        "fault",
+        "count",
+        "recorded",
+        "merged",
+        "declared",
+        "lost",
+        "named",
+        "double",
+        "silent",
+        "longest ack",
+        "longest pause",
+    ),
     *("memory", "answer", ""),
 )
 LINE = "{:<16}{:>6}{:>10}{:>9}{:>10}{:>6}{:>8}{:>8}{:>13}{:>15}{:>8}{:>8}  {}"
@@ -27,12 +39,12 @@ class FaultOutcome:
     """Result of one fault.
 
     count: how often it struck; recorded: samples in the audit files; declared: those that are in no journal and were
-    declared lost to the server; lost: those that are in no journal and were not; silent: those of the lost that no log,
-    health or metric named either. ack_ms_max: the longest time from the first sending of a batch until it was
-    acknowledged, as agents that ended in order report it; longest_pause_s: between two commits of one machine, without
-    the time that faults lasted; both None where no agents run. memory_ratio: the server's peak, as a multiple of what
-    it has with one reader; answer_s_max: the longest time that this reader waited; both None but for faults of readers.
-    skipped: why it did not run.
+    declared lost to the server; lost: those that are in no journal and were not; named: those of the lost that the
+    server names as missing, by machine and number; silent: the others. ack_ms_max: the longest time from the first
+    sending of a batch until it was acknowledged, as agents that ended in order report it; longest_pause_s: between two
+    commits of one machine, without the time that faults lasted; both None where no agents run. memory_ratio: the
+    server's peak, as a multiple of what it has with one reader; answer_s_max: the longest time that this reader waited;
+    both None but for faults of readers. skipped: why it did not run.
     """
 
     fault: str
@@ -41,6 +53,7 @@ class FaultOutcome:
     merged: int = 0
     declared: int = 0
     lost: int = 0
+    named: int = 0
     double: int = 0
     silent: int = 0
     ack_ms_max: int | None = None
@@ -54,8 +67,8 @@ class FaultOutcome:
 
     @property
     def is_good(self) -> bool:
-        """Nothing lost, nothing double, and nothing else that should not be."""
-        return self.lost == self.double == self.silent == 0 and not self.problems
+        """Nothing lost but what is named, nothing double, and nothing else that should not be."""
+        return self.lost - self.named == self.double == self.silent == 0 and not self.problems
 
 
 @dataclass(frozen=True)
@@ -109,7 +122,7 @@ def _row(outcome: FaultOutcome) -> tuple[str, ...]:
         return (outcome.fault, *("-",) * 11, f"skipped: {outcome.skipped}")
     pause = "-" if outcome.longest_pause_s is None else f"{outcome.longest_pause_s:.1f} s"
     ack = "-" if outcome.ack_ms_max is None else f"{outcome.ack_ms_max} ms"
-    names = ("count", "recorded", "merged", "declared", "lost", "double", "silent")
+    names = ("count", "recorded", "merged", "declared", "lost", "named", "double", "silent")
     counts = (getattr(outcome, name) for name in names)
     verdict = "ok" if outcome.is_good else "FAILED: " + "; ".join(outcome.problems or ["lost or double"])
     ratio = "-" if outcome.memory_ratio is None else f"{outcome.memory_ratio} x"
