@@ -23,7 +23,8 @@ from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
 from sitegrid.process.children import Children, wait_until
 from tests.integration.site_run import kill
-from tests.integration.web_site import NAME, Frame, WebSite
+from tests.integration.web_site import NAME, READY_S, Frame, WebSite
+from tests.soak import SITE_TOML
 
 pytestmark = pytest.mark.processes
 
@@ -191,6 +192,18 @@ def test_slow_headers_do_not_hold_a_place(web: WebSite):
         slow.sendall(b"GET / HTTP/1.1\r\nHost: x\r\nX-Slow: ")
         slow.settimeout(30)
         assert slow.recv(1000) == b""
+
+
+def test_two_sites_stand_behind_one_address(tmp_path: Path):
+    with Children(tmp_path) as children:
+        web = WebSite(tmp_path, children, "--site", "pit")
+        (tmp_path / "pit.toml").write_text(SITE_TOML.replace('"soak"', '"pit"'))
+        words = ("--site-file", tmp_path / "pit.toml", "--store", tmp_path / "pit")
+        children.start("pit", "server", "--endpoint", web.endpoint, *words).expect("ready", READY_S)
+        web.drive(4)
+        assert [site["name"] for site in web.get("/api/v1/sites").json["sites"]] == [NAME, "pit"]
+        assert web.get("info").json["samples_merged"] > 0
+        assert web.get("/api/v1/sites/pit/info").json["samples_merged"] == 0
 
 
 # --- the live connection ---------------------------------------------------------------------------------------------
