@@ -27,7 +27,7 @@ COLUMNS = (
     ),
     *("memory", "answer", ""),
 )
-LINE = "{:<16}{:>6}{:>10}{:>9}{:>10}{:>6}{:>8}{:>8}{:>13}{:>15}{:>8}{:>8}  {}"
+LINE = "{:<17}{:>6}{:>10}{:>9}{:>10}{:>6}{:>7}{:>8}{:>8}{:>13}{:>15}{:>8}{:>8}  {}"
 
 
 class InterruptError(Exception):
@@ -67,8 +67,8 @@ class FaultOutcome:
 
     @property
     def is_good(self) -> bool:
-        """Nothing lost but what is named, nothing double, and nothing else that should not be."""
-        return self.lost - self.named == self.double == self.silent == 0 and not self.problems
+        """Nothing lost, nothing double, and nothing else that should not be."""
+        return self.lost == self.double == self.silent == 0 and not self.problems
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def table(outcomes: Iterable[FaultOutcome]) -> str:
 
 def _row(outcome: FaultOutcome) -> tuple[str, ...]:
     if outcome.skipped:
-        return (outcome.fault, *("-",) * 11, f"skipped: {outcome.skipped}")
+        return (outcome.fault, *("-",) * (len(COLUMNS) - 2), f"skipped: {outcome.skipped}")
     pause = "-" if outcome.longest_pause_s is None else f"{outcome.longest_pause_s:.1f} s"
     ack = "-" if outcome.ack_ms_max is None else f"{outcome.ack_ms_max} ms"
     names = ("count", "recorded", "merged", "declared", "lost", "named", "double", "silent")

@@ -287,11 +287,11 @@ def test_a_skipped_fault_is_no_failure():
 
 
 def test_a_loss_that_was_named_fails_the_suite_and_is_not_silent():
-    outcome = FaultOutcome("restored_store", recorded=9, merged=8, lost=1)
+    outcome = FaultOutcome("restored_store", recorded=9, merged=8, lost=1, named=1)
     assert not outcome.is_good
-    header, row = (line.split()[:8] for line in table([outcome]).splitlines())
+    header, row = (line.split()[:9] for line in table([outcome]).splitlines())
     shown = dict(zip(header, row, strict=True))
-    assert (shown["declared"], shown["lost"], shown["silent"]) == ("0", "1", "0")
+    assert [shown[name] for name in ("declared", "lost", "named", "silent")] == ["0", "1", "1", "0"]
 
 
 @pytest.mark.parametrize(
