@@ -39,7 +39,7 @@ SITE_TOML = 'name = "soak"\norigin_lat_deg = 49.01\norigin_lon_deg = 8.4\n'
 BATCH_S, RATE_HZ = 4.0, 2.5  # of a machine: one batch so often, so many samples a second (5 m/s, one each 2 m)
 ASK_S, PAST_S, LOOK_S = 10.0, 100.0, 60.0  # site time between two questions, two about the past, two looks
 MOST_GROWTH_PCT = 5.0
-READY_S = 60.0
+READY_S = 120.0  # a first start in a new folder compiles kernels
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from sitegrid.process.children import Child, Children, wait_until
 
 DEFAULT_MANIFEST = Path("evaluation/logs/rl_test1_husky/log.toml")
 DEFAULT_DATA = Path("../shared/data/rl_test1_husky")
-READY_S = 30.0
+READY_S = 120.0  # the first start in a new folder compiles kernels: most of a minute on a busy machine
 LOG_SPEED = 20.0  # times real time
 SIM_OPTIONS = ("scenario", "world", "machines", "seed", "seconds", "speed")  # those that the demo passes on
 

@@ -12,7 +12,7 @@ from sim.config import SimConfig, resolve, write_configs
 from sitegrid import Client, connect
 from sitegrid.process.children import Child, Children, wait_until
 
-READY_S = 40.0
+READY_S = 120.0  # a first start in a new folder compiles kernels
 
 
 class SiteRun:

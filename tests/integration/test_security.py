@@ -39,7 +39,7 @@ from sitegrid.security.signing import Signer
 certificates = pytest.importorskip("sitegrid.security.certificates", reason="cryptography is not installed")
 pytestmark = pytest.mark.processes
 
-READY_S = 40.0
+READY_S = 120.0  # a first start in a new folder compiles kernels
 SITE = "paper"
 ROLES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim"}
 DAY = timedelta(days=1)

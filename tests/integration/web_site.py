@@ -21,7 +21,7 @@ from sitegrid import Client, connect
 from sitegrid.process.children import Child, Children
 from tests.soak import BATCH_S, SITE_TOML, START_NS, SoakMachine
 
-READY_S = 60.0
+READY_S = 120.0  # a first start in a new folder compiles kernels
 NAME = "soak"
 
 
