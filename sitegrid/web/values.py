@@ -1,4 +1,4 @@
-"""Parameters of requests to checked values, and values to JSON; a Problem names what is wrong."""
+"""Parameters of requests to checked values, and values to JSON; a Problem or QueryError names what is wrong."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from protocol.errors import Refusal
 from protocol.machine.readings import MAX_STAMP_NS
+from protocol.queries import parameters as ps
 from protocol.site.site_config import Projection
 from sitegrid.web.problems import bad
 
@@ -20,19 +21,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def number(parameters: Parameters, name: str, default: float | None = None) -> float:
-    """A finite number."""
-    text = parameters.get(name)
-    if text is None:
-        if default is None:
-            raise bad(Refusal.MISSING_FIELD, f"parameter `{name}` is missing")
+    """A finite number, as the map server's own queries have it."""
+    if default is not None and name not in parameters:
         return default
-    try:
-        value = float(text)
-    except ValueError:
-        raise bad(Refusal.WRONG_TYPE, f"parameter `{name}`: {text[:40]!r} is no number") from None
-    if not math.isfinite(value) or abs(value) > 1e15:
-        raise bad(Refusal.NOT_FINITE, f"parameter `{name}`: {text[:40]} is not usable")
-    return value
+    return ps.number(parameters, name)
 
 
 def place(parameters: Parameters, projection: Projection) -> tuple[float, float]:
