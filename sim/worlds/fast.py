@@ -34,8 +34,8 @@ _BESIDE = ("grip_n", "crab_rad", "centre_mps2", "ride_m", "ride_mps", "ride_aim_
 _AXES = {"rates_radps": 3, "rates_dot_radps2": 3, "force_mps2": 3, "wheel_radps": 2, "wheel_rad": 2}
 STATE = np.dtype([(name, "f8", _AXES.get(name, ())) for name in (*_IN_BOTH, *_BESIDE)])
 
-# One machine's parameters, as `chassis.Chassis` and `chassis.Weight` explain them. level_*: how far an axle's tyres give
-# way under the nominal machine, empty, which stands level on them.
+# One machine's parameters, as `chassis.Chassis` and `chassis.Weight` explain them. level_*: how far an axle's tyres
+# give way under the nominal machine, empty, which stands level on them.
 _OF_TYRES = ("tyre_stiffness_npm", "tyre_damping_nspm", "wheel_radius_m", "wheel_inertia_kgm2")
 _FIGURES = ("rear_to_joint_m", "front_to_joint_m", "half_track_m", "level_front_m", "level_rear_m")
 _FIGURES += (*_OF_TYRES, *chassis.Weight._fields)
