@@ -94,14 +94,14 @@ class Positioning:
             poses, restarts = self.localiser.update(reading, sensor, self.dead_reckoning), decision is Decision.RESTART
         except DivergedError:
             self._counters["filter_restarts"] += 1
+            self._config = replace(self._config, start=())  # a start that was configured is far behind by now
             self._restart()
             poses, restarts = [], True
         return Accepted(reading, sensor, poses, restarts)
 
     def _restart(self) -> None:
-        """Start again, from wherever the machine is by now: a start that was configured is long past."""
+        """Start again, and keep the counts."""
         self._counters.update(self.localiser.counters)
-        self._config = replace(self._config, start=())
         self._start()
 
     def _start(self) -> None:

@@ -25,6 +25,7 @@ ALPHA, BETA = 1.0, 1.0  # with kappa = 3 - n the paper's lambda, and the weights
 class _Extended(ExtendedKalmanFilter):  # type: ignore[misc]
     """With a motion that is not linear: filterpy asks for this method to be replaced then."""
 
+    x: Floats
     f: Model
 
     def predict_x(self, u: object = 0) -> None:  # noqa: ARG002 - nothing controls the machine here
