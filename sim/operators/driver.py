@@ -119,6 +119,7 @@ def drive(
     wheelbase = crew.rear_to_joint_m + crew.front_to_joint_m
     heading = state.yaw_rad + state.articulation_rad * crew.rear_to_joint_m / wheelbase
     steer = travel * pursue(crew, target, np.where(travel < 0, heading + np.pi, heading))
+    steer = np.where(at_stop, state.articulation_rad, steer)  # who steers while he stands folds the machine up
 
     # Keep the speed that the leg allows; gently up, and at once down.
     limit = np.where(travel < 0, REVERSE_SHARE, 1.0) * course.limit(leg, distance + LOOK_AHEAD_S * speed)

@@ -15,7 +15,9 @@ from protocol.arrays import Floats, Ints
 from protocol.config import require_between
 
 WANDER_STEP_M, WANDER_STEPS = 2.0, 4096  # between points of a driver's wander; after 8 km it begins again
+RUN_UP_M = 40.0  # machines start on their lines, and are as far from them as they wander after so far
 WIDEST = 2.5  # standard deviations: no driver goes further from his line
+STEEPEST = 0.05  # wander over its length: hydraulics that cannot follow make a machine weave from side to side
 STOPS = 256  # drawn for each driver; then they begin again
 SPREAD = (0.5, 1.5)  # of the distance from stop to stop, over its mean
 
@@ -37,6 +39,10 @@ class DrivingConfig:
     def __post_init__(self) -> None:
         require_between(self, 0, 1, "wander_m")
         require_between(self, 10, 1000, "wander_length_m")
+        if self.wander_m > STEEPEST * self.wander_length_m:
+            most_m = STEEPEST * self.wander_length_m
+            problem = f"{self.wander_m:g} m is more than machines can steer with a wander_length_m of"
+            raise ValueError(f"wander_m: {problem} {self.wander_length_m:g} m: at most {most_m:g} m")
         require_between(self, 20, 1e5, "stop_every_m")
         shortest, longest = self.stop_s
         if not 1 <= shortest <= longest <= 3600:
@@ -66,7 +72,7 @@ class Habits:
         whole = np.floor(steps)
         number, count, driver = whole.astype(np.int64), self.left_m.shape[1], np.arange(len(steps))
         here, there = self.left_m[driver, number % count], self.left_m[driver, (number + 1) % count]
-        aside: Floats = here + (steps - whole) * (there - here)
+        aside: Floats = np.minimum(driven_m / RUN_UP_M, 1.0) * (here + (steps - whole) * (there - here))
         return aside
 
     def stop(self, number: Ints) -> tuple[Floats, Floats]:
