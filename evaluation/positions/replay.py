@@ -138,12 +138,14 @@ def covered(trace: Trace) -> float:
 
 
 def _spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:
-    """Cut readings at the multiples of STEP_NS."""
+    """Cut readings at the multiples of STEP_NS; one whose stamp goes back stays with those that it came with."""
     span: list[Reading] = []
+    step = 0
     for reading in readings:
-        if span and reading.stamp_ns // STEP_NS != span[0].stamp_ns // STEP_NS:
+        if span and reading.stamp_ns // STEP_NS > step:
             yield span
             span = []
+        step = max(step, reading.stamp_ns // STEP_NS)
         span.append(reading)
     if span:
         yield span
