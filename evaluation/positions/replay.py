@@ -125,16 +125,16 @@ def score(trace: Trace, truth: Truth) -> Score:
 def covered(trace: Trace) -> float:
     """Share of the time of the readings with a pose, at the log's own rate; 0 to 1.
 
-    A pose stands for the time since the one before, as far as that is an interval of this log: of a hole, and before
-    the first pose, it stands for one usual (median) interval alone.
+    The time between two poses counts, and that from the first reading and to the last one; of a hole, one usual
+    (median) interval.
     """
     if not len(trace.stamp_ns):
         return 0.0
-    intervals_s = np.diff(trace.stamp_ns) * 1e-9
-    usual_s = float(np.median(intervals_s)) if len(intervals_s) else STEP_NS * 1e-9
-    stands_s = np.where(intervals_s <= HOLE * usual_s, intervals_s, usual_s)
-    first_s = min(usual_s, float(trace.since_start_s[0]))
-    return min(1.0, (first_s + float(stands_s.sum())) / trace.seconds) if trace.seconds else 1.0
+    between_s = np.diff(trace.since_start_s)
+    usual_s = float(np.median(between_s)) if len(between_s) else STEP_NS * 1e-9
+    intervals_s = np.diff(trace.since_start_s, prepend=0.0, append=trace.seconds)
+    counts_s = np.where(intervals_s <= HOLE * usual_s, intervals_s, usual_s)
+    return min(1.0, float(counts_s.sum()) / trace.seconds) if trace.seconds else 1.0
 
 
 def _spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:
