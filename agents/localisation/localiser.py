@@ -27,7 +27,7 @@ from protocol.site.site_config import Projection
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
 Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
-ENGINES: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
+FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
 
 
@@ -35,10 +35,10 @@ PROFILES = ("default", "paper")
 class LocalisationConfig:
     """How positions are found.
 
-    filter: ekf or ukf. profile: "paper" takes GPS errors as white; "default" estimates a slow error of each receiver, a
-    bias of each yaw gyro and the wheels' scale. start: x, y [m] and heading [rad] in `map`, where they are known: no
-    alignment is needed then, nor GPS. slip, slip_soft: wheel slip per traction on firm ground, and how much it rises
-    with the rolling resistance; of the tyres.
+    filter: ekf or ukf. profile: "paper" takes GPS errors as white, and runs filterpy's filters (extra `paper`);
+    "default" estimates a slow error of each receiver, a bias of each yaw gyro and the wheels' scale, with our own.
+    start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. slip,
+    slip_soft: wheel slip per traction on firm ground, and how much it rises with the rolling resistance; of the tyres.
     """
 
     filter: str = "ukf"
@@ -48,8 +48,8 @@ class LocalisationConfig:
     slip_soft: float = 0.9
 
     def __post_init__(self) -> None:
-        if self.filter not in ENGINES:
-            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(ENGINES)}")
+        if self.filter not in FILTERS:
+            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(FILTERS)}")
         if self.profile not in PROFILES:
             raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
         if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
@@ -65,6 +65,7 @@ class Localiser:
         self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, step_s: float = STEP_S
     ) -> None:
         self._config = config
+        self._engine = _engine(config)
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
@@ -160,7 +161,7 @@ class Localiser:
     def _start(self, alignment: Alignment) -> list[Belief]:
         first, layout = self._steps[0], self._model.layout
         belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
-        self._fusion = Fusion(ENGINES[self._config.filter], self._model, belief)
+        self._fusion = Fusion(self._engine, self._model, belief)
         beliefs = [belief]
         events: list[Event] = [*list(self._steps)[1:], *self._fixes, *self._velocities]
         for event in sorted(events, key=lambda e: e.stamp_ns):
@@ -169,6 +170,15 @@ class Localiser:
         self._fixes.clear()
         self._velocities.clear()
         return beliefs
+
+
+def _engine(config: LocalisationConfig) -> Filter:
+    """Our own filter, or the textbook's, which is imported for the profile that needs it alone."""
+    if config.profile != "paper":
+        return FILTERS[config.filter]
+    from agents.localisation.filters.textbook import TextbookEkf, TextbookUkf
+
+    return TextbookEkf() if config.filter == "ekf" else TextbookUkf()
 
 
 def _layout_of(machine: MachineConfig) -> Layout:
