@@ -85,7 +85,7 @@ def gps_error(preset: str) -> Row:
         "rms_2d_m": round((2 * (slow + white)) ** 0.5 * gps.scale, 3),
         "slow_variance_share": round(slow / (slow + white), 3),
         "correlation_time_s": gps.drift_time_s,
-        **{name: getattr(gps, name) for name in ("rate_hz", "shared", "outage_s", "outage_period_s")},
+        **{n: getattr(gps, n) for n in ("rate_hz", "machine_share", "site_share", "outage_s", "outage_period_s")},
     }
 
 

@@ -82,7 +82,7 @@ class Past:
         nodes = self._with(stamp_ns, x, P)
         over = int(np.searchsorted(nodes.stamp_ns, stamp_ns - self.lag_ns, side="right"))
         final = tuple(_poses(nodes, over)) if over else ()
-        rest = Nodes(*(values[over:] for values in nodes)) if over else nodes
+        rest = Nodes._make(values[over:] for values in nodes) if over else nodes
         return Past(self.lag_ns, rest, final, F, np.zeros(len(x)), np.zeros((len(x), len(x))))
 
     def mapped(self, M: Floats) -> "Past":
