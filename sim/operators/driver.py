@@ -101,7 +101,7 @@ def drive(
     arrived &= ~done
     travel = course.travel[leg]
 
-    # Stops of their own.
+    # Now and then it stops where the driver wants to.
     driven = old.driven_m + np.abs(state.speed_mps) * dt
     at_stop = old.stop_m - driven < STOP_M
     stood = np.where(at_stop & standing, old.stood_s + dt, 0.0)
@@ -110,12 +110,12 @@ def drive(
     stop = np.where(rested, driven + habits.stop(stops)[0], old.stop_m)
     at_stop &= ~rested
 
-    # Steer for a point ahead, as far aside from the line as they happen to keep there.
+    # Steer for a point ahead, as far beside the line as they happen to keep there.
     speed = travel * state.speed_mps
     target_distance = distance + LOOK_AHEAD_M + LOOK_AHEAD_S * np.abs(speed)
     point, direction = course.at(leg, target_distance)
-    aside = travel * habits.aside_m(driven + target_distance - distance)
-    target = point + aside[:, None] * np.stack([-direction[:, 1], direction[:, 0]], axis=-1) - position
+    lateral = travel * habits.lateral_m(driven + target_distance - distance)
+    target = point + lateral[:, None] * np.stack([-direction[:, 1], direction[:, 0]], axis=-1) - position
     wheelbase = crew.rear_to_joint_m + crew.front_to_joint_m
     heading = state.yaw_rad + state.articulation_rad * crew.rear_to_joint_m / wheelbase
     steer = travel * pursue(crew, target, np.where(travel < 0, heading + np.pi, heading))

@@ -66,14 +66,14 @@ class Habits:
     gap_m: Floats
     stop_s: Floats
 
-    def aside_m(self, driven_m: Floats) -> Floats:
+    def lateral_m(self, driven_m: Floats) -> Floats:
         """Distance to the left of the line that drivers aim at after a distance driven, both (n,)."""
         steps = driven_m / WANDER_STEP_M
         whole = np.floor(steps)
         number, count, driver = whole.astype(np.int64), self.left_m.shape[1], np.arange(len(steps))
         here, there = self.left_m[driver, number % count], self.left_m[driver, (number + 1) % count]
-        aside: Floats = np.minimum(driven_m / RUN_UP_M, 1.0) * (here + (steps - whole) * (there - here))
-        return aside
+        lateral: Floats = np.minimum(driven_m / RUN_UP_M, 1.0) * (here + (steps - whole) * (there - here))
+        return lateral
 
     def stop(self, number: Ints) -> tuple[Floats, Floats]:
         """Distance (n,) from the stop before to the one with this number (n,), from 0, and how long it lasts [s]."""
@@ -105,4 +105,5 @@ def _wander(white: Floats, std_m: float, length_m: float) -> Floats:
     gain = 1 / (1 + (0.5 * length_m * per_m) ** 2)
     power = gain**2 @ np.where((per_m > 0) & (np.arange(len(gain)) < steps // 2), 2.0, 1.0) / steps
     left_m = np.fft.irfft(np.fft.rfft(white, axis=1) * gain, steps, axis=1) * (std_m / np.sqrt(power))
-    return np.clip(left_m, -WIDEST * std_m, WIDEST * std_m)
+    kept: Floats = np.clip(left_m, -WIDEST * std_m, WIDEST * std_m)
+    return kept
