@@ -93,7 +93,7 @@ class Positioning:
             self._counters["reading_unknown_sensor"] += 1
             return None
         if sensor.delay_s:
-            reading = replace(reading, stamp_ns=reading.stamp_ns - round(sensor.delay_s * 1e9))
+            reading = replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns))
         decision = self._order.decide(reading)
         if decision is Decision.REFUSE:
             return None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
-from agents.localisation.filters.belief import Belief, Filter, PoseBelief
+from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
@@ -15,17 +15,19 @@ from agents.localisation.filters.smoother import SmoothedPose, nothing_past
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, anchored_headings
 from agents.localisation.imu_steps import FilterStep, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
-from protocol.machine.readings import Gps, Reading
+from protocol.machine.readings import Gps, GpsVelocity, Reading
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
+Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
 MAX_LAG_S = 3600.0  # each second of it is a node to smooth
@@ -87,6 +89,7 @@ class Localiser:
         self._fusion: Fusion | None = None
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
+        self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
 
     @property
     def is_aligned(self) -> bool:
@@ -118,18 +121,22 @@ class Localiser:
 
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
-        event: FilterStep | Fix | None = (
-            self._receivers.fix(reading, dead_reckoning.pose)
-            if isinstance(reading, Gps)
-            else self._gatherer.gather(reading, sensor, dead_reckoning)
-        )
+        event: Event | None
+        if isinstance(reading, Gps):
+            event = self._receivers.fix(reading, dead_reckoning.pose)
+        elif isinstance(reading, GpsVelocity):
+            event = gps_velocity(reading, sensor)
+        else:
+            event = self._gatherer.gather(reading, sensor, dead_reckoning)
         if event is None:
             return []
         beliefs = self._filter(self._fusion, event) if self._fusion else self._collect(event, dead_reckoning.distance_m)
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
-    def _filter(self, fusion: Fusion, event: FilterStep | Fix) -> list[Belief]:
+    def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
         """Beliefs that an event changed."""
+        if isinstance(event, Measurement):
+            return fusion.add([event])
         if isinstance(event, Fix):
             return self._filter_modal(fusion, self._receivers, event)
         fusion.model = replace(fusion.model, traction=event.traction)
@@ -157,12 +164,14 @@ class Localiser:
             sensors.confirm(value, fusion.last[measurement.sensor])
         return beliefs
 
-    def _collect(self, event: FilterStep | Fix, distance_m: float) -> list[Belief]:
+    def _collect(self, event: Event, distance_m: float) -> list[Belief]:
         """Keep an event until the heading is known, then filter all that was kept."""
         alignment: Alignment | None = None
         if isinstance(event, Fix):
             self._fixes.append(event)
             alignment = align_fixes(self._fixes, distance_m) if self._steps else None
+        elif isinstance(event, Measurement):
+            self._velocities.append(event)
         else:
             self._steps.append(event)
             alignment = align_start(self._config.start, self._steps[0].reckoned) if self._config.start else None
@@ -174,11 +183,12 @@ class Localiser:
         belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
         self._fusion = Fusion(self._engine, self._model, belief)
         beliefs = [belief]
-        events: list[FilterStep | Fix] = [*list(self._steps)[1:], *self._fixes]
+        events: list[Event] = [*list(self._steps)[1:], *self._fixes, *self._velocities]
         for event in sorted(events, key=lambda e: e.stamp_ns):
             beliefs += self._filter(self._fusion, event)
         self._steps.clear()
         self._fixes.clear()
+        self._velocities.clear()
         return beliefs
 
 
