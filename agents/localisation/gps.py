@@ -7,7 +7,7 @@ and yaw (navsat_transform): on the way back into the map the rotations cancel, a
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -15,10 +15,10 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation import measurements
 from agents.localisation.consistency import Consistency, InnovationMonitor
-from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement
+from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, anchor_states
 from agents.localisation.filters.motion import GpsError, gps_covariance
 from agents.localisation.filters.state import YAW, Layout
-from agents.localisation.sensor_modes import ModalSensors, StampedValue, anchor_states
+from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from agents.localisation.shared_errors import MOST_SHARED, SharedFix, ShareEstimator
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
@@ -220,8 +220,9 @@ def _antenna(belief: Belief, lever_m: Floats) -> tuple[Floats, Floats]:
 def _join(belief: Belief, states: slice, H: Floats, variance: float) -> Belief:
     """The belief with states e (k,) for an error of which others tell a part: e = -H x + v."""
     joined = anchor_states(belief, states, H, variance)
-    joined.x[states] = -H @ belief.x
-    return joined
+    x = joined.x.copy()
+    x[states] = -H @ belief.x
+    return replace(joined, x=x)
 
 
 def _anchor_antenna(belief: Belief, states: slice, lever_m: Floats, variance: float) -> Belief:

@@ -1,16 +1,16 @@
 """How much of their slow errors the GPS receivers of one machine share, from the differences of their fixes.
 
-Antennas a metre apart see the same satellites through the same air; reflections are each one's own. In the difference of
-two fixes, less that of their antennas by dead reckoning, the machine's place and whatever both receivers err alike drop
-out. What is left of a share s, of slow variances U and V, is a Gauss-Markov process per axis with white noise on it:
+Antennas a metre apart see the same satellites through the same air; reflections are each one's own. In the difference
+of two fixes, less that of their antennas by dead reckoning, the machine's place and whatever both receivers err alike
+drop out. What is left of a share s, of slow variances U and V, is a Gauss-Markov process per axis, and white noise:
 
     difference = d + white        variance of d = U + V - 2 s min(U, V)
 
-It changes in half a minute, so ten minutes are worth some dozen independent values, which no mean square could use well.
+It lasts for half a minute, so ten minutes are worth some dozen independent values, too few for a mean square of them.
 So a Kalman filter per candidate s follows d, and the likelihood of what it did not expect weighs its candidate
 (multiple-model estimation, Magill 1965; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
-Navigation, section 11.6.2). All shares are equally likely at first. The mean is what a filter needs: the variance of what
-receivers have in common is linear in s.
+Navigation, section 11.6.2). All shares are equally likely at first. The mean is what the filter of positions needs,
+since the variance of what receivers have in common is linear in s.
 """
 
 import math
@@ -83,7 +83,7 @@ class ShareEstimator:
         self._sums[:] = 0.0
 
     def _compare(self, differences: Floats, white_m2: Floats, seen: Bools) -> None:
-        """Weigh the candidates by differences (p, 2) of p pairs, with white noise (p,), of which some were seen (p,)."""
+        """Weigh the candidates by the differences (p, 2) of p pairs and their white noise (p,); seen: which there are (p,)."""
         U, V, times = self._slow_m2[self._first], self._slow_m2[self._second], self._time_s
         dt_s = (self._span - self._filtered) * SPAN_NS * 1e-9
         self._filtered = self._span

@@ -1,6 +1,7 @@
 """What receivers share, estimated from made-up fixes of a machine that drives in circles."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ def slow_errors(seed: int, seconds: float, receivers: int, share: float, slow_m2
     keep = np.exp(-1 / RATE_HZ / TIME_S)
     parts = rng.standard_normal((n, receivers + 1, 2))
     parts[1:] *= np.sqrt(1 - keep**2)
-    for before, now in zip(parts, parts[1:], strict=False):
+    for before, now in pairwise(parts):
         now += keep * before
     return np.sqrt(slow_m2) * (np.sqrt(share) * parts[:, :1] + np.sqrt(1 - share) * parts[:, 1:])
 
@@ -62,7 +63,7 @@ def test_before_any_fix_all_shares_are_equally_likely() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("receivers", [2, 3])
 def test_over_all_shares_the_mean_is_right_and_better_with_time(receivers: int) -> None:
-    """Of true shares drawn as the estimator expects them, the mean of what is left is zero (a law of every posterior)."""
+    """Of shares drawn as the estimator expects them, the mean of what is left is zero: a law of every posterior."""
     true = (np.arange(36) + 0.5) / 36
     early, late = [], []
     for seed, share in enumerate(true):

@@ -13,8 +13,8 @@ from agents.localisation.filters.motion import (
     SLIP_STD,
     SLIP_TIME_S,
     GpsError,
-    gps_covariance,
     MotionModel,
+    gps_covariance,
     map_from_base,
     motion,
 )
