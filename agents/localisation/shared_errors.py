@@ -83,7 +83,7 @@ class ShareEstimator:
         self._sums[:] = 0.0
 
     def _compare(self, differences: Floats, white_m2: Floats, seen: Bools) -> None:
-        """Weigh the candidates by the differences (p, 2) of p pairs and their white noise (p,); seen: which there are (p,)."""
+        """Weigh the candidates by differences (p, 2) of p pairs and their white noise (p,); seen: which there are."""
         U, V, times = self._slow_m2[self._first], self._slow_m2[self._second], self._time_s
         dt_s = (self._span - self._filtered) * SPAN_NS * 1e-9
         self._filtered = self._span
