@@ -135,8 +135,9 @@ class Receivers(ModalSensors[Fix]):
         super().confirm(fix, result)
         name = fix.sensor.name
         self._monitors[name].note(result)
-        if result.accepted:
-            self._accepted_ns[name] = max(fix.stamp_ns, self._accepted_ns.get(name, 0))
+        if not result.accepted:
+            return
+        self._accepted_ns[name] = max(fix.stamp_ns, self._accepted_ns.get(name, 0))
         if len(self._compared) > 1 and name in self._compared:
             white_m2, slow_m2, time_s = float(self._white(fix).mean()), self._drift_m2[name], fix.sensor.drift_time_s
             i, antenna = self._compared[name], fix.reckoned_antenna_m
