@@ -194,9 +194,9 @@ def test_errors_of_equal_times_are_those_of_a_common_process_and_own_ones() -> N
     share, variance_m2, dt_s = 0.8, 2.5, 3.0
     model = MotionModel(FULL, gps_errors=(GpsError(variance_m2, 45.0, (share * variance_m2,)),) * 2)
     moves = motion(model, at(np.zeros(FULL.n)), dt_s)
-    renewed = variance_m2 * -math.expm1(-2 * dt_s / 45.0)
+    added_m2 = variance_m2 * -math.expm1(-2 * dt_s / 45.0)
     sums = np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])  # common + own, of each
-    parts = np.diag([share, 1 - share, 1 - share]) * renewed
+    parts = np.diag([share, 1 - share, 1 - share]) * added_m2
     east = FULL.gps_errors.start + np.array([0, 2])
     np.testing.assert_allclose(moves.Q[np.ix_(east, east)], sums @ parts @ sums.T, rtol=1e-12)
     np.testing.assert_array_equal(moves.Q[np.ix_(east, east + 1)], 0.0)
