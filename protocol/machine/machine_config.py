@@ -20,6 +20,7 @@ BASE, FRONT = "base_link", "front_link"
 # accelerometer, an orientation whose heading is of no use.
 QUANTITIES = {
     "gps": ("position",),
+    "gps_velocity": ("velocity",),
     "imu": ("rate", "force"),
     "attitude": ("tilt", "heading"),
     "odometry": ("speed", "rate"),
@@ -30,6 +31,8 @@ QUANTITIES = {
 # that moment, later ones count from it (Moore & Stouch, robot_localization).
 MODES = ABSOLUTE, DIFFERENTIAL, RELATIVE = ("absolute", "differential", "relative")
 WITH_MODE = ("gps", "attitude")
+MAX_DELAY_S = 0.4  # what is 0.5 s behind the newest reading is refused as late; readings do not arrive in perfect order
+MAX_EARLY_S = 10.0  # a stamp that is further ahead of its reading is no delay, but another clock
 
 
 @dataclass(frozen=True)
@@ -50,9 +53,10 @@ class SensorConfig:
 
     name: as readings carry it. use: false ignores the sensor's readings. measures: which of its quantities are used, by
     the names in QUANTITIES; empty: all. std: standard deviations by these names, instead of what readings state or the
-    filter's options say: `position` [m]; `tilt`, `heading` [rad]; `rate` [rad/s]; `force` [m/s2]; `speed` [m/s].
-    mode: one of MODES, for GPS and attitude. delay_s: how much later than it was true a reading is stamped. gate_sigma:
-    refused if further off than so many standard deviations; 0: as the filter's options say. frame: which frame of an
+    filter's options say: `position` [m]; `tilt`, `heading` [rad]; `rate` [rad/s]; `force` [m/s2]; `speed`,
+    `velocity` [m/s]. mode: one of MODES, for GPS and attitude. delay_s: how much later than it was true a reading is
+    stamped; negative if earlier. gate_sigma: refused if further off than so many standard deviations; 0: as the
+    filter's options say. frame: which frame of an
     articulated machine carries it; `front_link` starts at the joint, at the height of the wheels' hubs. drift_share,
     drift_time_s: of a GPS receiver, the share of its variance that is a slow error, and that error's correlation time.
     ticks_per_rev: of an encoder.
@@ -80,8 +84,11 @@ class SensorConfig:
         self._check_meaning()
         if self.frame not in (BASE, FRONT):
             raise ValueError(f"frame: {self.frame!r} is neither {BASE} nor {FRONT}")
-        if not (0 <= self.delay_s <= 10 and 0 <= self.gate_sigma <= 1000):
-            raise ValueError("delay_s must be between 0 and 10, gate_sigma between 0 and 1000")
+        if not (-MAX_EARLY_S <= self.delay_s <= MAX_DELAY_S and 0 <= self.gate_sigma <= 1000):
+            limits = (
+                f"delay_s must be between -{MAX_EARLY_S:g} and {MAX_DELAY_S:g}: readings that are later are refused"
+            )
+            raise ValueError(f"{self.name}: {limits}; gate_sigma between 0 and 1000")
         if not 0 <= self.drift_share <= 1:
             raise ValueError(f"drift_share: {self.drift_share} is not between 0 and 1")
         if self.drift_time_s <= 0 or self.ticks_per_rev <= 0:
@@ -101,6 +108,10 @@ class SensorConfig:
         if self.mode not in modes:
             raise ValueError(f"mode: {self.name}: {self.kind} has no {self.mode!r}, but {', '.join(modes)}")
 
+    def true_ns(self, stamp_ns: int) -> int:
+        """When that was true which a reading of this stamp measured."""
+        return stamp_ns - round(self.delay_s * 1e9)
+
     def provides(self, quantity: str) -> bool:
         """Whether its readings are used for this quantity, one of QUANTITIES."""
         return not self.measures or quantity in self.measures
@@ -115,7 +126,8 @@ class MachineConfig:
     """Nominal body of a machine; `base_link` is its rear frame, on the ground below the rear axle's centre.
 
     load_centre_m: how far ahead of `base_link` the wheel loads' centre lies. rotating_mass_factor: mass plus the
-    wheels' inertia over mass. A machine without a drive torque sensor needs no mass.
+    wheels' inertia over mass. A machine without a drive torque sensor needs no mass. machine_share: share of the slow
+    variance that its GPS receivers have in common, None to estimate it.
 
     The rest, 0 where not known: wheelbase_m: from the rear axle to the front one, straight ahead. axle_stiffness_npm:
     vertical, of the two tyres of one axle together. cog_height_m: of the empty machine's centre of mass above the
@@ -128,6 +140,7 @@ class MachineConfig:
     wheel_radius_m: float = 0.75
     load_centre_m: float = 1.5
     rotating_mass_factor: float = 1.07
+    machine_share: float | None = None
     wheelbase_m: float = 0.0
     axle_stiffness_npm: float = 0.0
     cog_height_m: float = 0.0
@@ -142,6 +155,8 @@ class MachineConfig:
             raise ValueError("mass_kg and wheel_radius_m must be positive")
         if self.rotating_mass_factor < 1:
             raise ValueError("rotating_mass_factor: below 1")
+        if self.machine_share is not None and not 0 <= self.machine_share <= 1:
+            raise ValueError(f"machine_share: {self.machine_share} is not between 0 and 1")
         for name in ("wheelbase_m", "axle_stiffness_npm", "cog_height_m", "payload_z_m"):
             if not 0 <= getattr(self, name) < math.inf:  # also false for NaN
                 raise ValueError(f"{name}: {getattr(self, name)!r} is not a positive number, nor 0 for not known")
