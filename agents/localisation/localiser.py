@@ -16,11 +16,11 @@ from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
-from agents.localisation.headings import References, anchored_headings
+from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
+from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity, Reading
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
@@ -79,13 +79,13 @@ class Localiser:
         self._engine = _engine(config)
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
-        self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
+        self._gatherer = StepGatherer(machine, step_s)
         self._receivers = Receivers(
             machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
         )
-        self._references = References(machine.sensors, layout)
+        self._references = References(machine.sensors, layout, slow=augmented)
         self._body = MotionSensors(machine, layout, step_s, config.slip, config.slip_soft)
-        source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
+        source, on_plane = turn_source(machine), not _shows_tilt(machine)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
         self._model = MotionModel(layout, on_plane, self._receivers.errors, turn_error_radps=turn_error)
         self._fusion: Fusion | None = None
@@ -146,13 +146,15 @@ class Localiser:
             return fusion.add([event])
         if isinstance(event, Fix):
             return self._filter_modal(fusion, self._receivers, event)
-        fusion.model = replace(fusion.model, traction=event.traction)
+        absolute = self._references.measurements(event, fusion.belief)
+        errors = self._references.errors
+        fusion.model = replace(fusion.model, traction=event.traction, heading_errors=errors)
         beliefs: list[Belief] = []
         for orientation in self._references.own_stamped(event):
             beliefs += self._filter_modal(fusion, self._references, orientation)
         measurements = [
             *self._body.inertial(event),
-            *self._references.measurements(event),
+            *absolute,
             *self._body.turn(event),
             *self._body.wheels(event),
         ]
@@ -213,13 +215,13 @@ def _layout_of(machine: MachineConfig) -> Layout:
     source = turn_source(machine)
     imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
     turns = imus + (source is not None and source.kind != "imu")
-    return Layout(turns, True, len(drifting(machine.sensors)), len(anchored_headings(machine.sensors)))
+    return Layout(turns, True, len(drifting(machine.sensors)), len(heading_references(machine.sensors)))
 
 
-def _shows_tilt(machine: MachineConfig, profile: str) -> bool:
+def _shows_tilt(machine: MachineConfig) -> bool:
     """Whether a sensor shows roll and pitch, or how they change; a machine without any is taken to be on a plane."""
     return any(
-        s.kind == "imu" or (s.kind == "attitude" and s.provides("tilt") and (profile == "paper" or s.mode != ABSOLUTE))
+        s.kind == "imu" or (s.kind == "attitude" and s.provides("tilt"))
         for s in machine.sensors
         if s.use
     )
