@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,13 +29,14 @@ HOLE = 3  # times the usual interval between poses: nothing was believed in a lo
 class Trace:
     """What was believed, once per STEP_NS from the first pose on.
 
-    stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2) in `map`. first_ns, last_ns: of the readings. cpu_s:
-    processor time of whatever was run: the whole pipeline, or localisation alone.
+    stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2), heading_rad: (n,) in `map`. first_ns, last_ns: of the
+    readings. cpu_s: processor time of whatever was run: the whole pipeline, or localisation alone.
     """
 
     stamp_ns: Ints
     position_m: Floats
     covariance_m2: Floats
+    heading_rad: Floats
     first_ns: int
     last_ns: int
     cpu_s: float
@@ -49,6 +50,15 @@ class Trace:
     def since_start_s(self) -> Floats:
         """Stamps (n,) as seconds after the first reading."""
         return np.asarray(self.stamp_ns - self.first_ns, float) * 1e-9
+
+    def moved(self, lever_m: Floats) -> Trace:
+        """Of another point of the machine, lever_m (3,) off in `base_link`, as a machine on the plane has it.
+
+        The covariance stays: what the heading adds, its standard deviation times the lever, is small beside it.
+        """
+        c, s, (ahead, left, _) = np.cos(self.heading_rad), np.sin(self.heading_rad), lever_m
+        off = np.stack([c * ahead - s * left, s * ahead + c * left], axis=1)
+        return replace(self, position_m=self.position_m + off)
 
 
 @dataclass(frozen=True)
@@ -90,6 +100,7 @@ def replay(core: PoseSource, readings: Sequence[Reading], holdout: Holdout | Non
         stamp_ns=np.array([p.stamp_ns for p in poses], np.int64),
         position_m=np.array([(p.x_m, p.y_m) for p in poses]).reshape(-1, 2),
         covariance_m2=np.array([p.covariance_m2 for p in poses]).reshape(-1, 2, 2),
+        heading_rad=np.array([p.heading_rad for p in poses]),
         first_ns=readings[0].stamp_ns if readings else 0,
         last_ns=readings[-1].stamp_ns if readings else 0,
         cpu_s=cpu_s,
