@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from agents.config import require_place
 from agents.holdout import NOTHING, Holdout, HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import PipelineConfig, Positioning
 from evaluation.campaign.figures import Report, Row, root_mean_square, rounded
 from evaluation.campaign.truth import Truth
 from evaluation.positions.configurations import select
@@ -22,7 +22,16 @@ from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 
-TRUTH_FIGURES = ("rmse_x_m", "rmse_y_m", "net_m", "max_m", "nees", "coverage95")
+TRUTH_FIGURES = (
+    "rmse_x_m",
+    "rmse_y_m",
+    "net_m",
+    "max_m",
+    "nees",
+    "coverage95",
+    "smoothed_net_m",
+    "smoothed_coverage95",
+)
 
 
 @dataclass(frozen=True)
@@ -163,16 +172,16 @@ def _row(
     """
     settle = {"settle_s": 0.0} if isinstance(pattern, Outage) else {}
     holdout = Holdout(log.site, log.machine, pattern, **settle) if pattern else None
-    pipeline = Pipeline(log.site, log.machine, PipelineConfig(localisation=options))
-    trace = replay(pipeline, readings, holdout)
-    health = pipeline.health()
+    core = Positioning(log.site, log.machine, PipelineConfig(localisation=options))
+    trace = replay(core, readings, holdout)
+    consistency = core.localiser.consistency.items()
     return {
         "withhold": str(pattern or "none"),
         **(holdout.report() if holdout else NOTHING),
         "covered": round(covered(trace), 4),
         "us_per_second": round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None,
-        "counters": health["counters"],
-        "consistency": health["consistency"],
+        "counters": dict(core.counters),
+        "consistency": {name: {**asdict(value), "good": value.is_good} for name, value in consistency},
         **(_against_truth(trace.moved(truth.lever_m), truth.track, pattern) if truth else {}),
     }
 
