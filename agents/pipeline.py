@@ -4,7 +4,7 @@
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -14,7 +14,8 @@ import numpy as np
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
-from agents.localisation.filters.belief import PoseBelief
+from agents.localisation.filters.belief import DivergedError, PoseBelief
+from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.localisation.imu_steps import Sensed
 from agents.localisation.localiser import LocalisationConfig, Localiser
@@ -37,11 +38,13 @@ class PipelineConfig:
 class Accepted(NamedTuple):
     """Readings of one stamp that count, at the stamp of what they measured; a tuple, as there are hundreds a second.
 
-    poses: what they made possible or changed, oldest first. restarts: nothing before them counts any more.
+    poses: what they made possible or changed, oldest first. smoothed: past poses that became final with them, oldest
+    first. restarts: nothing before them counts any more; then smoothed are all that remained.
     """
 
     readings: list[Sensed]
     poses: list[PoseBelief]
+    smoothed: list[SmoothedPose]
     restarts: bool
 
 
@@ -70,55 +73,77 @@ class Positioning:
         """What was used and refused, before restarts too."""
         return self._counters + self._order.counters + self.localiser.counters
 
-    def step(self, readings: Sequence[Reading]) -> None:
-        """Take in readings in the order of their stamps."""
+    def step(self, readings: Sequence[Reading]) -> list[SmoothedPose]:
+        """Take in readings in the order of their stamps; returns the smoothed poses that became final."""
+        smoothed: list[SmoothedPose] = []
         for reading in readings:
             for accepted in self.accept(reading):
+                smoothed += accepted.smoothed
                 for pose in accepted.poses:
                     self.poses.append(pose)
+        return smoothed
 
-    def accept(self, reading: Reading) -> list[Accepted]:
-        """Take in one reading; returns what counts of the stamp that it ends.
+    def remaining(self) -> list[SmoothedPose]:
+        """Smoothed poses that are not final, as known by now: the last words on them where the stream ends."""
+        return self.localiser.remaining()
 
-        The caller appends the poses to `poses`, one by one.
+    def accept(self, reading: Reading) -> Iterator[Accepted]:
+        """Take in one reading; yields what counts of the stamp that it ends.
+
+        The caller appends the poses to `poses`, one by one, before it takes the next.
         """
         sensor = self._sensors.get(reading.sensor)
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
-            return []
-        return self._accept(self._order.gather(reading))
+            return
+        known_ns = max(reading.stamp_ns, sensor.true_ns(reading.stamp_ns))  # never before it was true
+        yield from self._accept(self._order.gather(reading, known_ns))
 
-    def finish(self) -> list[Accepted]:
-        """Take in the readings of the last stamp, as the stream ends."""
-        return self._accept(self._order.rest())
+    def finish(self) -> Iterator[Accepted]:
+        """Take in the readings of the last stamp, as the stream ends; like `accept`."""
+        yield from self._accept(self._order.rest())
 
-    def _accept(self, readings: Sequence[Reading]) -> list[Accepted]:
-        if not readings:
-            return []
-        return [accepted for group in by_stamp(map(self._undelayed, readings)) if (accepted := self._take(group))]
+    def _accept(self, readings: Sequence[Reading]) -> Iterator[Accepted]:
+        for group in by_stamp(map(self._undelayed, readings)):
+            if accepted := self._take(group):
+                yield accepted
 
     def _undelayed(self, reading: Reading) -> Reading:
-        delay_s = self._sensors[reading.sensor].delay_s
-        return replace(reading, stamp_ns=reading.stamp_ns - round(delay_s * 1e9)) if delay_s else reading
+        sensor = self._sensors[reading.sensor]
+        return replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)) if sensor.delay_s else reading
 
     def _take(self, readings: Sequence[Reading]) -> Accepted | None:
         """Take in the readings of one stamp; None where all are refused."""
         taken: list[Sensed] = []
+        smoothed: list[SmoothedPose] = []
         restarts = False
         for reading in readings:
             decision = self._order.decide(reading)
             if decision is Decision.REFUSE:
                 continue
             if decision is Decision.RESTART:
-                self._counters.update(self.localiser.counters)
-                self._start()
+                smoothed += self._restart()
                 taken, restarts = [], True
             taken.append((reading, self._sensors[reading.sensor]))
         if not taken:
             return None
         for reading, sensor in taken:
             self.dead_reckoning.update(reading, sensor)
-        return Accepted(taken, self.localiser.update(taken, self.dead_reckoning), restarts)
+        try:
+            poses = self.localiser.update(taken, self.dead_reckoning)
+        except DivergedError:
+            self._counters["filter_restarts"] += 1
+            self._config = replace(self._config, start=())  # a start that was configured is far behind by now
+            smoothed += self._restart()
+            poses, restarts = [], True
+        return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts)
+
+    def _restart(self) -> list[SmoothedPose]:
+        """Start again, and keep the counts; returns the smoothed poses that remained."""
+        self._counters.update(self.localiser.counters)
+        smoothed = self.localiser.take_smoothed() + self.remaining()
+        self._start()
+        return smoothed
 
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""
@@ -185,11 +210,11 @@ class Pipeline:
             },
         }
 
-    def _take(self, stamps: Sequence[Accepted]) -> list[Table]:
+    def _take(self, stamps: Iterable[Accepted]) -> list[Table]:
         return [rows for accepted in stamps for rows in self._take_one(accepted)]
 
     def _take_one(self, accepted: Accepted) -> list[Table]:
-        readings, poses, restarts = accepted
+        readings, poses, _, restarts = accepted
         made: list[Table] = []
         if restarts:
             made.append(self._remainder())

@@ -37,20 +37,20 @@ class StreamOrder:
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
-        self._held: dict[str, Reading] = {}  # of one stamp, by sensor
+        self._held: dict[str, Reading] = {}  # of one time, by sensor
         self._held_ns = 0
         self._newest_ns = 0
         self._by_sensor: dict[str, int] = {}
         self._late_in_a_row = 0
 
-    def gather(self, reading: Reading) -> list[Reading]:
-        """Hold a reading until one of another stamp comes: only then all of its stamp are there. Returns that stamp's.
+    def gather(self, reading: Reading, known_ns: int) -> list[Reading]:
+        """Hold a reading until one of another time comes: only then all of its time are there. Returns those.
 
-        So a step of the filter waits for the next reading of any sensor, and results depend neither on the order of
-        sensors nor on how a stream is cut into bundles.
+        known_ns: when the machine had it. So a step of the filter waits for the next reading of any sensor, and results
+        depend neither on the order of sensors nor on how a stream is cut into bundles.
         """
-        ended = self.rest() if reading.stamp_ns != self._held_ns else []
-        self._held_ns = reading.stamp_ns
+        ended = self.rest() if known_ns != self._held_ns else []
+        self._held_ns = known_ns
         if reading.sensor in self._held:
             self.counters["reading_duplicate"] += 1
         else:

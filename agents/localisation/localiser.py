@@ -8,36 +8,41 @@ from dataclasses import dataclass, replace
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
-from agents.localisation.filters.belief import Belief, Filter, PoseBelief
+from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
+from agents.localisation.filters.smoother import SmoothedPose, nothing_past
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, anchored_headings
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig
-from protocol.machine.readings import Gps
+from protocol.machine.readings import Gps, GpsVelocity
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
-ENGINES: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
+Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
+FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
+MAX_LAG_S = 3600.0  # each second of it is a node to smooth
 
 
 @dataclass(frozen=True)
 class LocalisationConfig:
     """How positions are found.
 
-    filter: ekf or ukf. profile: "paper" takes GPS errors as white; "default" estimates a slow error of each receiver, a
-    bias of each yaw gyro and the wheels' scale. start: x, y [m] and heading [rad] in `map`, where they are known: no
-    alignment is needed then, nor GPS. slip, slip_soft: wheel slip per traction on firm ground, and how much it rises
-    with the rolling resistance; of the tyres.
+    filter: ekf or ukf. profile: "paper" takes GPS errors as white, and runs filterpy's filters (extra `paper`);
+    "default" estimates a slow error of each receiver, a bias of each yaw gyro and the wheels' scale, with our own.
+    start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. slip,
+    slip_soft: wheel slip per traction on firm ground, and how much it rises with the rolling resistance; of the tyres.
+    lag_s: how long places of the past are smoothed by what comes after them, 0 for not at all; "paper" never smooths.
     """
 
     filter: str = "ukf"
@@ -45,16 +50,24 @@ class LocalisationConfig:
     start: tuple[float, ...] = ()
     slip: float = 0.1
     slip_soft: float = 0.9
+    lag_s: float = 90.0
 
     def __post_init__(self) -> None:
-        if self.filter not in ENGINES:
-            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(ENGINES)}")
+        if self.filter not in FILTERS:
+            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(FILTERS)}")
         if self.profile not in PROFILES:
             raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
         if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
             raise ValueError("slip: must be from 0 to below 1, slip_soft not negative")
+        if not 0 <= self.lag_s <= MAX_LAG_S:
+            raise ValueError(f"lag_s: must be from 0 to {MAX_LAG_S:.0f} s")
         if len(self.start) not in (0, 3) or not all(map(math.isfinite, self.start)):
             raise ValueError("start: must be x, y and heading, or empty")
+
+    @property
+    def smoothing_s(self) -> float:
+        """The lag of the smoother; 0 for the profile `paper`, whose method has none."""
+        return self.lag_s if self.profile == "default" else 0.0
 
 
 class Localiser:
@@ -64,6 +77,7 @@ class Localiser:
         self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, step_s: float = STEP_S
     ) -> None:
         self._config = config
+        self._engine = _engine(config)
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
@@ -77,6 +91,7 @@ class Localiser:
         self._fusion: Fusion | None = None
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
+        self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
 
     @property
     def is_aligned(self) -> bool:
@@ -98,23 +113,40 @@ class Localiser:
         """The whole state, once it is known."""
         return self._fusion.belief if self._fusion else None
 
+    def take_smoothed(self) -> list[SmoothedPose]:
+        """Smoothed poses that became final since the last call, oldest first."""
+        return self._fusion.take_smoothed() if self._fusion else []
+
+    def remaining(self) -> list[SmoothedPose]:
+        """Smoothed poses within the lag, as known by now; the last is the newest belief's. They stay."""
+        return self._fusion.remaining() if self._fusion else []
+
     def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in the readings of one stamp, after dead reckoning did; returns poses that became possible or changed.
 
         In the order of their stamps.
         """
-        fast = [sensed for sensed in readings if not isinstance(sensed[0], Gps)]
-        step = self._gatherer.gather(fast, dead_reckoning) if fast else None
-        fixes = [self._receivers.fix(r, dead_reckoning.pose) for r, _ in readings if isinstance(r, Gps)]
-        events: list[FilterStep | Fix] = [*([step] if step else []), *fixes]
+        fast: list[Sensed] = []
+        events: list[Event] = []
+        for reading, sensor in readings:
+            if isinstance(reading, Gps):
+                events.append(self._receivers.fix(reading, dead_reckoning.pose))
+            elif isinstance(reading, GpsVelocity):
+                events.append(gps_velocity(reading, sensor))
+            else:
+                fast.append((reading, sensor))
+        if fast and (step := self._gatherer.gather(fast, dead_reckoning)):
+            events.insert(0, step)
         beliefs: list[Belief] = []
         for event in events:
             known = self._fusion
             beliefs += self._filter(known, event) if known else self._collect(event, dead_reckoning.distance_m)
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
-    def _filter(self, fusion: Fusion, event: FilterStep | Fix) -> list[Belief]:
+    def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
         """Beliefs that an event changed."""
+        if isinstance(event, Measurement):
+            return fusion.add([event])
         if isinstance(event, Fix):
             return self._filter_modal(fusion, self._receivers, event)
         fusion.model = replace(fusion.model, traction=event.traction)
@@ -142,12 +174,14 @@ class Localiser:
             sensors.confirm(value, fusion.last[measurement.sensor])
         return beliefs
 
-    def _collect(self, event: FilterStep | Fix, distance_m: float) -> list[Belief]:
+    def _collect(self, event: Event, distance_m: float) -> list[Belief]:
         """Keep an event until the heading is known, then filter all that was kept."""
         alignment: Alignment | None = None
         if isinstance(event, Fix):
             self._fixes.append(event)
             alignment = align_fixes(self._fixes, distance_m) if self._steps else None
+        elif isinstance(event, Measurement):
+            self._velocities.append(event)
         else:
             self._steps.append(event)
             alignment = align_start(self._config.start, self._steps[0].reckoned) if self._config.start else None
@@ -156,14 +190,25 @@ class Localiser:
     def _start(self, alignment: Alignment) -> list[Belief]:
         first, layout = self._steps[0], self._model.layout
         belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
-        self._fusion = Fusion(ENGINES[self._config.filter], self._model, belief)
+        belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
+        self._fusion = Fusion(self._engine, self._model, belief)
         beliefs = [belief]
-        events: list[FilterStep | Fix] = [*list(self._steps)[1:], *self._fixes]
+        events: list[Event] = [*list(self._steps)[1:], *self._fixes, *self._velocities]
         for event in sorted(events, key=lambda e: e.stamp_ns):
             beliefs += self._filter(self._fusion, event)
         self._steps.clear()
         self._fixes.clear()
+        self._velocities.clear()
         return beliefs
+
+
+def _engine(config: LocalisationConfig) -> Filter:
+    """Our own filter, or the textbook's, which is imported for the profile that needs it alone."""
+    if config.profile != "paper":
+        return FILTERS[config.filter]
+    from agents.localisation.filters.textbook import TextbookEkf, TextbookUkf
+
+    return TextbookEkf() if config.filter == "ekf" else TextbookUkf()
 
 
 def _layout_of(machine: MachineConfig) -> Layout:

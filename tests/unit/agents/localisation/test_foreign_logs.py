@@ -139,14 +139,15 @@ def shuffled_stamps(readings: Sequence[Reading], rng: np.random.Generator) -> li
     return [group[i] for group in groups for i in rng.permutation(len(group))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [5, 20])
 @pytest.mark.parametrize("engine", ["ekf", "ukf"])
 def test_no_order_of_sensor_tables_and_of_readings_of_a_stamp_changes_a_bit(engine: str, rate_hz: float) -> None:
     vehicle = cart(*MANY)
-    readings = readings_of(vehicle, drive(TOUR, vehicle), rate_hz, seed=4)[: 30 * rate_hz * len(MANY)]
+    readings = readings_of(vehicle, drive(TOUR, vehicle), rate_hz, seed=4)[: 25 * rate_hz * len(MANY)]
     _, poses, _ = located(vehicle, readings, engine)
     assert len(poses) > 50
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         swapped = replace(vehicle, sensors=tuple(MANY[i] for i in rng.permutation(len(MANY))))
         _, others, _ = located(swapped, shuffled_stamps(readings, rng), engine)
