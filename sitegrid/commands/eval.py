@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from sitegrid.options.groups import add_action
 from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import count, positive, seed, withhold
+from sitegrid.options.values import count, positive, seed, shares, withhold
 from sitegrid.process.lifetime import note, plain, raise_interrupts, say, tell
 from sitegrid.process.progress import Display
 
@@ -52,6 +52,8 @@ def add_options(parser: ArgumentParser) -> None:
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
+    shared = "shares of slow GPS errors that the receivers have in common, comma-separated (default: as recorded, 0)"
+    table.add_argument("--shares", type=shares, default=(None,), help=shared)
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
@@ -95,7 +97,7 @@ def _localisation(arguments: Namespace) -> Report:
     from evaluation.positions import table
     from evaluation.positions.configurations import HEADLINE, SENSORS, configurations
 
-    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS)
+    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS, arguments.shares)
     work = partial(table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows)
     return _experiment(arguments, "machines drive, filters follow", work, "evaluation.positions.plots")
 
