@@ -1,8 +1,9 @@
 """The paper's table: every configuration on the same recordings of the paper's site, against the truth.
 
 Poses are all it compares, so only the localising half of the pipeline runs, without ground estimation and sampling;
-`us_per_second` is what localisation costs, which is the paper's argument for cheap sensors on a small computer. Smoothed
-poses, which samples get, are judged at their own stamps; those within the lag are as known when the drive ends.
+`us_per_second` is what localisation costs, which is the paper's argument for cheap sensors on a small computer.
+Smoothed poses, which samples get, are judged at their own stamps; those within the lag are as known when the drive
+ends.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from evaluation.positions.replay import Score, errors, replay, score
 from evaluation.positions.substitution import gps_errors, true_motion, with_gps_errors
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
-from sim.sensors.presets import load_preset
+from sim.sensors.presets import GpsNoise
 
 TRACE_S = 1.0  # between two points of the curves that plots draw
 SOURCES = (
@@ -61,8 +62,8 @@ def run(
     runner: Runner, seeds: Sequence[int], seconds: float, rows: Sequence[Configuration], setup: Setup = PAPER
 ) -> tuple[Report, list[Outcome]]:
     """Record, replay and score all configurations with all seeds; `missing`: those that the pipeline cannot run."""
-    drives = [PlannedDrive(seed, seconds, setup=setup) for seed in seeds]
-    machine, recorded = drives[0].machine, load_preset(drives[0].preset).gps.machine_share
+    drives = [PlannedDrive(seed, seconds, setup.preset, setup) for seed in seeds]
+    machine, recorded = drives[0].machine, _gps(drives[0]).machine_share
     rows = [replace(row, machine_share=recorded) if row.machine_share is None else row for row in rows]
     refusals = {row: _why_not(machine, row) for row in rows}
     runnable = [row for row, why in refusals.items() if not why]
@@ -72,7 +73,7 @@ def run(
     scores = {row: [o.run for o in outcomes if o.row == row] for row in runnable}
     report: Report = {
         "scenario": setup.scenario,
-        "gps_error": gps_error(drives[0].preset),
+        "gps_error": gps_error(drives[0]),
         "seeds": list(seeds),
         "seconds": seconds,
         "rows": [summarise(row, several) for row, several in scores.items()],
@@ -82,17 +83,21 @@ def run(
     return report, outcomes
 
 
-def gps_error(preset: str) -> Row:
-    """How slow the GPS errors of a preset are: on white noise every filter looks wonderful."""
-    gps = load_preset(preset).gps
+def gps_error(drive: PlannedDrive) -> Row:
+    """How slow the GPS errors of a drive are: on white noise every filter looks wonderful."""
+    gps = _gps(drive)
     slow, white = gps.drift_std_m**2, gps.white_std_m**2
     return {
-        "preset": preset,
+        "preset": drive.preset,
         "rms_2d_m": round((2 * (slow + white)) ** 0.5 * gps.scale, 3),
         "slow_variance_share": round(slow / (slow + white), 3),
         "correlation_time_s": gps.drift_time_s,
         **{n: getattr(gps, n) for n in ("rate_hz", "machine_share", "site_share", "outage_s", "outage_period_s")},
     }
+
+
+def _gps(drive: PlannedDrive) -> GpsNoise:
+    return drive.scenario.preset(drive.preset).gps
 
 
 def _why_not(machine: MachineConfig, row: Configuration) -> str:
@@ -208,7 +213,7 @@ def _with_share(task: Task[Configuration], cache: Path) -> RecordedDrive:
     """
     recording, drive, share = task.recording(cache), task.drive, task.variant.machine_share
     assert drive
-    gps = load_preset(drive.preset).gps
+    gps = _gps(drive)
     if share is None or share == gps.machine_share:
         return recording
     motion = true_motion(drive.folder(cache))

@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.campaign.experiment import Runner
 from evaluation.campaign.figures import Report
-from evaluation.campaign.recordings import PAPER, load
+from evaluation.campaign.recordings import PAPER, PlannedDrive, load
 from evaluation.positions import table
 from evaluation.positions.configurations import Configuration
 from evaluation.positions.replay import Score
@@ -126,7 +126,7 @@ def test_the_share_that_was_recorded_is_the_recording_itself(runner: Runner, res
 
 
 def test_the_report_says_how_slow_gps_errors_are():
-    error = table.gps_error("paper")
+    error = table.gps_error(PlannedDrive(0, 1.0))
     assert (error["slow_variance_share"], error["correlation_time_s"]) == (0.9, 45.0)
 
 
