@@ -122,7 +122,7 @@ def run(
     rows = [BudgetRow(gps, truth) for gps in RECEIVERS for truth in ROWS]
     pairs = [(drive, row) for drive in drives for row in rows]
     done = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
-    scores = {row: [s for (_, of), s in zip(pairs, done, strict=True) if of == row] for row in rows}
+    scores = {row: [one for (_, own), one in zip(pairs, done, strict=True) if own == row] for row in rows}
     table = [_summary(row, scores[row], scores[BudgetRow(row.gps, ())]) for row in rows]
     return {"scenario": setup.scenario, "seeds": list(seeds), "seconds": seconds, "rows": table}, scores
 
