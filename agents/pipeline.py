@@ -17,6 +17,7 @@ from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
+from agents.smoothed_track import SmoothedTrack
 from agents.stream_order import Decision, StreamOrder
 from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig, SensorConfig
@@ -30,6 +31,17 @@ class PipelineConfig:
 
     localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
     estimation: EstimationConfig = field(default_factory=EstimationConfig)
+
+
+class Samples(NamedTuple):
+    """Samples that a step made, in the order of their stamps.
+
+    pending: (n,), new ones at the filter's position. final: (k,), the last words on those that were made first and had
+    none so far; they may be of the same step.
+    """
+
+    pending: Table
+    final: Table
 
 
 class Accepted(NamedTuple):
@@ -109,7 +121,7 @@ class Pipeline:
     ) -> None:
         """calibration: of the ground estimator, from before."""
         self._site, self._machine = site, machine
-        self._config = config
+        self._config, self._smooths = config, config.localisation.smoothing_s > 0
         self._positioning = Positioning(site, machine, config)
         self._counters: Counter[str] = Counter()
         self._newest_ns = 0
@@ -124,16 +136,19 @@ class Pipeline:
         """Pose at a recent stamp, None where it is not known."""
         return self._positioning.pose_at(stamp_ns)
 
-    def step(self, readings: Sequence[Reading]) -> Table:
-        """Take in readings in the order of their stamps; returns the samples (n,) that they made possible."""
-        made = [rows for reading in readings for rows in self._step_one(reading) if len(rows)]
-        return np.concatenate(made) if made else NOTHING
+    def step(self, readings: Sequence[Reading]) -> Samples:
+        """Take in readings in the order of their stamps; returns the samples that they made possible."""
+        return _joined([samples for reading in readings for samples in self._step_one(reading)])
 
-    def finish(self) -> Table:
-        """Samples (n,) of what still waits, as the stream ends."""
-        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
+    def settle(self) -> Samples:
+        """Samples of all that is known now, all of them final: no reading may come for long."""
+        return self._settle(self._positioning.remaining())
+
+    def finish(self) -> Samples:
+        """The same, as the stream ends; what has no place then is counted."""
+        samples = self.settle()
         self._sampler.withheld["no_pose"] += self._sampler.waiting
-        return rows
+        return samples
 
     @property
     def calibration(self) -> Calibration:
@@ -156,28 +171,44 @@ class Pipeline:
             },
         }
 
-    def _step_one(self, reading: Reading) -> list[Table]:
+    def _step_one(self, reading: Reading) -> list[Samples]:
         accepted = self._positioning.accept(reading)
         if accepted is None:
             return []
-        reading, sensor, poses, restarts = accepted
-        made: list[Table] = []
+        reading, sensor, poses, smoothed, restarts = accepted
+        self._track.append(smoothed)
+        made: list[Samples] = []
         if restarts:
-            made.append(self.finish())
-            self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
+            made.append(self._settle(()))
+            self._count_withheld()
             self._start(self._estimator.calibration)
         for pose in poses:  # each at once: after a late alignment they are more than the history holds
             self._positioning.poses.append(pose)
-            made.append(self._due_samples())
+            made += self._due_samples()
         self._newest_ns = max(self._newest_ns, reading.stamp_ns)
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
         self._estimator.update(reading, sensor, dead_reckoning, self._known_c_rr())
         speed_mps = float(belief.x[SPEED]) if belief else 0.0
         self._sampler.mark(reading.stamp_ns, self._odometer.update(reading, dead_reckoning.distance_m, speed_mps))
-        return [*made, self._due_samples()]
+        made += self._due_samples()
+        if smoothed and not restarts:
+            made.append(Samples(NOTHING, self._sampler.final_samples(self._track.corrected)))
+        return made
 
-    def _due_samples(self) -> Table:
-        return self._sampler.due_samples(self._newest_ns, self._estimator.at)
+    def _due_samples(self) -> list[Samples]:
+        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at)
+        if not len(rows):
+            return []
+        return [Samples(rows, NOTHING if self._smooths else self._sampler.final_samples(lambda pose: pose))]
+
+    def _settle(self, remaining: Sequence[SmoothedPose]) -> Samples:
+        """Samples of all that is known. remaining: smoothed poses that are not final."""
+        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
+        return Samples(rows, self._sampler.final_samples(lambda pose: self._track.corrected_by_now(pose, remaining)))
+
+    def _count_withheld(self) -> None:
+        self._sampler.withheld["no_pose"] += self._sampler.waiting
+        self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
 
     def _known_c_rr(self) -> float | None:
         """Resistance of the ground here, where the site states it and the position is sure enough."""
@@ -194,6 +225,11 @@ class Pipeline:
         self._estimator = GroundEstimator(machine, config.estimation, known)
         self._sampler = Sampler(self._positioning.poses, machine.load_centre_m)
         self._odometer = Odometer()
+        self._track = SmoothedTrack()
+
+
+def _joined(made: Sequence[Samples]) -> Samples:
+    return Samples(*map(np.concatenate, zip(*made, strict=True))) if made else Samples(NOTHING, NOTHING)
 
 
 PoseSource = Positioning | Pipeline  # what locates a machine
