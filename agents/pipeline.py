@@ -14,6 +14,7 @@ from agents.dead_reckoning import DeadReckoning
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
 from agents.localisation.filters.belief import PoseBelief
+from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
@@ -47,12 +48,14 @@ class Samples(NamedTuple):
 class Accepted(NamedTuple):
     """A reading that counts, at the stamp of what it measured; a tuple, as there are hundreds a second.
 
-    poses: what it made possible or changed, oldest first. restarts: nothing before it counts any more.
+    poses: what it made possible or changed, oldest first. smoothed: past poses that became final with it, oldest first.
+    restarts: nothing before it counts any more; then smoothed are all that remained.
     """
 
     reading: Reading
     sensor: SensorConfig
     poses: list[PoseBelief]
+    smoothed: list[SmoothedPose]
     restarts: bool
 
 
@@ -81,12 +84,19 @@ class Positioning:
         """What was used and refused, before restarts too."""
         return self._counters + self._order.counters + self.localiser.counters
 
-    def step(self, readings: Sequence[Reading]) -> None:
-        """Take in readings in the order of their stamps."""
+    def step(self, readings: Sequence[Reading]) -> list[SmoothedPose]:
+        """Take in readings in the order of their stamps; returns the smoothed poses that became final."""
+        smoothed: list[SmoothedPose] = []
         for reading in readings:
             if accepted := self.accept(reading):
+                smoothed += accepted.smoothed
                 for pose in accepted.poses:
                     self.poses.append(pose)
+        return smoothed
+
+    def remaining(self) -> list[SmoothedPose]:
+        """Smoothed poses that are not final, as known by now: the last words on them where the stream ends."""
+        return self.localiser.remaining()
 
     def accept(self, reading: Reading) -> Accepted | None:
         """Take in one reading; None where it is refused. The caller appends its poses to `poses`, one by one."""
@@ -99,12 +109,14 @@ class Positioning:
         decision = self._order.decide(reading)
         if decision is Decision.REFUSE:
             return None
-        if decision is Decision.RESTART:
+        restarts, smoothed = decision is Decision.RESTART, []
+        if restarts:
             self._counters.update(self.localiser.counters)
+            smoothed = self.remaining()
             self._start()
         self.dead_reckoning.update(reading, sensor)
         poses = self.localiser.update(reading, sensor, self.dead_reckoning)
-        return Accepted(reading, sensor, poses, decision is Decision.RESTART)
+        return Accepted(reading, sensor, poses, smoothed + self.localiser.take_smoothed(), restarts)
 
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""

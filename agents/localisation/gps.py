@@ -15,10 +15,10 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation import measurements
 from agents.localisation.consistency import Consistency, InnovationMonitor
-from agents.localisation.filters.belief import Belief, Conditioned, Measurement
+from agents.localisation.filters.belief import Belief, Conditioned, Measurement, anchor_states, reset_states
 from agents.localisation.filters.motion import GpsError
 from agents.localisation.filters.state import Layout
-from agents.localisation.sensor_modes import ModalSensors, StampedValue, anchor_states, reset_states
+from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
 from protocol.machine.readings import Gps

@@ -11,6 +11,7 @@ from agents.localisation.filters.belief import Belief, Filter, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
+from agents.localisation.filters.smoother import SmoothedPose, nothing_past
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
@@ -27,6 +28,7 @@ STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
 ENGINES: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
+MAX_LAG_S = 3600.0  # each second of it is a node to smooth
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class LocalisationConfig:
     filter: ekf or ukf. profile: "paper" takes GPS errors as white; "default" estimates a slow error of each receiver, a
     bias of each yaw gyro and the wheels' scale. start: x, y [m] and heading [rad] in `map`, where they are known: no
     alignment is needed then, nor GPS. slip, slip_soft: wheel slip per traction on firm ground, and how much it rises
-    with the rolling resistance; of the tyres.
+    with the rolling resistance; of the tyres. lag_s: how long places of the past are smoothed by what comes after them,
+    0 for not at all; "paper" never smooths.
     """
 
     filter: str = "ukf"
@@ -44,6 +47,7 @@ class LocalisationConfig:
     start: tuple[float, ...] = ()
     slip: float = 0.1
     slip_soft: float = 0.9
+    lag_s: float = 90.0
 
     def __post_init__(self) -> None:
         if self.filter not in ENGINES:
@@ -52,8 +56,15 @@ class LocalisationConfig:
             raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
         if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
             raise ValueError("slip: must be from 0 to below 1, slip_soft not negative")
+        if not 0 <= self.lag_s <= MAX_LAG_S:
+            raise ValueError(f"lag_s: must be from 0 to {MAX_LAG_S:.0f} s")
         if len(self.start) not in (0, 3) or not all(map(math.isfinite, self.start)):
             raise ValueError("start: must be x, y and heading, or empty")
+
+    @property
+    def smoothing_s(self) -> float:
+        """The lag of the smoother; 0 for the profile `paper`, whose method has none."""
+        return self.lag_s if self.profile == "default" else 0.0
 
 
 class Localiser:
@@ -95,6 +106,14 @@ class Localiser:
     def belief(self) -> Belief | None:
         """The whole state, once it is known."""
         return self._fusion.belief if self._fusion else None
+
+    def take_smoothed(self) -> list[SmoothedPose]:
+        """Smoothed poses that became final since the last call, oldest first."""
+        return self._fusion.take_smoothed() if self._fusion else []
+
+    def remaining(self) -> list[SmoothedPose]:
+        """Smoothed poses within the lag, as known by now; the last is the newest belief's. They stay."""
+        return self._fusion.remaining() if self._fusion else []
 
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
@@ -151,6 +170,7 @@ class Localiser:
     def _start(self, alignment: Alignment) -> list[Belief]:
         first, layout = self._steps[0], self._model.layout
         belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
+        belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
         self._fusion = Fusion(ENGINES[self._config.filter], self._model, belief)
         beliefs = [belief]
         events: list[FilterStep | Fix] = [*list(self._steps)[1:], *self._fixes]
