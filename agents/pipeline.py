@@ -148,6 +148,11 @@ class Pipeline:
         """Pose at a recent stamp, None where it is not known."""
         return self._positioning.pose_at(stamp_ns)
 
+    @property
+    def pending(self) -> int:
+        """How many samples are not final yet."""
+        return self._sampler.pending
+
     def step(self, readings: Sequence[Reading]) -> Samples:
         """Take in readings in the order of their stamps; returns the samples that they made possible."""
         return _joined([samples for reading in readings for samples in self._step_one(reading)])

@@ -150,7 +150,7 @@ class Sampler:
         return np.array([self._row(place, place.pose) for place in made], SAMPLE_DTYPE)
 
     def final_samples(self, corrected: Callable[[PoseBelief], PoseBelief | None]) -> Table:
-        """Final values (n,) of the oldest pending samples. corrected: a pose as smoothed, None while it is not known."""
+        """Final values (n,) of the oldest pending samples. corrected: a pose as smoothed, None while not known."""
         rows = []
         while self._pending and (pose := corrected(self._pending[0].pose)):
             rows.append(self._row(self._pending.popleft(), pose))

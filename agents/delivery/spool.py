@@ -134,7 +134,7 @@ class Spool:
             meta = self._meta
             return {
                 "depth": self._depth,
-                "pending": self._pending,
+                "pending": self._held_back,
                 "dropped": meta.dropped,
                 "put_aside": self._quarantined,
                 "recorded": meta.recorded,
@@ -155,16 +155,15 @@ class Spool:
         finals = empty() if finals is None else finals
         left = self._pending - len(finals)
         if left < 0 or not 0 <= pending <= len(rows) or (left and pending < len(rows)):
-            raise ValueError(
-                f"{len(finals)} final values and {len(rows) - pending} final samples, {self._pending} pending"
-            )
+            new = f"{pending} of {len(rows)} new ones"
+            raise ValueError(f"{len(finals)} final values for {self._pending} pending samples and {new}")
         with self._access():
-            first, oldest = self._meta.newest + 1, self._meta.newest - self._pending + 1
-            self._write(rows, finals, oldest, left + pending)
-            base = self._runs[-1].base
-            self._note(oldest - base, finals)
-            self._note(first - base, rows)
-            return first - base
+            base, first, oldest = self._runs[-1].base, self.newest + 1, self.newest - self._pending + 1
+            gone = max(0, self.acknowledged + 1 - oldest)  # a copy of the file has delivered these as they were
+            self._write(rows, finals[gone:], base + oldest + gone, left + pending)
+            self._note(oldest + gone, finals[gone:])
+            self._note(first, rows)
+            return first
 
     def head(self, limit: int) -> Head | None:
         """What to send next, at most `limit` final samples without a hole between them; None if there is nothing.
@@ -172,7 +171,7 @@ class Spool:
         Runs come one after the other; one that has no samples left is closed with an empty head.
         """
         with self._access():
-            run, end = self._runs[self._sending], self._last_final(self._sending)
+            run, end = self._runs[self._sending], self._end(self._sending)
             while damaged := _damaged(oldest := self._oldest(limit)):
                 self._move_to_quarantine(run, damaged, "damaged on the machine's disk")
             newest = None if self._sending < len(self._runs) - 1 else end
@@ -187,7 +186,7 @@ class Spool:
         """Delete what the server has on disk, of one run, which is bound to that store from then on."""
         with self._access():
             at = self._index(spool_id)
-            run, end = self._runs[at], self._last_final(at)
+            run, end = self._runs[at], self._end(at)
             upto = max(run.acknowledged, min(watermark, end))
             is_earlier = at < len(self._runs) - 1
             closed = run.closed or (is_earlier and watermark >= end)
@@ -328,6 +327,11 @@ class Spool:
         is_last = at == len(self._runs) - 1
         return (self._meta.newest if is_last else self._runs[at + 1].base) - self._runs[at].base
 
+    @property
+    def _held_back(self) -> int:
+        """Samples of the file that are pending."""
+        return min(self._pending, self.newest - self.acknowledged)
+
     def _last_final(self, at: int) -> int:
         """The last seq of a run that may be sent."""
         return self._end(at) - (self._pending if at == len(self._runs) - 1 else 0)
@@ -343,7 +347,7 @@ class Spool:
         """Add samples, and give others, from that number on, their final values; then so many are pending."""
         old, n = self._meta, len(rows)
         added, replaced = _numbered(rows, old.newest + 1), _numbered(finals, oldest)
-        excess = max(0, self._depth + n - pending - self._config.max_samples)
+        excess = max(0, self._depth + n - min(pending, self.newest + n - self.acknowledged) - self._config.max_samples)
         with transaction(self._db):
             self._db.executemany("UPDATE sample SET row = ?2, crc32 = ?3 WHERE number = ?1", replaced)
             self._db.executemany("INSERT INTO sample VALUES (?, ?, ?)", added)

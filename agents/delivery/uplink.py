@@ -71,9 +71,9 @@ class Pacing:
 class Head:
     """What the spool hands over: its oldest final samples, of one run; none where an earlier run is to be closed.
 
-    lost_before: how many directly before them will never be sent. newest: the last sequence number that may have been
-    sent by now, of the run that is being recorded; None for an earlier run. store: id of the store that the run is
-    bound to, empty before one has acknowledged a sample of it.
+    lost_before: how many directly before them will never be sent. newest: the last sequence number given out, of the
+    run that is being recorded; None for an earlier run. store: id of the store that the run is bound to, empty before
+    one has acknowledged a sample of it.
     """
 
     spool_id: int

@@ -98,13 +98,15 @@ def test_other_lines_are_skipped() -> None:
 def test_spool_notes_what_it_records_finalises_and_numbers_anew(tmp_path: Path, path: Path) -> None:
     spool = Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([5, 6]).__next__)
     spool.record(ROWS[:2])
-    spool.record(ROWS[2:4], final=False)
-    spool.finalise(3, ROWS[12:14])
-    spool.finalise(1, ROWS[15:16])  # is final already
-    assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14]])
+    spool.record(ROWS[2:5], pending=3)
+    assert read_audit(path) == numbered(5, 1, HASHES[:5])
+    spool.record(ROWS[:0], finals=ROWS[12:14])
+    assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14], HASHES[4]])
     spool.acknowledge(5, 1)
     spool.start_new_run()
-    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14]])
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14], HASHES[4]])
+    spool.record(ROWS[:0], finals=ROWS[14:15])
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:15]])
     spool.close()
 
 

@@ -363,7 +363,7 @@ def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
     assert sorted(h for _, _, h in server.accepted) == sorted(good)
     assert set(server.accepted.values()) == {1}
     assert server.lost == (bad < 19)
-    assert d.spool.counters() == {"depth": 0, "dropped": 0, "put_aside": 1, "recorded": 20, "gone": 0}
+    assert d.spool.counters() == {"depth": 0, "pending": 0, "dropped": 0, "put_aside": 1, "recorded": 20, "gone": 0}
     assert d.quarantined == [(bad + 1, content_hash(rows[bad]))]
     assert d.uplink.counters["refused_out_of_range"] >= 1
 
