@@ -13,7 +13,7 @@ import numpy as np
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
-from agents.localisation.filters.belief import PoseBelief
+from agents.localisation.filters.belief import DivergedError, PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
@@ -105,18 +105,28 @@ class Positioning:
             self._counters["reading_unknown_sensor"] += 1
             return None
         if sensor.delay_s:
-            reading = replace(reading, stamp_ns=reading.stamp_ns - round(sensor.delay_s * 1e9))
+            reading = replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns))
         decision = self._order.decide(reading)
         if decision is Decision.REFUSE:
             return None
-        restarts, smoothed = decision is Decision.RESTART, []
-        if restarts:
-            self._counters.update(self.localiser.counters)
-            smoothed = self.remaining()
-            self._start()
+        restarts = decision is Decision.RESTART
+        smoothed = self._restart() if restarts else []
         self.dead_reckoning.update(reading, sensor)
-        poses = self.localiser.update(reading, sensor, self.dead_reckoning)
+        try:
+            poses = self.localiser.update(reading, sensor, self.dead_reckoning)
+        except DivergedError:
+            self._counters["filter_restarts"] += 1
+            self._config = replace(self._config, start=())  # a start that was configured is far behind by now
+            smoothed += self._restart()
+            poses, restarts = [], True
         return Accepted(reading, sensor, poses, smoothed + self.localiser.take_smoothed(), restarts)
+
+    def _restart(self) -> list[SmoothedPose]:
+        """Start again, and keep the counts; returns the smoothed poses that remained."""
+        self._counters.update(self.localiser.counters)
+        smoothed = self.localiser.take_smoothed() + self.remaining()
+        self._start()
+        return smoothed
 
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""

@@ -56,7 +56,7 @@ def _signals_are_put_back() -> Iterator[None]:
 
 
 # `make quick` leaves out what takes longer than about half a second of processor time, quietly run. Eight times that
-# is enforced: processor time itself grows three times on a loaded or slower machine, and with the first use of a library.
+# is enforced: processor time itself doubles on a loaded machine, and the first use of a library costs some, too.
 MOST_CPU_S = 4.0
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
-from agents.localisation.filters.belief import Belief, Filter, PoseBelief
+from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
@@ -15,18 +15,20 @@ from agents.localisation.filters.smoother import SmoothedPose, nothing_past
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, anchored_headings
 from agents.localisation.imu_steps import FilterStep, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
-from protocol.machine.readings import Gps, Reading
+from protocol.machine.readings import Gps, GpsVelocity, Reading
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
-ENGINES: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
+Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
+FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
 MAX_LAG_S = 3600.0  # each second of it is a node to smooth
 
@@ -35,11 +37,11 @@ MAX_LAG_S = 3600.0  # each second of it is a node to smooth
 class LocalisationConfig:
     """How positions are found.
 
-    filter: ekf or ukf. profile: "paper" takes GPS errors as white; "default" estimates a slow error of each receiver, a
-    bias of each yaw gyro and the wheels' scale. start: x, y [m] and heading [rad] in `map`, where they are known: no
-    alignment is needed then, nor GPS. slip, slip_soft: wheel slip per traction on firm ground, and how much it rises
-    with the rolling resistance; of the tyres. lag_s: how long places of the past are smoothed by what comes after them,
-    0 for not at all; "paper" never smooths.
+    filter: ekf or ukf. profile: "paper" takes GPS errors as white, and runs filterpy's filters (extra `paper`);
+    "default" estimates a slow error of each receiver, a bias of each yaw gyro and the wheels' scale, with our own.
+    start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. slip,
+    slip_soft: wheel slip per traction on firm ground, and how much it rises with the rolling resistance; of the tyres.
+    lag_s: how long places of the past are smoothed by what comes after them, 0 for not at all; "paper" never smooths.
     """
 
     filter: str = "ukf"
@@ -50,8 +52,8 @@ class LocalisationConfig:
     lag_s: float = 90.0
 
     def __post_init__(self) -> None:
-        if self.filter not in ENGINES:
-            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(ENGINES)}")
+        if self.filter not in FILTERS:
+            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(FILTERS)}")
         if self.profile not in PROFILES:
             raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
         if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
@@ -74,6 +76,7 @@ class Localiser:
         self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, step_s: float = STEP_S
     ) -> None:
         self._config = config
+        self._engine = _engine(config)
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
@@ -86,6 +89,7 @@ class Localiser:
         self._fusion: Fusion | None = None
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
+        self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
 
     @property
     def is_aligned(self) -> bool:
@@ -117,18 +121,22 @@ class Localiser:
 
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
-        event: FilterStep | Fix | None = (
-            self._receivers.fix(reading, dead_reckoning.pose)
-            if isinstance(reading, Gps)
-            else self._gatherer.gather(reading, sensor, dead_reckoning)
-        )
+        event: Event | None
+        if isinstance(reading, Gps):
+            event = self._receivers.fix(reading, dead_reckoning.pose)
+        elif isinstance(reading, GpsVelocity):
+            event = gps_velocity(reading, sensor)
+        else:
+            event = self._gatherer.gather(reading, sensor, dead_reckoning)
         if event is None:
             return []
         beliefs = self._filter(self._fusion, event) if self._fusion else self._collect(event, dead_reckoning.distance_m)
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
-    def _filter(self, fusion: Fusion, event: FilterStep | Fix) -> list[Belief]:
+    def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
         """Beliefs that an event changed."""
+        if isinstance(event, Measurement):
+            return fusion.add([event])
         if isinstance(event, Fix):
             return self._filter_modal(fusion, self._receivers, event)
         fusion.model = replace(fusion.model, traction=event.traction)
@@ -156,12 +164,14 @@ class Localiser:
             sensors.confirm(value, fusion.last[measurement.sensor])
         return beliefs
 
-    def _collect(self, event: FilterStep | Fix, distance_m: float) -> list[Belief]:
+    def _collect(self, event: Event, distance_m: float) -> list[Belief]:
         """Keep an event until the heading is known, then filter all that was kept."""
         alignment: Alignment | None = None
         if isinstance(event, Fix):
             self._fixes.append(event)
             alignment = align_fixes(self._fixes, distance_m) if self._steps else None
+        elif isinstance(event, Measurement):
+            self._velocities.append(event)
         else:
             self._steps.append(event)
             alignment = align_start(self._config.start, self._steps[0].reckoned) if self._config.start else None
@@ -171,14 +181,24 @@ class Localiser:
         first, layout = self._steps[0], self._model.layout
         belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
         belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
-        self._fusion = Fusion(ENGINES[self._config.filter], self._model, belief)
+        self._fusion = Fusion(self._engine, self._model, belief)
         beliefs = [belief]
-        events: list[FilterStep | Fix] = [*list(self._steps)[1:], *self._fixes]
+        events: list[Event] = [*list(self._steps)[1:], *self._fixes, *self._velocities]
         for event in sorted(events, key=lambda e: e.stamp_ns):
             beliefs += self._filter(self._fusion, event)
         self._steps.clear()
         self._fixes.clear()
+        self._velocities.clear()
         return beliefs
+
+
+def _engine(config: LocalisationConfig) -> Filter:
+    """Our own filter, or the textbook's, which is imported for the profile that needs it alone."""
+    if config.profile != "paper":
+        return FILTERS[config.filter]
+    from agents.localisation.filters.textbook import TextbookEkf, TextbookUkf
+
+    return TextbookEkf() if config.filter == "ekf" else TextbookUkf()
 
 
 def _layout_of(machine: MachineConfig) -> Layout:

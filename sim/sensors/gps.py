@@ -10,7 +10,7 @@ from protocol.arrays import Bools, Floats, Ints
 from protocol.site.site_config import Projection
 from sim.sensors.frames import map_from_base
 from sim.sensors.noise import Draws, GaussMarkov, generator, site_generator
-from sim.sensors.presets import BASE_RATE_HZ
+from sim.sensors.presets import BASE_RATE_HZ, GpsNoise
 from sim.sensors.sensor_group import SensorGroup, SensorUnit
 from sim.state import STEP_S, FleetState
 
@@ -25,15 +25,7 @@ class GpsGroup(SensorGroup):
         super().__init__(units)
         self._projection = projection
         noises = [unit.rig.preset.gps for unit in units]
-        drift_m = AXES[:, None] * [noise.scale * noise.drift_std_m for noise in noises]
-        self._white_m = AXES[:, None] * [noise.scale * noise.white_std_m for noise in noises]
-        self._variances = np.maximum(drift_m**2 + self._white_m**2, LEAST_M2)[:, None]
-        time_s, shared = np.array([(noise.drift_time_s, noise.shared) for noise in noises]).T
-        self._shared_m = drift_m * np.sqrt(shared)
-        own_m, dt = drift_m * np.sqrt(1 - shared), 1 / noises[0].rate_hz
-        self._drift = GaussMarkov(own_m, time_s, dt, self.per_unit(lambda unit: unit.rng.standard_normal(3)))
-        self._draws = Draws([unit.rng for unit in units], 6)
-        self._common = SiteDrift(seed, time_s) if shared.any() else None
+        self._errors = ReceiverErrors(noises, [unit.machine for unit in units], [unit.rng for unit in units], seed)
         self._lever_m = self.per_unit(lambda unit: unit.sensor.mount.xyz_m)[:, None]
         self._off_m = self.per_unit(lambda unit: unit.rig.faults.antenna_off_m)[:, None]
         self._outage_s, self._period_s = np.array([(noise.outage_s, noise.outage_period_s) for noise in noises]).T
@@ -44,12 +36,9 @@ class GpsGroup(SensorGroup):
         lever = self._lever_m + self._off_m * self.faulty(steps)
         attitude = [self.pick(angle, rows) for angle in (states.yaw_rad, states.pitch_rad, states.roll_rad)]
         base = np.stack([self.pick(place, rows) for place in (states.x_m, states.y_m, states.z_m)])
-        draws = self._draws.next_rows(len(steps))
-        errors = self._drift.run(draws[:3]) + self._white_m[:, None] * draws[3:]
-        if self._common:
-            errors += self._shared_m[:, None] * self._common.at(steps)
-        fixes = self._projection.to_geodetic_many(*(base + map_from_base(lever, *attitude) + errors))
-        return np.concatenate([fixes, np.broadcast_to(self._variances, base.shape)])
+        slow, white = self._errors.run(steps)
+        fixes = self._projection.to_geodetic_many(*(base + map_from_base(lever, *attitude) + (slow + white)))
+        return np.concatenate([fixes, np.broadcast_to(self._errors.stated_m2[:, None], base.shape)])
 
     def valid(self, steps: Ints) -> Bools:
         """False for outage_s of every outage_period_s."""
@@ -58,24 +47,62 @@ class GpsGroup(SensorGroup):
         return valid
 
 
-class SiteDrift:
-    """The drift that receivers of a site share, (3, r, units) of variance 1; the same for equal correlation times.
+class ReceiverErrors:
+    """Errors of receivers east, north and up: slow ones of the site, the machine and the receiver, and white noise.
 
-    It runs at every step of the world, whatever the receivers' rates; the weather is one, so all correlation times
-    answer to the same white noise.
+    noises: of each receiver, all of one rate. machines: which machine carries it. rngs: a generator each. stated_m2:
+    the variances (3, units) that they state.
     """
 
-    def __init__(self, seed: int, time_s: Floats) -> None:
-        rng = site_generator(seed)
-        times_s, self._process_of = np.unique(time_s, return_inverse=True)
-        sigma = np.ones((3, len(times_s)))
-        self._drift = GaussMarkov(sigma, times_s, 1 / BASE_RATE_HZ, sigma * rng.standard_normal((3, 1)))
-        self._draws = Draws([rng], 3)
+    def __init__(
+        self, noises: Sequence[GpsNoise], machines: Sequence[int], rngs: Sequence[np.random.Generator], seed: int
+    ) -> None:
+        drift_m = AXES[:, None] * [noise.scale * noise.drift_std_m for noise in noises]
+        self._white_m = AXES[:, None] * [noise.scale * noise.white_std_m for noise in noises]
+        self.stated_m2: Floats = np.maximum(drift_m**2 + self._white_m**2, LEAST_M2)
+        time_s = np.array([noise.drift_time_s for noise in noises])
+        machine, site = np.array([(noise.machine_share, noise.site_share) for noise in noises]).T
+        start = np.stack([rng.standard_normal(3) for rng in rngs], axis=-1)
+        self._own = GaussMarkov(drift_m * np.sqrt(1 - machine), time_s, 1 / noises[0].rate_hz, start)
+        self._draws = Draws(rngs, 6)
+        carriers, carrier = np.unique(machines, return_inverse=True)
+        sources = (
+            (site, np.zeros_like(carrier), [site_generator(seed)]),
+            (machine - site, carrier, [generator(seed, m, "receivers") for m in carriers.tolist()]),
+        )
+        self._common = [
+            (drift_m * np.sqrt(share), CommonDrift(shared, source, time_s))
+            for share, source, shared in sources
+            if share.any()
+        ]
+
+    def run(self, steps: Ints) -> tuple[Floats, Floats]:
+        """Slow and white errors, (3, r, units) each [m], at the next steps (r,) at which these receivers read."""
+        draws = self._draws.next_rows(len(steps))
+        slow = self._own.run(draws[:3])
+        for std_m, drift in self._common:
+            slow += std_m[:, None] * drift.run(steps)
+        return slow, self._white_m[:, None] * draws[3:]
+
+
+class CommonDrift:
+    """Drifts that several receivers have in common, (3, r, units) of variance 1; the same for equal correlation times.
+
+    rngs: of each source, the site or a machine. source: that of each receiver (units,). They run at every step of the
+    world, whatever the receivers' rates; all correlation times of one source answer to the same white noise.
+    """
+
+    def __init__(self, rngs: Sequence[np.random.Generator], source: Ints, time_s: Floats) -> None:
+        processes, self._process_of = np.unique(np.stack([source, time_s]), axis=1, return_inverse=True)
+        self._source_of = processes[0].astype(int)
+        start = np.stack([rng.standard_normal(3) for rng in rngs], axis=-1)[:, self._source_of]
+        self._drift = GaussMarkov(np.ones_like(start), processes[1], 1 / BASE_RATE_HZ, start)
+        self._draws = Draws(rngs, 3)
         self._step = 0
 
-    def at(self, steps: Ints) -> Floats:
+    def run(self, steps: Ints) -> Floats:
         """Run on to the last of these steps; returns the drift after each."""
-        drift = self._drift.run(self._draws.next_rows(int(steps[-1]) - self._step))
+        drift = self._drift.run(self._draws.next_rows(int(steps[-1]) - self._step)[:, :, self._source_of])
         rows = steps - self._step - 1
         self._step = int(steps[-1])
         picked: Floats = drift[:, rows[:, None], self._process_of]

@@ -54,20 +54,24 @@ class SensorErrors(Ranged):
 class GpsNoise(SensorErrors):
     """A receiver: slow Gauss-Markov drift and white noise per horizontal axis; heights are 5/3 worse.
 
-    scale: multiplies drift and white noise alike. shared: share of the drift's variance that all receivers of the site
-    have in common. The receiver is silent for outage_s of every outage_period_s.
+    scale: multiplies drift and white noise alike. machine_share: share of the drift's variance that the receivers of
+    one machine have in common; site_share: the part of it that all receivers of the site have in common. The receiver
+    is silent for outage_s of every outage_period_s.
     """
 
     drift_std_m: NotNegative
     drift_time_s: Positive
     white_std_m: NotNegative
     scale: NotNegative
-    shared: Share
+    machine_share: Share
+    site_share: Share
     outage_s: NotNegative
     outage_period_s: Positive
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.site_share > self.machine_share:
+            raise ValueError(f"site_share: {self.site_share} is above machine_share, of which it is a part")
         if self.outage_s > self.outage_period_s:
             raise ValueError(f"outage_s: {self.outage_s} is longer than outage_period_s")
 

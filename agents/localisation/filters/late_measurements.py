@@ -77,11 +77,12 @@ class Fusion:
 
     def remaining(self) -> list[SmoothedPose]:
         """Poses within the smoother's lag, as known by now, and that of the newest belief; none without a lag."""
-        belief = self.belief
-        if belief.past is None:
+        beliefs = [node.belief for node in self._nodes if node.belief]  # a filter that failed left the newest without
+        newest = beliefs[-1]
+        if newest.past is None:
             return []
-        left = [pose for node in self._nodes if node.belief and node.belief.past for pose in node.belief.past.final]
-        return left + belief.past.poses(belief.stamp_ns, belief.x, belief.P)
+        left = [pose for belief in beliefs if belief.past for pose in belief.past.final]
+        return left + newest.past.poses(newest.stamp_ns, newest.x, newest.P)
 
     def add(self, measurements: Sequence[Measurement]) -> list[Belief]:
         """Filter measurements of one stamp; returns the beliefs that they changed, oldest first, none if refused."""

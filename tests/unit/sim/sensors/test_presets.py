@@ -40,7 +40,7 @@ def test_stated_rms_is_what_the_values_give(name: str) -> None:
 
 def test_paper_receivers_are_2_m_off_before_their_scale_and_mostly_slowly() -> None:
     gps = load_preset("paper").gps
-    assert (gps.shared, gps.drift_time_s) == (0.0, 45.0)
+    assert (gps.machine_share, gps.site_share, gps.drift_time_s) == (0.0, 0.0, 45.0)
     assert math.sqrt(2 * (gps.drift_std_m**2 + gps.white_std_m**2)) == pytest.approx(2.0, abs=0.01)
     assert gps.white_std_m == pytest.approx(gps.drift_std_m / 3, abs=1e-3)
     assert gps.outage_s / gps.outage_period_s == 0.1
@@ -74,7 +74,9 @@ def test_a_scenario_changes_single_values_of_a_base() -> None:
         ({"base": "dgps", "gps": {"drift_m": 1.0}}, ["gps", "`drift_m`", "drift_std_m"]),
         ({"base": "dgps", "sonar": {}}, ["`sonar`"]),
         ({"base": "dgps", "gps": 3}, ["gps", "table"]),
-        ({"base": "dgps", "gps": {"shared": 1.5}}, ["gps", "shared: 1.5"]),
+        ({"base": "dgps", "gps": {"shared": 0.5}}, ["gps", "`shared`", "machine_share, site_share"]),
+        ({"base": "dgps", "gps": {"machine_share": 1.5}}, ["gps", "machine_share: 1.5"]),
+        ({"base": "dgps", "gps": {"site_share": 0.5}}, ["gps", "site_share: 0.5 is above machine_share"]),
         ({"base": "dgps", "gps": {"rate_hz": 7}}, ["rate_hz: 7 does not divide 100"]),
         ({"base": "dgps", "gps": {"rate_hz": 5.0}}, ["rate_hz", "int"]),
         ({"base": "dgps", "imu": {"drift_time_s": 0}}, ["drift_time_s: 0"]),
@@ -115,7 +117,7 @@ def test_rates_must_divide_those_of_the_world() -> None:
 
 def test_outage_cannot_be_longer_than_its_period() -> None:
     with pytest.raises(ValueError, match="outage_s"):
-        GpsNoise(5, 1.0, 1.0, 1.0, 1.0, 0.0, 11.0, 10.0)
+        GpsNoise(5, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 11.0, 10.0)
 
 
 # --- machines --------------------------------------------------------------------------------------------------------

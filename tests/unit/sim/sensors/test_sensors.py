@@ -92,7 +92,7 @@ def test_readings_do_not_depend_on_how_many_steps_are_sampled_at_a_time(span: in
 
 
 def test_shared_drift_does_not_depend_on_how_many_steps_are_sampled_at_a_time() -> None:
-    shared = rig(replace(DGPS, gps=replace(DGPS.gps, shared=0.5)), gps=(1, 2))
+    shared = rig(replace(DGPS, gps=replace(DGPS.gps, machine_share=0.7, site_share=0.5)), gps=(1, 2))
     assert run([shared], span=7) == run([shared], span=600)
 
 
