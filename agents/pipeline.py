@@ -196,6 +196,7 @@ class Pipeline:
             "consistency": {
                 name: {**asdict(value), "good": value.is_good} for name, value in localiser.consistency.items()
             },
+            "machine_share": localiser.machine_share,
         }
 
     def _step_one(self, reading: Reading) -> list[Samples]:
