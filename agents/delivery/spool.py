@@ -214,6 +214,11 @@ class Spool:
             self._runs[at], self._sending = new, 0
             self._mark.write(self._run_end(at).values())
 
+    def declare_again(self) -> None:
+        """Close all earlier runs once more, each with what was acknowledged of it: the server may have lost some."""
+        with self._lock:
+            self._sending = 0
+
     def start_new_run(self) -> None:
         """Give what is not acknowledged of this run a new identity: another agent sends under the present one."""
         with self._access():
