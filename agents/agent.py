@@ -19,8 +19,9 @@ from agents.delivery.write_buffer import WriteBuffer
 from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
-from agents.pipeline import Pipeline, Samples
+from agents.pipeline import Pipeline
 from agents.presence import Presence
+from agents.sampling import Samples
 from protocol.errors import StoreError
 from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig

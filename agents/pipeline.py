@@ -19,7 +19,7 @@ from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.localisation.imu_steps import Sensed
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
+from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler, Samples, joined
 from agents.smoothed_track import SmoothedTrack
 from agents.stream_order import Decision, StreamOrder, by_stamp
 from protocol.arrays import Table
@@ -34,17 +34,6 @@ class PipelineConfig:
 
     localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
     estimation: EstimationConfig = field(default_factory=EstimationConfig)
-
-
-class Samples(NamedTuple):
-    """Samples that a step made, in the order of their stamps.
-
-    pending: (n,), new ones at the filter's position. final: (k,), the last words on those that were made first and had
-    none so far; they may be of the same step.
-    """
-
-    pending: Table
-    final: Table
 
 
 class Accepted(NamedTuple):
@@ -194,12 +183,12 @@ class Pipeline:
 
     def step(self, readings: Sequence[Reading]) -> Samples:
         """Take in readings in the order of their stamps; returns the samples that they made possible."""
-        return _joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
+        return joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
 
     def settle(self) -> Samples:
         """Samples of all that is known now, all of them final: no reading may come for long."""
         rest = self._take(self._positioning.finish())
-        return _joined([*rest, self._settle(self._positioning.remaining())])
+        return joined([*rest, self._settle(self._positioning.remaining())])
 
     def finish(self) -> Samples:
         """The same, as the stream ends; what has no place then is counted."""
@@ -292,10 +281,6 @@ class Pipeline:
 def in_name_order(machine: MachineConfig) -> MachineConfig:
     """The machine with its sensors by name: the order of their tables in a file must not change any result."""
     return replace(machine, sensors=tuple(sorted(machine.sensors, key=attrgetter("name"))))
-
-
-def _joined(made: Sequence[Samples]) -> Samples:
-    return Samples(*map(np.concatenate, zip(*made, strict=True))) if made else Samples(NOTHING, NOTHING)
 
 
 PoseSource = Positioning | Pipeline  # what locates a machine

@@ -7,9 +7,10 @@ filter's position then, and is pending; once the smoother has its word on that p
 import math
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,6 +47,17 @@ class Place:
     mark: Mark
     pose: PoseBelief
     estimate: GroundEstimate
+
+
+class Samples(NamedTuple):
+    """Samples that a step made, in the order of their stamps.
+
+    pending: (n,), new ones at the filter's position. final: (k,), the last words on those that were made first and had
+    none so far; they may be of the same step.
+    """
+
+    pending: Table
+    final: Table
 
 
 class PoseHistory:
@@ -178,6 +190,11 @@ class Sampler:
         grade = (c * e.slope_x - s * e.slope_y, s * e.slope_x + c * e.slope_y, e.slope_var)
         at = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)
         return (*at, e.c_rr, e.c_rr_var, *grade)
+
+
+def joined(made: Sequence[Samples]) -> Samples:
+    """Samples of several steps in one."""
+    return Samples(*map(np.concatenate, zip(*made, strict=True))) if made else Samples(NOTHING, NOTHING)
 
 
 def _interpolate(a: PoseBelief, b: PoseBelief, stamp_ns: int) -> PoseBelief:

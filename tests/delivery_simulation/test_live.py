@@ -20,8 +20,8 @@ from agents.delivery.spool import Spool, SpoolConfig
 from agents.delivery.uplink import Uplink, UplinkConfig, Wait
 from agents.delivery.uplink_thread import UplinkThread
 from agents.localisation.filters.belief import PoseBelief
-from agents.pipeline import Samples
 from agents.presence import PATIENCE, Presence, find_namesake
+from agents.sampling import Samples
 from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol.errors import LinkError
