@@ -1,8 +1,8 @@
 """The paper's table: every configuration on the same recordings of the paper's site, against the truth.
 
 Poses are all it compares, so only the localising half of the pipeline runs, without ground estimation and sampling;
-`us_per_second` is what localisation costs, which is the paper's argument for cheap sensors on a small computer. Smoothed
-poses, which samples get, are judged at their own stamps; those within the lag are as known when the drive ends.
+`us_per_second` is what localisation costs, which is the paper's argument for cheap sensors on a small computer.
+Smoothed poses, which samples get, are judged at their own stamps; those within the lag as known when the drive ends.
 """
 
 from __future__ import annotations
