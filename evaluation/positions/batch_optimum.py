@@ -10,7 +10,7 @@ So it has the filter's gates and the filter's noise, and shows what linearising 
 model is right. Two things differ. Q is a little larger (`FLOOR`) where it is singular, as for the place of a machine at
 rest. And the wheels' model stays linear at the filter's states: it multiplies speed by scale, and the most probable
 speeds and scale together are not the most probable scale: each of thousands of speeds has its noise, which shrinks as
-speeds shrink, so that the sum falls as the scale grows. On a first minute with one receiver that moved the track by 1.2 m.
+speeds shrink, so that the sum falls as the scale grows. It moved the track of a drive's first minute by 1.2 m.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _moved(what: Motion | LinearChange, floor: Floats) -> Callable[..., tuple[Fl
 
     def at(before: Floats, after: Floats) -> tuple[Floats, ...]:
         if isinstance(what, LinearChange):
-            return W.dot(after - what.M.dot(before)), -W.dot(what.M), W
+            return W.dot(after - what.M.dot(before) - what.c), -W.dot(what.M), W
         return W.dot(after - what.f(before[None])[0]), -W.dot(what.jacobian(before)), W
 
     return at

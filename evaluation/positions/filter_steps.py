@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, Motion
-from protocol.arrays import Bools, Floats
+from protocol.arrays import Floats
 
 REMEMBERED_NS = 10_000_000_000  # a filter goes back less than that
 
 
 @dataclass(frozen=True)
 class LinearChange:
-    """A change of the state: its error mapped by M (n, n), and noise of covariance V (n, n)."""
+    """A change of the state x (n,) to M x + c, with noise of covariance V (n, n)."""
 
     M: Floats
+    c: Floats
     V: Floats
 
 
@@ -54,8 +54,11 @@ class StepRecorder:
         return result
 
     def steps(self, last: Belief) -> list[Step]:
-        """All steps that led to a recent belief, oldest first."""
-        steps, number = [], self._recent[id(last)][0]
+        """All steps that led to a recent belief, oldest first; ValueError of a belief that it did not make."""
+        if id(last) not in self._recent:
+            raise ValueError("the belief is of another run")
+        steps: list[Step] = []
+        number: int | None = self._recent[id(last)][0]
         while number is not None:
             steps.append(self._steps[number])
             number = steps[-1].before
@@ -88,17 +91,22 @@ class StepRecorder:
 
 
 def linear_change(before: Belief, after: Belief) -> LinearChange | None:
-    """The change that made one belief of another: states that were reset, or opened; None where it was neither."""
+    """The change that made one belief of another, of which some states stay as they are; None where none does.
+
+    The others were opened, so that their variance alone grew, or stand anew for what the rest says of them: the
+    regression on the rest, with the variance that it leaves. A reset is one on nothing.
+    """
     changed = (before.x != after.x) | (before.P.diagonal() != after.P.diagonal())
-    if not np.array_equal(before.P[np.ix_(~changed, ~changed)], after.P[np.ix_(~changed, ~changed)]):
+    rest, n = ~changed, len(changed)
+    M, c, V = np.eye(n), np.zeros(n), np.zeros((n, n))
+    kept, states, across = np.ix_(rest, rest), np.ix_(changed, changed), np.ix_(changed, rest)
+    if not rest.any() or not np.array_equal(before.P[kept], after.P[kept]):
         return None
-    M, V = np.eye(len(changed)), np.zeros_like(after.P)
-    states, across = np.ix_(changed, changed), np.ix_(changed, ~changed)
-    if not after.P[across].any():
-        M[changed] = 0.0
-        V[states] = after.P[states]
-    elif np.array_equal(before.P[across], after.P[across]):
+    if np.array_equal(before.x, after.x) and np.array_equal(before.P[across], after.P[across]):
         V[states] = after.P[states] - before.P[states]
-    else:
-        return None
-    return LinearChange(M, V)
+        return LinearChange(M, c, V)
+    M[changed] = 0.0
+    M[across] = np.linalg.solve(after.P[kept], after.P[across].T).T
+    c[changed] = after.x[changed] - M[across].dot(after.x[rest])
+    V[states] = after.P[states] - M[across].dot(after.P[across].T)
+    return LinearChange(M, c, V)
