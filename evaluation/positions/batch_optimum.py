@@ -48,8 +48,8 @@ def optimum(steps: Sequence[Step]) -> dict[int, Floats]:
             error, *jacobians = at(*states[list(keys)])
             blocks = [part for pair in zip(keys, jacobians, strict=True) for part in pair]
             linear.add(gtsam.JacobianFactor(*blocks, -error, ones[len(error)]))
-        found = linear.optimize()
-        move = np.array([found.at(key) for key in range(len(states))])
+        solution = linear.optimize()
+        move = np.array([solution.at(key) for key in range(len(states))])
         states = states + move
         if np.abs(move[:, POSITION]).max() < STILL_M:
             return dict(zip(stamps, states, strict=True))

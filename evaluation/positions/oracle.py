@@ -55,10 +55,10 @@ def run(runner: Runner, outcomes: Sequence[Outcome]) -> list[Row]:
 
 def summarise(row: Configuration, runs: Sequence[OracleRun]) -> Row:
     """One row: means over the seeds, and ratios to the optimum with the half-widths of their 95 % intervals."""
-    of = {name: np.array([getattr(run, name) for run in runs]) for name in vars(runs[0])}
-    summary: Row = {**vars(row), **{name: float(values.mean()) for name, values in of.items()}}
+    figures = {name: np.array([getattr(run, name) for run in runs]) for name in vars(runs[0])}
+    summary: Row = {**vars(row), **{name: float(values.mean()) for name, values in figures.items()}}
     for name in ("whole", "smoothed", "live"):
-        ratio, half = paired_ratio(of[f"{name}_net_m"], of["optimum_net_m"])
+        ratio, half = paired_ratio(figures[f"{name}_net_m"], figures["optimum_net_m"])
         summary |= {f"{name}_over_optimum": ratio, f"{name}_ci95": half}
     return rounded(summary, 4)
 
