@@ -60,6 +60,8 @@ def add_options(parser: ArgumentParser) -> None:
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
     shared = "shares of slow GPS errors that the receivers have in common, comma-separated (default: as recorded)"
     table.add_argument("--shares", type=shares, default=(None,), help=shared)
+    judged = "compare the EKF of the profile default with the batch optimum of the same runs, by GTSAM (extra oracle)"
+    table.add_argument("--oracle", action="store_true", help=judged)
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
@@ -117,7 +119,21 @@ def _localisation(arguments: Namespace) -> Report:
     work = partial(
         table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows, setup=SETUPS[arguments.scenario]
     )
-    return _experiment(arguments, "machines drive, filters follow", work, "evaluation.positions.plots")
+    judged = _with_oracle(work) if arguments.oracle else work
+    return _experiment(arguments, "machines drive, filters follow", judged, "evaluation.positions.plots")
+
+
+def _with_oracle(table: Callable[[Runner], tuple[Report, Any]]) -> Callable[[Runner], tuple[Report, Any]]:
+    """The same experiment, and its EKF judged by the batch optimum."""
+    from evaluation.positions import oracle
+
+    oracle.require()
+
+    def work(runner: Runner) -> tuple[Report, Any]:
+        report, outcomes = table(runner)
+        return {**report, "oracle": oracle.run(runner, outcomes)}, outcomes
+
+    return work
 
 
 def _budget(arguments: Namespace) -> Report:
