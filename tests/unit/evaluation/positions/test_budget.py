@@ -1,4 +1,4 @@
-"""The error budget: what the filter is told, and rows on a short drive."""
+"""The error budget: what the filter is informed, and rows on a short drive."""
 
 from dataclasses import replace
 
@@ -52,8 +52,8 @@ def test_a_constant_that_the_filter_does_not_have_is_an_error_and_nothing_is_set
 def test_sensors_are_worth_what_the_truth_makes_them():
     machine = PlannedDrive(0, 1.0).machine
     assert configured(machine, ()) == machine
-    told = configured(machine, ("wheels", "turn rate", "slow GPS error"))
-    by_kind = {kind: [s for s in told.sensors if s.kind == kind] for kind in ("torque", "encoder", "imu", "gps")}
+    informed = configured(machine, ("wheels", "turn rate", "slow GPS error"))
+    by_kind = {kind: [s for s in informed.sensors if s.kind == kind] for kind in ("torque", "encoder", "imu", "gps")}
     assert not any(s.use for s in by_kind["torque"])
     assert [dict(s.std) for s in by_kind["encoder"]] == [{"speed": 0.01}]
     assert {s.std["rate"] for s in by_kind["imu"]} == {0.001}
