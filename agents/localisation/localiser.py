@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from agents.dead_reckoning import DeadReckoning, turn_source
@@ -17,11 +18,11 @@ from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, heading_references
-from agents.localisation.imu_steps import FilterStep, StepGatherer
+from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Gps, GpsVelocity, Reading
+from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig
+from protocol.machine.readings import Gps, GpsVelocity
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
@@ -74,13 +75,16 @@ class LocalisationConfig:
 
 
 class Localiser:
-    """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order."""
+    """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order.
+
+    engine: the filter; an evaluation may put one that watches it in its place, before the first reading.
+    """
 
     def __init__(
         self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, step_s: float = STEP_S
     ) -> None:
         self._config = config
-        self._engine = _engine(config)
+        self.engine = _engine(config)
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s)
@@ -88,8 +92,9 @@ class Localiser:
             machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
         )
         self._references = References(machine.sensors, layout, slow=augmented)
-        self._body = MotionSensors(machine, layout, step_s, config.slip, config.slip_soft)
         source, on_plane = turn_source(machine), not _shows_tilt(machine)
+        tyres = config.slip, config.slip_soft
+        self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
         self._model = MotionModel(layout, on_plane, self._receivers.errors, turn_error_radps=turn_error)
         self._fusion: Fusion | None = None
@@ -131,18 +136,26 @@ class Localiser:
         """Smoothed poses within the lag, as known by now; the last is the newest belief's. They stay."""
         return self._fusion.remaining() if self._fusion else []
 
-    def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
-        """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
-        event: Event | None
-        if isinstance(reading, Gps):
-            event = self._receivers.fix(reading, dead_reckoning.pose)
-        elif isinstance(reading, GpsVelocity):
-            event = gps_velocity(reading, sensor)
-        else:
-            event = self._gatherer.gather(reading, sensor, dead_reckoning)
-        if event is None:
-            return []
-        beliefs = self._filter(self._fusion, event) if self._fusion else self._collect(event, dead_reckoning.distance_m)
+    def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
+        """Take in the readings of one stamp, after dead reckoning did; returns poses that became possible or changed.
+
+        In the order of their stamps.
+        """
+        fast: list[Sensed] = []
+        events: list[Event] = []
+        for reading, sensor in readings:
+            if isinstance(reading, Gps):
+                events.append(self._receivers.fix(reading, dead_reckoning.pose))
+            elif isinstance(reading, GpsVelocity):
+                events.append(gps_velocity(reading, sensor))
+            else:
+                fast.append((reading, sensor))
+        if fast and (step := self._gatherer.gather(fast, dead_reckoning)):
+            events.insert(0, step)
+        beliefs: list[Belief] = []
+        for event in events:
+            known = self._fusion
+            beliefs += self._filter(known, event) if known else self._collect(event, dead_reckoning.distance_m)
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
     def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
@@ -197,7 +210,7 @@ class Localiser:
         first, layout = self._steps[0], self._model.layout
         belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
         belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
-        self._fusion = Fusion(self._engine, self._model, belief)
+        self._fusion = Fusion(self.engine, self._model, belief)
         beliefs = [belief]
         events: list[Event] = [*list(self._steps)[1:], *self._fixes, *self._velocities]
         for event in sorted(events, key=lambda e: e.stamp_ns):
@@ -226,12 +239,19 @@ def _layout_of(machine: MachineConfig) -> Layout:
 
 
 def _shows_tilt(machine: MachineConfig) -> bool:
-    """Whether a sensor shows roll and pitch, or how they change; a machine without any is taken to be on a plane."""
-    return any(
-        s.kind == "imu" or (s.kind == "attitude" and s.provides("tilt"))
-        for s in machine.sensors
-        if s.use
-    )
+    """Whether the sensors show roll and pitch; a machine without is taken to be on a plane.
+
+    By a reference of attitude, else by the direction of gravity between rates of turn. Rates
+    alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the acceleration's.
+    """
+    used = [s for s in machine.sensors if s.use]
+    bends = any(s.kind == "articulation" for s in used)
+    imus = [s for s in used if s.kind == "imu" and (s.frame == BASE or bends)]
+    references = [s for s in used if s.kind == "attitude" and s.frame == BASE and s.provides("tilt")]
+    if any(s.mode in (ABSOLUTE, RELATIVE) for s in references):
+        return True
+    turns = any(s.provides("rate") for s in imus) or any(s.mode == DIFFERENTIAL for s in references)
+    return turns and any(s.provides("force") for s in imus)
 
 
 def _pose(belief: Belief, speed_mps: float) -> PoseBelief:

@@ -186,7 +186,9 @@ _NEVER_WORSE = [
     for figure, limit in (("ratio", 1.0), ("worst_seed", MAX_RATIO))
 ]
 _HONEST = [
-    Goal({"case": BLACKOUT, "sensors": sensors, "profile": "default", "seconds": LENGTHS_S[-1]}, "coverage95", ">=", 0.9)
+    Goal(
+        {"case": BLACKOUT, "sensors": sensors, "profile": "default", "seconds": LENGTHS_S[-1]}, "coverage95", ">=", 0.9
+    )
     for sensors in SENSORS
 ]
 GOALS = (
@@ -267,7 +269,10 @@ def _forks(core: Positioning, readings: Sequence[Reading], places_s: Sequence[fl
 
 def _course(forks: Sequence[Fork], recording: RecordedDrive, seconds: int) -> Courses:
     """Replay each to so many seconds after its first reading."""
-    error_m, covariance_m2 = np.full((len(forks), seconds + 1, 2), np.nan), np.full((len(forks), seconds + 1, 2, 2), np.nan)
+    error_m, covariance_m2 = (
+        np.full((len(forks), seconds + 1, 2), np.nan),
+        np.full((len(forks), seconds + 1, 2, 2), np.nan),
+    )
     for i, (core, readings) in enumerate(forks):
         until_ns = readings[0].stamp_ns + round((seconds + 0.2) * 1e9)
         trace = replay(core, [reading for reading in readings if reading.stamp_ns < until_ns])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from sitegrid.options.groups import add_action
 from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import count, positive, seed, withhold
+from sitegrid.options.values import count, count_or_names, names, positive, seed, setting, shares, withhold
 from sitegrid.process.lifetime import note, plain, raise_interrupts, say, tell
 from sitegrid.process.progress import Display
 
@@ -35,26 +35,33 @@ def add_options(parser: ArgumentParser) -> None:
         "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
     )
     table = add_action(what, "localisation", "repeat the paper's table on simulated recordings")
+    budget = add_action(what, "budget", "show what each kind of error costs, by the truth in its place")
     ground = add_action(what, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work")
     merge = add_action(what, "merge", "compare this map merge with other methods")
-    for action, seeds in ((physics, 3), (table, 12), (ground, 12), (merge, 12)):
+    for action, seeds in ((physics, 3), (table, 12), (budget, 12), (ground, 12), (merge, 12)):
         action.add_argument("--seeds", type=count, default=seeds, help="number of seeds (default %(default)s)")
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
+    for action in (table, budget, ground, merge):
+        action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
+        action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
         (table, "errors over time, tracks and the table"),
         (ground, "estimates along the track, errors by place"),
         (merge, "the maps of the first seed and the table"),
     ):
-        action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
-        action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
         action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
-    for action, seconds in ((table, 1200.0), (ground, 600.0)):
+    for action, seconds in ((table, 1200.0), (budget, 1200.0), (ground, 600.0)):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
     scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
-    table.add_argument("--scenario", choices=SCENARIOS, default=SCENARIOS[0], help=scenario)
+    for action in (table, budget):
+        action.add_argument("--scenario", choices=SCENARIOS, default=SCENARIOS[0], help=scenario)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
+    shared = "shares of slow GPS errors that the receivers have in common, comma-separated (default: as recorded)"
+    table.add_argument("--shares", type=shares, default=(None,), help=shared)
+    judged = "compare the EKF of the profile default with the batch optimum of the same runs, by GTSAM (extra oracle)"
+    table.add_argument("--oracle", action="store_true", help=judged)
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
@@ -62,12 +69,20 @@ def add_options(parser: ArgumentParser) -> None:
 def _add_log(log: ArgumentParser) -> None:
     log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
     log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
-    off = "OFF seconds without GPS in every PERIOD seconds; may be repeated (default none, 1/10, 10/30, 30/60)"
-    log.add_argument("--withhold", action="append", type=withhold, metavar="OFF/PERIOD", help=off)
-    log.add_argument("--gps", type=count, help="number of GPS receivers to use")
+    off = (
+        "OFF/PERIOD: no GPS for OFF seconds in every PERIOD; START,LENGTH: once, for LENGTH seconds; none: all of it; "
+        "may be repeated, a row each (default none, 1/10, 10/30, 30/60)"
+    )
+    log.add_argument("--withhold", action="append", type=withhold, metavar="WHEN", help=off)
+    sensors = "names of the sensors to use, comma-separated, and no others (default: as the manifest says)"
+    log.add_argument("--sensors", type=names, default=(), metavar="NAMES", help=sensors)
+    receivers = "of the GPS receivers, how many to use, or which, by name, comma-separated"
+    log.add_argument("--gps", type=count_or_names, default=(), metavar="N|NAMES", help=receivers)
     log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="filter (default %(default)s)")
     profile = "filter profile (default %(default)s)"
     log.add_argument("--profile", choices=("default", "paper"), default="default", help=profile)
+    option = "an option of [pipeline.localisation] in agent.toml, as start=[0,0,1.57]; may be repeated"
+    log.add_argument("--set", action="append", type=setting, default=[], metavar="NAME=VALUE", help=option)
 
 
 def run(arguments: Namespace) -> int:
@@ -75,6 +90,7 @@ def run(arguments: Namespace) -> int:
     evaluations = {
         "physics": _physics,
         "localisation": _localisation,
+        "budget": _budget,
         "ground": _ground,
         "merge": _merge,
         "log": _log,
@@ -84,7 +100,7 @@ def run(arguments: Namespace) -> int:
     if arguments.json:
         say(plain(report))
     else:
-        tell("\n\n".join(_lines(report)))
+        tell("\n\n".join(_lines(plain(report))))
     return 0
 
 
@@ -99,11 +115,34 @@ def _localisation(arguments: Namespace) -> Report:
     from evaluation.positions import table
     from evaluation.positions.configurations import HEADLINE, SENSORS, configurations
 
-    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS)
+    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS, arguments.shares)
     work = partial(
         table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows, setup=SETUPS[arguments.scenario]
     )
-    return _experiment(arguments, "machines drive, filters follow", work, "evaluation.positions.plots")
+    judged = _with_oracle(work) if arguments.oracle else work
+    return _experiment(arguments, "machines drive, filters follow", judged, "evaluation.positions.plots")
+
+
+def _with_oracle(table: Callable[[Runner], tuple[Report, Any]]) -> Callable[[Runner], tuple[Report, Any]]:
+    """The same experiment, and its EKF judged by the batch optimum."""
+    from evaluation.positions import oracle
+
+    oracle.require()
+
+    def work(runner: Runner) -> tuple[Report, Any]:
+        report, outcomes = table(runner)
+        return {**report, "oracle": oracle.run(runner, outcomes)}, outcomes
+
+    return work
+
+
+def _budget(arguments: Namespace) -> Report:
+    from evaluation.campaign.recordings import SETUPS
+    from evaluation.positions import budget
+
+    setup = SETUPS[arguments.scenario]
+    work = partial(budget.run, seeds=_seeds(arguments), seconds=arguments.seconds, setup=setup)
+    return _experiment(arguments, "machines drive, filters are given the truth", work)
 
 
 def _ground(arguments: Namespace) -> Report:
@@ -122,8 +161,10 @@ def _merge(arguments: Namespace) -> Report:
     return _experiment(arguments, "machines drive, their samples are merged", work, "evaluation.maps.plots")
 
 
-def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str) -> Report:
-    """Run an experiment with its progress shown, and draw its pictures where they are asked for."""
+def _experiment(
+    arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str = ""
+) -> Report:
+    """Run an experiment with its progress shown, and draw its pictures, if it has any and they are asked for."""
     from evaluation.campaign.experiment import Runner
     from evaluation.campaign.workers import cores
 
@@ -133,20 +174,23 @@ def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple
         report, outcomes = work(runner)
     if not arguments.json:
         note(f"recordings and results are in {arguments.out}")
-    if arguments.plots:
+    if plots and arguments.plots:
         pictures = import_module(plots)  # imported here: only pictures need matplotlib
         report = {**report, "plots": list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))}
     return report
 
 
 def _log(arguments: Namespace) -> Report:
+    from agents.localisation.localiser import LocalisationConfig
     from evaluation.positions import real_logs
-    from evaluation.positions.configurations import Configuration, select
+    from protocol.config import from_table
 
-    with real_logs.opened(arguments.manifest, arguments.data) as (log, truth):
-        log = real_logs.refitted(log, select(log.machine, gps=arguments.gps))
-        row = Configuration(arguments.filter, real_logs.receivers(log.machine), 1, arguments.profile)
-        return real_logs.run(log, truth, row, arguments.withhold or real_logs.WITHHOLD, on_progress=note)
+    named = {"filter": arguments.filter, "profile": arguments.profile, **dict(arguments.set)}
+    options = from_table(LocalisationConfig, named, "--set")
+    patterns = [real_logs.parse_pattern(*words) for words in arguments.withhold or ()] or real_logs.WITHHOLD
+    choose = partial(real_logs.chosen, sensors=arguments.sensors, gps=arguments.gps)
+    report = real_logs.run(arguments.manifest, arguments.data, options, patterns, choose, on_progress=note)
+    return report if arguments.json else {**report, "measurements": real_logs.measurements(report["rows"])}
 
 
 def _parity(arguments: Namespace) -> Report:

@@ -36,7 +36,9 @@ def turned(readings: list[Reading], by_rad: float, from_s: float) -> list[Readin
     """The reference off by an angle from a time on."""
     c, s = math.cos(by_rad / 2), math.sin(by_rad / 2)
     return [
-        replace(r, qz=r.qz * c + r.qw * s, qw=r.qw * c - r.qz * s) if isinstance(r, Attitude) and after(r, from_s) else r
+        replace(r, qz=r.qz * c + r.qw * s, qw=r.qw * c - r.qz * s)
+        if isinstance(r, Attitude) and after(r, from_s)
+        else r
         for r in readings
     ]
 
