@@ -117,16 +117,18 @@ class References(ModalSensors[Orientation]):
     def _heading(self, orientation: Orientation, stamp_ns: int, belief: Belief) -> list[Measurement]:
         """The heading of a reference, with the state of its error.
 
-        An error that turns out larger than stated is taken for that large: else it would be expected to fade, and the
-        believed heading would follow it. References of one machine stand in one magnetic field: several count as one.
+        An error that turns out larger than stated is taken for that large, and to change as fast as one of the stated
+        size (2 std^2 / time stays): else it would be expected to fade, and the believed heading would follow it.
+        References of one machine stand in one magnetic field: several count as one.
         """
         sensor = orientation.sensor
         if sensor.name not in self._errors:
             return []
         state, variance = self._states[sensor.name], float(orientation.value.variances[2])
         stated = math.sqrt(variance) if "heading" in sensor.std else max(math.sqrt(variance), MIN_HEADING_STD_RAD)
-        std = math.sqrt(len(self._errors)) * max(stated, abs(float(belief.x[state])))
-        self._errors[sensor.name] = HeadingError(std, HEADING_TIME_S)
+        times = max(1.0, abs(float(belief.x[state])) / stated)
+        std = math.sqrt(len(self._errors)) * times * stated
+        self._errors[sensor.name] = HeadingError(std, HEADING_TIME_S * times**2)
         first = partial(reset_states, states=slice(state, state + 1), variance=std**2)
         change = None if sensor.name in self._confirmed else first
         self._confirmed.add(sensor.name)

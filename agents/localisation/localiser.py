@@ -27,9 +27,9 @@ from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
-# Without fixes for so long, the wheels' scale learns nothing: h = (1 + s) v is linearised at a speed that jitters from
-# step to step, which looks like information about s. While fixes show the distance they outweigh it; without them it bent
-# the scale by 6 % in ten minutes.
+# Without GPS for so long, wheels and IMUs teach neither the wheels' scale s nor the place: h = (1 + s) v is linearised at
+# a speed that jitters from step to step, which looks like information about s. While fixes show the distance, they
+# outweigh it; without them it bent the scale by 6 % in ten minutes.
 UNPLACED_S = 5.0
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
 Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
@@ -172,12 +172,12 @@ class Localiser:
         beliefs: list[Belief] = []
         for orientation in self._references.own_stamped(event):
             beliefs += self._filter_modal(fusion, self._references, orientation)
-        body = self._body
-        measurements = [*body.inertial(event), *absolute, *body.turn(event), *body.wheels(event)]
+        inertial, turn, wheels = self._body.inertial(event), self._body.turn(event), self._body.wheels(event)
         layout = fusion.model.layout
         if layout.wheel_scale and event.stamp_ns - self._placed_ns > UNPLACED_S * 1e9:
             considers = (X, Y, Z, layout.wheel_scales.start)
-            measurements = [replace(m, considers=considers) for m in measurements]
+            inertial, wheels = ([replace(m, considers=considers) for m in several] for several in (inertial, wheels))
+        measurements = [*inertial, *absolute, *turn, *wheels]
         return beliefs + (fusion.add(measurements) if measurements else [])
 
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:

@@ -1,8 +1,8 @@
 """Positions without GPS: blackouts in the middle of a drive, receivers that come back wrong, drives from a start alone.
 
-A drive is replayed once with GPS. At each placement all that is believed is copied, and the copy goes on without GPS: one
-blackout shows the error after each length. In the case `jump` GPS comes back after a minute, but wrong, and recovers
-slowly. In the case `start` there is none at all, and the start is known.
+A drive is replayed once with GPS. At each placement all that is believed is copied, and the copy goes on without GPS:
+one blackout shows the error after each length. In the cases `jump` GPS comes back after a minute, but wrong, and
+recovers slowly. In the case `start` there is none at all, and the start is known.
 """
 
 from __future__ import annotations

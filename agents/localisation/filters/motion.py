@@ -88,8 +88,8 @@ class MotionModel:
 
     on_plane: whether the machine moves on a plane. gps_errors: one per receiver of the layout. heading_errors:
     of the first references of the layout; headings of the others count from an anchor, and their errors walk. traction:
-    drive force over weight [-], 0 where it is not known. turn_error_radps: standard deviation of the lasting error of an odometry's
-    turn rate, 0 where the turn comes from another sensor.
+    drive force over weight [-], 0 where it is not known. turn_error_radps: standard deviation of the lasting error of
+    an odometry's turn rate, 0 where the turn comes from another sensor.
     """
 
     layout: Layout

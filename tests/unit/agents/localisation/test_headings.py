@@ -81,7 +81,7 @@ def test_an_error_larger_than_stated_is_learnt_and_does_no_harm(wrong_deg: float
     with_it, without = localiser(vehicle), localiser(WITHOUT)
     with_it.run(readings)
     without.run([r for r in readings if r.sensor != "ahrs"])
-    assert off_rad(with_it, made) < max(off_rad(without, made), 0.02)
+    assert off_rad(with_it, made) < max(off_rad(without, made), math.radians(2))
     assert off_m(with_it, made) < off_m(without, made) + 3.0  # of 300 m; not learnt, 8 degrees would cost 40 m
 
 
@@ -157,7 +157,7 @@ def test_what_it_states_is_not_believed_unless_it_is_configured(options: dict[st
     made = drive(LAPS[:2], vehicle)
     located = localiser(vehicle, start=START)
     located.run(until(with_ahrs(made, variance=1e-6), 0.0))
-    assert located._references.errors == (HeadingError(pytest.approx(std_rad), pytest.approx(300.0)),)
+    assert located._references.errors == (HeadingError(pytest.approx(std_rad, rel=0.1), pytest.approx(300.0, rel=0.1)),)
 
 
 @pytest.mark.parametrize(("weighs", "used"), [(True, False), (False, True)])
