@@ -27,8 +27,8 @@ from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
-# Without GPS for so long, wheels and IMUs teach neither the wheels' scale s nor the place: h = (1 + s) v is linearised at
-# a speed that jitters from step to step, which looks like information about s. While fixes show the distance, they
+# Without GPS for so long, wheels and IMUs teach neither the wheels' scale s nor the place: h = (1 + s) v is linearised
+# at a speed that jitters from step to step, which looks like information about s. While fixes show the distance, they
 # outweigh it; without them it bent the scale by 6 % in ten minutes.
 UNPLACED_S = 5.0
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
