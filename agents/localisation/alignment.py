@@ -86,7 +86,7 @@ def start_belief(
     x, variance = np.zeros(layout.n), np.full(layout.n, 1e-6)
     x[:2] = alignment.origin_m + np.array([c * reckoned.x_m - s * reckoned.y_m, s * reckoned.x_m + c * reckoned.y_m])
     x[state.YAW] = wrap_angle(alignment.rotation_rad + reckoned.angle_rad)
-    x[state.SPEED] = step.speed_mps
+    x[state.SPEED] = step.wheels.speed_mps
     if forces_mps2:
         ahead, left, _ = np.mean(forces_mps2, axis=0) / GRAVITY_MPS2
         x[state.ROLL], x[state.PITCH] = math.asin(np.clip(left, -0.7, 0.7)), -math.asin(np.clip(ahead, -0.7, 0.7))

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from agents.dead_reckoning import DeadReckoning, turn_source
@@ -17,11 +18,11 @@ from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, anchored_headings
-from agents.localisation.imu_steps import FilterStep, StepGatherer
+from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
-from protocol.machine.readings import Gps, GpsVelocity, Reading
+from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig
+from protocol.machine.readings import Gps, GpsVelocity
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
@@ -84,8 +85,9 @@ class Localiser:
             machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
         )
         self._references = References(machine.sensors, layout)
-        self._body = MotionSensors(machine, layout, step_s, config.slip, config.slip_soft)
         source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
+        tyres = config.slip, config.slip_soft
+        self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
         self._model = MotionModel(layout, on_plane, self._receivers.errors, turn_error_radps=turn_error)
         self._fusion: Fusion | None = None
@@ -126,18 +128,26 @@ class Localiser:
         """Smoothed poses within the lag, as known by now; the last is the newest belief's. They stay."""
         return self._fusion.remaining() if self._fusion else []
 
-    def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
-        """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
-        event: Event | None
-        if isinstance(reading, Gps):
-            event = self._receivers.fix(reading, dead_reckoning.pose)
-        elif isinstance(reading, GpsVelocity):
-            event = gps_velocity(reading, sensor)
-        else:
-            event = self._gatherer.gather(reading, sensor, dead_reckoning)
-        if event is None:
-            return []
-        beliefs = self._filter(self._fusion, event) if self._fusion else self._collect(event, dead_reckoning.distance_m)
+    def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
+        """Take in the readings of one stamp, after dead reckoning did; returns poses that became possible or changed.
+
+        In the order of their stamps.
+        """
+        fast: list[Sensed] = []
+        events: list[Event] = []
+        for reading, sensor in readings:
+            if isinstance(reading, Gps):
+                events.append(self._receivers.fix(reading, dead_reckoning.pose))
+            elif isinstance(reading, GpsVelocity):
+                events.append(gps_velocity(reading, sensor))
+            else:
+                fast.append((reading, sensor))
+        if fast and (step := self._gatherer.gather(fast, dead_reckoning)):
+            events.insert(0, step)
+        beliefs: list[Belief] = []
+        for event in events:
+            known = self._fusion
+            beliefs += self._filter(known, event) if known else self._collect(event, dead_reckoning.distance_m)
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
     def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
@@ -217,12 +227,20 @@ def _layout_of(machine: MachineConfig) -> Layout:
 
 
 def _shows_tilt(machine: MachineConfig, profile: str) -> bool:
-    """Whether a sensor shows roll and pitch, or how they change; a machine without any is taken to be on a plane."""
-    return any(
-        s.kind == "imu" or (s.kind == "attitude" and s.provides("tilt") and (profile == "paper" or s.mode != ABSOLUTE))
-        for s in machine.sensors
-        if s.use
-    )
+    """Whether the sensors show roll and pitch; a machine without is taken to be on a plane.
+
+    By a reference of attitude that the profile uses, else by the direction of gravity between rates of turn. Rates
+    alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the acceleration's.
+    """
+    used = [s for s in machine.sensors if s.use]
+    bends = any(s.kind == "articulation" for s in used)
+    imus = [s for s in used if s.kind == "imu" and (s.frame == BASE or bends)]
+    references = [s for s in used if s.kind == "attitude" and s.frame == BASE and s.provides("tilt")]
+    modes = (ABSOLUTE, RELATIVE) if profile == "paper" else (RELATIVE,)
+    if any(s.mode in modes for s in references):
+        return True
+    turns = any(s.provides("rate") for s in imus) or any(s.mode == DIFFERENTIAL for s in references)
+    return turns and any(s.provides("force") for s in imus)
 
 
 def _pose(belief: Belief, speed_mps: float) -> PoseBelief:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from sitegrid.options.groups import add_action
 from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import count, count_or_names, names, positive, seed, setting, withhold
+from sitegrid.options.values import count, count_or_names, names, positive, seed, setting, shares, withhold
 from sitegrid.process.lifetime import note, plain, raise_interrupts, say, tell
 from sitegrid.process.progress import Display
 
@@ -55,6 +55,8 @@ def add_options(parser: ArgumentParser) -> None:
     scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
     table.add_argument("--scenario", choices=SCENARIOS, default=SCENARIOS[0], help=scenario)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
+    shared = "shares of slow GPS errors that the receivers have in common, comma-separated (default: as recorded)"
+    table.add_argument("--shares", type=shares, default=(None,), help=shared)
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
@@ -107,7 +109,7 @@ def _localisation(arguments: Namespace) -> Report:
     from evaluation.positions import table
     from evaluation.positions.configurations import HEADLINE, SENSORS, configurations
 
-    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS)
+    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS, arguments.shares)
     work = partial(
         table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows, setup=SETUPS[arguments.scenario]
     )

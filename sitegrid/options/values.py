@@ -38,6 +38,13 @@ def not_negative(text: str) -> float:
     return float(text)
 
 
+def shares(text: str) -> tuple[float, ...]:
+    """Shares of 0 to 1, comma-separated; the least first."""
+    values = tuple(sorted(set(map(float, text.split(",")))))
+    _require(all(0 <= value <= 1 for value in values), f"{text} is not from 0 to 1")
+    return values
+
+
 def address(text: str) -> tuple[str, int]:
     """`9464`, of this host alone, or `0.0.0.0:9464`; port 0 takes a free one."""
     host, _, port = text.rpartition(":")
