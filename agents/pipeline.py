@@ -208,6 +208,7 @@ class Pipeline:
             "consistency": {
                 name: {**asdict(value), "good": value.is_good} for name, value in localiser.consistency.items()
             },
+            "machine_share": localiser.machine_share,
         }
 
     def _take(self, stamps: Iterable[Accepted]) -> list[Table]:

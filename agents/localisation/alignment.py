@@ -59,7 +59,7 @@ def align_fixes(fixes: Sequence[Fix], distance_m: float) -> Alignment | None:
     absolute = [fix for fix in fixes if fix.is_absolute]
     if distance_m < DISTANCE_M or len(absolute) < MIN_FIXES:
         return None
-    antennas = np.array([_reckoned_antenna(fix) for fix in absolute])
+    antennas = np.array([fix.reckoned_antenna_m for fix in absolute])
     if float(np.sqrt(((antennas - antennas.mean(axis=0)) ** 2).sum(axis=1).mean())) < SPREAD_M:
         return None
     std_m = math.sqrt(sum(float(fix.variance_m2.mean()) for fix in absolute) / len(absolute))
@@ -99,9 +99,3 @@ def start_belief(
     if layout.imus and turn_error_radps:
         variance[layout.gyro_biases.stop - 1] = turn_error_radps**2
     return Belief(step.stamp_ns, x, np.diag(variance))
-
-
-def _reckoned_antenna(fix: Fix) -> tuple[float, float]:
-    lever, reckoned = fix.sensor.mount.xyz_m, fix.reckoned
-    c, s = math.cos(reckoned.angle_rad), math.sin(reckoned.angle_rad)
-    return reckoned.x_m + c * lever[0] - s * lever[1], reckoned.y_m + s * lever[0] + c * lever[1]

@@ -81,7 +81,9 @@ class Localiser:
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
-        self._receivers = Receivers(machine.sensors, projection, layout, slow=augmented)
+        self._receivers = Receivers(
+            machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
+        )
         self._references = References(machine.sensors, layout)
         source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
         tyres = config.slip, config.slip_soft
@@ -107,6 +109,11 @@ class Localiser:
     def consistency(self) -> dict[str, Consistency]:
         """How consistent the filter is with each GPS receiver, of those with enough fixes."""
         return self._receivers.consistency
+
+    @property
+    def machine_share(self) -> float | None:
+        """Share of the slow variance that the receivers have in common, as it is taken for; None of fewer than two."""
+        return self._receivers.machine_share
 
     @property
     def belief(self) -> Belief | None:

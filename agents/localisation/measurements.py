@@ -37,11 +37,12 @@ def fix(
     lever_m: Floats,
     error: slice | None,
     gate: float,
+    opens: slice = PLACE,
     change: Change | None = None,
 ) -> Measurement:
     """A GPS fix (2,): z = [p + R r]_en + e.
 
-    error: states of the receiver's slow error e, None if the filter has none.
+    error: states of the receiver's slow error e, None if the filter has none. opens: as of a Measurement.
     """
 
     def h(x: Floats) -> Floats:
@@ -60,7 +61,7 @@ def fix(
             H[:, error] = EYE[:2, :2]
         return H
 
-    return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=PLACE, change=change)
+    return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=opens, change=change)
 
 
 def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_m: Floats, gate: float) -> Measurement:

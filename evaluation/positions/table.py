@@ -21,7 +21,6 @@ from evaluation.positions.configurations import Configuration, UnsupportedError,
 from evaluation.positions.replay import Score, errors, replay, score
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
-from sim.sensors.presets import load_preset
 
 TRACE_S = 1.0  # between two points of the curves that plots draw
 SOURCES = (
@@ -57,7 +56,7 @@ def run(
     runner: Runner, seeds: Sequence[int], seconds: float, rows: Sequence[Configuration], setup: Setup = PAPER
 ) -> tuple[Report, list[Outcome]]:
     """Record, replay and score all configurations with all seeds; `missing`: those that the pipeline cannot run."""
-    drives = [PlannedDrive(seed, seconds, setup=setup) for seed in seeds]
+    drives = [PlannedDrive(seed, seconds, setup.preset, setup) for seed in seeds]
     machine = drives[0].machine
     refusals = {row: _why_not(machine, row) for row in rows}
     runnable = [row for row, why in refusals.items() if not why]
@@ -67,7 +66,7 @@ def run(
     scores = {row: [o.run for o in outcomes if o.row == row] for row in runnable}
     report: Report = {
         "scenario": setup.scenario,
-        "gps_error": gps_error(drives[0].preset),
+        "gps_error": gps_error(drives[0]),
         "seeds": list(seeds),
         "seconds": seconds,
         "rows": [summarise(row, several) for row, several in scores.items()],
@@ -77,12 +76,12 @@ def run(
     return report, outcomes
 
 
-def gps_error(preset: str) -> Row:
-    """How slow the GPS errors of a preset are: on white noise every filter looks wonderful."""
-    gps = load_preset(preset).gps
+def gps_error(drive: PlannedDrive) -> Row:
+    """How slow the GPS errors of a drive are: on white noise every filter looks wonderful."""
+    gps = drive.scenario.preset(drive.preset).gps
     slow, white = gps.drift_std_m**2, gps.white_std_m**2
     return {
-        "preset": preset,
+        "preset": drive.preset,
         "rms_2d_m": round((2 * (slow + white)) ** 0.5 * gps.scale, 3),
         "slow_variance_share": round(slow / (slow + white), 3),
         "correlation_time_s": gps.drift_time_s,

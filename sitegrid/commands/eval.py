@@ -22,6 +22,7 @@ HELP = "run the accuracy experiments"
 EXTRA = "eval"
 Report = dict[str, Any]  # plain values by name; lists of rows are tables
 MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side
+SCENARIOS = ("paper_site", "paper_site_driven", "haul_road_driven")  # of the paper's table; one machine drives alone
 SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
 
@@ -51,6 +52,8 @@ def add_options(parser: ArgumentParser) -> None:
     for action, seconds in ((table, 1200.0), (ground, 600.0)):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
+    scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
+    table.add_argument("--scenario", choices=SCENARIOS, default=SCENARIOS[0], help=scenario)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
@@ -92,11 +95,14 @@ def _physics(arguments: Namespace) -> Report:
 
 
 def _localisation(arguments: Namespace) -> Report:
+    from evaluation.campaign.recordings import SETUPS
     from evaluation.positions import table
     from evaluation.positions.configurations import HEADLINE, SENSORS, configurations
 
     rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS)
-    work = partial(table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows)
+    work = partial(
+        table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows, setup=SETUPS[arguments.scenario]
+    )
     return _experiment(arguments, "machines drive, filters follow", work, "evaluation.positions.plots")
 
 

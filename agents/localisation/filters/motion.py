@@ -5,7 +5,7 @@ Over a step dt, with R = map_from_base and E the matrix from body rates to the r
 
     position += R (velocity dt + acceleration dt^2 / 2)        attitude += E rate dt
     velocity += acceleration dt                                rate, acceleration, biases, scale stay
-    GPS error *= exp(-dt / tau)
+    GPS error *= exp(-dt / tau), of its own tau; what several receivers see, such as one sky, moves all their errors
 
 `velocity` is that of base_link's origin in its own axes and `acceleration` its rate of change; what an accelerometer
 measures besides (rate x velocity, gravity) belongs to the measurement. On a plane (two_d_mode of robot_localization)
@@ -56,14 +56,21 @@ BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a
 
 @dataclass(frozen=True)
 class GpsError:
-    """A receiver's slow error: a stationary Gauss-Markov process per axis, of that variance and correlation time."""
+    """A receiver's slow error: a stationary Gauss-Markov process per axis, of that variance and correlation time.
+
+    common_m2: the parts of the variance that come from sources which other receivers see too, source by source, as many
+    for all receivers. Of each source two receivers have the smaller part in common, since it is one error in metres.
+    """
 
     variance_m2: float
     time_s: float
+    common_m2: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not (0 < self.variance_m2 < math.inf and 0 < self.time_s < math.inf):
             raise ValueError("variance_m2 and time_s must be positive and finite")
+        if not (all(part >= 0 for part in self.common_m2) and sum(self.common_m2) < self.variance_m2):
+            raise ValueError("common_m2 must not be negative, nor in sum as large as variance_m2")
 
 
 @dataclass(frozen=True)
@@ -89,16 +96,13 @@ class MotionModel:
 def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     """The motion over dt_s from a belief, whose attitude and velocity direct the slip noise."""
     layout = model.layout
-    keep, walks, errors = _constants(layout, on_plane=model.on_plane)
+    keep, walks = _constants(layout, on_plane=model.on_plane)
     scale, Q = keep.copy(), walks * dt_s
     if model.on_plane:
         Q[OFF_PLANE, OFF_PLANE] = OFF_PLANE_VARIANCE
-    for error, states in zip(model.gps_errors, errors, strict=True):
-        fading = math.exp(-dt_s / error.time_s)
-        # exact for steps of any length: what fades is renewed, so that the variance stays
-        renewal = error.variance_m2 * -math.expm1(-2 * dt_s / error.time_s)
-        for state in states:
-            scale[state], Q[state, state] = fading, renewal
+    if model.gps_errors:
+        gps = layout.gps_errors
+        scale[gps], Q[gps, gps] = _gps_motion(model.gps_errors, dt_s)
     of_position = Q[POSITION, POSITION]
     of_position += _slip(belief.x * scale, dt_s, _slip_variance_m2(model.traction * float(belief.x[SPEED]), dt_s))
     if model.turn_error_radps:
@@ -112,6 +116,21 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         return _jacobian(x * scale, dt_s) * scale
 
     return Motion(f, jacobian, Q, ANGLES)
+
+
+@lru_cache
+def gps_covariance(errors: tuple[GpsError, ...]) -> Floats:
+    """Covariance (k, k) of the slow errors of k receivers, per axis [m2].
+
+    What they have in common answers to one noise: with correlation times t and u, 2 sqrt(t u) / (t + u) of it is left.
+    """
+    times = np.array([error.time_s for error in errors])
+    parts = np.array([error.common_m2 for error in errors]).reshape(len(errors), -1)
+    common = np.minimum(parts[:, None], parts).sum(axis=2)
+    covariance: Floats = common * 2 * np.sqrt(np.outer(times, times)) / np.add.outer(times, times)
+    np.fill_diagonal(covariance, [error.variance_m2 for error in errors])
+    covariance.setflags(write=False)
+    return covariance
 
 
 def map_from_base(attitude: Floats) -> Floats:
@@ -227,11 +246,21 @@ def _slip(x: Floats, dt_s: float, along_m2: float) -> Floats:
 
 
 @lru_cache
-def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats, tuple[range, ...]]:
+def _gps_motion(errors: tuple[GpsError, ...], dt_s: float) -> tuple[Floats, Floats]:
+    """Factors (2 k,) by which the errors of k receivers fade in a step, and their noise (2 k, 2 k).
+
+    Exact for steps of any length: what fades is renewed, so that the covariance stays.
+    """
+    fading = np.array([-dt_s / error.time_s for error in errors])  # logarithms
+    renewal = gps_covariance(errors) * -np.expm1(np.add.outer(fading, fading))
+    return np.exp(fading).repeat(2), np.kron(renewal, EYE[:2, :2])
+
+
+@lru_cache
+def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats]:
     """What every motion of a layout begins with.
 
-    Factor (n,) that sets the states off the plane to zero, covariance (n, n) of the random walks of a second, and the
-    states of each GPS error.
+    Factor (n,) that sets the states off the plane to zero, and covariance (n, n) of the random walks of a second.
     """
     keep, deviation = np.ones(layout.n), np.zeros(layout.n)
     if on_plane:
@@ -247,4 +276,4 @@ def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats, tuple
     walks = np.diag(deviation**2)
     for shared in (keep, walks):
         shared.setflags(write=False)
-    return keep, walks, tuple(range(layout.n)[layout.gps_error(i)] for i in range(layout.receivers))
+    return keep, walks

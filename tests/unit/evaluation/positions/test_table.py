@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.campaign.experiment import Runner
 from evaluation.campaign.figures import Report
-from evaluation.campaign.recordings import PAPER
+from evaluation.campaign.recordings import PAPER, PlannedDrive
 from evaluation.positions import table
 from evaluation.positions.configurations import Configuration
 from evaluation.positions.replay import Score
@@ -101,7 +101,7 @@ def test_rows_are_scored_on_one_recording_and_what_cannot_run_is_named(result, r
 
 
 def test_the_report_says_how_slow_gps_errors_are():
-    error = table.gps_error("paper")
+    error = table.gps_error(PlannedDrive(0, 1.0))
     assert (error["slow_variance_share"], error["correlation_time_s"]) == (0.9, 45.0)
 
 

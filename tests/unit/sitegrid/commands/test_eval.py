@@ -48,6 +48,22 @@ def test_options_of_an_experiment_reach_it(monkeypatch, capsys):
     assert default_options["seconds"] == 1200.0
 
 
+@pytest.mark.slow
+def test_the_table_is_made_on_the_scenario_that_is_asked_for(monkeypatch, capsys):
+    from evaluation.campaign.recordings import SETUPS
+    from evaluation.positions import table
+
+    assert tuple(SETUPS) == command.SCENARIOS
+    asked = []
+    monkeypatch.setattr(table, "run", lambda _, **options: (asked.append(options["setup"]), ({"rows": []}, []))[1])
+    for words in ((), ("--scenario", "haul_road_driven")):
+        assert cli.main(["eval", "localisation", *words, "--json"]) == 0
+    assert asked == [SETUPS["paper_site"], SETUPS["haul_road_driven"]]
+    with pytest.raises(SystemExit):
+        parse("localisation", "--scenario", "loading")
+    assert "invalid choice: 'loading'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [("--json", "physics"), ("physics", "--json")])
 def test_json_stands_before_or_behind_what_is_run(words: tuple[str, ...]):
     assert parse(*words).json
