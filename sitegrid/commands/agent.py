@@ -55,10 +55,12 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Run until the stream ends or the process is stopped; the router may come and go."""
     from agents.agent import Agent, Places
+    from agents.config import require_place
 
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
     site, machine, config = _configure(arguments, log)
+    require_place(machine, config.pipeline.localisation)
     session = _open(join(arguments.endpoint, arguments.keys, role="machine", name=machine.name, site=site.name))
     with ExitStack() as opened:
         opened.callback(session.close)
