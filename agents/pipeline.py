@@ -206,7 +206,7 @@ class Pipeline:
             "without_resistance": dict(self._sampler.without_resistance),
             "ground": self._estimator.health(),
             "consistency": {
-                name: {**asdict(value), "good": value.is_good} for name, value in localiser.consistency.items()
+                name: {**asdict(value), "verdict": value.verdict} for name, value in localiser.consistency.items()
             },
             "machine_share": localiser.machine_share,
         }
