@@ -215,6 +215,20 @@ def test_a_gyro_without_accelerometer_does_not_make_the_tilt_wander(engine: str)
     assert positioning.counters["gyro_gated"] == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("sensors", [(GYRO, ODOMETRY), (SensorConfig("odometry", "odometry"),), (IMU, ENCODER)])
+@pytest.mark.parametrize("rate_hz", [5, 20])
+def test_both_filters_agree_where_the_model_is_the_same(sensors: tuple[SensorConfig, ...], rate_hz: float) -> None:
+    """Where nothing but the start's wide heading is far from linear; a log that begins in motion."""
+    vehicle = cart(*sensors, GPS)
+    made = drive(TOUR, vehicle)
+    readings = readings_of(vehicle, made, rate_hz, seed=1, from_s=9.0)
+    (_, ekf, _), (_, ukf, _) = (located(vehicle, readings, engine) for engine in ("ekf", "ukf"))
+    apart = [math.dist((a.x_m, a.y_m), (b.x_m, b.y_m)) for a, b in zip(ekf, ukf, strict=True)]
+    assert max(apart) < 0.1
+    assert net_m(made, ukf) == pytest.approx(net_m(made, ekf), rel=0.05)
+
+
 # --- what nobody can know --------------------------------------------------------------------------------------------
 
 
