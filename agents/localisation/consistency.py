@@ -12,7 +12,7 @@ larger than stated. With one receiver, or with several that err alike, nobody ca
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -52,6 +52,11 @@ class Consistency:
         ):
             return INCONSISTENT
         return CONSISTENT if self.is_checked else CANNOT_TELL
+
+    @property
+    def report(self) -> dict[str, float | bool | str]:
+        """All of it in plain values."""
+        return {**asdict(self), "verdict": self.verdict}
 
 
 class InnovationMonitor:
