@@ -22,7 +22,6 @@ from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler, Samples, joined
 from agents.smoothed_track import SmoothedTrack
 from agents.stream_order import Decision, StreamOrder, by_stamp
-from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection, SiteConfig

@@ -37,7 +37,8 @@ def add_options(parser: ArgumentParser) -> None:
     table = add_action(what, "localisation", "repeat the paper's table on simulated recordings")
     ground = add_action(what, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work")
     merge = add_action(what, "merge", "compare this map merge with other methods")
-    for action, seeds in ((physics, 3), (table, 12), (ground, 12), (merge, 12)):
+    lag = add_action(what, "lag", "compare the maps of four loaders at work with and without the smoother's lag")
+    for action, seeds in ((physics, 3), (table, 12), (ground, 12), (merge, 12), (lag, 12)):
         action.add_argument("--seeds", type=count, default=seeds, help="number of seeds (default %(default)s)")
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
@@ -45,11 +46,13 @@ def add_options(parser: ArgumentParser) -> None:
         (table, "errors over time, tracks and the table"),
         (ground, "estimates along the track, errors by place"),
         (merge, "the maps of the first seed and the table"),
+        (lag, ""),
     ):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
-        action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
-    for action, seconds in ((table, 1200.0), (ground, 600.0)):
+        if drawn:
+            action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
+    for action, seconds in ((table, 1200.0), (ground, 600.0), (lag, 900.0)):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
     scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
@@ -87,6 +90,7 @@ def run(arguments: Namespace) -> int:
         "localisation": _localisation,
         "ground": _ground,
         "merge": _merge,
+        "lag": _lag,
         "log": _log,
         "parity": _parity,
     }
@@ -132,7 +136,16 @@ def _merge(arguments: Namespace) -> Report:
     return _experiment(arguments, "machines drive, their samples are merged", work, "evaluation.maps.plots")
 
 
-def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str) -> Report:
+def _lag(arguments: Namespace) -> Report:
+    from evaluation.ground import lag
+
+    work = partial(lag.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    return _experiment(arguments, "loaders work, their samples are smoothed and merged", work)
+
+
+def _experiment(
+    arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str = ""
+) -> Report:
     """Run an experiment with its progress shown, and draw its pictures where they are asked for."""
     from evaluation.campaign.experiment import Runner
     from evaluation.campaign.workers import cores
@@ -143,7 +156,7 @@ def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple
         report, outcomes = work(runner)
     if not arguments.json:
         note(f"recordings and results are in {arguments.out}")
-    if arguments.plots:
+    if plots and arguments.plots:
         pictures = import_module(plots)  # imported here: only pictures need matplotlib
         report = {**report, "plots": list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))}
     return report
