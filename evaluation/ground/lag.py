@@ -22,7 +22,7 @@ from evaluation.ground.truth import LoadTrack, read_load_track
 from evaluation.maps.methods import soft_votes
 from evaluation.maps.samples import Delivery
 from evaluation.maps.score import score_driven
-from protocol.arrays import Floats, Table
+from protocol.arrays import Floats, Floats32, Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.readings import Reading
 from protocol.queries.answers import MapVersion, Region
@@ -171,16 +171,19 @@ def batches(machine: str, rows: Table) -> Iterator[Delivery]:
         yield Delivery(machine, batch, int(batch["stamp_ns"].max()))
 
 
-def merged(deliveries: Sequence[Delivery], truth: TruthMap) -> tuple[Region, dict[str, Floats]]:
+def merged(deliveries: Sequence[Delivery], truth: TruthMap) -> tuple[Region, dict[str, Floats32]]:
     """The server's map of samples on the cells of a true map, and the true layers."""
     rows, columns = truth.c_rr.shape
     window = CellWindow(round(truth.west_m / truth.cell_m), round(truth.south_m / truth.cell_m), columns, rows)
     layers, _ = soft_votes(sorted(deliveries, key=lambda delivery: delivery.received_ns), window)
-    x_m = truth.west_m + (np.arange(columns) + 0.5) * truth.cell_m
-    y_m = truth.south_m + (np.arange(rows) + 0.5) * truth.cell_m
-    region = Region(x_m, y_m, truth.cell_m, layers, MapVersion("", 0, 0), 0)
+    x_m, y_m = (
+        np.asarray(corner_m + (np.arange(n) + 0.5) * truth.cell_m, np.float64)
+        for corner_m, n in ((truth.west_m, columns), (truth.south_m, rows))
+    )
+    shown = {name: values.astype(np.float32) for name, values in layers.items()}
+    region = Region(x_m, y_m, truth.cell_m, shown, MapVersion("", 0, 0), 0)
     true = {"resistance": truth.c_rr, "grade_east": truth.grade_east, "grade_north": truth.grade_north}
-    return region, {name: values.astype(np.float64) for name, values in true.items()}
+    return region, true
 
 
 EXPERIMENT = Experiment("lag", LagResult, SOURCES, _solve)
