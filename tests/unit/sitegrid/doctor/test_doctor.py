@@ -79,7 +79,7 @@ AHEAD = replace(
     machines={f"loader-{i}": SampleCounts(**COUNTS, newest_ns=NOW_NS + 36_000 * 10**9 * i) for i in (1, 2)},
 )
 STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
-HEALTHY = {"spool": {"depth": 3, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
+HEALTHY = {"spool": {"depth": 3, "pending": 2, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
 
 
 def router(took_s: float | None, **link: bool) -> Finding:
@@ -194,7 +194,7 @@ def positions(**verdicts: str) -> Finding:
         (disk.check_spool(SpoolState(0, 0, 0, 0, damage="a.db-wal is damaged"), NOW_NS), WARN, "a.db-wal is damaged"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "gone": 8}}), WARN, "8 are gone"),
         (disk.check_health("loader-1", {**HEALTHY, "spool_damage": "the log is damaged"}), WARN, "the log is damaged"),
-        (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait"),
+        (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait, 2 of them for the smoother; "),
         (disk.check_health("loader-1", {**HEALTHY, "uplink": {"problem": "no answer"}}), WARN, "; no answer"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
         # what others say may be anything
