@@ -4,7 +4,7 @@ Absolute: orientations are measurements of the filter step that they came in. Th
 it comes from the machine's own steel, from iron and currents near by and from the calibration, and lasts for tens of
 metres to for ever. So each absolute heading has a state for it, a Gauss-Markov process: while GPS shows the heading the
 error is learnt, and without GPS the heading is held to within what the error may have changed since. The profile
-`paper` takes orientations as they are, with white errors.
+`paper` takes orientations as they are, with white errors, and their tilt too.
 
 Differential: successive orientations make
 an angular rate. Relative: the heading is turned so that the first one agrees with the believed heading; roll and pitch
@@ -33,7 +33,6 @@ UNKNOWN_STD = 1e4  # of a quantity that a sensor does not measure
 MIN_HEADING_STD_RAD = math.radians(3)  # unless it is configured
 WHITE_SHARE = 0.1  # of the variance
 HEADING_TIME_S = 300.0  # between a disturbance beside the road (seconds) and the steel of the machine (for ever)
-TILT_TIME_S = 60.0  # how long errors of roll and pitch last
 DUE_S = 0.5  # between two that are used: more of a slow error tell nothing new
 
 
@@ -71,7 +70,6 @@ class References(ModalSensors[Orientation]):
         self._slow = slow
         absolute = [s.name for s in references if s.mode == ABSOLUTE] if slow else []
         self._errors = dict.fromkeys(absolute, HeadingError(MIN_HEADING_STD_RAD, HEADING_TIME_S))
-        self._weighs = any(s.kind == "imu" and s.use and s.provides("force") for s in sensors)
         self._used_ns: dict[str, int] = {}
 
     @property
@@ -86,7 +84,7 @@ class References(ModalSensors[Orientation]):
             return [self._attitude(o, step.stamp_ns, o.value.values) for o in absolute]
         due = [o for o in absolute if step.stamp_ns - self._used_ns.get(o.sensor.name, 0) >= DUE_S * 1e9]
         self._used_ns.update((o.sensor.name, step.stamp_ns) for o in due)
-        return [m for o in due for m in (*self._heading(o, step.stamp_ns, belief), *self._tilt(o, step.stamp_ns))]
+        return [m for o in due for m in self._heading(o, step.stamp_ns, belief)]
 
     def own_stamped(self, step: FilterStep) -> list[Orientation]:
         """Orientations of the other references, which become measurements of their own stamps."""
@@ -134,18 +132,6 @@ class References(ModalSensors[Orientation]):
         self._confirmed.add(sensor.name)
         yaw, white, gate = float(orientation.value.values[2]), WHITE_SHARE * stated**2, sensor.gate(GATE_SIGMA)
         return [measurements.heading(stamp_ns, sensor.name, yaw, white, state, gate, change)]
-
-    def _tilt(self, orientation: Orientation, stamp_ns: int) -> list[Measurement]:
-        """Roll and pitch, where no accelerometer shows them as well.
-
-        Their slow errors have no state: the variance is that of white ones that tell as much in the long run.
-        """
-        sensor, rpy = orientation.sensor, orientation.value
-        if self._weighs or not sensor.provides("tilt"):
-            return []
-        kept = math.exp(-DUE_S / TILT_TIME_S)
-        R, gate = np.diag(rpy.variances[:2] * (1 + kept) / (1 - kept)), sensor.gate(GATE_SIGMA)
-        return [measurements.tilt(stamp_ns, f"{sensor.name}-tilt", rpy.values[:2], R, gate)]
 
     def _attitude(
         self, orientation: Orientation, stamp_ns: int, rpy_rad: Floats, change: Change | None = None

@@ -92,7 +92,7 @@ class Localiser:
             machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
         )
         self._references = References(machine.sensors, layout, slow=augmented)
-        source, on_plane = turn_source(machine), not _shows_tilt(machine)
+        source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
         tyres = config.slip, config.slip_soft
         self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
@@ -244,17 +244,18 @@ def _layout_of(machine: MachineConfig) -> Layout:
     return Layout(turns, True, len(drifting(machine.sensors)), len(heading_references(machine.sensors)))
 
 
-def _shows_tilt(machine: MachineConfig) -> bool:
+def _shows_tilt(machine: MachineConfig, profile: str) -> bool:
     """Whether the sensors show roll and pitch; a machine without is taken to be on a plane.
 
-    By a reference of attitude, else by the direction of gravity between rates of turn. Rates
-    alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the acceleration's.
+    By a reference of attitude that the profile uses for it, else by the direction of gravity between rates of turn.
+    Rates alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the acceleration's.
     """
     used = [s for s in machine.sensors if s.use]
     bends = any(s.kind == "articulation" for s in used)
     imus = [s for s in used if s.kind == "imu" and (s.frame == BASE or bends)]
     references = [s for s in used if s.kind == "attitude" and s.frame == BASE and s.provides("tilt")]
-    if any(s.mode in (ABSOLUTE, RELATIVE) for s in references):
+    modes = (ABSOLUTE, RELATIVE) if profile == "paper" else (RELATIVE,)
+    if any(s.mode in modes for s in references):
         return True
     turns = any(s.provides("rate") for s in imus) or any(s.mode == DIFFERENTIAL for s in references)
     return turns and any(s.provides("force") for s in imus)

@@ -92,18 +92,15 @@ def inertial(
 
         f = a + w x (v + w x r) + g R^T e_z,    R^T e_z = (-sin pitch, cos pitch sin roll, cos pitch cos roll)
 
-    bias: state of the yaw gyro's bias b, None if the filter has none; one that has takes w x (v + w x r) at its mean.
-    Forces would teach it v and w else, and through them yaw and b: a hundredth of g that leans on a bend for minutes is
-    no noise, and turned a machine without GPS by 100 degrees.
+    bias: state of the yaw gyro's bias b, None if the filter has none.
     """
-    at_mean = bias is not None
     by_rate = -_matrix(lever_m)  # w x r = -[r]x w
 
     def h(x: Floats) -> Floats:
         columns = x.T
         w, tilt = columns[RATE], columns[ROLL:YAW]
-        moving = columns[VELOCITY] + by_rate.dot(w)
-        (p, q, r), (ahead, left, up) = (w[:, :1], moving[:, :1]) if at_mean else (w, moving)
+        p, q, r = w
+        ahead, left, up = columns[VELOCITY] + by_rate.dot(w)
         (sr, sp), (cr, cp) = np.sin(tilt), np.cos(tilt)
         level = GRAVITY_MPS2 * cp
         rows = np.empty((6, len(x)))
@@ -124,9 +121,8 @@ def inertial(
         H[:3, RATE] = H[3:, ACCELERATION] = EYE
         if bias is not None:
             H[2, bias] = 1.0
-        if not at_mean:
-            H[3:, VELOCITY] = across = _matrix(w)
-            H[3:, RATE] = across.dot(by_rate) - _matrix(moving)  # d/dw of w x (v + w x r)
+        H[3:, VELOCITY] = across = _matrix(w)
+        H[3:, RATE] = across.dot(by_rate) - _matrix(moving)  # d/dw of w x (v + w x r)
         H[3:, ROLL:YAW] = GRAVITY_MPS2 * np.array([(0.0, -cp), (cp * cr, -sp * sr), (-cp * sr, -sp * cr)])
         return H
 
@@ -202,11 +198,6 @@ def heading(
 
     z, R, opens = np.array([yaw_rad]), np.array([[variance]]), slice(error, error + 1)
     return Measurement(sensor, stamp_ns, z, R, h, jacobian, (0,), gate_sigma=gate, opens=opens, change=change)
-
-
-def tilt(stamp_ns: int, sensor: str, roll_pitch_rad: Floats, R: Floats, gate: float) -> Measurement:
-    """Roll and pitch (2,) of `base_link`: z = (roll, pitch)."""
-    return Measurement(sensor, stamp_ns, roll_pitch_rad, R, *_picked(slice(ROLL, YAW)), (0, 1), gate_sigma=gate)
 
 
 def orientation(

@@ -22,7 +22,7 @@ from evaluation.campaign.recordings import PAPER, PlannedDrive, RecordedDrive, S
 from evaluation.positions.configurations import PROFILES, Configuration, select
 from evaluation.positions.consistency import ellipse_limit, normalised_square
 from evaluation.positions.replay import Trace, errors, replay
-from protocol.arrays import Floats
+from protocol.arrays import Floats, Ints
 from protocol.errors import SitegridError
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, Reading
@@ -282,7 +282,7 @@ def _course(forks: Sequence[Fork], recording: RecordedDrive, seconds: int) -> Co
     return Courses(error_m, covariance_m2)
 
 
-def _whole_seconds(trace: Trace, seconds: int) -> tuple[Floats, Floats]:
+def _whole_seconds(trace: Trace, seconds: int) -> tuple[Ints, Ints]:
     """Whole seconds up to a last one, and the first pose of a trace in each of them."""
     at, picked = np.unique(trace.since_start_s.astype(int), return_index=True)
     return at[at <= seconds], picked[at <= seconds]

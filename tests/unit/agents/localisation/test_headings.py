@@ -12,7 +12,7 @@ from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.headings import MIN_HEADING_STD_RAD, heading_references
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Attitude, Gps, Imu, Reading
-from tests.unit.agents.drives import START, Drive, Leg, RunLocaliser, after, changed_sensor, drive, localiser, with_ahrs
+from tests.unit.agents.drives import START, Drive, Leg, RunLocaliser, after, drive, localiser, with_ahrs
 from tests.unit.agents.drives import VEHICLE as WITHOUT
 
 STATED = math.radians(1.5) ** 2
@@ -158,13 +158,3 @@ def test_what_it_states_is_not_believed_unless_it_is_configured(options: dict[st
     located = localiser(vehicle, start=START)
     located.run(until(with_ahrs(made, variance=1e-6), 0.0))
     assert located._references.errors == (HeadingError(pytest.approx(std_rad, rel=0.1), pytest.approx(300.0, rel=0.1)),)
-
-
-@pytest.mark.parametrize(("weighs", "used"), [(True, False), (False, True)])
-def test_tilt_is_used_where_no_accelerometer_shows_it(weighs: bool, used: bool) -> None:
-    vehicle = of_ahrs() if weighs else changed_sensor(of_ahrs(), "imu", measures=("rate",))
-    made = drive(LAPS[:2], vehicle)
-    located = localiser(vehicle, start=START)
-    located.run(with_ahrs(made))
-    assert (located.counters["ahrs-tilt_used"] > 10) == used
-    assert located.counters["ahrs_used"] > 10

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,7 +71,7 @@ def test_blackouts_begin_after_gps_was_known_and_end_within_the_drive(seconds: f
     assert places[-1] + GAP_S + BACK_S[-1] < seconds
 
 
-def test_drives_too_short_for_a_blackout_are_refused(tmp_path) -> None:
+def test_drives_too_short_for_a_blackout_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SitegridError, match="400 is too short; blackouts need drives of 421 s"):
         blackouts.run(Runner(tmp_path), (0,), 400.0)
 
