@@ -20,7 +20,7 @@ from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
 from agents.stream_order import Decision, StreamOrder
 from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Reading
+from protocol.machine.readings import Correction, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 
@@ -82,6 +82,8 @@ class Positioning:
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
             return None
+        if isinstance(reading, Correction):
+            return Accepted(reading, sensor, self.localiser.update(reading, sensor, self.dead_reckoning), False)
         if sensor.delay_s:
             reading = replace(reading, stamp_ns=reading.stamp_ns - round(sensor.delay_s * 1e9))
         decision = self._order.decide(reading)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
+from agents.localisation.corrections import Corrections, base_of
 from agents.localisation.filters.belief import Belief, Filter, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
@@ -19,7 +20,7 @@ from agents.localisation.imu_steps import FilterStep, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
-from protocol.machine.readings import Gps, Reading
+from protocol.machine.readings import Correction, Gps, Reading
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
@@ -67,6 +68,8 @@ class Localiser:
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
         self._receivers = Receivers(machine.sensors, projection, layout, slow=augmented)
+        base = base_of(machine.sensors) if augmented and layout.corrected else None
+        self._corrections = Corrections(base, layout) if base else None
         self._references = References(machine.sensors, layout)
         self._body = MotionSensors(machine, layout, step_s, config.slip, config.slip_soft)
         source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
@@ -98,6 +101,8 @@ class Localiser:
 
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
+        if isinstance(reading, Correction):
+            return self._correct(reading)
         event: FilterStep | Fix | None = (
             self._receivers.fix(reading, dead_reckoning.pose)
             if isinstance(reading, Gps)
@@ -111,7 +116,13 @@ class Localiser:
     def _filter(self, fusion: Fusion, event: FilterStep | Fix) -> list[Belief]:
         """Beliefs that an event changed."""
         if isinstance(event, Fix):
-            return self._filter_modal(fusion, self._receivers, event)
+            beliefs = self._filter_modal(fusion, self._receivers, event)
+            if self._corrections and event.is_absolute:
+                error = self._receivers.errors[0]
+                white = float(self._receivers._white(event).mean())
+                self._corrections.note(event, fusion.belief, white, error)
+                beliefs += self._take_correction(fusion)
+            return beliefs
         fusion.model = replace(fusion.model, traction=event.traction)
         beliefs: list[Belief] = []
         for orientation in self._references.own_stamped(event):
@@ -122,7 +133,26 @@ class Localiser:
             *self._body.turn(event),
             *self._body.wheels(event),
         ]
-        return beliefs + (fusion.add(measurements) if measurements else [])
+        beliefs += fusion.add(measurements) if measurements else []
+        if self._corrections:
+            self._corrections.follow(event, fusion.belief)
+        return beliefs
+
+    def _correct(self, correction: Correction) -> list[PoseBelief]:
+        if self._corrections is None or self._fusion is None:
+            return []
+        self._corrections.take(correction, self._fusion.belief.stamp_ns)
+        return []
+
+    def _take_correction(self, fusion: Fusion) -> list[Belief]:
+        measurement = self._corrections.due(fusion.belief, self._receivers.errors[0])
+        if measurement is None:
+            return []
+        fusion.model = replace(fusion.model, base=self._corrections.error)
+        beliefs = fusion.add([measurement])
+        if beliefs:
+            self._corrections.confirm(fusion.last[measurement.sensor], fusion.belief.stamp_ns)
+        return beliefs
 
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
         """Filter a value whose sensor may count from what is believed at its stamp."""
@@ -166,7 +196,8 @@ def _layout_of(machine: MachineConfig) -> Layout:
     source = turn_source(machine)
     imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
     turns = imus + (source is not None and source.kind != "imu")
-    return Layout(turns, True, len(drifting(machine.sensors)), len(anchored_headings(machine.sensors)))
+    corrected = base_of(machine.sensors) is not None and bool(drifting(machine.sensors))
+    return Layout(turns, True, len(drifting(machine.sensors)), len(anchored_headings(machine.sensors)), corrected)
 
 
 def _shows_tilt(machine: MachineConfig, profile: str) -> bool:

@@ -10,10 +10,20 @@ import msgpack
 import numpy as np
 
 from protocol.errors import MessageError, Refusal
-from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
+from protocol.machine.readings import KINDS, MAX_STAMP_NS, Correction, Reading, columns, parse_reading
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples, empty
 from protocol.site.site_config import NAME
-from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
+from protocol.wire.messages import (
+    VERSION,
+    Ack,
+    Health,
+    PackedBatch,
+    Pose,
+    Refused,
+    SampleBatch,
+    SensorBundle,
+    SiteCorrection,
+)
 
 MAX_BATCH_BYTES = 4 * 2**20
 MAX_BATCH_SAMPLES = 20_000
@@ -256,6 +266,29 @@ def _decode_group(group: dict[str, Any], refused: Counter[str]) -> list[Reading]
         except MessageError as error:
             refused[error.reason] += 1
     return readings
+
+
+# --- corrections -----------------------------------------------------------------------------------------------------
+
+
+def encode_correction(message: SiteCorrection) -> bytes:
+    """What a base station says of its site's GPS errors."""
+    correction = message.correction
+    values = {name: getattr(correction, name) for name in columns(Correction.kind)}
+    return pack({"base": correction.sensor, "frame": message.frame, "stamp_ns": correction.stamp_ns, **values})
+
+
+def decode_correction(data: bytes, frame: str) -> SiteCorrection:
+    """Undo `encode_correction`; refused where a value is not plausible, or is of another frame than this one."""
+    table = unpack(data, MAX_SMALL_BYTES)
+    base, stamp_ns, of_base = _take_name(table, "base"), _take_stamp(table), take(table, "frame", str)
+    if of_base != frame:
+        problem = f"corrections of {base} are in frame {of_base[:40]!r}, this site's is {frame!r}: compare the site files"
+        raise MessageError(Refusal.WRONG_FRAME, problem, field="frame")
+    values = tuple(take(table, name, float) for name in columns(Correction.kind))
+    correction = parse_reading(Correction.kind, base, stamp_ns, values)
+    assert isinstance(correction, Correction)
+    return SiteCorrection(of_base, correction)
 
 
 # --- live pose and health --------------------------------------------------------------------------------------------

@@ -51,6 +51,7 @@ GYRO_BIAS_WALK = 5e-5  # [rad/s/sqrt(s)]
 WHEEL_SCALE_WALK = 2e-4  # [1/sqrt(s)]
 SLIP_STD = 0.08  # of the wheels' slip per traction, which the speed is corrected by
 SLIP_TIME_S = 5.0  # how long a ground's slip stays the same
+BASE_OFFSET_WALK = 5e-3  # [m/sqrt(s)]: after an hour a mean over fixes says no more
 BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a wrong scale makes another in every bend
 
 
@@ -67,6 +68,13 @@ class GpsError:
 
 
 @dataclass(frozen=True)
+class BaseError(GpsError):
+    """The slow error of a base station. share: its correlation with that of the machine."""
+
+    share: float = 0.0
+
+
+@dataclass(frozen=True)
 class MotionModel:
     """What the motion depends on besides the belief.
 
@@ -80,6 +88,7 @@ class MotionModel:
     gps_errors: tuple[GpsError, ...] = ()
     traction: float = 0.0
     turn_error_radps: float = 0.0
+    base: BaseError | None = None
 
     def __post_init__(self) -> None:
         if len(self.gps_errors) != self.layout.receivers:
@@ -99,6 +108,8 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         renewal = error.variance_m2 * -math.expm1(-2 * dt_s / error.time_s)
         for state in states:
             scale[state], Q[state, state] = fading, renewal
+    if model.base:
+        _add_base(model, scale, Q, dt_s)
     of_position = Q[POSITION, POSITION]
     of_position += _slip(belief.x * scale, dt_s, _slip_variance_m2(model.traction * float(belief.x[SPEED]), dt_s))
     if model.turn_error_radps:
@@ -112,6 +123,18 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         return _jacobian(x * scale, dt_s) * scale
 
     return Motion(f, jacobian, Q, ANGLES)
+
+
+def _add_base(model: MotionModel, scale: Floats, Q: Floats, dt_s: float) -> None:
+    layout, base, machine = model.layout, model.base, model.gps_errors[0]
+    b, e = layout.base_error, layout.gps_error(0)
+    scale[b] = math.exp(-dt_s / base.time_s)
+    variances, times = (base.variance_m2, machine.variance_m2), (base.time_s, machine.time_s)
+    Q[b, b] = np.eye(2) * (base.variance_m2 * -math.expm1(-2 * dt_s / base.time_s))
+    most = 0.99 * 2 * math.sqrt(times[0] * times[1]) / sum(times)
+    both = min(base.share, most) * math.sqrt(variances[0] * variances[1])
+    both *= -math.expm1(-dt_s * (1 / times[0] + 1 / times[1]))
+    Q[b, e] = Q[e, b] = np.eye(2) * both
 
 
 def map_from_base(attitude: Floats) -> Floats:
@@ -244,6 +267,7 @@ def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats, tuple
     deviation[layout.gyro_biases] = GYRO_BIAS_WALK
     deviation[layout.wheel_scales] = WHEEL_SCALE_WALK
     deviation[layout.heading_errors] = HEADING_WALK
+    deviation[layout.base_offset] = BASE_OFFSET_WALK
     walks = np.diag(deviation**2)
     for shared in (keep, walks):
         shared.setflags(write=False)

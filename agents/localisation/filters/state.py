@@ -33,6 +33,7 @@ class Layout:
     wheel_scale: bool = False
     receivers: int = 0
     references: int = 0
+    corrected: bool = False
 
     def __post_init__(self) -> None:
         if min(self.imus, self.receivers, self.references) < 0:
@@ -41,7 +42,7 @@ class Layout:
     @property
     def n(self) -> int:
         """Number of states."""
-        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references
+        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references + 4 * self.corrected
 
     @property
     def gyro_biases(self) -> slice:
@@ -63,7 +64,19 @@ class Layout:
     @property
     def heading_errors(self) -> slice:
         """One per reference [rad]."""
-        return slice(self.gps_errors.stop, self.n)
+        first = self.gps_errors.stop
+        return slice(first, first + self.references)
+
+    @property
+    def base_error(self) -> slice:
+        """Slow error of the base station: east, north [m]."""
+        first = self.heading_errors.stop
+        return slice(first, first + 2 * self.corrected)
+
+    @property
+    def base_offset(self) -> slice:
+        """What the base is off for good: east, north [m]."""
+        return slice(self.base_error.stop, self.n)
 
     def gyro_bias(self, imu: int) -> int:
         """State of the bias of one yaw gyro."""
