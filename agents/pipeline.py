@@ -13,7 +13,7 @@ import numpy as np
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
-from agents.localisation.filters.belief import PoseBelief
+from agents.localisation.filters.belief import DivergedError, PoseBelief
 from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
@@ -90,11 +90,21 @@ class Positioning:
         if decision is Decision.REFUSE:
             return None
         if decision is Decision.RESTART:
-            self._counters.update(self.localiser.counters)
-            self._start()
+            self._restart()
         self.dead_reckoning.update(reading, sensor)
-        poses = self.localiser.update(reading, sensor, self.dead_reckoning)
-        return Accepted(reading, sensor, poses, decision is Decision.RESTART)
+        try:
+            poses, restarts = self.localiser.update(reading, sensor, self.dead_reckoning), decision is Decision.RESTART
+        except DivergedError:
+            self._counters["filter_restarts"] += 1
+            self._config = replace(self._config, start=())  # a start that was configured is far behind by now
+            self._restart()
+            poses, restarts = [], True
+        return Accepted(reading, sensor, poses, restarts)
+
+    def _restart(self) -> None:
+        """Start again, and keep the counts."""
+        self._counters.update(self.localiser.counters)
+        self._start()
 
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""

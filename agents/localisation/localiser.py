@@ -26,7 +26,7 @@ from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
-ENGINES: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
+FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
 
 
@@ -34,10 +34,10 @@ PROFILES = ("default", "paper")
 class LocalisationConfig:
     """How positions are found.
 
-    filter: ekf or ukf. profile: "paper" takes GPS errors as white; "default" estimates a slow error of each receiver, a
-    bias of each yaw gyro and the wheels' scale. start: x, y [m] and heading [rad] in `map`, where they are known: no
-    alignment is needed then, nor GPS. slip, slip_soft: wheel slip per traction on firm ground, and how much it rises
-    with the rolling resistance; of the tyres.
+    filter: ekf or ukf. profile: "paper" takes GPS errors as white, and runs filterpy's filters (extra `paper`);
+    "default" estimates a slow error of each receiver, a bias of each yaw gyro and the wheels' scale, with our own.
+    start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. slip,
+    slip_soft: wheel slip per traction on firm ground, and how much it rises with the rolling resistance; of the tyres.
     """
 
     filter: str = "ukf"
@@ -47,8 +47,8 @@ class LocalisationConfig:
     slip_soft: float = 0.9
 
     def __post_init__(self) -> None:
-        if self.filter not in ENGINES:
-            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(ENGINES)}")
+        if self.filter not in FILTERS:
+            raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(FILTERS)}")
         if self.profile not in PROFILES:
             raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
         if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
@@ -64,6 +64,7 @@ class Localiser:
         self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, step_s: float = STEP_S
     ) -> None:
         self._config = config
+        self._engine = _engine(config)
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
@@ -181,7 +182,7 @@ class Localiser:
     def _start(self, alignment: Alignment) -> list[Belief]:
         first, layout = self._steps[0], self._model.layout
         belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
-        self._fusion = Fusion(ENGINES[self._config.filter], self._model, belief)
+        self._fusion = Fusion(self._engine, self._model, belief)
         beliefs = [belief]
         events: list[FilterStep | Fix] = [*list(self._steps)[1:], *self._fixes]
         for event in sorted(events, key=lambda e: e.stamp_ns):
@@ -189,6 +190,15 @@ class Localiser:
         self._steps.clear()
         self._fixes.clear()
         return beliefs
+
+
+def _engine(config: LocalisationConfig) -> Filter:
+    """Our own filter, or the textbook's, which is imported for the profile that needs it alone."""
+    if config.profile != "paper":
+        return FILTERS[config.filter]
+    from agents.localisation.filters.textbook import TextbookEkf, TextbookUkf
+
+    return TextbookEkf() if config.filter == "ekf" else TextbookUkf()
 
 
 def _layout_of(machine: MachineConfig) -> Layout:

@@ -25,7 +25,21 @@ def test_it_is_never_uploaded_and_has_its_extras(root: Path):
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
     assert "Private :: Do Not Upload" in project["classifiers"]
     assert set(project["optional-dependencies"]) == {
-        *("agent", "archive", "server", "sim", "eval", "web", "export", "ros", "bench", "security", "all", "dev")
+        *(
+            "agent",
+            "archive",
+            "server",
+            "sim",
+            "eval",
+            "web",
+            "export",
+            "ros",
+            "bench",
+            "paper",
+            "security",
+            "all",
+            "dev",
+        )
     }
     base = {requirement.split(">")[0] for requirement in project["dependencies"]}
     assert base == {"eclipse-zenoh", "msgpack", "numpy"}

@@ -92,8 +92,12 @@ class PoseBelief:
     covariance_m2: Floats
 
 
+class DivergedError(ArithmeticError):
+    """What a filter computed is no covariance: nothing is left to go on with but a new start."""
+
+
 class Filter(Protocol):
-    """An EKF or UKF: pure steps, equal to use."""
+    """An EKF or UKF: pure steps, equal to use. One that does not repair its covariance raises DivergedError."""
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
         """Move the belief through a motion, to its new stamp."""

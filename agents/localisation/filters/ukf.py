@@ -1,8 +1,7 @@
 """The unscented Kalman filter, all sigma points at once, in a form whose covariance cannot go negative.
 
-Each step draws its own sigma points. filterpy is the reference in the tests, which find the same steps; it is not run
-here: with filterpy 2.0 several `update()` after one `predict()` reuse stale sigma points, and its covariance can go
-negative. x, P = L L^T: belief, L_i: column of the factor, Q, R: noise.
+Each step draws its own sigma points. filterpy's filter (`textbook.py`), whose covariance can go negative, takes the
+same steps to 1e-9. x, P = L L^T: belief, L_i: column of the factor, Q, R: noise.
 
 The scaled unscented transform (van der Merwe 2004) takes a function g at x and at the sigma points x +- gamma L_i, with
 gamma^2 = alpha^2 (n + kappa). Put into the usual sums, the weights (W = 1 / (2 gamma^2), and large ones of either sign

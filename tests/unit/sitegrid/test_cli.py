@@ -75,6 +75,7 @@ def test_errors_are_one_line_or_json(monkeypatch, capsys):
     ("command", "words", "missing", "extras"),
     [
         ("agent", ["--spool", "x.db"], "scipy.linalg", "agent"),
+        ("agent", ["--spool", "x.db"], "filterpy.kalman", "agent,paper"),
         ("demo", ["--out", "x"], "pybullet", "agent,server,sim,web"),
         ("eval", ["physics"], "pybullet", "eval"),
         ("keys", ["list"], "cryptography", "security"),

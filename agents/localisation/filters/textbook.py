@@ -1,0 +1,135 @@
+"""The filters of the profile `paper`: filterpy's own UnscentedKalmanFilter and ExtendedKalmanFilter.
+
+The paper's method runs on the field's textbook library, as its readers would build it; the square-root filters beside
+it (`ekf.py`, `ukf.py`) are those of the profile `default`. The sums are filterpy's; what it leaves to its users is
+added: models, wrapped angles, gates, and sigma points drawn again before each measurement, since its `update` reuses
+those of `predict`. The models answer for all sigma points at once, not point after point.
+
+With the paper's lambda = 3 - n the weight of the central point is negative, and P - K S K^T is a difference: what comes
+out may be no covariance. Then nothing is left to go on with, and `DivergedError` says so.
+"""
+
+import math
+from functools import lru_cache, partial
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+from agents.localisation.filters.belief import Belief, Conditioned, DivergedError, Measurement, Model, Motion
+from agents.localisation.filters.square_root import noise_root, refused, wrapped, wrapped_state
+from protocol.arrays import Floats
+
+ALPHA, BETA = 1.0, 1.0  # with kappa = 3 - n the paper's lambda, and the weights of `Ukf`
+
+
+class _Extended(ExtendedKalmanFilter):  # type: ignore[misc]
+    """With a motion that is not linear: filterpy asks for this method to be replaced then."""
+
+    x: Floats
+    f: Model
+
+    def predict_x(self, u: object = 0) -> None:  # noqa: ARG002 - nothing controls the machine here
+        self.x = self.f(self.x[None])[0]
+
+
+class _Unscented(UnscentedKalmanFilter):  # type: ignore[misc]
+    """With a motion of all sigma points at once."""
+
+    f: Model
+
+    def compute_process_sigmas(self, dt: float, fx: object = None, **_: object) -> None:  # noqa: ARG002
+        self.sigmas_f = self.f(self.points_fn.sigma_points(self.x, self.P))
+
+
+class TextbookEkf:
+    """filterpy's ExtendedKalmanFilter."""
+
+    def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
+        """Move the belief: x <- f(x), P <- F P F^T + Q."""
+        stock = _Extended(len(belief.x), 1)
+        stock.x, stock.P, stock.Q, stock.F, stock.f = belief.x, belief.P, motion.Q, motion.jacobian(belief.x), motion.f
+        stock.predict()
+        return _believed(stamp_ns, wrapped_state(stock.x, motion.angles), stock.P)
+
+    def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
+        """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
+        if not _is_usable(measurement):
+            return refused(belief, measurement)
+        stock = ExtendedKalmanFilter(len(belief.x), len(measurement.z))
+        stock.x, stock.P = belief.x, belief.P
+        residual = partial(_difference, angles=measurement.angles)
+        hx = lambda x: measurement.h(x[None])[0]  # noqa: E731
+        try:
+            stock.update(measurement.z, measurement.jacobian, hx, R=measurement.R, residual=residual)
+        except ValueError:  # LinAlgError is one
+            raise DivergedError("the innovation covariance is singular") from None
+        return _concluded(belief, measurement, stock)
+
+
+class TextbookUkf:
+    """filterpy's UnscentedKalmanFilter with van der Merwe's scaled sigma points."""
+
+    def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
+        """Move the belief through the motion."""
+        n = len(belief.x)
+        stock = _Unscented(n, 1, 0.0, None, None, _sigma_points(n))
+        stock.x, stock.P, stock.Q, stock.f = belief.x, belief.P, motion.Q, motion.f
+        try:
+            stock.predict()  # it draws points of the prediction too
+        except ValueError:  # LinAlgError is one
+            raise DivergedError("the covariance is not positive definite") from None
+        return _believed(stamp_ns, wrapped_state(stock.x, motion.angles), stock.P)
+
+    def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
+        """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
+        if not _is_usable(measurement):
+            return refused(belief, measurement)
+        n, angles, points = len(belief.x), measurement.angles, _sigma_points(len(belief.x))
+        circular = {"z_mean_fn": partial(_mean, angles=angles), "residual_z": partial(_difference, angles=angles)}
+        stock = UnscentedKalmanFilter(n, len(measurement.z), 0.0, None, None, points, **(circular if angles else {}))
+        stock.x, stock.P = belief.x, belief.P
+        try:
+            stock.sigmas_f = points.sigma_points(stock.x, stock.P)
+            seen = iter(measurement.h(stock.sigmas_f))
+            stock.update(measurement.z, R=measurement.R, hx=lambda _: next(seen))
+        except ValueError:  # LinAlgError is one
+            raise DivergedError("the covariance is not positive definite") from None
+        return _concluded(belief, measurement, stock)
+
+
+@lru_cache
+def _sigma_points(n: int) -> MerweScaledSigmaPoints:
+    return MerweScaledSigmaPoints(n, ALPHA, BETA, 3.0 - n)
+
+
+def _is_usable(measurement: Measurement) -> bool:
+    return bool(np.isfinite(measurement.z).all()) and noise_root(measurement) is not None
+
+
+def _difference(a: Floats, b: Floats, angles: tuple[int, ...]) -> Floats:
+    return wrapped(a - b, angles)
+
+
+def _mean(points: Floats, weights: Floats, angles: tuple[int, ...]) -> Floats:
+    """Mean (k,) of points (m, k), whose deviations from the central one are wrapped where they are angles."""
+    mean: Floats = points[0] + weights.dot(wrapped(points - points[0], angles))
+    return mean
+
+
+def _believed(stamp_ns: int, x: Floats, P: Floats) -> Belief:
+    """What came out, where it is a mean and may be a covariance; whether it is definite shows when it is factored."""
+    if not (math.isfinite(x.dot(x)) and np.isfinite(P).all() and P.diagonal().min() > 0):
+        raise DivergedError("a variance is not positive")
+    return Belief(stamp_ns, x, P)
+
+
+def _concluded(
+    belief: Belief, measurement: Measurement, stock: ExtendedKalmanFilter | UnscentedKalmanFilter
+) -> Conditioned:
+    """What a filter made of a measurement, unless it is beyond its gate."""
+    nis = float(stock.y.dot(stock.SI).dot(stock.y))
+    if not math.isfinite(nis) or nis < 0:
+        raise DivergedError("the innovation covariance is not positive definite")
+    if 0 < measurement.gate_sigma**2 < nis:
+        return Conditioned(belief, stock.y, stock.S, nis, accepted=False)
+    return Conditioned(_believed(belief.stamp_ns, stock.x, stock.P), stock.y, stock.S, nis, accepted=True)
