@@ -11,7 +11,7 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.config import from_table
 from protocol.errors import ConfigError
-from protocol.machine.readings import KINDS
+from protocol.machine.readings import KINDS, Correction
 from protocol.rotations import matrix_from_rpy
 from protocol.site.site_config import NAME
 
@@ -150,6 +150,9 @@ class MachineConfig:
         names = [s.name for s in self.sensors]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise ValueError(f"sensors: two are named {twice[0]!r}")
+        bases = [s.name for s in self.sensors if s.kind == Correction.kind and s.use]
+        if len(bases) > 1:
+            raise ValueError(f"sensors: a machine uses one base station, not {' and '.join(bases)}: `use = false`")
 
     def sensor(self, name: str) -> SensorConfig | None:
         """The sensor of that name."""
