@@ -154,6 +154,11 @@ class MachineConfig:
         if len(bases) > 1:
             raise ValueError(f"sensors: a machine uses one base station, not {' and '.join(bases)}: `use = false`")
 
+    @property
+    def base(self) -> SensorConfig | None:
+        """The base station whose corrections it uses."""
+        return next((s for s in self.sensors if s.kind == Correction.kind and s.use), None)
+
     def sensor(self, name: str) -> SensorConfig | None:
         """The sensor of that name."""
         return next((s for s in self.sensors if s.name == name), None)
