@@ -169,7 +169,9 @@ class BaseStation:
         if not float(np.abs(off_m).max()) < FAR_M:
             self.counters["fix_far_off"] += 1
             return None
-        stated_m2 = sensor.std["position"] ** 2 if "position" in sensor.std else (reading.var_e_m2 + reading.var_n_m2) / 2
+        stated_m2 = (
+            sensor.std["position"] ** 2 if "position" in sensor.std else (reading.var_e_m2 + reading.var_n_m2) / 2
+        )
         least_m2 = MIN_DRIFT_M2 if "position" in sensor.std else MIN_FIX_STD_M**2
         white_m2 = max((1 - sensor.drift_share) * stated_m2, least_m2)
         return _Fix(reading.stamp_ns, off_m, white_m2, max(sensor.drift_share * stated_m2, MIN_DRIFT_M2))

@@ -18,6 +18,7 @@ from sim.operators.course import APART_M, Start, build_course, crew_of, spread_s
 from sim.operators.driver import DRIVER_STEPS, LOOK_OUT_STEPS, at_start, drive, look_out, no_commands
 from sim.scenario.ground import build_terrain, with_zone
 from sim.scenario.tables import Scenario
+from sim.sensors.base_receiver import BaseReceiver
 from sim.sensors.rigs import draw_bodies
 from sim.sensors.sensors import FleetReadings, Sensors
 from sim.state import STEP_S, FleetState, stack
@@ -62,7 +63,14 @@ class Simulator:
         for machine, start in enumerate(starts):
             if start.payload_kg:
                 self._world.set_payload(machine, start.payload_kg)
-        self._sensors = Sensors(rigs, self.scenario.seed, Projection(self.site))
+        projection, seed = Projection(self.site), self.scenario.seed
+        self._sensors = Sensors(rigs, seed, projection)
+        self._bases = {
+            base.name: BaseReceiver(
+                (*base.place_m, base.height_m), self.scenario.preset(base.preset).gps, len(rigs) + i, seed, projection
+            )
+            for i, base in enumerate(self.scenario.base_station)
+        }
         self._steps = 0
         self._tracks: list[Table] = []
         self.former_truth_maps: list[tuple[float, TruthMap]] = []
@@ -79,14 +87,22 @@ class Simulator:
         return -int(-seconds * 1000 // self._bundle_ms) if seconds else None
 
     @property
+    def participants(self) -> list[str]:
+        """Names of all that have sensors: machines, then base stations."""
+        return [*(machine.name for machine in self.machines), *self._bases]
+
+    @property
     def state(self) -> FleetState:
         """True state of all machines."""
         return self._world.state
 
     def advance(self) -> dict[str, list[Reading]]:
-        """Simulate the span of one bundle; returns the readings of each machine in the order of their stamps."""
-        span = self.sense()
-        return {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
+        """Simulate the span of one bundle; returns readings by machine or base station, in the order of their stamps."""
+        span, first = self.sense(), self._steps - self._bundle_ms // STEP_MS + 1
+        readings = {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
+        steps = np.arange(first, self._steps + 1)
+        bases = {name: base.sample(steps, START_NS + steps * STEP_NS) for name, base in self._bases.items()}
+        return readings | bases
 
     def sense(self) -> FleetReadings:
         """Simulate the span of one bundle; returns the readings of all machines as columns."""

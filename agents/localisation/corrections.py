@@ -103,7 +103,9 @@ class Corrections:
         if not self._begun:
             offset = np.array([c.offset_e_m, c.offset_n_m])
             change = partial(_begin, layout=self._layout, share=self._share.share, machine=machine, c=c, offset=offset)
-        return measurements.correction(belief.stamp_ns, self._base.name, _error_m(c), R, fade, self._layout, self._base.gate(GATE_SIGMA), change)
+        return measurements.correction(
+            belief.stamp_ns, self._base.name, _error_m(c), R, fade, self._layout, self._base.gate(GATE_SIGMA), change
+        )
 
     def confirm(self, result: Conditioned, stamp_ns: int) -> None:
         self._begun = True

@@ -19,7 +19,7 @@ from evaluation.campaign.figures import root_mean_square
 from evaluation.campaign.truth import Truth
 from evaluation.positions.consistency import normalised_square, summarise
 from protocol.arrays import Floats, Ints
-from protocol.machine.readings import Reading
+from protocol.machine.readings import Correction, Reading
 
 STEP_NS = 100_000_000
 
@@ -123,12 +123,15 @@ def score(trace: Trace, truth: Truth) -> Score:
 
 
 def _spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:
-    """Cut readings at the multiples of STEP_NS."""
+    """Cut readings at the multiples of STEP_NS; corrections, whose stamps are another's, go with the reading before."""
     span: list[Reading] = []
+    number = 0
     for reading in readings:
-        if span and reading.stamp_ns // STEP_NS != span[0].stamp_ns // STEP_NS:
-            yield span
-            span = []
+        if not isinstance(reading, Correction):
+            if span and reading.stamp_ns // STEP_NS != number:
+                yield span
+                span = []
+            number = reading.stamp_ns // STEP_NS
         span.append(reading)
     if span:
         yield span

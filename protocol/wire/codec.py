@@ -283,7 +283,9 @@ def decode_correction(data: bytes, frame: str) -> SiteCorrection:
     table = unpack(data, MAX_SMALL_BYTES)
     base, stamp_ns, of_base = _take_name(table, "base"), _take_stamp(table), take(table, "frame", str)
     if of_base != frame:
-        problem = f"corrections of {base} are in frame {of_base[:40]!r}, this site's is {frame!r}: compare the site files"
+        problem = (
+            f"corrections of {base} are in frame {of_base[:40]!r}, this site's is {frame!r}: compare the site files"
+        )
         raise MessageError(Refusal.WRONG_FRAME, problem, field="frame")
     values = tuple(take(table, name, float) for name in columns(Correction.kind))
     correction = parse_reading(Correction.kind, base, stamp_ns, values)

@@ -104,9 +104,7 @@ BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
 LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60, store=STORE)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
-CORRECTION = SiteCorrection(
-    "0123abcd", Correction("base-1", T0, 1.25, -0.5, 0.25, 1.5, 45.0, 0.125, -0.0625, 0.0625)
-)
+CORRECTION = SiteCorrection("0123abcd", Correction("base-1", T0, 1.25, -0.5, 0.25, 1.5, 45.0, 0.125, -0.0625, 0.0625))
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
 POINT = records.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, VERSION, T0)
 SPANS = (
