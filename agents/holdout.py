@@ -1,4 +1,7 @@
-"""Fixes that are withheld from the filter and compared with its poses: an honest error on real logs."""
+"""Fixes that are withheld from the filter and compared with its poses: an honest error on real logs.
+
+A receiver that is away has no velocity either, so that is withheld with the fixes.
+"""
 
 import math
 from collections import deque
@@ -9,7 +12,7 @@ import numpy as np
 
 from agents.pipeline import PoseSource
 from protocol.machine.machine_config import MachineConfig
-from protocol.machine.readings import Gps, Reading
+from protocol.machine.readings import Gps, GpsVelocity, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 SETTLE_S = 40.0  # fixes are judged from so long after the first reading on: by then a machine that drives is aligned
@@ -35,7 +38,7 @@ class Holdout:
     ) -> None:
         self._config, self._settle_s = config, settle_s
         self._projection = Projection(site)
-        self._levers = {s.name: s.mount.xyz_m for s in machine.sensors}
+        self._sensors = {s.name: s for s in machine.sensors}
         self._first_ns = 0
         self._waiting: deque[Gps] = deque()
         self._errors_m: list[float] = []
@@ -47,11 +50,12 @@ class Holdout:
     def compare(self, pipeline: PoseSource) -> None:
         """Compare withheld fixes with the poses that are known by now."""
         pose = pipeline.pose
-        while pose and self._waiting and self._waiting[0].stamp_ns <= pose.stamp_ns:
+        while pose and self._waiting and self._true_ns(self._waiting[0]) <= pose.stamp_ns:
             fix = self._waiting.popleft()
-            if (at := pipeline.pose_at(fix.stamp_ns)) and self._seconds(fix) >= self._settle_s:
+            if (at := pipeline.pose_at(self._true_ns(fix))) and self._seconds(fix) >= self._settle_s:
                 x, y, _ = self._projection.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
-                lever, c, s = self._levers[fix.sensor], math.cos(at.heading_rad), math.sin(at.heading_rad)
+                lever = self._sensors[fix.sensor].mount.xyz_m
+                c, s = math.cos(at.heading_rad), math.sin(at.heading_rad)
                 dx = at.x_m + c * lever[0] - s * lever[1] - x
                 dy = at.y_m + s * lever[0] + c * lever[1] - y
                 self._errors_m.append(math.hypot(dx, dy))
@@ -71,12 +75,16 @@ class Holdout:
 
     def _is_withheld(self, reading: Reading) -> bool:
         self._first_ns = self._first_ns or reading.stamp_ns
-        if not isinstance(reading, Gps) or reading.sensor not in self._levers:
+        if not isinstance(reading, Gps | GpsVelocity) or reading.sensor not in self._sensors:
             return False
         if self._seconds(reading) % self._config.period_s >= self._config.off_s:
             return False
-        self._waiting.append(reading)
+        if isinstance(reading, Gps):
+            self._waiting.append(reading)
         return True
+
+    def _true_ns(self, fix: Gps) -> int:
+        return self._sensors[fix.sensor].true_ns(fix.stamp_ns)
 
     def _seconds(self, reading: Reading) -> float:
         return (reading.stamp_ns - self._first_ns) * 1e-9

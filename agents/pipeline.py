@@ -14,6 +14,7 @@ from agents.dead_reckoning import DeadReckoning
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimator
 from agents.localisation.filters.belief import DivergedError, PoseBelief
+from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
@@ -35,12 +36,14 @@ class PipelineConfig:
 class Accepted(NamedTuple):
     """A reading that counts, at the stamp of what it measured; a tuple, as there are hundreds a second.
 
-    poses: what it made possible or changed, oldest first. restarts: nothing before it counts any more.
+    poses: what it made possible or changed, oldest first. smoothed: past poses that became final with it, oldest first.
+    restarts: nothing before it counts any more; then smoothed are all that remained.
     """
 
     reading: Reading
     sensor: SensorConfig
     poses: list[PoseBelief]
+    smoothed: list[SmoothedPose]
     restarts: bool
 
 
@@ -69,12 +72,19 @@ class Positioning:
         """What was used and refused, before restarts too."""
         return self._counters + self._order.counters + self.localiser.counters
 
-    def step(self, readings: Sequence[Reading]) -> None:
-        """Take in readings in the order of their stamps."""
+    def step(self, readings: Sequence[Reading]) -> list[SmoothedPose]:
+        """Take in readings in the order of their stamps; returns the smoothed poses that became final."""
+        smoothed: list[SmoothedPose] = []
         for reading in readings:
             if accepted := self.accept(reading):
+                smoothed += accepted.smoothed
                 for pose in accepted.poses:
                     self.poses.append(pose)
+        return smoothed
+
+    def remaining(self) -> list[SmoothedPose]:
+        """Smoothed poses that are not final, as known by now: the last words on them where the stream ends."""
+        return self.localiser.remaining()
 
     def accept(self, reading: Reading) -> Accepted | None:
         """Take in one reading; None where it is refused. The caller appends its poses to `poses`, one by one."""
@@ -85,26 +95,28 @@ class Positioning:
         if isinstance(reading, Correction):
             return Accepted(reading, sensor, self.localiser.update(reading, sensor, self.dead_reckoning), False)
         if sensor.delay_s:
-            reading = replace(reading, stamp_ns=reading.stamp_ns - round(sensor.delay_s * 1e9))
+            reading = replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns))
         decision = self._order.decide(reading)
         if decision is Decision.REFUSE:
             return None
-        if decision is Decision.RESTART:
-            self._restart()
+        restarts = decision is Decision.RESTART
+        smoothed = self._restart() if restarts else []
         self.dead_reckoning.update(reading, sensor)
         try:
-            poses, restarts = self.localiser.update(reading, sensor, self.dead_reckoning), decision is Decision.RESTART
+            poses = self.localiser.update(reading, sensor, self.dead_reckoning)
         except DivergedError:
             self._counters["filter_restarts"] += 1
             self._config = replace(self._config, start=())  # a start that was configured is far behind by now
-            self._restart()
+            smoothed += self._restart()
             poses, restarts = [], True
-        return Accepted(reading, sensor, poses, restarts)
+        return Accepted(reading, sensor, poses, smoothed + self.localiser.take_smoothed(), restarts)
 
-    def _restart(self) -> None:
-        """Start again, and keep the counts."""
+    def _restart(self) -> list[SmoothedPose]:
+        """Start again, and keep the counts; returns the smoothed poses that remained."""
         self._counters.update(self.localiser.counters)
+        smoothed = self.localiser.take_smoothed() + self.remaining()
         self._start()
+        return smoothed
 
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""
@@ -172,7 +184,7 @@ class Pipeline:
         accepted = self._positioning.accept(reading)
         if accepted is None:
             return []
-        reading, sensor, poses, restarts = accepted
+        reading, sensor, poses, _, restarts = accepted
         made: list[Table] = []
         if restarts:
             made.append(self.finish())

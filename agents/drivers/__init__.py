@@ -7,7 +7,7 @@ from protocol.machine.readings import Reading
 
 
 class Driver(Protocol):
-    """A source of readings in the order of their stamps."""
+    """A source of readings in the order in which a machine has them: mostly that of their stamps."""
 
     def read(self, timeout_s: float) -> Sequence[Reading] | None:
         """Readings that have come in, none if nothing came within timeout_s, None once the stream has ended."""

@@ -1,13 +1,13 @@
-"""Corrections of a base station: which count, and what the filter makes of them.
+"""Corrections of a base station: which of them count, and what the filter makes of them.
 
-A base stands at a known place, so that what its fixes are off is its GPS error alone. Part of that error is the
-machine's too. The filter has states for the base's slow error b and for the lasting part d, as of a wrong survey:
+A base stands at a known place, so that what its fixes are off is its GPS error alone, and a part of that is the machine's
+too. The filter has states for the base's slow error b and for the part of it that lasts, d, as of a wrong survey:
 
     correction = b + d + white noise
 
-and the noise of b is correlated with that of the machine's error, by the share that `site_share` finds. So nothing has
-to be switched: where the two have nothing in common, b is of no use and does no harm; a base that falls silent is
-forgotten as its error fades; and when it jumps, its corrections are refused until d has been opened.
+The noise of b is correlated with that of the machine's error, by the share that `site_share` finds. So nothing has to be
+switched: a base that has nothing in common with the machine is of no use and does no harm, one that falls silent is
+forgotten as its error fades, and corrections of one that jumps are refused until d has been opened for them.
 """
 
 import math
@@ -19,141 +19,156 @@ from typing import Any
 import numpy as np
 
 from agents.localisation import measurements
-from agents.localisation.filters.belief import Belief, Conditioned, Measurement
+from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, reset_states
 from agents.localisation.filters.motion import BaseError, GpsError
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.gps import Fix
 from agents.localisation.imu_steps import FilterStep
-from agents.localisation.site_share import ShareEstimator
+from agents.localisation.site_share import SiteShareEstimator
 from protocol.arrays import Floats
 from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import Correction
 
-MAX_AGE_S = 30.0  # older ones are refused: a slow GPS error lasts about so long
-MAX_AHEAD_S = 10.0  # those of later stamps wait for the machine to come so far; beyond that, a clock is wrong
-REPEATS = 5  # the same error so often in a row is a receiver, or a base, that stands still
+MAX_AGE_S = 30.0  # older ones are refused: by then a slow GPS error has mostly become another one
+MAX_AHEAD_S = 10.0  # so far ahead of the machine's own readings they wait for these; beyond that a clock is wrong
+REPEATS = 5  # the same error so often in a row is no measurement any more
 GATE_SIGMA = 4.0  # as of fixes
-
-
-def base_of(sensors: Sequence[SensorConfig]) -> SensorConfig | None:
-    """The base station whose corrections a machine uses."""
-    return next((s for s in sensors if s.kind == Correction.kind and s.use), None)
+LEAST_SHARE = 0.05  # a smaller one is none
 
 
 class Corrections:
-    """The corrections of one base, on their way into one machine's filter."""
+    """The corrections of one base, on their path into one machine's filter; `counters` says what was refused, and why.
+
+    Until a correction is due it waits: the machine's own readings are the clock.
+    """
 
     def __init__(self, base: SensorConfig, layout: Layout) -> None:
         self.counters: Counter[str] = Counter()
         self._base, self._layout = base, layout
-        self._share = ShareEstimator()
+        self._share = SiteShareEstimator()
         self._waiting: list[Correction] = []
-        self._newest: Correction | None = None
+        self._newest: Correction | None = None  # of those that count
         self._repeats = 0
-        self._begun = False
-        self._used_ns = 0
-        self._track_m, self._turn, self._step = np.zeros(2), np.eye(2), None
+        self._why = "no correction has come in"
+        self._due_ns = 0  # stamp of the last that was due
+        self._offset_m: Floats | None = None  # what the base said of d at first: the state counts from there
+        self._accepted = False
+        self._step: FilterStep | None = None
+        self._track_m, self._map_from_reckoned = np.zeros(2), np.eye(2)
+
+    # --- readings ----------------------------------------------------------------------------------------------------
 
     def take(self, correction: Correction, now_ns: int) -> None:
-        """Keep a correction that is plausible, until it is due."""
-        if why := self._why_not(correction, now_ns):
-            self.counters[f"{self._base.name}_{why}"] += 1
+        """Keep a correction until it is due, if it counts; now_ns: the newest stamp of the machine's own readings."""
+        reason = self._reason_against(correction, now_ns)
+        self._newest = correction if reason in ("", "repeated") else self._newest
+        if reason:
+            self.counters[f"correction_{reason}"] += 1
+            self._why = f"the last one was {reason.replace('_', ' ')}"
             return
-        self._newest = correction
-        self._waiting.append(correction)
-        self._share.add_correction(
-            correction.stamp_ns, _error_m(correction), correction.white_m2, correction.slow_m2, correction.time_s
-        )
+        self._why = ""
+        ahead = [c for c in self._waiting if c.stamp_ns > now_ns]
+        self._waiting = [*ahead, correction]
 
-    def _why_not(self, correction: Correction, now_ns: int) -> str:
-        last = self._newest
+    def follow(self, step: FilterStep, belief: Belief) -> None:
+        """Follow dead reckoning in `map`, by the heading and the wheels' scale that are believed."""
+        if self._step is not None:
+            self._track_m = self._reckoned_m(step)
+            self._share.drive(abs(step.reckoned.travel_m - self._step.reckoned.travel_m))
+        angle = float(belief.x[YAW]) - step.reckoned.angle_rad
+        scale = 1 + float(belief.x[self._layout.wheel_scales].sum())
+        c, s = math.cos(angle) / scale, math.sin(angle) / scale
+        self._map_from_reckoned, self._step = np.array([[c, -s], [s, c]]), step
+
+    def compare(self, fix: Fix, belief: Belief, white_m2: float, error: GpsError) -> None:
+        """Compare a fix with dead reckoning; white_m2, error: its white noise, and the receiver's slow error."""
+        if self._step is None or not fix.is_absolute:
+            return
+        yaw, (ahead, left, _) = float(belief.x[YAW]), fix.sensor.mount.xyz_m
+        c, s = math.cos(yaw), math.sin(yaw)
+        antenna = np.array([c * ahead - s * left, s * ahead + c * left])
+        off_m = fix.position_m - antenna - self._reckoned_m(fix)
+        self._share.add_fix(fix.sensor.name, belief.stamp_ns, off_m, white_m2, error)
+
+    # --- the filter --------------------------------------------------------------------------------------------------
+
+    @property
+    def error(self) -> BaseError | None:
+        """The slow error of the base; None while nothing is known of it."""
+        newest = self._newest
+        return BaseError(newest.slow_m2, newest.time_s, round(self._share.share, 2)) if newest else None
+
+    def measurement(self, belief: Belief) -> Measurement | None:
+        """The newest correction that is due, as a measurement at the belief's stamp; None where none is.
+
+        With the base's b of now, one of age t is exp(-t / tau) b + d, and what b did since is noise, which corrections
+        of the same time have in common.
+        """
+        due = [c for c in self._waiting if c.stamp_ns <= belief.stamp_ns]
+        if not due:
+            return None
+        self._waiting = [c for c in self._waiting if c.stamp_ns > belief.stamp_ns]
+        newest = max(due, key=lambda c: c.stamp_ns)
+        between_ns, self._due_ns = newest.stamp_ns - self._due_ns, newest.stamp_ns
+        age_s = (belief.stamp_ns - newest.stamp_ns) * 1e-9
+        fade = math.exp(-age_s / newest.time_s)
+        alike = max(1.0, age_s / (between_ns * 1e-9))
+        variance_m2 = newest.white_m2 + newest.slow_m2 * (1 - fade**2) * alike
+        off_m = np.array([newest.east_m, newest.north_m])
+        self._share.add_correction(belief.stamp_ns, off_m, newest)
+        change = None if self._accepted else self._begin(newest)
+        z, R, gate = off_m - self._offset_m, np.eye(2) * variance_m2, self._base.gate(GATE_SIGMA)
+        return measurements.correction(belief.stamp_ns, self._base.name, z, R, fade, self._layout, gate, change)
+
+    def confirm(self, result: Conditioned) -> None:
+        """Note what the filter made of a correction."""
+        self._accepted |= result.accepted
+        self._why = "" if result.accepted else "the filter refuses them: the base jumped, or was moved"
+
+    def report(self, now_ns: int) -> dict[str, Any]:
+        """Whether corrections are used, how old the last one is, and why they are not, in plain values."""
+        newest, share = self._newest, self._share.share
+        age_s = (now_ns - newest.stamp_ns) * 1e-9 if newest else None
+        why = self._why
+        if age_s is not None and age_s > MAX_AGE_S:
+            why = f"the last one is {age_s:.0f} s old"
+        elif not why and not self._accepted:
+            why = "the machine does not know its heading yet"
+        elif not why and share < LEAST_SHARE:
+            why = "its errors are not those of this machine"
+        return {
+            "name": self._base.name,
+            "used": not why,
+            "why_not": why,
+            "age_s": None if age_s is None else round(age_s, 1),
+            "share": round(share, 2),
+        }
+
+    def _reason_against(self, correction: Correction, now_ns: int) -> str:
+        """Why a correction does not count; nothing if it does."""
+        last, age_s = self._newest, (now_ns - correction.stamp_ns) * 1e-9
         if last and correction.stamp_ns <= last.stamp_ns:
             return "not_newer"
-        age_s = (now_ns - correction.stamp_ns) * 1e-9
         if age_s > MAX_AGE_S:
             return "too_old"
         if age_s < -MAX_AHEAD_S:
             return "in_future"
         same = last is not None and (last.east_m, last.north_m) == (correction.east_m, correction.north_m)
         self._repeats = self._repeats + 1 if same else 0
-        if self._repeats >= REPEATS:
-            self._newest = correction
-            return "repeated"
-        return ""
+        return "repeated" if self._repeats >= REPEATS else ""
 
-    @property
-    def error(self) -> BaseError | None:
-        newest = self._newest
-        if newest is None:
-            return None
-        return BaseError(newest.slow_m2, newest.time_s, self._share.share)
+    def _begin(self, first: Correction) -> Change:
+        """What gives b and d their first values."""
+        self._offset_m = np.array([first.offset_e_m, first.offset_n_m])
+        return partial(_begun, layout=self._layout, slow_m2=first.slow_m2, offset_m2=first.offset_m2)
 
-    def due(self, belief: Belief, machine: GpsError) -> Measurement | None:
-        """The newest correction that is not ahead of the belief, as a measurement at its stamp."""
-        ready = [c for c in self._waiting if c.stamp_ns <= belief.stamp_ns]
-        if not ready:
-            return None
-        self._waiting = [c for c in self._waiting if c.stamp_ns > belief.stamp_ns]
-        c = ready[-1]
-        age_s = (belief.stamp_ns - c.stamp_ns) * 1e-9
-        fade = math.exp(-age_s / c.time_s)
-        changed_m2 = c.slow_m2 * (1 - fade**2) * max(1.0, age_s * 5)
-        R = np.eye(2) * (c.white_m2 + changed_m2)
-        change = None
-        if not self._begun:
-            offset = np.array([c.offset_e_m, c.offset_n_m])
-            change = partial(_begin, layout=self._layout, share=self._share.share, machine=machine, c=c, offset=offset)
-        return measurements.correction(
-            belief.stamp_ns, self._base.name, _error_m(c), R, fade, self._layout, self._base.gate(GATE_SIGMA), change
-        )
-
-    def confirm(self, result: Conditioned, stamp_ns: int) -> None:
-        self._begun = True
-        if result.accepted:
-            self._used_ns = stamp_ns
-
-    def follow(self, step: FilterStep, belief: Belief) -> None:
-        """Follow dead reckoning in `map`, by the heading and wheel scale that are believed."""
-        if self._step is not None:
-            self._track_m = self._track_m + self._moved(step.reckoned)
-            self._share.drive(abs(step.reckoned.travel_m - self._step.reckoned.travel_m))
-        angle = float(belief.x[YAW]) - step.reckoned.angle_rad
-        scale = 1.0
-        if self._layout.wheel_scale:
-            scale = 1 / (1 + float(belief.x[self._layout.wheel_scales.start]))
-        c, s = math.cos(angle) * scale, math.sin(angle) * scale
-        self._turn, self._step = np.array([[c, -s], [s, c]]), step
-
-    def _moved(self, reckoned) -> Floats:
-        before = self._step.reckoned
-        return self._turn @ np.array([reckoned.x_m - before.x_m, reckoned.y_m - before.y_m])
-
-    def note(self, fix: Fix, belief: Belief, white_m2: float, slow: GpsError) -> None:
-        if self._step is None:
-            return
-        lever = fix.lever_m
-        yaw = float(belief.x[YAW])
-        c, s = math.cos(yaw), math.sin(yaw)
-        antenna = np.array([c * lever[0] - s * lever[1], s * lever[0] + c * lever[1]])
-        off = fix.position_m - antenna - self._track_m - self._moved(fix.reckoned)
-        self._share.add_fix(fix.stamp_ns, off, white_m2, slow.variance_m2, slow.time_s)
-
-    def report(self, now_ns: int) -> dict[str, Any]:
-        return {"share": self._share.share}
+    def _reckoned_m(self, event: FilterStep | Fix) -> Floats:
+        """Where the machine is by dead reckoning since the last step (2,)."""
+        assert self._step
+        before, now = self._step.reckoned, event.reckoned
+        moved: Floats = self._map_from_reckoned @ np.array([now.x_m - before.x_m, now.y_m - before.y_m])
+        return self._track_m + moved
 
 
-def _error_m(correction: Correction) -> Floats:
-    return np.array([correction.east_m, correction.north_m])
-
-
-def _begin(belief: Belief, layout: Layout, share: float, machine: GpsError, c: Correction, offset: Floats) -> Belief:
-    e, b, d = layout.gps_error(0), layout.base_error, layout.base_offset
-    k = share * math.sqrt(c.slow_m2 / machine.variance_m2)
-    M = np.eye(len(belief.x))
-    M[b], M[d] = 0.0, 0.0
-    M[b, e] = np.eye(2) * k
-    x, P = M @ belief.x, M @ belief.P @ M.T
-    x[d] = offset
-    P[b, b] += np.eye(2) * c.slow_m2 * (1 - share**2)
-    P[d, d] += np.eye(2) * c.offset_m2
-    return Belief(belief.stamp_ns, x, P)
+def _begun(belief: Belief, layout: Layout, slow_m2: float, offset_m2: float) -> Belief:
+    return reset_states(reset_states(belief, layout.base_error, slow_m2), layout.base_offset, offset_m2)

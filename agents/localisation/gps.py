@@ -15,10 +15,10 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation import measurements
 from agents.localisation.consistency import Consistency, InnovationMonitor
-from agents.localisation.filters.belief import Belief, Conditioned, Measurement
+from agents.localisation.filters.belief import Belief, Conditioned, Measurement, anchor_states, reset_states
 from agents.localisation.filters.motion import GpsError
 from agents.localisation.filters.state import Layout
-from agents.localisation.sensor_modes import ModalSensors, StampedValue, anchor_states, reset_states
+from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
 from protocol.machine.readings import Gps
@@ -89,6 +89,10 @@ class Receivers(ModalSensors[Fix]):
         stated = (gps.var_e_m2, gps.var_n_m2)
         variance = [sensor.std["position"] ** 2] * 2 if "position" in sensor.std else stated
         return Fix(gps.stamp_ns, sensor, np.array([x, y]), np.array(variance), reckoned)
+
+    def expected(self, fix: Fix) -> tuple[float, GpsError]:
+        """What a fix is off: variance of its white noise, per axis [m2], and the slow error of its receiver."""
+        return float(self._white(fix).mean()), GpsError(_drift_m2(fix), fix.sensor.drift_time_s)
 
     def anchor(self, fix: Fix, belief: Belief) -> None:
         """Shift the receiver so that this fix lies at the believed antenna."""

@@ -13,11 +13,11 @@ from functools import partial
 import numpy as np
 
 from agents.localisation import measurements
-from agents.localisation.filters.belief import Belief, Change, Measurement
+from agents.localisation.filters.belief import Belief, Change, Measurement, anchor_states
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.imu_steps import FilterStep
 from agents.localisation.measurements import GATE_SIGMA
-from agents.localisation.sensor_modes import ModalSensors, StampedValue, anchor_states
+from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, RELATIVE, SensorConfig
 

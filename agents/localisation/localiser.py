@@ -3,31 +3,36 @@
 import math
 from collections import Counter, deque
 from dataclasses import dataclass, replace
+from typing import Any
 
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
-from agents.localisation.corrections import Corrections, base_of
-from agents.localisation.filters.belief import Belief, Filter, PoseBelief
+from agents.localisation.corrections import Corrections
+from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
+from agents.localisation.filters.smoother import SmoothedPose, nothing_past
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, anchored_headings
 from agents.localisation.imu_steps import FilterStep, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
-from protocol.machine.readings import Correction, Gps, Reading
+from protocol.machine.readings import Correction, Gps, GpsVelocity, Reading
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
+Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
+MAX_LAG_S = 3600.0  # each second of it is a node to smooth
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,7 @@ class LocalisationConfig:
     "default" estimates a slow error of each receiver, a bias of each yaw gyro and the wheels' scale, with our own.
     start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. slip,
     slip_soft: wheel slip per traction on firm ground, and how much it rises with the rolling resistance; of the tyres.
+    lag_s: how long places of the past are smoothed by what comes after them, 0 for not at all; "paper" never smooths.
     """
 
     filter: str = "ukf"
@@ -45,6 +51,7 @@ class LocalisationConfig:
     start: tuple[float, ...] = ()
     slip: float = 0.1
     slip_soft: float = 0.9
+    lag_s: float = 90.0
 
     def __post_init__(self) -> None:
         if self.filter not in FILTERS:
@@ -53,8 +60,15 @@ class LocalisationConfig:
             raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
         if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
             raise ValueError("slip: must be from 0 to below 1, slip_soft not negative")
+        if not 0 <= self.lag_s <= MAX_LAG_S:
+            raise ValueError(f"lag_s: must be from 0 to {MAX_LAG_S:.0f} s")
         if len(self.start) not in (0, 3) or not all(map(math.isfinite, self.start)):
             raise ValueError("start: must be x, y and heading, or empty")
+
+    @property
+    def smoothing_s(self) -> float:
+        """The lag of the smoother; 0 for the profile `paper`, whose method has none."""
+        return self.lag_s if self.profile == "default" else 0.0
 
 
 class Localiser:
@@ -69,8 +83,7 @@ class Localiser:
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
         self._receivers = Receivers(machine.sensors, projection, layout, slow=augmented)
-        base = base_of(machine.sensors) if augmented and layout.corrected else None
-        self._corrections = Corrections(base, layout) if base else None
+        self._corrections = Corrections(machine.base, layout) if machine.base and layout.corrected else None
         self._references = References(machine.sensors, layout)
         self._body = MotionSensors(machine, layout, step_s, config.slip, config.slip_soft)
         source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
@@ -79,6 +92,7 @@ class Localiser:
         self._fusion: Fusion | None = None
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
+        self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
 
     @property
     def is_aligned(self) -> bool:
@@ -88,41 +102,59 @@ class Localiser:
     @property
     def counters(self) -> Counter[str]:
         """Measurements used and gated, readings refused."""
-        return self._body.counters + self._gatherer.counters + (self._fusion.counters if self._fusion else Counter())
+        of_parts = [part.counters for part in (self._fusion, self._corrections) if part]
+        return sum(of_parts, self._body.counters + self._gatherer.counters)
 
     @property
     def consistency(self) -> dict[str, Consistency]:
         """How consistent the filter is with each GPS receiver, of those with enough fixes."""
         return self._receivers.consistency
 
+    def base_report(self) -> dict[str, Any] | None:
+        """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
+        now_ns = self._fusion.belief.stamp_ns if self._fusion else 0
+        return self._corrections.report(now_ns) if self._corrections else None
+
     @property
     def belief(self) -> Belief | None:
         """The whole state, once it is known."""
         return self._fusion.belief if self._fusion else None
 
+    def take_smoothed(self) -> list[SmoothedPose]:
+        """Smoothed poses that became final since the last call, oldest first."""
+        return self._fusion.take_smoothed() if self._fusion else []
+
+    def remaining(self) -> list[SmoothedPose]:
+        """Smoothed poses within the lag, as known by now; the last is the newest belief's. They stay."""
+        return self._fusion.remaining() if self._fusion else []
+
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
         if isinstance(reading, Correction):
-            return self._correct(reading)
-        event: FilterStep | Fix | None = (
-            self._receivers.fix(reading, dead_reckoning.pose)
-            if isinstance(reading, Gps)
-            else self._gatherer.gather(reading, sensor, dead_reckoning)
-        )
+            if self._corrections and self._fusion:
+                self._corrections.take(reading, self._fusion.belief.stamp_ns)
+            return []
+        event: Event | None
+        if isinstance(reading, Gps):
+            event = self._receivers.fix(reading, dead_reckoning.pose)
+        elif isinstance(reading, GpsVelocity):
+            event = gps_velocity(reading, sensor)
+        else:
+            event = self._gatherer.gather(reading, sensor, dead_reckoning)
         if event is None:
             return []
         beliefs = self._filter(self._fusion, event) if self._fusion else self._collect(event, dead_reckoning.distance_m)
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
-    def _filter(self, fusion: Fusion, event: FilterStep | Fix) -> list[Belief]:
+    def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
         """Beliefs that an event changed."""
+        if isinstance(event, Measurement):
+            return fusion.add([event])
         if isinstance(event, Fix):
             beliefs = self._filter_modal(fusion, self._receivers, event)
-            if self._corrections and event.is_absolute:
-                error = self._receivers.errors[0]
-                white = float(self._receivers._white(event).mean())
-                self._corrections.note(event, fusion.belief, white, error)
-                beliefs += self._take_correction(fusion)
+            if self._corrections:
+                white_m2, error = self._receivers.expected(event)
+                self._corrections.compare(event, fusion.belief, white_m2, error)
             return beliefs
         fusion.model = replace(fusion.model, traction=event.traction)
         beliefs: list[Belief] = []
@@ -137,22 +169,17 @@ class Localiser:
         beliefs += fusion.add(measurements) if measurements else []
         if self._corrections:
             self._corrections.follow(event, fusion.belief)
-        return beliefs
+        return beliefs + self._correct(fusion)
 
-    def _correct(self, correction: Correction) -> list[PoseBelief]:
-        if self._corrections is None or self._fusion is None:
-            return []
-        self._corrections.take(correction, self._fusion.belief.stamp_ns)
-        return []
-
-    def _take_correction(self, fusion: Fusion) -> list[Belief]:
-        measurement = self._corrections.due(fusion.belief, self._receivers.errors[0])
-        if measurement is None:
+    def _correct(self, fusion: Fusion) -> list[Belief]:
+        """Beliefs that a base station's correction changed, if one is due."""
+        measurement = self._corrections.measurement(fusion.belief) if self._corrections else None
+        if measurement is None or self._corrections is None:
             return []
         fusion.model = replace(fusion.model, base=self._corrections.error)
         beliefs = fusion.add([measurement])
         if beliefs:
-            self._corrections.confirm(fusion.last[measurement.sensor], fusion.belief.stamp_ns)
+            self._corrections.confirm(fusion.last[measurement.sensor])
         return beliefs
 
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
@@ -168,12 +195,14 @@ class Localiser:
             sensors.confirm(value, fusion.last[measurement.sensor])
         return beliefs
 
-    def _collect(self, event: FilterStep | Fix, distance_m: float) -> list[Belief]:
+    def _collect(self, event: Event, distance_m: float) -> list[Belief]:
         """Keep an event until the heading is known, then filter all that was kept."""
         alignment: Alignment | None = None
         if isinstance(event, Fix):
             self._fixes.append(event)
             alignment = align_fixes(self._fixes, distance_m) if self._steps else None
+        elif isinstance(event, Measurement):
+            self._velocities.append(event)
         else:
             self._steps.append(event)
             alignment = align_start(self._config.start, self._steps[0].reckoned) if self._config.start else None
@@ -182,13 +211,15 @@ class Localiser:
     def _start(self, alignment: Alignment) -> list[Belief]:
         first, layout = self._steps[0], self._model.layout
         belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
+        belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
         self._fusion = Fusion(self._engine, self._model, belief)
         beliefs = [belief]
-        events: list[FilterStep | Fix] = [*list(self._steps)[1:], *self._fixes]
+        events: list[Event] = [*list(self._steps)[1:], *self._fixes, *self._velocities]
         for event in sorted(events, key=lambda e: e.stamp_ns):
             beliefs += self._filter(self._fusion, event)
         self._steps.clear()
         self._fixes.clear()
+        self._velocities.clear()
         return beliefs
 
 
@@ -206,7 +237,7 @@ def _layout_of(machine: MachineConfig) -> Layout:
     source = turn_source(machine)
     imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
     turns = imus + (source is not None and source.kind != "imu")
-    corrected = base_of(machine.sensors) is not None and bool(drifting(machine.sensors))
+    corrected = machine.base is not None and bool(drifting(machine.sensors))
     return Layout(turns, True, len(drifting(machine.sensors)), len(anchored_headings(machine.sensors)), corrected)
 
 

@@ -10,8 +10,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-import numpy as np
-
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement
 from protocol.arrays import Floats
 from protocol.machine.machine_config import RELATIVE, SensorConfig
@@ -89,27 +87,3 @@ class ModalSensors(ABC, Generic[Value]):
             return None
         self._last[name] = now
         return rate_between(before, now, angles=angles)
-
-
-def reset_states(belief: Belief, states: slice, variance: float) -> Belief:
-    """The belief with these states at zero, of this variance and correlated with nothing."""
-    x, P = belief.x.copy(), belief.P.copy()
-    x[states], P[states, :], P[:, states] = 0.0, 0.0, 0.0
-    P[states, states] = np.eye(states.stop - states.start) * variance
-    return Belief(belief.stamp_ns, x, P)
-
-
-def anchor_states(belief: Belief, states: slice, H: Floats, variance: float) -> Belief:
-    """The belief with states e (k,) for the error of an anchor: e = -H (x_true - x) + v.
-
-    H (k, n): Jacobian of what is anchored. variance: of v, whatever else makes the anchor wrong. A value that counts
-    from the anchor measures H x + e, which is independent of x at this moment.
-    """
-    anchored = reset_states(belief, states, variance)
-    seen = H @ anchored.P
-    anchored.P[states, states] += seen @ H.T
-    others = np.ones(len(anchored.x), bool)
-    others[states] = False
-    anchored.P[states, others] = -seen[:, others]
-    anchored.P[others, states] = -seen[:, others].T
-    return anchored

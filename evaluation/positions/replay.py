@@ -19,9 +19,10 @@ from evaluation.campaign.figures import root_mean_square
 from evaluation.campaign.truth import Truth
 from evaluation.positions.consistency import normalised_square, summarise
 from protocol.arrays import Floats, Ints
-from protocol.machine.readings import Correction, Reading
+from protocol.machine.readings import Reading
 
 STEP_NS = 100_000_000
+HOLE = 3  # times the usual interval between poses: nothing was believed in a longer one
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Score:
 
     rmse_x_m, rmse_y_m, net_m: root mean squares; net is that of the distance. nees: mean, 2 where the covariance is
     right; nees_low, nees_high: its 95 % interval then. coverage95: share of time that the 95 % ellipse holds the truth.
-    covered: share of time with a pose. us_per_second: processor time [us] per second of readings.
+    covered: share of time with a pose, as `covered` has it. us_per_second: processor time [us] per second of readings.
     """
 
     rmse_x_m: float
@@ -107,7 +108,6 @@ def score(trace: Trace, truth: Truth) -> Score:
     off, covariance = off[known], trace.covariance_m2[known]
     nees = summarise(normalised_square(off, covariance), dof=2)
     x, y = (root_mean_square(column) for column in off.T)
-    steps = max(1, round(trace.seconds * 1e9 / STEP_NS))
     return Score(
         rmse_x_m=x,
         rmse_y_m=y,
@@ -117,21 +117,35 @@ def score(trace: Trace, truth: Truth) -> Score:
         nees_low=nees.low,
         nees_high=nees.high,
         coverage95=nees.coverage,
-        covered=min(1.0, len(trace.stamp_ns) / steps),
+        covered=covered(trace),
         us_per_second=trace.cpu_s * 1e6 / trace.seconds if trace.seconds else math.nan,
     )
 
 
+def covered(trace: Trace) -> float:
+    """Share of the time of the readings with a pose, at the log's own rate; 0 to 1.
+
+    The time between two poses counts, and that from the first reading and to the last one; of a hole, one usual
+    (median) interval.
+    """
+    if not len(trace.stamp_ns):
+        return 0.0
+    between_s = np.diff(trace.since_start_s)
+    usual_s = float(np.median(between_s)) if len(between_s) else STEP_NS * 1e-9
+    intervals_s = np.diff(trace.since_start_s, prepend=0.0, append=trace.seconds)
+    counts_s = np.where(intervals_s <= HOLE * usual_s, intervals_s, usual_s)
+    return min(1.0, float(counts_s.sum()) / trace.seconds) if trace.seconds else 1.0
+
+
 def _spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:
-    """Cut readings at the multiples of STEP_NS; corrections, whose stamps are another's, go with the reading before."""
+    """Cut readings at the multiples of STEP_NS; one whose stamp goes back stays with those that it came with."""
     span: list[Reading] = []
-    number = 0
+    step = 0
     for reading in readings:
-        if not isinstance(reading, Correction):
-            if span and reading.stamp_ns // STEP_NS != number:
-                yield span
-                span = []
-            number = reading.stamp_ns // STEP_NS
+        if span and reading.stamp_ns // STEP_NS > step:
+            yield span
+            span = []
+        step = max(step, reading.stamp_ns // STEP_NS)
         span.append(reading)
     if span:
         yield span

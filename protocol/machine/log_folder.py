@@ -10,6 +10,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
@@ -57,10 +58,19 @@ class LogFolder:
     refused: Counter[str] = field(default_factory=Counter)
 
     def readings(self) -> Iterator[Reading]:
-        """All readings of the sensors in use, in the order of their stamps; counts `refused` anew."""
+        """All readings of the sensors in use, in the order of `known_ns`; counts `refused` anew."""
         self.refused.clear()
         streams = [self._read(source) for source in self.sources if source.sensor.use]
-        return heapq.merge(*streams, key=lambda r: r.stamp_ns)
+        return heapq.merge(*streams, key=self.known_ns)
+
+    def known_ns(self, reading: Reading) -> int:
+        """When a machine had a reading: at its stamp, but never before it was true (a negative delay)."""
+        return reading.stamp_ns + self._early_ns.get(reading.sensor, 0)
+
+    @cached_property
+    def _early_ns(self) -> dict[str, int]:
+        """How much too early the stamps of some sensors are."""
+        return {s.name: s.true_ns(0) for s in (source.sensor for source in self.sources) if s.delay_s < 0}
 
     def _read(self, source: SensorFile) -> Iterator[Reading]:
         path = self.data / source.file

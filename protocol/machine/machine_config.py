@@ -20,6 +20,7 @@ BASE, FRONT = "base_link", "front_link"
 # accelerometer, an orientation whose heading is of no use.
 QUANTITIES = {
     "gps": ("position",),
+    "gps_velocity": ("velocity",),
     "imu": ("rate", "force"),
     "attitude": ("tilt", "heading"),
     "odometry": ("speed", "rate"),
@@ -30,6 +31,8 @@ QUANTITIES = {
 # that moment, later ones count from it (Moore & Stouch, robot_localization).
 MODES = ABSOLUTE, DIFFERENTIAL, RELATIVE = ("absolute", "differential", "relative")
 WITH_MODE = ("gps", "attitude")
+MAX_DELAY_S = 0.4  # what is 0.5 s behind the newest reading is refused as late; readings do not arrive in perfect order
+MAX_EARLY_S = 10.0  # a stamp that is further ahead of its reading is no delay, but another clock
 
 
 @dataclass(frozen=True)
@@ -50,9 +53,10 @@ class SensorConfig:
 
     name: as readings carry it. use: false ignores the sensor's readings. measures: which of its quantities are used, by
     the names in QUANTITIES; empty: all. std: standard deviations by these names, instead of what readings state or the
-    filter's options say: `position` [m]; `tilt`, `heading` [rad]; `rate` [rad/s]; `force` [m/s2]; `speed` [m/s].
-    mode: one of MODES, for GPS and attitude. delay_s: how much later than it was true a reading is stamped. gate_sigma:
-    refused if further off than so many standard deviations; 0: as the filter's options say. frame: which frame of an
+    filter's options say: `position` [m]; `tilt`, `heading` [rad]; `rate` [rad/s]; `force` [m/s2]; `speed`,
+    `velocity` [m/s]. mode: one of MODES, for GPS and attitude. delay_s: how much later than it was true a reading is
+    stamped; negative if earlier. gate_sigma: refused if further off than so many standard deviations; 0: as the
+    filter's options say. frame: which frame of an
     articulated machine carries it; `front_link` starts at the joint, at the height of the wheels' hubs. drift_share,
     drift_time_s: of a GPS receiver, the share of its variance that is a slow error, and that error's correlation time.
     ticks_per_rev: of an encoder.
@@ -80,8 +84,11 @@ class SensorConfig:
         self._check_meaning()
         if self.frame not in (BASE, FRONT):
             raise ValueError(f"frame: {self.frame!r} is neither {BASE} nor {FRONT}")
-        if not (0 <= self.delay_s <= 10 and 0 <= self.gate_sigma <= 1000):
-            raise ValueError("delay_s must be between 0 and 10, gate_sigma between 0 and 1000")
+        if not (-MAX_EARLY_S <= self.delay_s <= MAX_DELAY_S and 0 <= self.gate_sigma <= 1000):
+            limits = (
+                f"delay_s must be between -{MAX_EARLY_S:g} and {MAX_DELAY_S:g}: readings that are later are refused"
+            )
+            raise ValueError(f"{self.name}: {limits}; gate_sigma between 0 and 1000")
         if not 0 <= self.drift_share <= 1:
             raise ValueError(f"drift_share: {self.drift_share} is not between 0 and 1")
         if self.drift_time_s <= 0 or self.ticks_per_rev <= 0:
@@ -100,6 +107,10 @@ class SensorConfig:
         modes = MODES if self.kind in WITH_MODE else (ABSOLUTE,)
         if self.mode not in modes:
             raise ValueError(f"mode: {self.name}: {self.kind} has no {self.mode!r}, but {', '.join(modes)}")
+
+    def true_ns(self, stamp_ns: int) -> int:
+        """When that was true which a reading of this stamp measured."""
+        return stamp_ns - round(self.delay_s * 1e9)
 
     def provides(self, quantity: str) -> bool:
         """Whether its readings are used for this quantity, one of QUANTITIES."""

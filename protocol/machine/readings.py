@@ -45,6 +45,22 @@ class Gps(Reading):
 
 
 @dataclass(frozen=True, slots=True)
+class GpsVelocity(Reading):
+    """Velocity of one antenna east and north, by the Doppler shift of the signals, with the variances stated."""
+
+    kind: ClassVar[str] = "gps_velocity"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {
+        **dict.fromkeys(("velocity_e_mps", "velocity_n_mps"), (-100.0, 100.0)),
+        **dict.fromkeys(("var_e_m2ps2", "var_n_m2ps2"), (1e-8, 1e4)),
+    }
+
+    velocity_e_mps: float
+    velocity_n_mps: float
+    var_e_m2ps2: float
+    var_n_m2ps2: float
+
+
+@dataclass(frozen=True, slots=True)
 class Imu(Reading):
     """Angular rate and specific force (gravity included: +9.8 on the axis that points up at rest)."""
 
@@ -177,7 +193,7 @@ class Correction(Reading):
 
 KINDS: dict[str, type[Reading]] = {
     cls.kind: cls
-    for cls in (Gps, Imu, Attitude, Odometry, Encoder, Torque, Articulation, Steering, Payload, Correction)
+    for cls in (Gps, GpsVelocity, Imu, Attitude, Odometry, Encoder, Torque, Articulation, Steering, Payload, Correction)
 }
 
 

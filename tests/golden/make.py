@@ -15,7 +15,17 @@ import msgpack
 import numpy as np
 
 from protocol.errors import QueryError, Refusal
-from protocol.machine.readings import Articulation, Attitude, Correction, Encoder, Gps, Imu, Odometry, Torque
+from protocol.machine.readings import (
+    Articulation,
+    Attitude,
+    Correction,
+    Encoder,
+    Gps,
+    GpsVelocity,
+    Imu,
+    Odometry,
+    Torque,
+)
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
@@ -176,6 +186,11 @@ GOLDEN: dict[str, Golden] = {
         Refused("overloaded", "too many batches are waiting", retry_after_s=1.5), codec.encode_reply, codec.decode_reply
     ),
     "bundle.bin": Golden(SensorBundle("loader-1", 5, readings(), last=True), codec.encode_bundle, codec.decode_bundle),
+    "bundle_velocity.bin": Golden(
+        SensorBundle("loader-1", 6, (GpsVelocity("doppler", T0, 1.5, -0.25, 0.0625, 0.04),)),
+        codec.encode_bundle,
+        codec.decode_bundle,
+    ),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
     "correction.bin": Golden(CORRECTION, codec.encode_correction, decode_correction),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),

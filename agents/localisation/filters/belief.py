@@ -1,12 +1,17 @@
-"""Beliefs, motions and measurements: the values between the parts of localisation.
+"""Beliefs, motions and measurements: the values between the parts of localisation; and changes of a belief.
 
 x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k), as in the filtering literature.
+
+Whatever changes a belief but motions and measurements is here, since it maps the belief's past too (`smoother`).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import numpy as np
+
+from agents.localisation.filters.smoother import Past
 from protocol.arrays import Floats
 
 
@@ -14,13 +19,15 @@ from protocol.arrays import Floats
 class Belief:
     """Mean and covariance of the state at a stamp; neither is written to.
 
-    L: lower Cholesky factor of P, where it is known already; it saves computing it again.
+    L: lower Cholesky factor of P, where it is known already; it saves computing it again. past: what it still says of
+    the past, None where nothing is smoothed.
     """
 
     stamp_ns: int
     x: Floats
     P: Floats
     L: Floats | None = field(default=None, repr=False, compare=False)
+    past: Past | None = field(default=None, repr=False, compare=False)
 
 
 Change = Callable[[Belief], Belief]
@@ -104,3 +111,43 @@ class Filter(Protocol):
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement of its stamp."""
+
+
+# --- changes ---------------------------------------------------------------------------------------------------------
+
+
+def reset_states(belief: Belief, states: slice, variance: float) -> Belief:
+    """The belief with these states at zero, of this variance and correlated with nothing."""
+    x, P, M = belief.x.copy(), belief.P.copy(), np.eye(len(belief.x))
+    x[states], P[states, :], P[:, states], M[states] = 0.0, 0.0, 0.0, 0.0
+    P[states, states] = np.eye(states.stop - states.start) * variance
+    return Belief(belief.stamp_ns, x, P, past=_mapped(belief, M))
+
+
+def anchor_states(belief: Belief, states: slice, H: Floats, variance: float) -> Belief:
+    """The belief with states e (k,) for the error of an anchor: e = -H (x_true - x) + v.
+
+    H (k, n): Jacobian of what is anchored. variance: of v, whatever else makes the anchor wrong. A value that counts
+    from the anchor measures H x + e, which is independent of x at this moment.
+    """
+    anchored = reset_states(belief, states, variance)
+    P, M, others = anchored.P, np.eye(len(anchored.x)), np.ones(len(anchored.x), bool)
+    others[states] = False
+    seen = H @ P
+    P[states, states] += seen @ H.T
+    P[states, others] = -seen[:, others]
+    P[others, states] = -seen[:, others].T
+    M[states] = np.where(others, -H, 0.0)
+    return Belief(belief.stamp_ns, anchored.x, P, past=_mapped(belief, M))
+
+
+def open_states(belief: Belief, states: slice, covariance: Floats) -> Belief:
+    """The belief with these states (k,) less sure by a covariance (k, k)."""
+    P = belief.P.copy()
+    P[states, states] += covariance
+    return Belief(belief.stamp_ns, belief.x, P, past=belief.past)
+
+
+def _mapped(belief: Belief, M: Floats) -> Past | None:
+    """The past after a change that maps the state's error by M (n, n)."""
+    return belief.past and belief.past.mapped(M)

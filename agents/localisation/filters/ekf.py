@@ -5,15 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
-from agents.localisation.filters.square_root import (
-    bounded,
-    conclude,
-    definite,
-    noise_root,
-    refused,
-    root,
-    wrapped_state,
-)
+from agents.localisation.filters.square_root import conclude, conclude_motion, noise_root, refused, root
 
 
 @dataclass(frozen=True)
@@ -22,17 +14,17 @@ class Ekf:
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
         """Move the belief: x <- f(x), P <- F P F^T + Q, as the square of F L so that it is symmetric."""
-        x = wrapped_state(motion.f(belief.x[None])[0], motion.angles)
-        F_L = motion.jacobian(belief.x).dot(root(belief))
-        return definite(stamp_ns, x, bounded(F_L.dot(F_L.T) + motion.Q, motion.angles))
+        F = motion.jacobian(belief.x)
+        F_L = F.dot(root(belief))
+        return conclude_motion(belief, motion, stamp_ns, motion.f(belief.x[None])[0], F_L.dot(F_L.T) + motion.Q, F)
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
         noise = noise_root(measurement)
         if noise is None:
             return refused(belief, measurement)
-        L, (n, k) = root(belief), (len(belief.x), len(noise))
+        L, H, (n, k) = root(belief), measurement.jacobian(belief.x), (len(belief.x), len(noise))
         together = np.zeros((k + n, n + k))
-        together[:k, :n], together[:k, n:] = measurement.jacobian(belief.x).dot(L), noise
+        together[:k, :n], together[:k, n:] = H.dot(L), noise
         together[k:, :n] = L
-        return conclude(belief, measurement, measurement.h(belief.x[None])[0], together)
+        return conclude(belief, measurement, measurement.h(belief.x[None])[0], together, H)

@@ -13,8 +13,9 @@ from operator import attrgetter
 
 import numpy as np
 
-from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement
+from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, open_states
 from agents.localisation.filters.motion import MotionModel, motion
+from agents.localisation.filters.smoother import SmoothedPose
 
 WINDOW_S = 1.0  # how far back measurements may come; receivers and networks are late by less
 RELOCK = 15  # refusals in a row after which a sensor is accepted again: the filter is lost, not the sensor
@@ -50,6 +51,7 @@ class Fusion:
         self._window_ns = round(window_s * 1e9)
         self._nodes = [_Node(start.stamp_ns, [], start)]
         self._refused: Counter[str] = Counter()  # in a row
+        self._smoothed: list[SmoothedPose] = []
 
     @property
     def belief(self) -> Belief:
@@ -64,6 +66,23 @@ class Fusion:
         belief = self._nodes[max(index, 0)].belief
         assert belief is not None
         return self._moved(belief, stamp_ns)
+
+    def take_smoothed(self) -> list[SmoothedPose]:
+        """Poses that left the smoother's lag since the last call, oldest first.
+
+        They are those of beliefs that no late measurement can change any more, so its order of arrival is all one.
+        """
+        taken, self._smoothed = self._smoothed, []
+        return taken
+
+    def remaining(self) -> list[SmoothedPose]:
+        """Poses within the smoother's lag, as known by now, and that of the newest belief; none without a lag."""
+        beliefs = [node.belief for node in self._nodes if node.belief]  # a filter that failed left the newest without
+        newest = beliefs[-1]
+        if newest.past is None:
+            return []
+        left = [pose for belief in beliefs if belief.past for pose in belief.past.final]
+        return left + newest.past.poses(newest.stamp_ns, newest.x, newest.P)
 
     def add(self, measurements: Sequence[Measurement]) -> list[Belief]:
         """Filter measurements of one stamp; returns the beliefs that they changed, oldest first, none if refused."""
@@ -147,7 +166,11 @@ class Fusion:
     def _forget(self) -> None:
         """Drop nodes that are older than the window; one before it stays to start from."""
         oldest_ns = self._nodes[-1].stamp_ns - self._window_ns
-        del self._nodes[: max(bisect_right(self._nodes, oldest_ns, key=_stamp) - 1, 0)]
+        stands = max(bisect_right(self._nodes, oldest_ns, key=_stamp) - 1, 0)
+        for node in self._nodes[:stands]:
+            if node.belief and node.belief.past:
+                self._smoothed += node.belief.past.final
+        del self._nodes[:stands]
 
 
 def _changed(belief: Belief, measurements: Iterable[Measurement]) -> Belief:
@@ -161,6 +184,5 @@ def _opened(belief: Belief, result: Conditioned, states: slice | None) -> Belief
     """The belief with states as unsure as a measurement of them is off."""
     if states is None:
         return belief
-    P = belief.P.copy()
-    P[states, states] += np.outer(result.innovation, result.innovation) + np.eye(len(result.innovation))
-    return Belief(belief.stamp_ns, belief.x, P)
+    innovation = result.innovation
+    return open_states(belief, states, np.outer(innovation, innovation) + np.eye(len(innovation)))

@@ -14,7 +14,8 @@ import math
 import numpy as np
 from scipy.linalg.lapack import dposv, dpotrf
 
-from agents.localisation.filters.belief import Belief, Conditioned, Measurement
+from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
+from agents.localisation.filters.smoother import Past
 from protocol.arrays import Floats
 
 MIN_VARIANCE = 1e-18  # of any state, in its unit squared
@@ -53,30 +54,34 @@ def root(belief: Belief) -> Floats:
     return factor(belief.P) if belief.L is None else belief.L
 
 
-def definite(stamp_ns: int, x: Floats, P: Floats) -> Belief:
+def definite(stamp_ns: int, x: Floats, P: Floats, past: Past | None = None) -> Belief:
     """A belief of that covariance where it is positive definite by some margin, else of one nearby that is."""
     L, failed = _cholesky(P)
     pivots = L.diagonal()
     if failed or P.diagonal().dot(np.reciprocal(pivots * pivots)) > MAX_INFLATION:
         P = _repaired(P)
         L = factor(P)
-    return Belief(stamp_ns, x, P, L)
+    return Belief(stamp_ns, x, P, L, past)
 
 
-def bounded(P: Floats, angles: tuple[int, ...]) -> Floats:
-    """The covariance, with no angle less known than to a right angle.
+def conclude_motion(belief: Belief, motion: Motion, stamp_ns: int, x: Floats, P: Floats, F: Floats | None) -> Belief:
+    """The belief after a motion to x, P. F (n, n): what it did to the state's error, None of a belief without a past.
 
-    Without it the attitude of a machine whose tilt nobody measures is taken for linear over many turns, and the
-    covariance of all else grows without end; and sigma points sqrt(3) deviations off would meet behind the back. Rows
-    and columns are scaled, so what is definite stays so.
+    No angle is less known than to a right angle. Without that the attitude of a machine whose tilt nobody measures is
+    taken for linear over many turns, and the covariance of all else grows without end; and sigma points sqrt(3)
+    deviations off would meet behind the back. Rows and columns are scaled, so what is definite stays so.
     """
     variance = P.diagonal()
-    wide = [i for i in angles if variance[i] > UNKNOWN_ANGLE]
-    if not wide:
-        return P
-    scale = np.ones(len(P))
-    scale[wide] = np.sqrt(UNKNOWN_ANGLE / variance[wide])
-    return P * np.outer(scale, scale)
+    wide = [i for i in motion.angles if variance[i] > UNKNOWN_ANGLE]
+    if wide:
+        scale = np.ones(len(P))
+        scale[wide] = np.sqrt(UNKNOWN_ANGLE / variance[wide])
+        P = P * np.outer(scale, scale)
+        F = None if F is None else scale[:, None] * F
+    past = belief.past
+    if past is not None and F is not None:
+        past = past.advanced(belief.stamp_ns, belief.x, belief.P, F, stamp_ns)
+    return definite(stamp_ns, wrapped_state(x, motion.angles), P, past)
 
 
 def noise_root(measurement: Measurement) -> Floats | None:
@@ -94,10 +99,13 @@ def refused(belief: Belief, measurement: Measurement) -> Conditioned:
     return Conditioned(belief, np.full(k, np.nan), np.full((k, k), np.nan), math.nan, accepted=False)
 
 
-def conclude(belief: Belief, measurement: Measurement, predicted: Floats, together: Floats) -> Conditioned:
+def conclude(
+    belief: Belief, measurement: Measurement, predicted: Floats, together: Floats, H: Floats | None
+) -> Conditioned:
     """Gate the innovation, and condition the belief on it.
 
-    predicted: (k,). together: Z over X (k + n, m). The covariance is the square of what the measurement leaves of the
+    predicted: (k,). together: Z over X (k + n, m). H (k, n): how the measurement shows the state's error, None of a
+    belief without a past. The covariance is the square of what the measurement leaves of the
     deviations, X - K Z: where the measurement is linear that is (I - K H) P (I - K H)^T + K R K^T (Joseph 1964). A sum
     of squares stays symmetric, and definite but for rounding.
     """
@@ -113,7 +121,11 @@ def conclude(belief: Belief, measurement: Measurement, predicted: Floats, togeth
     if 0 < measurement.gate_sigma**2 < nis:
         return Conditioned(belief, y, S, nis, accepted=False)
     left = X - K.dot(Z)
-    posterior = definite(belief.stamp_ns, belief.x + K.dot(y), left.dot(left.T))
+    past = belief.past
+    if past is not None and H is not None:
+        shown = H.dot(past.transition)
+        past = past.informed(shown, _divided(shown.T, S), y, K)
+    posterior = definite(belief.stamp_ns, belief.x + K.dot(y), left.dot(left.T), past)
     return Conditioned(posterior, y, S, nis, accepted=True)
 
 

@@ -23,17 +23,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.linalg.lapack import dtrtrs
 
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
 from agents.localisation.filters.square_root import (
-    bounded,
     conclude,
-    definite,
+    conclude_motion,
     noise_root,
     refused,
     root,
     wrapped,
-    wrapped_state,
 )
 from protocol.arrays import Floats
 
@@ -62,7 +61,7 @@ class Ukf:
         points = self._points(len(belief.x), 0)
         _, d, mean = points.deviations(belief, motion.f, ())
         P = points.W * d.dot(d.T) + motion.Q
-        return definite(stamp_ns, wrapped_state(mean, motion.angles), bounded(P, motion.angles))
+        return conclude_motion(belief, motion, stamp_ns, mean, P, points.slope(d, belief))
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
@@ -72,9 +71,10 @@ class Ukf:
         k = len(noise)
         points = self._points(len(belief.x), k)
         of_x, d, mean = points.deviations(belief, measurement.h, measurement.angles)
+        H = points.slope(d, belief)
         together = points.root_W * np.concatenate([d, of_x])
         together[:k, -k:] = noise
-        return conclude(belief, measurement, mean, together)
+        return conclude(belief, measurement, mean, together, H)
 
     def _points(self, n: int, k: int) -> "SigmaPoints":
         return _sigma_points(n, k, self.alpha, self.beta, 3.0 - n if self.kappa is None else self.kappa)
@@ -106,6 +106,20 @@ class SigmaPoints:
         if self.surplus:
             d[:, 0] = math.sqrt(self.surplus / self.W) * m
         return of_x, d, centre + m
+
+    def slope(self, d: Floats, belief: Belief) -> Floats | None:
+        """The linear map (j, n) that regresses d of g on the state; None of a belief without a past.
+
+        The cross-covariance of g and x times P^-1 (statistical linearisation): for g' = (d_+ - d_-) / (2 gamma), its
+        deviations along the columns of L, that is g' L^-1.
+        """
+        if belief.past is None:
+            return None
+        n = len(belief.x)
+        along = (d[:, 1 : n + 1] - d[:, n + 1 : 2 * n + 1]) / (2 * self.gamma)
+        solved, _ = dtrtrs(root(belief), along.T, lower=1, trans=1)
+        slope: Floats = solved.T
+        return slope
 
 
 @lru_cache

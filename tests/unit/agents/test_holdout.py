@@ -8,10 +8,10 @@ from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from protocol.machine.log_folder import open_log
-from protocol.machine.machine_config import MachineConfig
-from protocol.machine.readings import Gps, Reading
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import Gps, GpsVelocity, Reading
 from tests.paths import ROOT
-from tests.unit.agents.drives import S_BEND, SITE, Drive, drive, fix, machine
+from tests.unit.agents.drives import S_BEND, SITE, Drive, changed_sensor, drive, fix, machine
 
 HUSKY = ROOT.parent / "shared" / "data" / "rl_test1_husky"
 CONFIG, SETTLE_S = HoldoutConfig(period_s=5.0, off_s=1.0), 10.0
@@ -72,6 +72,34 @@ def test_errors_are_right_on_a_made_up_case(vehicle: MachineConfig, made: Drive,
     assert report["median_m"] == pytest.approx(off_m, abs=0.5)
     assert report["median_m"] <= report["max_m"]
     assert report["rms_m"] <= report["max_m"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay_s", [0.3, -0.3])
+def test_fixes_are_compared_with_the_poses_of_when_they_were_true(
+    vehicle: MachineConfig, made: Drive, delay_s: float
+) -> None:
+    shift = round(delay_s * 1e9)
+    readings = [replace(r, stamp_ns=r.stamp_ns + shift) if isinstance(r, Gps) else r for r in made.readings]
+    reports = [
+        run(v, r)[1]
+        for v, r in ((vehicle, made.readings), (changed_sensor(vehicle, "gps-1", delay_s=delay_s), readings))
+    ]
+    assert reports[1]["rms_m"] == pytest.approx(reports[0]["rms_m"], abs=0.1)  # it drives 0.6 m meanwhile
+
+
+def test_velocities_are_withheld_with_the_fixes_and_judged_by_nobody(made: Drive) -> None:
+    vehicle = machine()
+    doppler = SensorConfig("doppler", "gps_velocity")
+    vehicle = replace(vehicle, sensors=(*vehicle.sensors, doppler))
+    velocities = [GpsVelocity("doppler", r.stamp_ns, 0.0, 0.0, 1.0, 1.0) for r in made.readings if isinstance(r, Gps)]
+    readings = sorted([*made.readings, *velocities], key=lambda r: r.stamp_ns)
+    holdout = Holdout(SITE, vehicle, CONFIG)
+    seen = holdout.split(readings)
+    stamps = [{r.stamp_ns for r in seen if r.sensor == name} for name in ("doppler", "gps-1")]
+    assert stamps[0] == stamps[1]
+    assert len(readings) - len(seen) == 60
+    assert holdout.report()["fixes"] == 0
 
 
 @pytest.mark.slow

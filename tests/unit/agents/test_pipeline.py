@@ -452,3 +452,13 @@ def test_sensor_whose_stamps_are_late_by_its_delay_is_as_one_in_time(
     late = [replace(r, stamp_ns=r.stamp_ns + 20_000_000) if r.sensor == "wheels" else r for r in recorded]
     samples, health = run(changed_sensor(vehicle, "wheels", delay_s=0.02), late)
     assert (samples, health) == base
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("early_s", [0.02, 3.0])
+def test_sensor_whose_stamps_are_too_early_is_as_one_in_time(
+    vehicle: MachineConfig, recorded: list[Reading], base: tuple[bytes, Any], early_s: float
+) -> None:
+    """A negative delay; by more than any window too, for a reading comes when it was true whatever its stamp says."""
+    early = [replace(r, stamp_ns=r.stamp_ns - round(early_s * 1e9)) if r.sensor == "gps-1" else r for r in recorded]
+    assert run(changed_sensor(vehicle, "gps-1", delay_s=-early_s), early) == base

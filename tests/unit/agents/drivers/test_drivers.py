@@ -19,7 +19,7 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, drive
+from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, changed_sensor, drive
 
 
 class Time:
@@ -79,6 +79,19 @@ def test_replay_keeps_pace(folder: Path, speed: float) -> None:
     assert max(early) <= 0.05 / speed + 1e-6  # at most what is handed on together
     assert min(early) >= -1e-6
     assert empty or speed > 1  # the silence is longer than a read may take
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_replay_hands_on_readings_with_too_early_stamps_when_they_were_true(tmp_path: Path, speed: float) -> None:
+    """And with the same pauses as if their stamps were right."""
+    made = drive([Leg(3, 0.5)], VEHICLE).readings
+    write_log(tmp_path / "right", "lot", SITE, VEHICLE, made)
+    early = [replace(r, stamp_ns=r.stamp_ns - 700_000_000) if r.sensor == "gps-1" else r for r in made]
+    write_log(tmp_path / "early", "lot", SITE, changed_sensor(VEHICLE, "gps-1", delay_s=-0.7), early)
+    right, early = (replay(tmp_path / name, speed) for name in ("right", "early"))
+    mended = [replace(r, stamp_ns=r.stamp_ns + 700_000_000) if r.sensor == "gps-1" else r for r in early[0]]
+    assert mended == right[0]
+    assert early[1] == pytest.approx(right[1])
 
 
 def test_replay_as_fast_as_possible_never_waits(folder: Path) -> None:

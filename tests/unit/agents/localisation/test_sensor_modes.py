@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.localisation.filters.belief import Belief
+from agents.localisation.filters.belief import Belief, anchor_states, reset_states
 from agents.localisation.filters.motion import HEADING_WALK, map_from_base, motion
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.localiser import LocalisationConfig
-from agents.localisation.sensor_modes import PAIR_S, StampedValue, anchor_states, rate_between, reset_states
+from agents.localisation.sensor_modes import PAIR_S, StampedValue, rate_between
 from agents.pipeline import Pipeline, PipelineConfig
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, SensorConfig

@@ -12,7 +12,7 @@ from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import Pipeline, PipelineConfig, PoseSource, Positioning
 from evaluation.campaign.truth import Truth
-from evaluation.positions.replay import STEP_NS, Trace, replay, score
+from evaluation.positions.replay import STEP_NS, Trace, covered, replay, score
 from protocol.machine.readings import Articulation, Reading
 from sim.config import SimConfig
 from sim.simulator import Simulator
@@ -66,6 +66,33 @@ def test_time_without_a_pose_is_stated_and_not_counted_as_error():
     result = score(*trace_of([(1.0, 0.0)] * 30, before=10))
     assert result.covered == pytest.approx(0.75)
     assert result.net_m == pytest.approx(1.0)
+
+
+def poses_at(times_s: Sequence[float], seconds: float) -> Trace:
+    """Poses at these times of readings that last so long."""
+    stamps, n = START_NS + np.round(np.array(times_s) * 1e9).astype(np.int64), len(times_s)
+    return Trace(stamps, np.zeros((n, 2)), np.zeros((n, 2, 2)), START_NS, START_NS + round(seconds * 1e9), 0.0)
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 1.0, 5.0, 7.3, 10.0])
+def test_a_slow_log_is_covered_wholly_at_its_own_rate(rate_hz: float):
+    times = np.arange(200) / rate_hz
+    assert covered(poses_at(times, times[-1])) == pytest.approx(1.0)
+    jittered = np.sort(times + np.random.default_rng(5).uniform(-0.4, 0.4, 200) / rate_hz)
+    assert covered(poses_at(jittered[1:], jittered[-1])) > 0.99
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 10.0])
+def test_a_hole_in_a_slow_log_is_not_covered(rate_hz: float):
+    times = [t for t in np.arange(0, 100, 1 / rate_hz) if not 40 < t < 60]
+    assert covered(poses_at(times, times[-1])) == pytest.approx(0.8, abs=2 / rate_hz / 100)
+    assert covered(poses_at([t for t in times if t >= 60], 100.0)) == pytest.approx(0.4, abs=2 / rate_hz / 100)
+
+
+def test_poses_that_end_early_cover_no_more():
+    assert covered(poses_at(np.arange(0, 50, 0.2), 100.0)) == pytest.approx(0.5, abs=0.01)
+    assert covered(poses_at([], 100.0)) == 0.0
+    assert covered(poses_at([30.0], 100.0)) == pytest.approx(0.002)
 
 
 def test_a_replay_of_nothing_has_no_pose_and_no_error_but_nan():

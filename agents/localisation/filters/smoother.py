@@ -1,0 +1,147 @@
+"""The fixed-lag smoother: what the present still says about the past (Anderson & Moore 1979, Optimal Filtering, 7.3).
+
+A node is what the filter believed last in a second, of which only place and heading s = (x, y, yaw) are kept. For the
+lag it stays jointly Gaussian with the present state x: mean m (3,), covariance P_s (3, 3) and cross-covariance
+C = cov(s, x) (3, n). Whatever happens to the present is a linear map of its error, and noise that the past has no part
+in. With the symbols of the filters, F and H Jacobians (EKF) or what sigma points regress (UKF):
+
+    motion, change of the state    C <- C F^T
+    measurement                    m += C H^T S^-1 y      P_s -= C H^T S^-1 H C^T      C <- C (I - K H)^T
+
+All nodes go through the same maps. So these are collected first, at a cost that does not depend on the lag, and done to
+the nodes once a second:
+
+    Phi = product of F and I - K H    adjoint = sum of Phi^T H^T S^-1 y    information = sum of Phi^T H^T S^-1 H Phi
+
+    m += C adjoint                    P_s -= C information C^T             C <- C Phi^T
+
+The sums are the adjoint variables of the modified Bryson-Frazier smoother (Bierman 1973).
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from agents.localisation.filters.state import YAW, X, Y
+from protocol.arrays import Floats, Ints
+from protocol.rotations import wrap_angle
+
+NODE_NS = 1_000_000_000
+KEPT = [X, Y, YAW]
+MIN_VARIANCE = 1e-8  # along any axis [m2, rad2]: a tenth of a millimetre; rounding must not make a covariance negative
+
+
+@dataclass(frozen=True)
+class SmoothedPose:
+    """Where the machine was, as known after what came since: position [m], heading [rad, in +-pi], covariance (2, 2).
+
+    correction: x, y [m] and heading [rad] (3,) less what the filter believed at that stamp.
+    """
+
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    covariance_m2: Floats
+    correction: Floats
+
+
+class Nodes(NamedTuple):
+    """Past places and headings [m, m, rad], oldest first; headings are not wrapped.
+
+    stamp_ns: (q,). filtered: (q, 3), as the filter believed at their stamps. mean: (q, 3), covariance: (q, 3, 3), as
+    known by now. cross: (q, 3, n), with the state.
+    """
+
+    stamp_ns: Ints
+    filtered: Floats
+    mean: Floats
+    covariance: Floats
+    cross: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """The nodes of the last lag_ns, and what happened to the state since they were brought up to date.
+
+    final: nodes that the last motion moved out of the lag. transition: Phi (n, n). adjoint: (n,). information: (n, n).
+    """
+
+    lag_ns: int
+    nodes: Nodes
+    final: tuple[SmoothedPose, ...]
+    transition: Floats
+    adjoint: Floats
+    information: Floats
+
+    def advanced(self, stamp_ns: int, x: Floats, P: Floats, F: Floats, to_ns: int) -> "Past":
+        """After a motion F (n, n) from a belief x, P at stamp_ns, which becomes a node if its second is over."""
+        if to_ns // NODE_NS == stamp_ns // NODE_NS:
+            return Past(self.lag_ns, self.nodes, (), F.dot(self.transition), self.adjoint, self.information)
+        nodes = self._with(stamp_ns, x, P)
+        over = int(np.searchsorted(nodes.stamp_ns, stamp_ns - self.lag_ns, side="right"))
+        final = tuple(_poses(nodes, over)) if over else ()
+        rest = Nodes._make(values[over:] for values in nodes) if over else nodes
+        return Past(self.lag_ns, rest, final, F, np.zeros(len(x)), np.zeros((len(x), len(x))))
+
+    def mapped(self, M: Floats) -> "Past":
+        """After a change that maps the state's error by M (n, n)."""
+        return replace(self, transition=M.dot(self.transition))
+
+    def informed(self, shown: Floats, weighted: Floats, y: Floats, K: Floats) -> "Past":
+        """After a measurement: shown: H Phi (k, n), weighted: its transpose times S^-1 (n, k); y: (k,), K: (n, k)."""
+        return Past(
+            self.lag_ns,
+            self.nodes,
+            self.final,
+            self.transition - K.dot(shown),
+            self.adjoint + weighted.dot(y),
+            self.information + weighted.dot(shown),
+        )
+
+    def poses(self, stamp_ns: int, x: Floats, P: Floats) -> list[SmoothedPose]:
+        """All nodes, as known by now, and the belief x, P at stamp_ns itself."""
+        return _poses(self._with(stamp_ns, x, P))
+
+    def _with(self, stamp_ns: int, x: Floats, P: Floats) -> Nodes:
+        """The nodes brought up to date, and the belief x, P at stamp_ns."""
+        _, filtered, mean, covariance, cross = self.nodes
+        flat = cross.reshape(-1, len(x))  # one product for all nodes
+        fell = flat.dot(self.information).reshape(cross.shape) @ cross.transpose(0, 2, 1)
+        s, C = x[None, KEPT], P[None, KEPT]
+        return Nodes(
+            np.append(self.nodes.stamp_ns, stamp_ns),
+            np.concatenate([filtered, s]),
+            np.concatenate([mean + flat.dot(self.adjoint).reshape(-1, 3), s]),
+            np.concatenate([covariance - (fell + fell.transpose(0, 2, 1)) / 2, C[:, :, KEPT]]),
+            np.concatenate([flat.dot(self.transition.T).reshape(cross.shape), C]),
+        )
+
+
+def nothing_past(n: int, lag_s: float) -> Past | None:
+    """The past of a belief of n states that has none yet; None where nothing is to be smoothed."""
+    if not lag_s:
+        return None
+    nodes = Nodes(np.zeros(0, np.int64), *(np.zeros((0, *shape)) for shape in ((3,), (3,), (3, 3), (3, n))))
+    return Past(round(lag_s * 1e9), nodes, (), np.eye(n), np.zeros(n), np.zeros((n, n)))
+
+
+def _poses(nodes: Nodes, end: int | None = None) -> list[SmoothedPose]:
+    """Poses of the nodes, or of the oldest up to one."""
+    rows = zip(*(values[:end] for values in nodes[:4]), strict=True)
+    return [_pose(int(stamp_ns), filtered, mean, covariance) for stamp_ns, filtered, mean, covariance in rows]
+
+
+def _pose(stamp_ns: int, filtered: Floats, mean: Floats, covariance: Floats) -> SmoothedPose:
+    x, y, heading = mean.tolist()
+    return SmoothedPose(stamp_ns, x, y, wrap_angle(heading), _floored(covariance[:2, :2]), mean - filtered)
+
+
+def _floored(covariance: Floats) -> Floats:
+    """The covariance, of which no eigenvalue is below MIN_VARIANCE."""
+    values, vectors = np.linalg.eigh(covariance)
+    if values[0] >= MIN_VARIANCE:
+        return covariance
+    floored: Floats = (vectors * np.maximum(values, MIN_VARIANCE)).dot(vectors.T)
+    return floored
