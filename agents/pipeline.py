@@ -92,10 +92,11 @@ class Positioning:
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
             return None
-        if isinstance(reading, Correction):
-            return Accepted(reading, sensor, self.localiser.update(reading, sensor, self.dead_reckoning), False)
         if sensor.delay_s:
             reading = replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns))
+        if isinstance(reading, Correction):  # of another one's clock, and late: it takes effect with the next readings
+            self.localiser.take(reading)
+            return None
         decision = self._order.decide(reading)
         if decision is Decision.REFUSE:
             return None

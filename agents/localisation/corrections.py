@@ -20,10 +20,9 @@ import numpy as np
 
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, reset_states
-from agents.localisation.filters.motion import BaseError, GpsError
-from agents.localisation.filters.state import YAW, Layout
+from agents.localisation.filters.motion import BaseError, GpsError, map_from_base
+from agents.localisation.filters.state import ATTITUDE, VELOCITY, Layout
 from agents.localisation.gps import Fix
-from agents.localisation.imu_steps import FilterStep
 from agents.localisation.site_share import SiteShareEstimator
 from protocol.arrays import Floats
 from protocol.machine.machine_config import SensorConfig
@@ -53,8 +52,8 @@ class Corrections:
         self._due_ns = 0  # stamp of the last that was due
         self._offset_m: Floats | None = None  # what the base said of d at first: the state counts from there
         self._accepted = False
-        self._step: FilterStep | None = None
-        self._track_m, self._map_from_reckoned = np.zeros(2), np.eye(2)
+        self._followed_ns = 0
+        self._track_m, self._velocity_mps = np.zeros(2), np.zeros(2)
 
     # --- readings ----------------------------------------------------------------------------------------------------
 
@@ -70,24 +69,21 @@ class Corrections:
         ahead = [c for c in self._waiting if c.stamp_ns > now_ns]
         self._waiting = [*ahead, correction]
 
-    def follow(self, step: FilterStep, belief: Belief) -> None:
-        """Follow dead reckoning in `map`, by the heading and the wheels' scale that are believed."""
-        if self._step is not None:
-            self._track_m = self._reckoned_m(step)
-            self._share.drive(abs(step.reckoned.travel_m - self._step.reckoned.travel_m))
-        angle = float(belief.x[YAW]) - step.reckoned.angle_rad
-        scale = 1 + float(belief.x[self._layout.wheel_scales].sum())
-        c, s = math.cos(angle) / scale, math.sin(angle) / scale
-        self._map_from_reckoned, self._step = np.array([[c, -s], [s, c]]), step
+    def follow(self, belief: Belief) -> None:
+        """Follow the machine by its believed velocity, which wheels and gyros show: dead reckoning in `map`."""
+        if self._followed_ns:
+            self._track_m = self._reckoned_m(belief.stamp_ns)
+            dt_s = (belief.stamp_ns - self._followed_ns) * 1e-9
+            self._share.drive(float(np.hypot(*self._velocity_mps)) * dt_s)
+        self._followed_ns = belief.stamp_ns
+        self._velocity_mps = map_from_base(belief.x[ATTITUDE])[:2] @ belief.x[VELOCITY]
 
     def compare(self, fix: Fix, belief: Belief, white_m2: float, error: GpsError) -> None:
         """Compare a fix with dead reckoning; white_m2, error: its white noise, and the receiver's slow error."""
-        if self._step is None or not fix.is_absolute:
+        if not self._followed_ns or not fix.is_absolute:
             return
-        yaw, (ahead, left, _) = float(belief.x[YAW]), fix.sensor.mount.xyz_m
-        c, s = math.cos(yaw), math.sin(yaw)
-        antenna = np.array([c * ahead - s * left, s * ahead + c * left])
-        off_m = fix.position_m - antenna - self._reckoned_m(fix)
+        antenna_m = map_from_base(belief.x[ATTITUDE])[:2] @ fix.lever_m
+        off_m = fix.position_m - antenna_m - self._reckoned_m(fix.stamp_ns)
         self._share.add_fix(fix.sensor.name, belief.stamp_ns, off_m, white_m2, error)
 
     # --- the filter --------------------------------------------------------------------------------------------------
@@ -162,12 +158,10 @@ class Corrections:
         self._offset_m = np.array([first.offset_e_m, first.offset_n_m])
         return partial(_begun, layout=self._layout, slow_m2=first.slow_m2, offset_m2=first.offset_m2)
 
-    def _reckoned_m(self, event: FilterStep | Fix) -> Floats:
-        """Where the machine is by dead reckoning since the last step (2,)."""
-        assert self._step
-        before, now = self._step.reckoned, event.reckoned
-        moved: Floats = self._map_from_reckoned @ np.array([now.x_m - before.x_m, now.y_m - before.y_m])
-        return self._track_m + moved
+    def _reckoned_m(self, stamp_ns: int) -> Floats:
+        """Where the machine is by dead reckoning (2,), around the last step."""
+        reckoned: Floats = self._track_m + self._velocity_mps * ((stamp_ns - self._followed_ns) * 1e-9)
+        return reckoned
 
 
 def _begun(belief: Belief, layout: Layout, slow_m2: float, offset_m2: float) -> Belief:

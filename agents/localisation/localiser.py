@@ -128,12 +128,13 @@ class Localiser:
         """Smoothed poses within the lag, as known by now; the last is the newest belief's. They stay."""
         return self._fusion.remaining() if self._fusion else []
 
+    def take(self, correction: Correction) -> None:
+        """Keep a correction of a base station until it is due, with a later reading."""
+        if self._corrections and self._fusion:
+            self._corrections.take(correction, self._fusion.belief.stamp_ns)
+
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
-        if isinstance(reading, Correction):
-            if self._corrections and self._fusion:
-                self._corrections.take(reading, self._fusion.belief.stamp_ns)
-            return []
         event: Event | None
         if isinstance(reading, Gps):
             event = self._receivers.fix(reading, dead_reckoning.pose)
@@ -168,7 +169,7 @@ class Localiser:
         ]
         beliefs += fusion.add(measurements) if measurements else []
         if self._corrections:
-            self._corrections.follow(event, fusion.belief)
+            self._corrections.follow(fusion.belief)
         return beliefs + self._correct(fusion)
 
     def _correct(self, fusion: Fusion) -> list[Belief]:
