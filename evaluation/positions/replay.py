@@ -1,6 +1,7 @@
 """Replay readings through the pipeline, or through its localising half, and compare its poses with the truth.
 
 A pose is compared at its own stamp, as it was known after the readings of that 100 ms: no later reading improves it.
+Smoothed poses are what later readings made of it: they are compared at their own stamps too, once a second.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import numpy as np
 
 from agents.holdout import Holdout
 from agents.localisation.filters.belief import PoseBelief
-from agents.pipeline import PoseSource
+from agents.localisation.filters.smoother import SmoothedPose
+from agents.pipeline import PoseSource, Positioning
 from evaluation.campaign.figures import root_mean_square
 from evaluation.campaign.truth import Truth
-from evaluation.positions.consistency import normalised_square, summarise
+from evaluation.positions.consistency import ConsistencySummary, normalised_square, summarise
 from protocol.arrays import Floats, Ints
 from protocol.machine.readings import Reading
 
@@ -26,19 +28,29 @@ HOLE = 3  # times the usual interval between poses: nothing was believed in a lo
 
 
 @dataclass(frozen=True)
-class Trace:
-    """What was believed, once per STEP_NS from the first pose on.
-
-    stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2) in `map`. first_ns, last_ns: of the readings. cpu_s:
-    processor time of whatever was run: the whole pipeline, or localisation alone.
-    """
+class Track:
+    """Where a machine is said to have been: stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2) in `map`."""
 
     stamp_ns: Ints
     position_m: Floats
     covariance_m2: Floats
+
+
+NOWHERE = Track(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+@dataclass(frozen=True)
+class Trace(Track):
+    """What was believed, once per STEP_NS from the first pose on.
+
+    first_ns, last_ns: of the readings. cpu_s: processor time of whatever was run: the whole pipeline, or localisation
+    alone. smoothed: what localisation alone says of the past in the end; empty of a pipeline, or without a smoother.
+    """
+
     first_ns: int
     last_ns: int
     cpu_s: float
+    smoothed: Track = NOWHERE
 
     @property
     def seconds(self) -> float:
@@ -70,43 +82,44 @@ class Score:
     coverage95: float
     covered: float
     us_per_second: float
+    smoothed_net_m: float
+    smoothed_nees: float
+    smoothed_coverage95: float
 
 
 def replay(core: PoseSource, readings: Sequence[Reading], holdout: Holdout | None = None) -> Trace:
     """Give readings to a pipeline or to its localising half, in the order of their stamps; holdout keeps fixes back."""
     poses: list[PoseBelief] = []
+    smoothed: list[SmoothedPose] = []
     cpu_s = 0.0
     for span in _spans(readings):
         seen = holdout.split(span) if holdout else span
         began_s = time.process_time()
-        core.step(seen)
+        if isinstance(core, Positioning):
+            smoothed += core.step(seen)
+        else:
+            core.step(seen)
         pose = core.pose
         cpu_s += time.process_time() - began_s
         if holdout:
             holdout.compare(core)
         if pose and (not poses or pose.stamp_ns > poses[-1].stamp_ns):
             poses.append(pose)
-    return Trace(
-        stamp_ns=np.array([p.stamp_ns for p in poses], np.int64),
-        position_m=np.array([(p.x_m, p.y_m) for p in poses]).reshape(-1, 2),
-        covariance_m2=np.array([p.covariance_m2 for p in poses]).reshape(-1, 2, 2),
-        first_ns=readings[0].stamp_ns if readings else 0,
-        last_ns=readings[-1].stamp_ns if readings else 0,
-        cpu_s=cpu_s,
-    )
+    if isinstance(core, Positioning):
+        smoothed += core.remaining()
+    first_ns, last_ns = (readings[0].stamp_ns, readings[-1].stamp_ns) if readings else (0, 0)
+    return Trace(**vars(_track(poses)), first_ns=first_ns, last_ns=last_ns, cpu_s=cpu_s, smoothed=_track(smoothed))
 
 
-def errors(trace: Trace, truth: Truth) -> Floats:
-    """Errors (n, 2) [m] of a trace; NaN where the truth is not known."""
-    return trace.position_m - truth.at(trace.stamp_ns)
+def errors(track: Track, truth: Truth) -> Floats:
+    """Errors (n, 2) [m] of a track; NaN where the truth is not known."""
+    return track.position_m - truth.at(track.stamp_ns)
 
 
 def score(trace: Trace, truth: Truth) -> Score:
     """Errors of a trace, NaN where it has none."""
-    off = errors(trace, truth)
-    known = np.isfinite(off).all(axis=1)
-    off, covariance = off[known], trace.covariance_m2[known]
-    nees = summarise(normalised_square(off, covariance), dof=2)
+    off, nees = _judged(trace, truth)
+    smoothed_off, smoothed_nees = _judged(trace.smoothed, truth)
     x, y = (root_mean_square(column) for column in off.T)
     return Score(
         rmse_x_m=x,
@@ -119,6 +132,25 @@ def score(trace: Trace, truth: Truth) -> Score:
         coverage95=nees.coverage,
         covered=covered(trace),
         us_per_second=trace.cpu_s * 1e6 / trace.seconds if trace.seconds else math.nan,
+        smoothed_net_m=root_mean_square(np.hypot(*smoothed_off.T)),
+        smoothed_nees=smoothed_nees.mean,
+        smoothed_coverage95=smoothed_nees.coverage,
+    )
+
+
+def _judged(track: Track, truth: Truth) -> tuple[Floats, ConsistencySummary]:
+    """Errors (m, 2) of a track where the truth is known, and its NEES."""
+    off = errors(track, truth)
+    known = np.isfinite(off).all(axis=1)
+    off = off[known]
+    return off, summarise(normalised_square(off, track.covariance_m2[known]), dof=2)
+
+
+def _track(poses: Sequence[PoseBelief] | Sequence[SmoothedPose]) -> Track:
+    return Track(
+        stamp_ns=np.array([p.stamp_ns for p in poses], np.int64),
+        position_m=np.array([(p.x_m, p.y_m) for p in poses]).reshape(-1, 2),
+        covariance_m2=np.array([p.covariance_m2 for p in poses]).reshape(-1, 2, 2),
     )
 
 

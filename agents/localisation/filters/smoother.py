@@ -79,7 +79,7 @@ class Past:
         """After a motion F (n, n) from a belief x, P at stamp_ns, which becomes a node if its second is over."""
         if to_ns // NODE_NS == stamp_ns // NODE_NS:
             return Past(self.lag_ns, self.nodes, (), F.dot(self.transition), self.adjoint, self.information)
-        nodes = self._with(stamp_ns, x, P)
+        nodes = self.nodes_with(stamp_ns, x, P)
         over = int(np.searchsorted(nodes.stamp_ns, stamp_ns - self.lag_ns, side="right"))
         final = tuple(_poses(nodes, over)) if over else ()
         rest = Nodes._make(values[over:] for values in nodes) if over else nodes
@@ -102,9 +102,9 @@ class Past:
 
     def poses(self, stamp_ns: int, x: Floats, P: Floats) -> list[SmoothedPose]:
         """All nodes, as known by now, and the belief x, P at stamp_ns itself."""
-        return _poses(self._with(stamp_ns, x, P))
+        return _poses(self.nodes_with(stamp_ns, x, P))
 
-    def _with(self, stamp_ns: int, x: Floats, P: Floats) -> Nodes:
+    def nodes_with(self, stamp_ns: int, x: Floats, P: Floats) -> Nodes:
         """The nodes brought up to date, and the belief x, P at stamp_ns."""
         _, filtered, mean, covariance, cross = self.nodes
         flat = cross.reshape(-1, len(x))  # one product for all nodes

@@ -12,7 +12,7 @@ from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.filters.belief import PoseBelief
 from agents.pipeline import Pipeline, PipelineConfig, PoseSource, Positioning
 from evaluation.campaign.truth import Truth
-from evaluation.positions.replay import STEP_NS, Trace, covered, replay, score
+from evaluation.positions.replay import STEP_NS, Trace, Track, covered, replay, score
 from protocol.machine.readings import Articulation, Reading
 from sim.config import SimConfig
 from sim.simulator import Simulator
@@ -95,6 +95,19 @@ def test_poses_that_end_early_cover_no_more():
     assert covered(poses_at([30.0], 100.0)) == pytest.approx(0.002)
 
 
+def test_smoothed_poses_are_judged_at_their_own_stamps():
+    trace, truth = trace_of([(3.0, 0.0)] * 40, std_m=2.0)
+    every = slice(None, None, 10)
+    off_m = np.array([(0.0, 1.0)] * 4)
+    smoothed = Track(
+        trace.stamp_ns[every], trace.position_m[every] - (3.0, 0.0) + off_m, trace.covariance_m2[every] / 4
+    )
+    result = score(replace(trace, smoothed=smoothed), truth)
+    assert (result.net_m, result.nees) == pytest.approx((3.0, 2.25))
+    assert (result.smoothed_net_m, result.smoothed_nees, result.smoothed_coverage95) == pytest.approx((1.0, 1.0, 1.0))
+    assert math.isnan(score(trace, truth).smoothed_net_m)
+
+
 def test_a_replay_of_nothing_has_no_pose_and_no_error_but_nan():
     core: Any = Scripted()
     trace, truth = trace_of([(0.0, 0.0)])
@@ -128,5 +141,8 @@ def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipel
     assert len(whole.stamp_ns) > 50
     assert judged[0] == judged[1]
     assert judged[0]["fixes"]
+    assert not len(whole.smoothed.stamp_ns)
+    assert np.diff(half.smoothed.stamp_ns[:-1]).min() > 0.9e9
+    assert len(half.smoothed.stamp_ns) >= 10
     for name in ("stamp_ns", "position_m", "covariance_m2"):
         assert getattr(whole, name).tobytes() == getattr(half, name).tobytes()

@@ -22,8 +22,8 @@ NEVER = Configuration("ukf", 9, 1, "default")
 SECONDS = 14.0
 
 
-def score(net_m: float, max_m: float = 3.0, us: float = 100.0) -> Score:
-    return Score(0.6 * net_m, 0.8 * net_m, net_m, max_m, 2.0, 1.0, 3.0, 0.95, 0.98, us)
+def score(net_m: float, max_m: float = 3.0, us: float = 100.0, smoothed: tuple[float, ...] = (math.nan,) * 3) -> Score:
+    return Score(0.6 * net_m, 0.8 * net_m, net_m, max_m, 2.0, 1.0, 3.0, 0.95, 0.98, us, *smoothed)
 
 
 def test_row_has_means_over_seeds_and_stands_beside_the_paper():
@@ -62,6 +62,14 @@ def test_ratios_are_of_profiles_and_of_filters_that_were_both_run():
     assert ratios({ONE: [score(1.0)]}) == []
 
 
+def test_smoothed_poses_stand_beside_the_live_ones_of_the_same_drives():
+    runs = [score(2.0, smoothed=(1.5, 1.8, 0.96)), score(4.0, smoothed=(3.3, 2.2, 0.94))]
+    row = summarise(ONE, runs)
+    assert (row["smoothed_net_m"], row["smoothed_nees"], row["smoothed_coverage95"]) == (2.4, 2.0, 0.95)
+    (ratio,) = ratios({ONE: runs})
+    assert (ratio["ratio"], ratio["net"]) == ("smoothed/live", 0.8)
+
+
 # --- on recordings ---------------------------------------------------------------------------------------------------
 
 
@@ -89,6 +97,7 @@ def test_rows_are_scored_on_one_recording_and_what_cannot_run_is_named(result, r
     assert len(outcomes[0].run.time_s) > 4
     assert [outcome.row for outcome in outcomes] == [ONE, TWO, NONE]
     assert list(rows[0])[:5] == ["filter", "gps", "imu", "profile", "rmse_x_m"]
+    assert all(0.05 < row["smoothed_net_m"] < 8 and row["smoothed_coverage95"] > 0.3 for row in rows[:2])
 
 
 def test_the_report_says_how_slow_gps_errors_are():
