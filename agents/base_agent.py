@@ -1,4 +1,4 @@
-"""A base station's process: driver -> corrections -> Zenoh; it shows its health and holds its name as a machine does."""
+"""A base station's process: driver -> corrections -> Zenoh. It shows health, and holds its name, as a machine does."""
 
 import logging
 import time

@@ -107,8 +107,7 @@ class BaseStation:
 
     def step(self, readings: Sequence[Reading]) -> list[Correction]:
         """Take in readings in the order of their stamps; returns the corrections of the spans that they complete."""
-        made = [correction for reading in readings if (correction := self._take(reading))]
-        return made
+        return [correction for reading in readings if (correction := self._take(reading))]
 
     def health(self) -> dict[str, Any]:
         """State in plain values."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig
 from agents.holdout import HoldoutConfig
+from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import PipelineConfig
 from protocol.config import from_table, section
 from protocol.errors import ConfigError
@@ -44,6 +45,13 @@ class AgentConfig:
             raise ValueError(f"place: {list(self.place)} is no latitude and longitude [deg]")
         if self.linger_s < 0:
             raise ValueError("linger_s: negative")
+
+
+def require_place(machine: MachineConfig, config: LocalisationConfig) -> None:
+    """Refuse a machine that can never know where it is; raises ConfigError."""
+    if not config.start and not any(s.kind == "gps" and s.use and s.mode == ABSOLUTE for s in machine.sensors):
+        problem = "no sensor in use shows its place, so it would never have a pose: give it a `gps`, or its `start`"
+        raise ConfigError(machine.name, f"{problem} ([pipeline.localisation])")
 
 
 def load_agent(path: Path) -> tuple[MachineConfig | None, AgentConfig]:

@@ -1,55 +1,80 @@
-"""Dead reckoning: distance, turn and speed of a machine from its wheels and gyro."""
+"""Dead reckoning: distance, turn and speed of a machine from its wheels and gyros.
+
+Several sensors of a kind count as their mean, of those that spoke within the last second. So no result depends on the
+order in which they are described, and one that dies leaves the others.
+"""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
-from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque
 from protocol.units import GRAVITY_MPS2
 
 TURN_KINDS = ("imu", "odometry", "steering")  # sensors that show the turn, the best first
 STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
+PAUSE_S = 1.0  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
 MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine
 MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
+MIN_NARROWING = 0.2  # of a bend for its inner wheel: one near the middle of the bend rolls too little to scale it up
 
 
 def turn_source(machine: MachineConfig) -> SensorConfig | None:
-    """The sensor that the turn is taken from: an IMU in use that measures rates, else odometry, else steering."""
-    able = [s for kind in TURN_KINDS for s in machine.sensors if s.kind == kind and s.use and s.provides("rate")]
-    return able[0] if able else None
+    """The sensor that the turn is taken from: an IMU in use that measures rates, else odometry, else steering.
+
+    Of several the one that states the least deviation; one that states none comes last, then the name decides.
+    """
+    able = [s for s in machine.sensors if s.kind in TURN_KINDS and s.use and s.provides("rate")]
+    return min(able, key=lambda s: (TURN_KINDS.index(s.kind), s.std.get("rate", math.inf), s.name), default=None)
 
 
 class WheelTracker:
     """Speed and acceleration from quantised wheel travel: a fading-memory filter of third order.
 
     Least squares of a parabola over the past, with weights that fade by exp(-dt / tau_s) (Morrison 1969): stable at
-    any rate, and without lasting error while the acceleration is constant.
+    any rate, and without lasting error while the acceleration is constant. It starts as plain least squares of all
+    readings so far (the expanding memory, ibid.), until the fading one weighs new readings more: then `is_settled`.
     """
 
     def __init__(self, tau_s: float = 0.15) -> None:
         self.speed_mps = 0.0
         self.accel_mps2 = 0.0
+        self.is_settled = False
         self._tau_s = tau_s
         self.travel_m = 0.0
         self._stamp_ns = 0
+        self._count = 0
 
-    def update(self, stamp_ns: int, travel_m: float) -> None:
-        """Take in the wheel travel so far."""
+    def update(self, stamp_ns: int, travel_m: float, speed_mps: float | None = None) -> None:
+        """Take in the wheel travel so far. speed_mps: where the sensor states it; the tracker starts from there."""
         dt = (stamp_ns - self._stamp_ns) * 1e-9
-        if not self._stamp_ns or dt > 1:  # the first, or a pause: start from here
-            self.travel_m, self._stamp_ns = travel_m, stamp_ns
+        if not self._stamp_ns or dt > PAUSE_S:
+            self.travel_m, self.speed_mps, self.accel_mps2 = travel_m, speed_mps or 0.0, 0.0
+            self._stamp_ns, self._count, self.is_settled = stamp_ns, 1, speed_mps is not None
             return
         if dt <= 0:
             return
-        fade = math.exp(-dt / self._tau_s)
+        self._stamp_ns, self._count = stamp_ns, self._count + 1
+        of_travel, of_speed, of_accel = self._gains(math.exp(-dt / self._tau_s))
         self.travel_m += dt * (self.speed_mps + 0.5 * self.accel_mps2 * dt)
         self.speed_mps += dt * self.accel_mps2
         error = travel_m - self.travel_m
-        self.travel_m += (1 - fade**3) * error
-        self.speed_mps += 1.5 * (1 - fade) ** 2 * (1 + fade) * error / dt
-        self.accel_mps2 += (1 - fade) ** 3 * error / dt**2
-        self._stamp_ns = stamp_ns
+        self.travel_m += of_travel * error
+        self.speed_mps += of_speed * error / dt
+        self.accel_mps2 += of_accel * error / dt**2
+
+    def _gains(self, fade: float) -> tuple[float, float, float]:
+        """Gains of travel, speed and acceleration, in units of the time step."""
+        if not self.is_settled:
+            k = self._count
+            if k == 2:  # two readings are a line
+                return 1.0, 1.0, 0.0
+            product = k * (k + 1) * (k + 2)
+            self.is_settled = (1 - fade) ** 3 * product >= 60
+            if not self.is_settled:
+                return 3 * (3 * k * k - 3 * k + 2) / product, 18 * (2 * k - 1) / product, 60 / product
+        return 1 - fade**3, 1.5 * (1 - fade) ** 2 * (1 + fade), (1 - fade) ** 3
 
 
 @dataclass(frozen=True)
@@ -63,35 +88,61 @@ class DeadReckonedPose:
     y_m: float
 
 
+@dataclass(frozen=True)
+class WheelSpeed:
+    """Mean speed and acceleration of the wheels. offset_m: how far left of the middle they are, on average.
+
+    is_known: whether their readings show a speed yet.
+    """
+
+    speed_mps: float = 0.0
+    accel_mps2: float = 0.0
+    offset_m: float = 0.0
+    is_known: bool = False
+
+
+@dataclass
+class _Wheel:
+    """One wheel sensor: its last reading, how far it has rolled by then, and the machine's angle then."""
+
+    reading: Encoder | Odometry
+    offset_m: float
+    angle_rad: float
+    rolled_m: float = 0.0
+    tracker: WheelTracker = field(default_factory=WheelTracker)
+
+
 class DeadReckoning:
-    """Accumulates wheel travel and turn, without GPS.
+    """Accumulates wheel travel and turn, without GPS. Readings of one stamp come with those of wheels last.
 
     slip: wheel slip per traction (drive force over weight), taken off where the machine has a torque sensor. travel_m:
-    of the machine, down in reverse; distance_m: up in reverse too. traction: the newest.
+    of `base_link`, down in reverse; distance_m: up in reverse too. traction: the newest. wheels: as of their newest
+    reading. stands_since_ns: since when no wheel has rolled.
     """
 
     def __init__(self, machine: MachineConfig, slip: float) -> None:
-        self.wheels = WheelTracker()
+        self.wheels = WheelSpeed()
         self.stamp_ns = 0
         self.travel_m = 0.0
         self.angle_rad = 0.0
         self.distance_m = 0.0
+        self.traction = 0.0
+        self.stands_since_ns = 0
         self._machine = machine
         self._slip = slip
-        self.traction = 0.0
-        self._rolled_m = 0.0
-        self._rotation: dict[str, Floats] = {}
-        self._imu: Imu | None = None
+        self._up: dict[str, list[float]] = {}  # the vertical of `base_link` in each gyro's axes
+        self._gyro_ns: dict[str, int] = {}
+        self._wheels: dict[str, _Wheel] = {}
         source = turn_source(machine)
         self._turn_sensor = source.name if source else ""
+        self._steers = source is not None and source.kind == "steering"
         self._turned_ns = 0  # by odometry or steering
         self._curvature = 0.0  # [1/m], by steering
-        self._wheel_reading: Encoder | Odometry | None = None
         self._x_m = 0.0
         self._y_m = 0.0
 
     def update(self, reading: Reading, sensor: SensorConfig) -> None:
-        """Take in a reading of the wheels, or of the sensor that shows the turn; others change nothing."""
+        """Take in a reading of the wheels, or of a sensor that shows the turn; others change nothing."""
         if isinstance(reading, Imu) and sensor.frame == BASE and sensor.provides("rate"):
             self._turn(reading, sensor)
         elif isinstance(reading, Encoder | Odometry):
@@ -113,51 +164,83 @@ class DeadReckoning:
         return DeadReckonedPose(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
 
     def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
-        """Integrate the vertical rate of the first gyro on the rear frame."""
-        if self._imu is not None and self._imu.sensor != imu.sensor:
-            return
-        if imu.sensor not in self._rotation:
-            self._rotation[imu.sensor] = sensor.mount.frame_from_sensor()
-        up = self._rotation[imu.sensor][2]
-        if self._imu is not None:
-            dt = (imu.stamp_ns - self._imu.stamp_ns) * 1e-9
-            rate = up[0] * imu.gyro_x_radps + up[1] * imu.gyro_y_radps + up[2] * imu.gyro_z_radps
-            self.angle_rad += rate * min(dt, 1.0)
-        self._imu = imu
+        """Integrate the vertical rate of a gyro on the rear frame, by its share in the mean."""
+        if imu.sensor not in self._up:
+            self._up[imu.sensor] = sensor.mount.frame_from_sensor()[2].tolist()
+        up = self._up[imu.sensor]
+        dt = (imu.stamp_ns - self._gyro_ns.get(imu.sensor, imu.stamp_ns)) * 1e-9
+        self._gyro_ns[imu.sensor] = imu.stamp_ns
+        speaking = sum(_speaks(last_ns, imu.stamp_ns) for last_ns in self._gyro_ns.values())
+        rate = up[0] * imu.gyro_x_radps + up[1] * imu.gyro_y_radps + up[2] * imu.gyro_z_radps
+        self.angle_rad += rate * min(dt, PAUSE_S) / speaking
         self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
 
     def _turn_by_odometry(self, odometry: Odometry) -> None:
         """Turn by the rate of odometry."""
         if self._turned_ns:
             dt_s = (odometry.stamp_ns - self._turned_ns) * 1e-9
-            self.angle_rad += odometry.rate_z_radps * min(dt_s, 1.0)
+            self.angle_rad += odometry.rate_z_radps * min(dt_s, PAUSE_S)
         self._turned_ns = odometry.stamp_ns
 
     def _roll(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
-        """Advance by the first wheel sensor that speaks; others are not used."""
-        last = self._wheel_reading or reading
-        if last.sensor == reading.sensor:
-            self._wheel_reading = reading
-            self._advance(reading.stamp_ns, self._rolled_between(last, reading, sensor))
+        """Advance by what a wheel sensor rolled since its last reading, by its share in the mean."""
+        stamp_ns, offset_m = reading.stamp_ns, sensor.mount.xyz_m[1]
+        wheel = self._wheels.setdefault(reading.sensor, _Wheel(reading, offset_m, self.angle_rad))
+        others = [w for w in self._wheels.values() if w is not wheel and _speaks(w.reading.stamp_ns, stamp_ns)]
+        is_new = not _speaks(wheel.reading.stamp_ns, stamp_ns) or wheel.reading is reading
+        rolled_m = 0.0 if is_new and others else self._rolled_between(wheel.reading, reading, sensor)
+        if rolled_m or is_new:
+            self.stands_since_ns = stamp_ns
+        wheel.reading, wheel.rolled_m = reading, wheel.rolled_m + rolled_m
+        wheel.tracker.update(stamp_ns, wheel.rolled_m, reading.speed_x_mps if isinstance(reading, Odometry) else None)
+        self.wheels = _mean_speed([wheel, *others])
+        self._advance(wheel, rolled_m, 1 + len(others))
 
     def _rolled_between(self, last: Encoder | Odometry, now: Encoder | Odometry, sensor: SensorConfig) -> float:
         dt_s = (now.stamp_ns - last.stamp_ns) * 1e-9
         if isinstance(now, Odometry):
-            return now.speed_x_mps * min(dt_s, 1.0)
+            return now.speed_x_mps * min(dt_s, PAUSE_S)
         assert isinstance(last, Encoder)
         ticks = (now.left_ticks - last.left_ticks + now.right_ticks - last.right_ticks) / 2
         rolled_m = ticks * 2 * math.pi * self._machine.wheel_radius_m / sensor.ticks_per_rev
         return rolled_m if abs(rolled_m) <= MAX_WHEEL_MPS * dt_s else 0.0
 
-    def _advance(self, stamp_ns: int, rolled_m: float) -> None:
-        self._rolled_m += rolled_m
-        self.wheels.update(stamp_ns, self._rolled_m)
-        travel_m = rolled_m * (1 - self._slip * self.traction * math.copysign(1.0, rolled_m))
+    def _advance(self, wheel: _Wheel, rolled_m: float, wheels: int) -> None:
+        """Move `base_link` as one of so many wheels rolled; one on the left rolls less in a bend to the left."""
+        stamp_ns = wheel.reading.stamp_ns
+        gripped_m = rolled_m * (1 - self._slip * self.traction * math.copysign(1.0, rolled_m))
+        curvature = self._curvature if stamp_ns - self._turned_ns < STALE_S * 1e9 else 0.0
+        if self._steers:
+            travel_m = gripped_m / narrowing(curvature, wheel.offset_m) / wheels
+            self.angle_rad += travel_m * curvature
+        else:
+            travel_m = (gripped_m + wheel.offset_m * (self.angle_rad - wheel.angle_rad)) / wheels
+        middle_rad = (wheel.angle_rad + self.angle_rad) / 2
+        wheel.angle_rad = self.angle_rad
         self.travel_m += travel_m
         self.distance_m += abs(travel_m)
-        steered_rad = travel_m * self._curvature if stamp_ns - self._turned_ns < STALE_S * 1e9 else 0.0
-        middle_rad = self.angle_rad + steered_rad / 2
         self._x_m += travel_m * math.cos(middle_rad)
         self._y_m += travel_m * math.sin(middle_rad)
-        self.angle_rad += steered_rad
         self.stamp_ns = max(self.stamp_ns, stamp_ns)
+
+
+def narrowing(curvature: float, offset_m: float) -> float:
+    """What a wheel rolls over what the middle of its axle travels, in a bend to the left, where the wheel is left.
+
+    It is 1 - curvature offset; the middle of the bend may lie near the wheel, but such a wheel shows no distance.
+    """
+    return max(1 - curvature * offset_m, MIN_NARROWING)
+
+
+def _speaks(last_ns: int, now_ns: int) -> bool:
+    """Whether a sensor that was last heard then still counts."""
+    return now_ns - last_ns <= PAUSE_S * 1e9
+
+
+def _mean_speed(wheels: Sequence[_Wheel]) -> WheelSpeed:
+    known = [w for w in wheels if w.tracker.is_settled]
+    if not known:
+        return WheelSpeed()
+    each = [(w.tracker.speed_mps, w.tracker.accel_mps2, w.offset_m) for w in known]
+    speed_mps, accel_mps2, offset_m = (sum(values) / len(known) for values in zip(*each, strict=True))
+    return WheelSpeed(speed_mps, accel_mps2, offset_m, is_known=True)

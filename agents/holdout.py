@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -15,7 +16,16 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, GpsVelocity, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
+FIGURES = ("rms_m", "median_m", "max_m", "end_m")
+NOTHING: dict[str, float | int | None] = {"fixes": 0, **dict.fromkeys(FIGURES)}  # the report if no fix was judged
 SETTLE_S = 40.0  # fixes are judged from so long after the first reading on: by then a machine that drives is aligned
+
+
+class Schedule(Protocol):
+    """When GPS is withheld."""
+
+    def withholds(self, seconds: float) -> bool:
+        """Whether it is withheld so long after the first reading."""
 
 
 @dataclass(frozen=True)
@@ -29,19 +39,25 @@ class HoldoutConfig:
         if not 0 < self.off_s < self.period_s:
             raise ValueError("off_s must lie between 0 and period_s")
 
+    def withholds(self, seconds: float) -> bool:
+        """Whether GPS is withheld so long after the first reading."""
+        return seconds % self.period_s < self.off_s
+
 
 class Holdout:
     """Splits off fixes before the pipeline sees them, and compares them with its poses afterwards."""
 
     def __init__(
-        self, site: SiteConfig, machine: MachineConfig, config: HoldoutConfig, settle_s: float = SETTLE_S
+        self, site: SiteConfig, machine: MachineConfig, schedule: Schedule, settle_s: float = SETTLE_S
     ) -> None:
-        self._config, self._settle_s = config, settle_s
+        self._schedule, self._settle_s = schedule, settle_s
         self._projection = Projection(site)
         self._sensors = {s.name: s for s in machine.sensors}
         self._first_ns = 0
-        self._waiting: deque[Gps] = deque()
+        self._waiting: deque[tuple[Gps, int]] = deque()  # and of which outage
         self._errors_m: list[float] = []
+        self._last_m: dict[int, float] = {}  # errors of the last fix of each outage
+        self._outage, self._is_dark = 0, False
 
     def split(self, readings: Sequence[Reading]) -> list[Reading]:
         """Return what the pipeline may see."""
@@ -50,38 +66,34 @@ class Holdout:
     def compare(self, pipeline: PoseSource) -> None:
         """Compare withheld fixes with the poses that are known by now."""
         pose = pipeline.pose
-        while pose and self._waiting and self._true_ns(self._waiting[0]) <= pose.stamp_ns:
-            fix = self._waiting.popleft()
+        while pose and self._waiting and self._true_ns(self._waiting[0][0]) <= pose.stamp_ns:
+            fix, outage = self._waiting.popleft()
             if (at := pipeline.pose_at(self._true_ns(fix))) and self._seconds(fix) >= self._settle_s:
                 x, y, _ = self._projection.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
                 lever = self._sensors[fix.sensor].mount.xyz_m
                 c, s = math.cos(at.heading_rad), math.sin(at.heading_rad)
                 dx = at.x_m + c * lever[0] - s * lever[1] - x
                 dy = at.y_m + s * lever[0] + c * lever[1] - y
-                self._errors_m.append(math.hypot(dx, dy))
+                self._last_m[outage] = math.hypot(dx, dy)
+                self._errors_m.append(self._last_m[outage])
 
     def report(self) -> dict[str, float | int | None]:
-        """How many fixes were judged, and the error against them [m]."""
+        """How many fixes were judged, and the error against them [m]; end_m: rms of the last ones of the outages."""
         if not self._errors_m:
-            return {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None}
-        errors = np.array(self._errors_m)
-        rms = float(np.sqrt((errors**2).mean()))
-        return {
-            "fixes": len(errors),
-            "rms_m": round(rms, 3),
-            "median_m": round(float(np.median(errors)), 3),
-            "max_m": round(float(errors.max()), 3),
-        }
+            return dict(NOTHING)
+        errors, last = np.array(self._errors_m), np.array(list(self._last_m.values()))
+        figures = np.sqrt((errors**2).mean()), np.median(errors), errors.max(), np.sqrt((last**2).mean())
+        return {"fixes": len(errors), **dict(zip(FIGURES, (round(float(f), 3) for f in figures), strict=True))}
 
     def _is_withheld(self, reading: Reading) -> bool:
         self._first_ns = self._first_ns or reading.stamp_ns
         if not isinstance(reading, Gps | GpsVelocity) or reading.sensor not in self._sensors:
             return False
-        if self._seconds(reading) % self._config.period_s >= self._config.off_s:
-            return False
-        if isinstance(reading, Gps):
-            self._waiting.append(reading)
-        return True
+        was_dark, self._is_dark = self._is_dark, self._schedule.withholds(self._seconds(reading))
+        self._outage += self._is_dark and not was_dark
+        if self._is_dark and isinstance(reading, Gps):
+            self._waiting.append((reading, self._outage))
+        return self._is_dark
 
     def _true_ns(self, fix: Gps) -> int:
         return self._sensors[fix.sensor].true_ns(fix.stamp_ns)

@@ -4,8 +4,9 @@
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,11 +17,12 @@ from agents.estimation.ground import EstimationConfig, GroundEstimator
 from agents.localisation.filters.belief import DivergedError, PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
+from agents.localisation.imu_steps import Sensed
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
-from agents.stream_order import Decision, StreamOrder
+from agents.stream_order import Decision, StreamOrder, by_stamp
 from protocol.arrays import Table
-from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
@@ -34,14 +36,13 @@ class PipelineConfig:
 
 
 class Accepted(NamedTuple):
-    """A reading that counts, at the stamp of what it measured; a tuple, as there are hundreds a second.
+    """Readings of one stamp that count, at the stamp of what they measured; a tuple, as there are hundreds a second.
 
-    poses: what it made possible or changed, oldest first. smoothed: past poses that became final with it, oldest first.
-    restarts: nothing before it counts any more; then smoothed are all that remained.
+    poses: what they made possible or changed, oldest first. smoothed: past poses that became final with them, oldest
+    first. restarts: nothing before them counts any more; then smoothed are all that remained.
     """
 
-    reading: Reading
-    sensor: SensorConfig
+    readings: list[Sensed]
     poses: list[PoseBelief]
     smoothed: list[SmoothedPose]
     restarts: bool
@@ -51,7 +52,7 @@ class Positioning:
     """Dead reckoning and localisation of one machine, and the history of its poses."""
 
     def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
-        self._machine, self._config = machine, config.localisation
+        self._machine, self._config = in_name_order(machine), config.localisation
         self._projection = Projection(site)
         self._sensors = {s.name: s for s in machine.sensors if s.use}
         self._order = StreamOrder()
@@ -76,7 +77,7 @@ class Positioning:
         """Take in readings in the order of their stamps; returns the smoothed poses that became final."""
         smoothed: list[SmoothedPose] = []
         for reading in readings:
-            if accepted := self.accept(reading):
+            for accepted in self.accept(reading):
                 smoothed += accepted.smoothed
                 for pose in accepted.poses:
                     self.poses.append(pose)
@@ -86,31 +87,59 @@ class Positioning:
         """Smoothed poses that are not final, as known by now: the last words on them where the stream ends."""
         return self.localiser.remaining()
 
-    def accept(self, reading: Reading) -> Accepted | None:
-        """Take in one reading; None where it is refused. The caller appends its poses to `poses`, one by one."""
+    def accept(self, reading: Reading) -> Iterator[Accepted]:
+        """Take in one reading; yields what counts of the stamp that it ends.
+
+        The caller appends the poses to `poses`, one by one, before it takes the next.
+        """
         sensor = self._sensors.get(reading.sensor)
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
-            return None
-        if sensor.delay_s:
-            reading = replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns))
+            return
         if isinstance(reading, Correction):  # of another one's clock, and late: it takes effect with the next readings
-            self.localiser.take(reading)
+            self.localiser.take(self._undelayed(reading))
+            return
+        known_ns = max(reading.stamp_ns, sensor.true_ns(reading.stamp_ns))  # never before it was true
+        yield from self._accept(self._order.gather(reading, known_ns))
+
+    def finish(self) -> Iterator[Accepted]:
+        """Take in the readings of the last stamp, as the stream ends; like `accept`."""
+        yield from self._accept(self._order.rest())
+
+    def _accept(self, readings: Sequence[Reading]) -> Iterator[Accepted]:
+        for group in by_stamp(map(self._undelayed, readings)):
+            if accepted := self._take(group):
+                yield accepted
+
+    def _undelayed(self, reading: Reading) -> Reading:
+        sensor = self._sensors[reading.sensor]
+        return replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)) if sensor.delay_s else reading
+
+    def _take(self, readings: Sequence[Reading]) -> Accepted | None:
+        """Take in the readings of one stamp; None where all are refused."""
+        taken: list[Sensed] = []
+        smoothed: list[SmoothedPose] = []
+        restarts = False
+        for reading in readings:
+            decision = self._order.decide(reading)
+            if decision is Decision.REFUSE:
+                continue
+            if decision is Decision.RESTART:
+                smoothed += self._restart()
+                taken, restarts = [], True
+            taken.append((reading, self._sensors[reading.sensor]))
+        if not taken:
             return None
-        decision = self._order.decide(reading)
-        if decision is Decision.REFUSE:
-            return None
-        restarts = decision is Decision.RESTART
-        smoothed = self._restart() if restarts else []
-        self.dead_reckoning.update(reading, sensor)
+        for reading, sensor in taken:
+            self.dead_reckoning.update(reading, sensor)
         try:
-            poses = self.localiser.update(reading, sensor, self.dead_reckoning)
+            poses = self.localiser.update(taken, self.dead_reckoning)
         except DivergedError:
             self._counters["filter_restarts"] += 1
             self._config = replace(self._config, start=())  # a start that was configured is far behind by now
             smoothed += self._restart()
             poses, restarts = [], True
-        return Accepted(reading, sensor, poses, smoothed + self.localiser.take_smoothed(), restarts)
+        return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts)
 
     def _restart(self) -> list[SmoothedPose]:
         """Start again, and keep the counts; returns the smoothed poses that remained."""
@@ -133,7 +162,7 @@ class Pipeline:
         self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig, calibration: Calibration | None = None
     ) -> None:
         """calibration: of the ground estimator, from before."""
-        self._site, self._machine = site, machine
+        self._site, self._machine = site, in_name_order(machine)
         self._config = config
         self._positioning = Positioning(site, machine, config)
         self._counters: Counter[str] = Counter()
@@ -151,11 +180,14 @@ class Pipeline:
 
     def step(self, readings: Sequence[Reading]) -> Table:
         """Take in readings in the order of their stamps; returns the samples (n,) that they made possible."""
-        made = [rows for reading in readings for rows in self._step_one(reading) if len(rows)]
-        return np.concatenate(made) if made else NOTHING
+        return _joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
 
     def finish(self) -> Table:
         """Samples (n,) of what still waits, as the stream ends."""
+        return _joined([*self._take(self._positioning.finish()), self._remainder()])
+
+    def _remainder(self) -> Table:
+        """Samples (n,) of what waits and can be sampled; the rest never will be."""
         rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
         self._sampler.withheld["no_pose"] += self._sampler.waiting
         return rows
@@ -179,26 +211,30 @@ class Pipeline:
             "consistency": {
                 name: {**asdict(value), "good": value.is_good} for name, value in localiser.consistency.items()
             },
+            "machine_share": localiser.machine_share,
         }
 
-    def _step_one(self, reading: Reading) -> list[Table]:
-        accepted = self._positioning.accept(reading)
-        if accepted is None:
-            return []
-        reading, sensor, poses, _, restarts = accepted
+    def _take(self, stamps: Iterable[Accepted]) -> list[Table]:
+        return [rows for accepted in stamps for rows in self._take_one(accepted)]
+
+    def _take_one(self, accepted: Accepted) -> list[Table]:
+        readings, poses, _, restarts = accepted
         made: list[Table] = []
         if restarts:
-            made.append(self.finish())
+            made.append(self._remainder())
             self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
             self._start(self._estimator.calibration)
         for pose in poses:  # each at once: after a late alignment they are more than the history holds
             self._positioning.poses.append(pose)
             made.append(self._due_samples())
-        self._newest_ns = max(self._newest_ns, reading.stamp_ns)
+        stamp_ns = readings[0][0].stamp_ns
+        self._newest_ns = max(self._newest_ns, stamp_ns)
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
-        self._estimator.update(reading, sensor, dead_reckoning, self._known_c_rr())
         speed_mps = float(belief.x[SPEED]) if belief else 0.0
-        self._sampler.mark(reading.stamp_ns, self._odometer.update(reading, dead_reckoning.distance_m, speed_mps))
+        for reading, sensor in readings:
+            self._estimator.update(reading, sensor, dead_reckoning, self._known_c_rr())
+            distance_m = self._odometer.update(reading, dead_reckoning.distance_m, speed_mps)
+        self._sampler.mark(stamp_ns, distance_m)
         return [*made, self._due_samples()]
 
     def _due_samples(self) -> Table:
@@ -219,6 +255,16 @@ class Pipeline:
         self._estimator = GroundEstimator(machine, config.estimation, known)
         self._sampler = Sampler(self._positioning.poses, machine.load_centre_m)
         self._odometer = Odometer()
+
+
+def in_name_order(machine: MachineConfig) -> MachineConfig:
+    """The machine with its sensors by name: the order of their tables in a file must not change any result."""
+    return replace(machine, sensors=tuple(sorted(machine.sensors, key=attrgetter("name"))))
+
+
+def _joined(tables: Sequence[Table]) -> Table:
+    made = [rows for rows in tables if len(rows)]
+    return np.concatenate(made) if made else NOTHING
 
 
 PoseSource = Positioning | Pipeline  # what locates a machine

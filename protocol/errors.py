@@ -87,6 +87,14 @@ class MessageError(SitegridError):
         self.row = row
 
 
+class RowError(SitegridError):
+    """A row of a log is refused. reason: the counter it belongs to."""
+
+    def __init__(self, reason: str, problem: str) -> None:
+        super().__init__(problem)
+        self.reason = reason
+
+
 class QueryError(SitegridError):
     """A map query is malformed, or the server refused it. retry_after_s: ask again then, 0 where that is no use."""
 

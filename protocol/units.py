@@ -18,6 +18,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "m/s": {"_mps": 1.0},
     "mm/s": {"_mps": 1e-3},
     "km/h": {"_mps": 1 / 3.6},
+    "kn": {"_mps": 1852 / 3600},
     "m2/s2": {"_m2ps2": 1.0},
     "m/s2": {"_mps2": 1.0},
     "g": {"_mps2": GRAVITY_MPS2},

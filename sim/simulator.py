@@ -16,9 +16,11 @@ from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
 from sim.operators.course import APART_M, Start, build_course, crew_of, spread_starts
 from sim.operators.driver import DRIVER_STEPS, LOOK_OUT_STEPS, at_start, drive, look_out, no_commands
+from sim.operators.habits import draw_habits
 from sim.scenario.ground import build_terrain, with_zone
 from sim.scenario.tables import Scenario
 from sim.sensors.base_receiver import BaseReceiver
+from sim.sensors.noise import generator
 from sim.sensors.rigs import draw_bodies
 from sim.sensors.sensors import FleetReadings, Sensors
 from sim.state import STEP_S, FleetState, stack
@@ -57,13 +59,16 @@ class Simulator:
         except ValueError as error:
             raise ConfigError(f"scenario {config.scenario}", str(error)) from None
         self._course = build_course(routes, speeds)
-        self._crew, self._drivers, self._commands = crew_of(self.models), at_start(starts), no_commands(len(starts))
-        bodies = draw_bodies(rigs, self.scenario.seed)
+        seed = self.scenario.seed
+        self._crew, self._commands = crew_of(self.models), no_commands(len(starts))
+        self._habits = draw_habits(self.scenario.driving, [generator(seed, i, "driver") for i in range(len(starts))])
+        self._drivers = at_start(starts, self._habits)
+        bodies = draw_bodies(rigs, seed)
         self._world = build_world(self.scenario.world, self.terrain, self.models, bodies, starts)
         for machine, start in enumerate(starts):
             if start.payload_kg:
                 self._world.set_payload(machine, start.payload_kg)
-        projection, seed = Projection(self.site), self.scenario.seed
+        projection = Projection(self.site)
         self._sensors = Sensors(rigs, seed, projection)
         self._bases = {
             base.name: BaseReceiver(
@@ -97,7 +102,7 @@ class Simulator:
         return self._world.state
 
     def advance(self) -> dict[str, list[Reading]]:
-        """Simulate the span of one bundle; returns readings by machine or base station, in the order of their stamps."""
+        """Simulate the span of one bundle; returns readings of each machine and base station, in order of stamps."""
         span, first = self.sense(), self._steps - self._bundle_ms // STEP_MS + 1
         readings = {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
         steps = np.arange(first, self._steps + 1)
@@ -144,7 +149,7 @@ class Simulator:
         if self._steps % DRIVER_STEPS == 0:
             carried = self._drivers.payload_kg
             dt = DRIVER_STEPS * STEP_S
-            self._drivers, self._commands = drive(self._course, self._crew, self._drivers, state, dt)
+            self._drivers, self._commands = drive(self._course, self._crew, self._habits, self._drivers, state, dt)
             for machine in np.flatnonzero(self._drivers.payload_kg != carried).tolist():
                 self._world.set_payload(machine, float(self._drivers.payload_kg[machine]))
         self._steps += 1

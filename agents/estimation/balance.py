@@ -135,7 +135,8 @@ class Balancer:
         gyro = (rotation @ (imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)).tolist()
         ahead, left, up = (rotation @ (imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)).tolist()
         ahead += (gyro[1] ** 2 + gyro[2] ** 2) * sensor.mount.xyz_m[0]  # what turning adds at the sensor's place
-        accel, speed = (wheels.accel_mps2, wheels.speed_mps) if self._wheels_s() < MAX_PAUSE_S else (0.0, 0.0)
+        shows_speed = wheels.is_known and self._wheels_s() < MAX_PAUSE_S
+        accel, speed = (wheels.accel_mps2, wheels.speed_mps) if shows_speed else (0.0, 0.0)
         self._slope.update(dt_s, (gyro[0], gyro[1], gyro[2]), (ahead - accel, left - speed * gyro[2]))
         n, force, norm, rate = self._force_sums
         self._force_sums = n + 1, force + ahead, norm + math.hypot(ahead, left, up), rate - gyro[1]
@@ -172,7 +173,7 @@ class Balancer:
             on_front=on_front,
             body_mps2=force - g * self._slope.ahead.sine,
             torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
-            wheels_s=self._wheels_s(),
+            wheels_s=self._wheels_s() if dead_reckoning.wheels.is_known else math.inf,
         )
 
     def _climb_of_bend(self, on_front: float, squat: float) -> float:

@@ -59,7 +59,7 @@ def align_fixes(fixes: Sequence[Fix], distance_m: float) -> Alignment | None:
     absolute = [fix for fix in fixes if fix.is_absolute]
     if distance_m < DISTANCE_M or len(absolute) < MIN_FIXES:
         return None
-    antennas = np.array([_reckoned_antenna(fix) for fix in absolute])
+    antennas = np.array([fix.reckoned_antenna_m for fix in absolute])
     if float(np.sqrt(((antennas - antennas.mean(axis=0)) ** 2).sum(axis=1).mean())) < SPREAD_M:
         return None
     std_m = math.sqrt(sum(float(fix.variance_m2.mean()) for fix in absolute) / len(absolute))
@@ -86,7 +86,7 @@ def start_belief(
     x, variance = np.zeros(layout.n), np.full(layout.n, 1e-6)
     x[:2] = alignment.origin_m + np.array([c * reckoned.x_m - s * reckoned.y_m, s * reckoned.x_m + c * reckoned.y_m])
     x[state.YAW] = wrap_angle(alignment.rotation_rad + reckoned.angle_rad)
-    x[state.SPEED] = step.speed_mps
+    x[state.SPEED] = step.wheels.speed_mps
     if forces_mps2:
         ahead, left, _ = np.mean(forces_mps2, axis=0) / GRAVITY_MPS2
         x[state.ROLL], x[state.PITCH] = math.asin(np.clip(left, -0.7, 0.7)), -math.asin(np.clip(ahead, -0.7, 0.7))
@@ -99,9 +99,3 @@ def start_belief(
     if layout.imus and turn_error_radps:
         variance[layout.gyro_biases.stop - 1] = turn_error_radps**2
     return Belief(step.stamp_ns, x, np.diag(variance))
-
-
-def _reckoned_antenna(fix: Fix) -> tuple[float, float]:
-    lever, reckoned = fix.sensor.mount.xyz_m, fix.reckoned
-    c, s = math.cos(reckoned.angle_rad), math.sin(reckoned.angle_rad)
-    return reckoned.x_m + c * lever[0] - s * lever[1], reckoned.y_m + s * lever[0] + c * lever[1]

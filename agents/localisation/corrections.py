@@ -1,18 +1,17 @@
 """Corrections of a base station: which of them count, and what the filter makes of them.
 
-A base stands at a known place, so that what its fixes are off is its GPS error alone, and a part of that is the machine's
-too. The filter has states for the base's slow error b and for the part of it that lasts, d, as of a wrong survey:
+A base stands at a known place, so that what its fixes are off is its GPS error alone, and a part of that is the
+machine's too. The filter has states for its slow error b and for a part that lasts, d, as of a wrong survey:
 
     correction = b + d + white noise
 
-The noise of b is correlated with that of the machine's error, by the share that `site_share` finds. So nothing has to be
-switched: a base that has nothing in common with the machine is of no use and does no harm, one that falls silent is
+The noise of b is correlated with that of the machine's error, by the share that `site_share` finds. So nothing has to
+be switched: a base that has nothing in common with the machine is of no use and does no harm, one that falls silent is
 forgotten as its error fades, and corrections of one that jumps are refused until d has been opened for them.
 """
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy as np
 
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, reset_states
-from agents.localisation.filters.motion import BaseError, GpsError, map_from_base
+from agents.localisation.filters.motion import GpsError, map_from_base
 from agents.localisation.filters.state import ATTITUDE, VELOCITY, Layout
 from agents.localisation.gps import Fix
 from agents.localisation.site_share import SiteShareEstimator
@@ -33,6 +32,7 @@ MAX_AHEAD_S = 10.0  # so far ahead of the machine's own readings they wait for t
 REPEATS = 5  # the same error so often in a row is no measurement any more
 GATE_SIGMA = 4.0  # as of fixes
 LEAST_SHARE = 0.05  # a smaller one is none
+UNKNOWN = GpsError(1.0, 45.0)
 
 
 class Corrections:
@@ -89,10 +89,15 @@ class Corrections:
     # --- the filter --------------------------------------------------------------------------------------------------
 
     @property
-    def error(self) -> BaseError | None:
-        """The slow error of the base; None while nothing is known of it."""
+    def base_error(self) -> GpsError:
+        """The slow error of the base; any one while nothing is known of it."""
         newest = self._newest
-        return BaseError(newest.slow_m2, newest.time_s, round(self._share.share, 2)) if newest else None
+        return GpsError(newest.slow_m2, newest.time_s) if newest else UNKNOWN
+
+    @property
+    def site_share(self) -> float:
+        """How much of the slow variance machine and base have in common; rounded, so that it does not always change."""
+        return round(self._share.share, 2) if self._accepted else 0.0
 
     def measurement(self, belief: Belief) -> Measurement | None:
         """The newest correction that is due, as a measurement at the belief's stamp; None where none is.

@@ -7,7 +7,7 @@ and yaw (navsat_transform): on the way back into the map the rotations cancel, a
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -15,10 +15,11 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation import measurements
 from agents.localisation.consistency import Consistency, InnovationMonitor
-from agents.localisation.filters.belief import Belief, Conditioned, Measurement, anchor_states, reset_states
-from agents.localisation.filters.motion import GpsError
-from agents.localisation.filters.state import Layout
+from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, anchor_states
+from agents.localisation.filters.motion import GpsError, gps_covariance
+from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
+from agents.localisation.shared_errors import MOST_SHARED, SharedFix, ShareEstimator
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
 from protocol.machine.readings import Gps
@@ -26,6 +27,7 @@ from protocol.site.site_config import Projection
 
 MIN_FIX_STD_M = 0.3  # receivers state less than their error; one whose std is configured may be better
 GATE_SIGMA = 4.0  # fixes further off are refused: outliers of GPS are common
+AGREED_NS = 3_000_000_000  # a receiver that was accepted so lately says that the filter is not lost
 MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
 
 
@@ -49,6 +51,13 @@ class Fix:
         """Where the antenna sits (3,)."""
         return np.array(self.sensor.mount.xyz_m)
 
+    @property
+    def reckoned_antenna_m(self) -> tuple[float, float]:
+        """Where the antenna is by dead reckoning, in its frame."""
+        (ahead, left, _), reckoned = self.sensor.mount.xyz_m, self.reckoned
+        c, s = math.cos(reckoned.angle_rad), math.sin(reckoned.angle_rad)
+        return reckoned.x_m + c * ahead - s * left, reckoned.y_m + s * ahead + c * left
+
 
 def drifting(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
     """Receivers whose slow error matters: it cancels in differences."""
@@ -58,23 +67,49 @@ def drifting(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
 class Receivers(ModalSensors[Fix]):
     """The receivers of one machine; `errors` are those of the layout's slow errors, as they are now.
 
-    slow: whether a share of each error is slow, else all of it is white.
+    slow: whether a share of each error is slow, else all of it is white. machine_share: how much of the slow variance
+    they have in common, None to estimate it.
     """
 
-    def __init__(self, sensors: Sequence[SensorConfig], projection: Projection, layout: Layout, *, slow: bool) -> None:
+    def __init__(
+        self,
+        sensors: Sequence[SensorConfig],
+        projection: Projection,
+        layout: Layout,
+        *,
+        slow: bool,
+        machine_share: float | None = None,
+    ) -> None:
         super().__init__()
         self._sensors = {s.name: s for s in sensors if s.kind == "gps" and s.use}
         self._projection, self._layout, self._slow = projection, layout, slow
         self._states = {s.name: i for i, s in enumerate(drifting(sensors))} if slow else {}
-        self._errors = [GpsError(MIN_DRIFT_M2, self._sensors[name].drift_time_s) for name in self._states]
+        self._drift_m2 = dict.fromkeys(self._states, MIN_DRIFT_M2)  # variance of the slow error, without an anchor's
+        absolute = [s.name for s in self._sensors.values() if s.mode == ABSOLUTE]
+        self._compared = {name: i for i, name in enumerate(absolute)} if slow and machine_share is None else {}
+        self._estimator = ShareEstimator(len(absolute))
+        self._configured = machine_share
         self._monitors = {name: InnovationMonitor() for name in self._sensors}
+        self._accepted_ns: dict[str, int] = {}
         self._shifts: dict[str, Floats] = {}  # of relative ones, and how unsure the believed antenna was then [m2]
         self._anchor_m2: dict[str, float] = {}
 
     @property
     def errors(self) -> tuple[GpsError, ...]:
-        """The slow error of each receiver that has states for it."""
-        return tuple(self._errors)
+        """The slow error of each receiver that has states for it; what they share is a source of the machine."""
+        return tuple(self._error(name) for name in self._states)
+
+    def errors_beside(self, base: GpsError, site_share: float) -> tuple[GpsError, ...]:
+        """The same, and behind them that of a base station, which has a share of each machine's variance too."""
+        machine = tuple(self._error(name, site_share) for name in self._states)
+        return *machine, GpsError(base.variance_m2, base.time_s, (0.0, site_share * base.variance_m2))
+
+    @property
+    def machine_share(self) -> float | None:
+        """Share of the slow variance that all receivers of the machine have in common; None of fewer than two."""
+        if not self._slow or len(self._sensors) < 2:
+            return None
+        return self._estimator.share if self._configured is None else self._configured
 
     @property
     def consistency(self) -> dict[str, Consistency]:
@@ -107,24 +142,57 @@ class Receivers(ModalSensors[Fix]):
     def confirm(self, fix: Fix, result: Conditioned) -> None:
         """Note what the filter made of a fix: the receiver's error has its first value now."""
         super().confirm(fix, result)
-        self._monitors[fix.sensor.name].note(result)
+        name = fix.sensor.name
+        self._monitors[name].note(result)
+        if not result.accepted:
+            return
+        self._accepted_ns[name] = max(fix.stamp_ns, self._accepted_ns.get(name, 0))
+        if len(self._compared) > 1 and name in self._compared:
+            white_m2, slow_m2, time_s = float(self._white(fix).mean()), self._drift_m2[name], fix.sensor.drift_time_s
+            i, antenna = self._compared[name], fix.reckoned_antenna_m
+            shared = SharedFix(i, fix.stamp_ns, fix.position_m, antenna, white_m2, slow_m2, time_s)
+            self._estimator.add(shared, float(result.belief.x[YAW]) - fix.reckoned.angle_rad)
+
+    def _error(self, name: str, site_share: float = 0.0) -> GpsError:
+        """The slow error of a receiver, as it is now: with parts that the machine, and the site, have in common."""
+        drift_m2, time_s, anchor_m2 = self._drift_m2[name], self._sensors[name].drift_time_s, self._anchor_m2.get(name)
+        common_m2 = min(self.machine_share or 0.0, MOST_SHARED) * drift_m2
+        # of a relative one both the error now and that of the first fix count, and where the filter was wrong then
+        variance_m2 = drift_m2 if anchor_m2 is None else 2 * drift_m2 + anchor_m2
+        site_m2 = site_share * drift_m2
+        return GpsError(variance_m2, time_s, (max(common_m2 - site_m2, 0.0), site_m2))
 
     def _position(self, fix: Fix) -> Measurement:
         sensor = fix.sensor
         place = fix.position_m + self._shifts[sensor.name] if sensor.mode == RELATIVE else fix.position_m
         error, change = None, None
         if self._slow:
-            index, drift_m2 = self._states[sensor.name], _drift_m2(fix)
-            error = self._layout.gps_error(index)
-            if fix.is_absolute:
-                change = partial(reset_states, states=error, variance=drift_m2)
-            else:  # both the error now and that of the first fix count, and where the filter was wrong then
-                change = partial(_anchor_antenna, states=error, lever_m=fix.lever_m, variance=2 * drift_m2)
-                drift_m2 = 2 * drift_m2 + self._anchor_m2[sensor.name]
-            self._errors[index] = GpsError(drift_m2, sensor.drift_time_s)
+            error = self._layout.gps_error(self._states[sensor.name])
+            self._drift_m2[sensor.name] = _drift_m2(fix)
+            if sensor.name not in self._confirmed:  # a receiver brings its own unknown error
+                change = self._joining(fix, error)
         R = np.diag(self._white(fix))
-        first = None if sensor.name in self._confirmed else change  # a receiver brings its own unknown error
-        return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, sensor.gate(GATE_SIGMA), first)
+        opens = error if error and self._others_agree(fix) else measurements.PLACE
+        gate = sensor.gate(GATE_SIGMA)
+        return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
+
+    def _others_agree(self, fix: Fix) -> bool:
+        """Whether another receiver was accepted lately: then the filter is not lost, should this one be refused."""
+        before_ns = fix.stamp_ns - AGREED_NS
+        return any(name != fix.sensor.name and ns > before_ns for name, ns in self._accepted_ns.items())
+
+    def _joining(self, fix: Fix, states: slice) -> Change:
+        """What gives the receiver's error its first value, by those of the receivers before it."""
+        if not fix.is_absolute:
+            return partial(_anchor_antenna, states=states, lever_m=fix.lever_m, variance=2 * _drift_m2(fix))
+        names = [n for n in self._states if n in self._confirmed and self._sensors[n].mode == ABSOLUTE]
+        covariance = gps_covariance(tuple(self._error(n) for n in [*names, fix.sensor.name]))
+        weights = np.linalg.solve(covariance[:-1, :-1], covariance[:-1, -1])
+        H = np.zeros((2, self._layout.n))
+        for name, weight in zip(names, weights, strict=True):
+            H[:, self._layout.gps_error(self._states[name])] = -weight * np.eye(2)
+        variance = float(covariance[-1, -1] - weights.dot(covariance[:-1, -1]))
+        return partial(_join, states=states, H=H, variance=variance)
 
     def _velocity(self, fix: Fix) -> Measurement | None:
         """Of the antenna, between the last fix and this one: slow errors cancel but for what they change meanwhile."""
@@ -134,8 +202,13 @@ class Receivers(ModalSensors[Fix]):
             return None
         R, dt_s = np.diag(mean.variances), (now.stamp_ns - before.stamp_ns) * 1e-9
         if self._slow:
-            R += np.eye(2) * (2 * _drift_m2(fix) * -math.expm1(-dt_s / sensor.drift_time_s) / dt_s**2)
+            R += np.eye(2) * (2 * self._differential_m2(fix) * -math.expm1(-dt_s / sensor.drift_time_s) / dt_s**2)
         return measurements.velocity(mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, sensor.gate(GATE_SIGMA))
+
+    def _differential_m2(self, fix: Fix) -> float:
+        """Variance of the slow error, so much larger that receivers which share it are together no better than one."""
+        others = sum(s.mode == DIFFERENTIAL for s in self._sensors.values()) - 1
+        return _drift_m2(fix) * (1 + others * (self.machine_share or 0.0))
 
     def _white(self, fix: Fix) -> Floats:
         """Variance (2,) of a fix without its slow part."""
@@ -153,6 +226,14 @@ def _antenna(belief: Belief, lever_m: Floats) -> tuple[Floats, Floats]:
     """Where the antenna is believed (2,) in `map`, and the Jacobian (2, n) of that."""
     model = measurements.fix(belief.stamp_ns, "", np.zeros(2), np.eye(2), lever_m, None, 0.0)
     return model.h(belief.x[None])[0], model.jacobian(belief.x)
+
+
+def _join(belief: Belief, states: slice, H: Floats, variance: float) -> Belief:
+    """The belief with states e (k,) for an error of which others tell a part: e = -H x + v."""
+    joined = anchor_states(belief, states, H, variance)
+    x = joined.x.copy()
+    x[states] = -H @ belief.x
+    return replace(joined, x=x)
 
 
 def _anchor_antenna(belief: Belief, states: slice, lever_m: Floats, variance: float) -> Belief:

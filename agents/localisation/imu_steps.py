@@ -2,17 +2,27 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from agents.dead_reckoning import STALE_S, DeadReckonedPose, DeadReckoning, WheelTracker, turn_source
+from agents.dead_reckoning import (
+    STALE_S,
+    DeadReckonedPose,
+    DeadReckoning,
+    WheelSpeed,
+    WheelTracker,
+    narrowing,
+    turn_source,
+)
 from agents.localisation.sensor_modes import StampedValue
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, FRONT, MachineConfig, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
 from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
 
+Sensed = tuple[Reading, SensorConfig]
 NOTHING = (0.0,) * 7  # count and sums
 MIN_NORM = 0.5  # a reference that has not settled yet sends a quaternion of zeros
 
@@ -42,15 +52,15 @@ class FilterStep:
     """Readings of fast sensors since the step before, up to a stamp.
 
     reckoned: the dead-reckoned pose at its end. orientations: the last roll, pitch, yaw (3,) of each attitude
-    reference. rolled: whether wheels were read in this step, else their speed is an old one. traction: drive force over
-    weight; still_s: how long without travel. turn: of a machine without IMU.
+    reference. wheels: their speed at its end. rolled: whether they were read in this step, and show a speed. traction:
+    drive force over weight; still_s: how long without travel. turn: of a machine without IMU.
     """
 
     stamp_ns: int
     reckoned: DeadReckonedPose
     imu_means: dict[str, ImuMean]
     orientations: dict[str, StampedValue]
-    speed_mps: float
+    wheels: WheelSpeed
     rolled: bool
     traction: float
     still_s: float
@@ -79,15 +89,19 @@ class StepGatherer:
         self._rolled_ns = 0
         self._begin_ns = 0
         self._joint = WheelTracker()  # the angle of articulation, smoothed in the same manner
-        self._knows_joint = False
         self._rolled = False
-        self._still_since = (0, math.nan)
 
-    def gather(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> FilterStep | None:
-        """Add one reading, after dead reckoning did; returns the step that it ends."""
+    def gather(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> FilterStep | None:
+        """Add the readings of one stamp, after dead reckoning took them; returns the step that they end."""
+        for reading, sensor in readings:
+            self._add(reading, sensor)
+        stamp_ns = readings[0][0].stamp_ns
+        self._begin_ns = self._begin_ns or stamp_ns
+        return self._finish(stamp_ns, dead_reckoning) if stamp_ns - self._begin_ns >= self._step_ns else None
+
+    def _add(self, reading: Reading, sensor: SensorConfig) -> None:
         if isinstance(reading, Articulation):
             self._joint.update(reading.stamp_ns, reading.angle_rad)
-            self._knows_joint = True
         elif isinstance(reading, Imu):
             self._add_imu(reading, sensor)
         elif isinstance(reading, Attitude) and (self._orients or sensor.mode != ABSOLUTE):
@@ -96,10 +110,6 @@ class StepGatherer:
             self._turn_values.append(math.tan(reading.angle_rad) / self._wheelbase_m)
         elif isinstance(reading, Encoder | Odometry):
             self._add_wheels(reading, sensor)
-        self._begin_ns = self._begin_ns or reading.stamp_ns
-        if reading.stamp_ns - self._begin_ns < self._step_ns:
-            return None
-        return self._finish(reading.stamp_ns, dead_reckoning)
 
     def _add_wheels(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
         if sensor.provides("speed"):
@@ -109,7 +119,7 @@ class StepGatherer:
 
     def _add_imu(self, imu: Imu, sensor: SensorConfig) -> None:
         """Sum up an IMU's readings in its own axes; their mean is turned once per step, as turning is linear."""
-        if sensor.frame == FRONT and not self._knows_joint:
+        if sensor.frame == FRONT and not self._joint.is_settled:
             self.counters["front_imu_without_articulation"] += 1
             return
         n, wx, wy, wz, fx, fy, fz = self._sums.get(imu.sensor, NOTHING)
@@ -161,19 +171,19 @@ class StepGatherer:
         self._attitudes.clear()
         self._sums.clear()
         self._begin_ns = stamp_ns
-        if dead_reckoning.travel_m != self._still_since[1]:
-            self._still_since = (stamp_ns, dead_reckoning.travel_m)
-        still_s = (stamp_ns - self._still_since[0]) * 1e-9
-        rolled, self._rolled = self._rolled, False
-        speed_mps, reckoned = dead_reckoning.wheels.speed_mps, dead_reckoning.pose
-        turn = self._turn(stamp_ns, speed_mps) if self._turn_values else None
-        traction = dead_reckoning.traction
-        return FilterStep(stamp_ns, reckoned, imu_means, orientations, speed_mps, rolled, traction, still_s, turn)
+        wheels, reckoned, traction = dead_reckoning.wheels, dead_reckoning.pose, dead_reckoning.traction
+        rolled, self._rolled = self._rolled and wheels.is_known, False
+        still_s = (stamp_ns - dead_reckoning.stands_since_ns) * 1e-9
+        turn = self._turn(stamp_ns, wheels) if self._turn_values else None
+        return FilterStep(stamp_ns, reckoned, imu_means, orientations, wheels, rolled, traction, still_s, turn)
 
-    def _turn(self, stamp_ns: int, speed_mps: float) -> Turn | None:
+    def _turn(self, stamp_ns: int, wheels: WheelSpeed) -> Turn | None:
         """By the readings of this step; steering shows no turn without a speed."""
         values, self._turn_values = self._turn_values, []
         mean = sum(values) / len(values)
         if not self._steers:
             return Turn(mean, 1.0)
-        return Turn(speed_mps * mean, speed_mps) if stamp_ns - self._rolled_ns < STALE_S * 1e9 else None
+        if not wheels.is_known or stamp_ns - self._rolled_ns >= STALE_S * 1e9:
+            return None
+        speed_mps = wheels.speed_mps / narrowing(mean, wheels.offset_m)
+        return Turn(speed_mps * mean, speed_mps)

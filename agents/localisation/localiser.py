@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,18 +13,18 @@ from agents.localisation.corrections import Corrections
 from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
-from agents.localisation.filters.motion import MotionModel
+from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import SmoothedPose, nothing_past
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, anchored_headings
-from agents.localisation.imu_steps import FilterStep, StepGatherer
+from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
-from protocol.machine.readings import Correction, Gps, GpsVelocity, Reading
+from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig
+from protocol.machine.readings import Correction, Gps, GpsVelocity
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
@@ -82,13 +83,16 @@ class Localiser:
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
-        self._receivers = Receivers(machine.sensors, projection, layout, slow=augmented)
-        self._corrections = Corrections(machine.base, layout) if machine.base and layout.corrected else None
+        self._receivers = Receivers(
+            machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
+        )
+        self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
         self._references = References(machine.sensors, layout)
-        self._body = MotionSensors(machine, layout, step_s, config.slip, config.slip_soft)
         source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
+        tyres = config.slip, config.slip_soft
+        self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
-        self._model = MotionModel(layout, on_plane, self._receivers.errors, turn_error_radps=turn_error)
+        self._model = MotionModel(layout, on_plane, self._gps_errors(), turn_error_radps=turn_error)
         self._fusion: Fusion | None = None
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
@@ -116,6 +120,11 @@ class Localiser:
         return self._corrections.report(now_ns) if self._corrections else None
 
     @property
+    def machine_share(self) -> float | None:
+        """Share of the slow variance that the receivers have in common, as it is taken for; None of fewer than two."""
+        return self._receivers.machine_share
+
+    @property
     def belief(self) -> Belief | None:
         """The whole state, once it is known."""
         return self._fusion.belief if self._fusion else None
@@ -133,18 +142,26 @@ class Localiser:
         if self._corrections and self._fusion:
             self._corrections.take(correction, self._fusion.belief.stamp_ns)
 
-    def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> list[PoseBelief]:
-        """Take in one reading, after dead reckoning did; returns poses that it made possible or changed, in order."""
-        event: Event | None
-        if isinstance(reading, Gps):
-            event = self._receivers.fix(reading, dead_reckoning.pose)
-        elif isinstance(reading, GpsVelocity):
-            event = gps_velocity(reading, sensor)
-        else:
-            event = self._gatherer.gather(reading, sensor, dead_reckoning)
-        if event is None:
-            return []
-        beliefs = self._filter(self._fusion, event) if self._fusion else self._collect(event, dead_reckoning.distance_m)
+    def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
+        """Take in the readings of one stamp, after dead reckoning did; returns poses that became possible or changed.
+
+        In the order of their stamps.
+        """
+        fast: list[Sensed] = []
+        events: list[Event] = []
+        for reading, sensor in readings:
+            if isinstance(reading, Gps):
+                events.append(self._receivers.fix(reading, dead_reckoning.pose))
+            elif isinstance(reading, GpsVelocity):
+                events.append(gps_velocity(reading, sensor))
+            else:
+                fast.append((reading, sensor))
+        if fast and (step := self._gatherer.gather(fast, dead_reckoning)):
+            events.insert(0, step)
+        beliefs: list[Belief] = []
+        for event in events:
+            known = self._fusion
+            beliefs += self._filter(known, event) if known else self._collect(event, dead_reckoning.distance_m)
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
     def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
@@ -177,11 +194,17 @@ class Localiser:
         measurement = self._corrections.measurement(fusion.belief) if self._corrections else None
         if measurement is None or self._corrections is None:
             return []
-        fusion.model = replace(fusion.model, base=self._corrections.error)
+        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
         beliefs = fusion.add([measurement])
         if beliefs:
             self._corrections.confirm(fusion.last[measurement.sensor])
         return beliefs
+
+    def _gps_errors(self) -> tuple[GpsError, ...]:
+        """Slow errors of the machine's receivers and, where it uses one, of the base station's."""
+        if self._corrections is None:
+            return self._receivers.errors
+        return self._receivers.errors_beside(self._corrections.base_error, self._corrections.site_share)
 
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
         """Filter a value whose sensor may count from what is believed at its stamp."""
@@ -190,7 +213,7 @@ class Localiser:
         measurement = sensors.measurement(value)
         if measurement is None:
             return []
-        fusion.model = replace(fusion.model, gps_errors=self._receivers.errors)
+        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
         beliefs = fusion.add([measurement])
         if beliefs:
             sensors.confirm(value, fusion.last[measurement.sensor])
@@ -238,17 +261,26 @@ def _layout_of(machine: MachineConfig) -> Layout:
     source = turn_source(machine)
     imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
     turns = imus + (source is not None and source.kind != "imu")
-    corrected = machine.base is not None and bool(drifting(machine.sensors))
-    return Layout(turns, True, len(drifting(machine.sensors)), len(anchored_headings(machine.sensors)), corrected)
+    receivers, references = drifting(machine.sensors), anchored_headings(machine.sensors)
+    base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
+    return Layout(turns, True, len(receivers) + base, len(references), base)
 
 
 def _shows_tilt(machine: MachineConfig, profile: str) -> bool:
-    """Whether a sensor shows roll and pitch, or how they change; a machine without any is taken to be on a plane."""
-    return any(
-        s.kind == "imu" or (s.kind == "attitude" and s.provides("tilt") and (profile == "paper" or s.mode != ABSOLUTE))
-        for s in machine.sensors
-        if s.use
-    )
+    """Whether the sensors show roll and pitch; a machine without is taken to be on a plane.
+
+    By a reference of attitude that the profile uses, else by the direction of gravity between rates of turn. Rates
+    alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the acceleration's.
+    """
+    used = [s for s in machine.sensors if s.use]
+    bends = any(s.kind == "articulation" for s in used)
+    imus = [s for s in used if s.kind == "imu" and (s.frame == BASE or bends)]
+    references = [s for s in used if s.kind == "attitude" and s.frame == BASE and s.provides("tilt")]
+    modes = (ABSOLUTE, RELATIVE) if profile == "paper" else (RELATIVE,)
+    if any(s.mode in modes for s in references):
+        return True
+    turns = any(s.provides("rate") for s in imus) or any(s.mode == DIFFERENTIAL for s in references)
+    return turns and any(s.provides("force") for s in imus)
 
 
 def _pose(belief: Belief, speed_mps: float) -> PoseBelief:

@@ -37,11 +37,12 @@ def fix(
     lever_m: Floats,
     error: slice | None,
     gate: float,
+    opens: slice = PLACE,
     change: Change | None = None,
 ) -> Measurement:
     """A GPS fix (2,): z = [p + R r]_en + e.
 
-    error: states of the receiver's slow error e, None if the filter has none.
+    error: states of the receiver's slow error e, None if the filter has none. opens: as of a Measurement.
     """
 
     def h(x: Floats) -> Floats:
@@ -60,7 +61,7 @@ def fix(
             H[:, error] = EYE[:2, :2]
         return H
 
-    return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=PLACE, change=change)
+    return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=opens, change=change)
 
 
 def correction(
@@ -144,14 +145,18 @@ def inertial(
     return Measurement(sensor, stamp_ns, z, R, h, jacobian, gate_sigma=gate)
 
 
-def wheels(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, scale: int | None, gate: float) -> Measurement:
-    """Velocity (3,) of `base_link` by the wheels, none sideways and upwards: z = ((1 + s) v_x, v_y, v_z).
+def wheels(
+    stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, scale: int | None, gate: float, offset_m: float = 0.0
+) -> Measurement:
+    """Velocity (3,) by wheels at y to the left of the axle's middle: z = ((1 + s) (v_x - w_z y), v_y, v_z).
 
-    scale: state of the wheels' scale s, None if the filter has none.
+    None sideways and upwards at `base_link`. offset_m: y, of several wheels the mean. scale: state of the wheels' scale
+    s, None if the filter has none.
     """
 
     def h(x: Floats) -> Floats:
         z = x[:, VELOCITY].copy()
+        z[:, 0] -= offset_m * x[:, YAW_RATE]
         if scale is not None:
             z[:, 0] *= 1 + x[:, scale]
         return z
@@ -159,16 +164,17 @@ def wheels(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, scale: i
     def jacobian(x: Floats) -> Floats:
         H = np.zeros((3, len(x)))
         H[:, VELOCITY] = EYE
+        H[0, YAW_RATE] = -offset_m
         if scale is not None:
-            H[0, VELOCITY.start] = 1 + x[scale]
-            H[0, scale] = x[VELOCITY.start]
+            H[0] *= 1 + x[scale]
+            H[0, scale] = x[VELOCITY.start] - offset_m * x[YAW_RATE]
         return H
 
     return Measurement(sensor, stamp_ns, velocity_mps, R, h, jacobian, gate_sigma=gate)
 
 
 def turn(
-    stamp_ns: int, rate_radps: float, std_radps: float, error: int | None, per_error: float, gate: float
+    stamp_ns: int, sensor: str, rate_radps: float, std_radps: float, error: int | None, per_error: float, gate: float
 ) -> Measurement:
     """Turn rate (1,) about the vertical of `base_link`: z = w_z + per_error e.
 
@@ -187,7 +193,7 @@ def turn(
         return H
 
     R = np.array([[std_radps**2]])
-    return Measurement("turn", stamp_ns, np.array([rate_radps]), R, h, jacobian, gate_sigma=gate)
+    return Measurement(sensor, stamp_ns, np.array([rate_radps]), R, h, jacobian, gate_sigma=gate)
 
 
 def orientation(

@@ -29,19 +29,21 @@ ROLLING_S = 0.5  # time constant of the low-pass on the rolling resistance
 
 
 class MotionSensors:
-    """The motion sensors of one machine; step_s: length of a filter step.
+    """The motion sensors of one machine.
 
-    slip, slip_soft: of the tyres.
+    step_s: length of a filter step. tyres: their `slip` and `slip_soft`. on_plane: whether the filter takes the machine
+    to be on a plane. There an IMU measures the turn alone: tilt and what changes it are no states.
     """
 
-    def __init__(self, machine: MachineConfig, layout: Layout, step_s: float, slip: float, slip_soft: float) -> None:
+    def __init__(
+        self, machine: MachineConfig, layout: Layout, step_s: float, tyres: tuple[float, float], *, on_plane: bool
+    ) -> None:
         self.counters: Counter[str] = Counter()
-        self._layout, self._step_s = layout, step_s
-        self._slip, self._slip_soft, self._rolling = slip, slip_soft, 0.0
+        self._layout, self._step_s, self._on_plane = layout, step_s, on_plane
+        (self._slip, self._slip_soft), self._rolling = tyres, 0.0
         used = [s for s in machine.sensors if s.use]
         self._imus = {s.name: s for s in used if s.kind == "imu"}
-        wheels = [s for s in used if s.kind in ("encoder", "odometry") and s.provides("speed")]
-        self._wheels = wheels[0] if wheels else None  # the one that dead reckoning uses, the first
+        self._wheels = [s for s in used if s.kind in ("encoder", "odometry") and s.provides("speed")]
         self._turn_sensor = turn_source(machine)
 
     @property
@@ -55,9 +57,11 @@ class MotionSensors:
         return [mean.force_mps2 for name, mean in step.imu_means.items() if self._imus[name].provides("force")]
 
     def inertial(self, step: FilterStep) -> list[Measurement]:
-        """One measurement per IMU with readings in the step."""
-        imus = enumerate(self._imus.values())
-        return [self._inertial(step, i, sensor) for i, sensor in imus if sensor.name in step.imu_means]
+        """One measurement per IMU with readings in the step, of those that measure anything of the state."""
+        imus = [(i, s) for i, s in enumerate(self._imus.values()) if s.name in step.imu_means]
+        if self._on_plane:
+            return [self._yaw_rate(step, i, sensor) for i, sensor in imus if sensor.provides("rate")]
+        return [self._inertial(step, i, sensor) for i, sensor in imus]
 
     def turn(self, step: FilterStep) -> list[Measurement]:
         """The turn rate where no IMU measures it. Where nothing does, it shows in fixes alone and is very unsure."""
@@ -69,30 +73,40 @@ class MotionSensors:
         error = layout.gyro_biases.stop - 1 if layout.imus else None
         rate, per_error = step.turn.rate_radps, step.turn.per_error
         std, gate = _turn_std(source), source.gate(GATE_SIGMA)
-        return [measurements.turn(step.stamp_ns, rate, std, error, per_error, gate)]
+        return [measurements.turn(step.stamp_ns, "turn", rate, std, error, per_error, gate)]
 
     def wheels(self, step: FilterStep) -> list[Measurement]:
         """Speed of the wheels less their slip, and a standstill; nothing of wheels that are silent, not at rest."""
-        if not step.rolled or self._wheels is None:
+        if not step.rolled or not self._wheels:
             return []
         if forces := self.forces(step):
-            self._rolling = rolling_resistance(self._rolling, step.traction, float(forces[0][0]), self._step_s)
-        speed = machine_speed(step.speed_mps, step.traction, self._slip + self._slip_soft * self._rolling)
-        forward_std, side_std = self._wheels.std.get("speed", measurements.SPEED_MPS), measurements.SIDE_MPS
-        R = np.diag([forward_std**2, side_std**2, side_std**2])
+            ahead = float(np.mean([force[0] for force in forces]))
+            self._rolling = rolling_resistance(self._rolling, step.traction, ahead, self._step_s)
+        slip = self._slip + self._slip_soft * self._rolling
+        z = np.array([machine_speed(step.wheels.speed_mps, step.traction, slip), 0.0, 0.0])
+        # They slip together, so the mean of several is as unsure as the least sure of them.
+        forward_std = max(s.std.get("speed", measurements.SPEED_MPS) for s in self._wheels)
+        R = np.diag([forward_std**2, measurements.SIDE_MPS**2, measurements.SIDE_MPS**2])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
-        z, gate = np.array([speed, 0.0, 0.0]), self._wheels.gate(GATE_SIGMA)
-        rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate)
+        gate, offset_m = max(s.gate(GATE_SIGMA) for s in self._wheels), step.wheels.offset_m
+        rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate, offset_m)
         return [rolled, measurements.standstill(step.stamp_ns)] if step.still_s >= STANDSTILL_S else [rolled]
 
     def _inertial(self, step: FilterStep, index: int, sensor: SensorConfig) -> Measurement:
         mean = step.imu_means[sensor.name]
-        rate_std = sensor.std.get("rate", measurements.RATE_RADPS) if sensor.provides("rate") else UNKNOWN_STD
+        rate_std = _gyro_std(sensor) if sensor.provides("rate") else UNKNOWN_STD
         force_std = sensor.std.get("force", measurements.FORCE_MPS2) if sensor.provides("force") else UNKNOWN_STD
         z, R = np.concatenate([mean.rates_radps, mean.force_mps2]), np.diag([rate_std**2] * 3 + [force_std**2] * 3)
-        bias = self._layout.gyro_bias(index) if self._layout.imus else None
-        lever = np.array(sensor.mount.xyz_m)
-        return measurements.inertial(step.stamp_ns, sensor.name, z, R, lever, bias, sensor.gate(GATE_SIGMA))
+        lever, gate = np.array(sensor.mount.xyz_m), sensor.gate(GATE_SIGMA)
+        return measurements.inertial(step.stamp_ns, sensor.name, z, R, lever, self._bias(index), gate)
+
+    def _yaw_rate(self, step: FilterStep, index: int, sensor: SensorConfig) -> Measurement:
+        rate, gate = float(step.imu_means[sensor.name].rates_radps[2]), sensor.gate(GATE_SIGMA)
+        return measurements.turn(step.stamp_ns, sensor.name, rate, _gyro_std(sensor), self._bias(index), 1.0, gate)
+
+    def _bias(self, index: int) -> int | None:
+        """State of a yaw gyro's bias."""
+        return self._layout.gyro_bias(index) if self._layout.imus else None
 
 
 def rolling_resistance(before: float, traction: float, force_ahead_mps2: float, dt_s: float) -> float:
@@ -104,6 +118,10 @@ def rolling_resistance(before: float, traction: float, force_ahead_mps2: float, 
 def machine_speed(wheel_mps: float, traction: float, slip_per_traction: float) -> float:
     """Speed of a machine [m/s] from that of its wheels."""
     return wheel_mps * (1 - traction * slip_per_traction * math.copysign(1.0, wheel_mps))
+
+
+def _gyro_std(imu: SensorConfig) -> float:
+    return imu.std.get("rate", measurements.RATE_RADPS)
 
 
 def _turn_std(source: SensorConfig) -> float:

@@ -1,17 +1,17 @@
 """How much of a machine's GPS error a base station has too, from the fixes of both.
 
-Sites differ, receivers too, and a base that fails may publish anything; so nobody configures the share. Both errors are
-stationary Gauss-Markov processes, whose common part has the share s of the smaller one's variance. A small Kalman filter
-per candidate s follows, per axis,
+Sites differ, receivers too, and a base that fails may publish anything; so nobody configures the share. Both errors
+are stationary Gauss-Markov processes, whose common part has the share s of the smaller one's variance. A small Kalman
+filter per candidate s follows, per axis,
 
     q+ = q + walk            error of dead reckoning [m]          fix less dead reckoning   z = q + e + white noise
     e+ = a e + noise         slow error of the machine            error of the base         z = b + d + white noise
     b+ = a b + noise         slow error of the base               cov(noise of e, noise of b) by s
     d+ = d                   lasting error of the base
 
-and the likelihood of what it did not expect weighs its candidate (multiple-model estimation, Magill 1965; Bar-Shalom, Li,
-Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.6.2). Dead reckoning knows little after a
-few minutes, but it is free of all GPS errors: the main filter's position has taken in already what is to be judged here.
+and the likelihood of what it did not expect weighs its candidate, as in `shared_errors`. Dead reckoning knows little
+after a few minutes, but it is nearly free of GPS errors: the main filter's position has taken in already what is to be
+judged here.
 """
 
 import math
@@ -22,7 +22,7 @@ from agents.localisation.filters.motion import GpsError
 from protocol.arrays import Floats
 from protocol.machine.readings import Correction
 
-CANDIDATES = np.array([0.0, 0.3, 0.6, 0.8, 0.9, 0.97])
+CANDIDATES = np.array([0.0, 0.25, 0.5, 0.7, 0.85, 0.95])
 NONE_AT_FIRST = 0.5  # probability of no common part before anything is known: a base has to earn its weight
 MEMORY_S = 300.0  # how long what was seen counts: a base that goes wrong must lose its weight
 SPAN_NS = 1_000_000_000  # fixes and corrections of a second are averaged

@@ -36,7 +36,8 @@ SUFFIXES = (".py", ".toml", ".urdf")  # of sources
 class Setup:
     """What all drives of an experiment share: a scenario, routes that take turns with the seeds, and sensors.
 
-    Everything else of the machine is as the scenario's first fleet has it. world: over the scenario's.
+    Everything else of the machine is as the scenario's first fleet has it. world: over the scenario's. preset: of a
+    drive where its experiment names no other.
     """
 
     scenario: str
@@ -45,10 +46,14 @@ class Setup:
     imu: tuple[int, ...]
     attitude: tuple[int, ...] = ()
     world: str | None = None
+    preset: str = "paper"
 
 
 # IMUs 3 and 4 sit under the rear frame, which is `base_link`, 1 under the front one.
 PAPER = Setup("paper_site", ("west", "east", "middle"), gps=(1, 2, 3), imu=(3, 4, 1), attitude=(3, 4, 1))
+DRIVEN = replace(PAPER, scenario="paper_site_driven", preset="paper_shared")
+HAUL_ROAD = replace(PAPER, scenario="haul_road_driven", routes=("haul",), preset="dgps_shared")
+SETUPS = {setup.scenario: setup for setup in (PAPER, DRIVEN, HAUL_ROAD)}
 
 
 @dataclass(frozen=True)

@@ -31,22 +31,27 @@ class UnsupportedError(SitegridError):
 
 @dataclass(frozen=True)
 class Configuration:
-    """One row of the table: filter, number of GPS receivers and IMUs, profile."""
+    """One row of the table: filter, number of GPS receivers and IMUs, profile.
+
+    machine_share: share of the slow GPS errors' variance that the receivers have in common; None: as it was recorded.
+    """
 
     filter: str
     gps: int
     imu: int
     profile: str
+    machine_share: float | None = None
 
     @property
     def name(self) -> str:
         """A name for files."""
-        return f"{self.filter}-{self.profile}-{self.gps}gps-{self.imu}imu"
+        share = "" if self.machine_share is None else f"-{self.machine_share:g}shared"
+        return f"{self.filter}-{self.profile}-{self.gps}gps-{self.imu}imu{share}"
 
     @property
-    def sensors(self) -> tuple[int, int]:
-        """Number of GPS receivers and of IMUs."""
-        return self.gps, self.imu
+    def sensors(self) -> tuple[int, int, float | None]:
+        """Number of GPS receivers and of IMUs, and what the receivers share."""
+        return self.gps, self.imu, self.machine_share
 
     @property
     def options(self) -> PipelineConfig:
@@ -59,9 +64,18 @@ class Configuration:
         return PAPER_NET_M.get((self.filter, self.gps, self.imu))
 
 
-def configurations(sensors: Sequence[tuple[int, int]] = SENSORS) -> list[Configuration]:
-    """All rows of the table: both filters and both profiles with each set of sensors."""
-    return [Configuration(f, gps, imu, p) for gps, imu in sensors for p in PROFILES for f in FILTERS]
+def configurations(
+    sensors: Sequence[tuple[int, int]] = SENSORS, shares: Sequence[float | None] = (None,)
+) -> list[Configuration]:
+    """All rows of the table: both filters and both profiles with each set of sensors, share by share."""
+    return [
+        Configuration(f, gps, imu, p, share)
+        for share in shares
+        for gps, imu in sensors
+        if gps or share == shares[0]  # without a receiver there is nothing to share
+        for p in PROFILES
+        for f in FILTERS
+    ]
 
 
 def select(machine: MachineConfig, gps: int | None = None, imu: int | None = None) -> MachineConfig:

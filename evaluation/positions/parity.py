@@ -13,6 +13,7 @@ from pathlib import Path
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.localiser import LocalisationConfig, Localiser
+from agents.stream_order import by_stamp
 from evaluation.campaign.figures import Row, rounded
 from evaluation.positions.real_logs import refitted
 from protocol.machine.log_folder import LogFolder, open_log
@@ -55,9 +56,11 @@ def _final_position(log: LogFolder, readings: list[Reading], name: str) -> tuple
     dead_reckoning = DeadReckoning(log.machine, config.slip)
     localiser = Localiser(log.machine, Projection(log.site), config, STEP_S)
     sensors = {sensor.name: sensor for sensor in log.machine.sensors}
-    for reading in readings:
-        dead_reckoning.update(reading, sensors[reading.sensor])
-        localiser.update(reading, sensors[reading.sensor], dead_reckoning)
+    for group in by_stamp(readings):
+        sensed = [(reading, sensors[reading.sensor]) for reading in group]
+        for reading, sensor in sensed:
+            dead_reckoning.update(reading, sensor)
+        localiser.update(sensed, dead_reckoning)
     assert localiser.belief is not None
     x, y, z = localiser.belief.x[:3].tolist()
     return x, y, z

@@ -27,6 +27,7 @@ from protocol.arrays import Floats
 ROOM_M = 8.0  # around a track
 ELLIPSE_EVERY_S = 30.0
 RADIUS_95 = 2.448  # of the 95 % circle, in standard deviations of one axis
+Group = tuple[int, int, float | None]  # GPS receivers, IMUs, what the receivers share
 COLOUR = {"default": pictures.BLUE, "paper": pictures.VERMILION}
 DASHES = {"ukf": "-", "ekf": "--"}
 
@@ -46,18 +47,18 @@ def draw(report: Report, outcomes: Sequence[Outcome], runner: Runner, folder: Pa
 def draw_table(report: Report) -> Figure:
     """Net errors of all rows with their intervals, and the paper's figures as crosses."""
     rows = [row for row in report["rows"] if math.isfinite(row["net_m"])]
-    groups = list(dict.fromkeys((row["gps"], row["imu"]) for row in rows))
+    groups = list(dict.fromkeys(map(_group, rows)))
     kinds = list(dict.fromkeys((row["filter"], row["profile"]) for row in rows))
     figure, axes = plt.subplots(figsize=(pictures.WIDTH_IN, 4.2))
     wide = 0.8 / len(kinds)
     for row in rows:
         kind = row["filter"], row["profile"]
-        x = groups.index((row["gps"], row["imu"])) + (kinds.index(kind) - (len(kinds) - 1) / 2) * wide
+        x = groups.index(_group(row)) + (kinds.index(kind) - (len(kinds) - 1) / 2) * wide
         axes.bar(x, row["net_m"], wide * 0.92, **_bar(*kind))
         axes.errorbar(x, row["net_m"], row["ci95_m"] or 0.0, color="black", capsize=2, lw=1)
         if row["paper_net_m"] is not None:
             axes.plot(x, row["paper_net_m"], "x", color="black", ms=7)
-    axes.set_xticks(range(len(groups)), [_sensors(gps, imu) for gps, imu in groups])
+    axes.set_xticks(range(len(groups)), [_sensors(*group, "\n") for group in groups])
     axes.set_ylabel("net RMSE [m]")
     axes.grid(visible=False, axis="x")
     _limit_height(axes, rows, groups)
@@ -73,14 +74,14 @@ def _bar(filter_: str, profile: str) -> Any:
     return {"color": COLOUR[profile], "hatch": "//" if filter_ == "ekf" else "", "edgecolor": "white"}
 
 
-def _limit_height(axes: Axes, rows: Sequence[Row], groups: Sequence[tuple[int, int]]) -> None:
+def _limit_height(axes: Axes, rows: Sequence[Row], groups: Sequence[Group]) -> None:
     """Without GPS errors are tens of metres: such bars leave the picture, and the figures stand beside them."""
     tops = [max(r["net_m"] + (r["ci95_m"] or 0), r["paper_net_m"] or 0) for r in rows if r["gps"]]
     if highest := max(tops, default=0):
         axes.set_ylim(0, 1.2 * highest)
         white = {"facecolor": "white", "edgecolor": "none"}
         for row in [row for row in rows if row["gps"] == 0 and row["net_m"] > highest][:1]:
-            x = groups.index((0, row["imu"]))
+            x = groups.index(_group(row))
             axes.text(x, 1.1 * highest, "off the scale", ha="center", fontsize=8, bbox=white)
 
 
@@ -180,12 +181,17 @@ def _lap_s(position_m: Floats) -> float:
     return float(len(away) - (near[-1] if len(near) else 0)) * TRACE_S
 
 
-def _groups(outcomes: Sequence[Outcome]) -> list[tuple[int, int]]:
+def _group(row: Row) -> Group:
+    return row["gps"], row["imu"], row["machine_share"]
+
+
+def _groups(outcomes: Sequence[Outcome]) -> list[Group]:
     return list(dict.fromkeys(o.row.sensors for o in outcomes))
 
 
-def _sensors(gps: int, imu: int) -> str:
-    return f"{gps} GPS, {imu} IMU"
+def _sensors(gps: int, imu: int, share: float | None, gap: str = ", ") -> str:
+    shared = f"{gap}{100 * share:g} % shared" if share else ""
+    return f"{gps} GPS, {imu} IMU{shared}"
 
 
 def _kind(filter_: str, profile: str) -> str:

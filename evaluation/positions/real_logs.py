@@ -1,112 +1,125 @@
-"""Real logs: errors against fixes that were withheld, and against the truth where there is one.
-
-What only an evaluation may know stands in `evaluation.toml` beside the manifest; agents never read that file:
-
-    [truth]                    # the true track of base_link, metres in `map`
-    file = "truth.csv.gz"      # in the data folder; stamp counts as in the manifest
-    stamp = "t"
-    x_m = "x"
-    y_m = "y"
-
-    [[planar]]                 # a GPS file in metres of `map`: gets the columns lat_deg and lon_deg
-    file = "gps_sim1.csv.gz"
-    x_m = "x"
-    y_m = "y"
-"""
+"""Real logs: errors against fixes that were withheld, and against the truth where there is one."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from agents.holdout import Holdout, HoldoutConfig
-from agents.pipeline import Pipeline
+from agents.config import require_place
+from agents.holdout import NOTHING, Holdout, HoldoutConfig
+from agents.localisation.localiser import LocalisationConfig
+from agents.pipeline import PipelineConfig, Positioning
 from evaluation.campaign.figures import Report, Row, root_mean_square, rounded
 from evaluation.campaign.truth import Truth
-from evaluation.positions.configurations import Configuration
-from evaluation.positions.replay import Trace, errors, replay, score
-from protocol.config import from_table
+from evaluation.positions.configurations import select
+from evaluation.positions.log_truth import LogTruth, read_log_truth
+from evaluation.positions.replay import Trace, covered, errors, replay, score
 from protocol.errors import ConfigError, LogFolderError
-from protocol.files import load_toml
-from protocol.machine.log_folder import MANIFEST, LogFolder, open_log, open_text
+from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
-from protocol.site.site_config import Projection
-from protocol.units import stamp_ns, stamp_scale
 
-SIDE_FILE = "evaluation.toml"
-NOTHING_WITHHELD = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None}
-TRUTH_FIGURES = ("rmse_x_m", "rmse_y_m", "net_m", "max_m", "nees", "coverage95", "covered")
-WITHHOLD = ((0.0, 1.0), (1.0, 10.0), (10.0, 30.0), (30.0, 60.0))  # seconds off, of every so many; the first is nothing
-
-
-@dataclass(frozen=True)
-class TruthFile:
-    """A CSV file of the data folder with the true track of `base_link`, and its columns."""
-
-    file: str
-    stamp: str
-    x_m: str
-    y_m: str
-    stamp_unit: str = "s"
+TRUTH_FIGURES = (
+    "rmse_x_m",
+    "rmse_y_m",
+    "net_m",
+    "max_m",
+    "nees",
+    "coverage95",
+    "smoothed_net_m",
+    "smoothed_coverage95",
+)
 
 
 @dataclass(frozen=True)
-class PlanarFile:
-    """A GPS file whose fixes are metres in `map`, and its columns."""
+class Outage:
+    """GPS is withheld once, for length_s from start_s on, counted from the first reading."""
 
-    file: str
-    x_m: str
-    y_m: str
+    start_s: float
+    length_s: float
+
+    def withholds(self, seconds: float) -> bool:
+        """Whether GPS is withheld so long after the first reading."""
+        return 0 <= seconds - self.start_s < self.length_s
+
+    def __str__(self) -> str:
+        return f"{self.start_s:g},{self.length_s:g}"
 
 
 @dataclass(frozen=True)
-class Side:
-    """`evaluation.toml`: what only an evaluation may know of a log."""
+class Periodic(HoldoutConfig):
+    """GPS is withheld for off_s of every period_s."""
 
-    truth: TruthFile | None = None
-    planar: tuple[PlanarFile, ...] = ()
+    def __str__(self) -> str:
+        return f"{self.off_s:g}/{self.period_s:g}"
 
 
-@contextmanager
-def opened(manifest: Path, data: Path | None = None) -> Iterator[tuple[LogFolder, Truth | None]]:
-    """Open a log, and the truth that its side file names; None without.
+Pattern = Outage | Periodic | None  # of None, nothing is withheld
+WITHHOLD: tuple[Pattern, ...] = (None, Periodic(10.0, 1.0), Periodic(30.0, 10.0), Periodic(60.0, 30.0))
 
-    Planar fixes are converted into a folder that lasts as long as the context.
-    """
-    log = open_log(manifest, data)
-    side_file = (manifest if manifest.is_dir() else manifest.parent) / SIDE_FILE
-    side = from_table(Side, load_toml(side_file), str(side_file)) if side_file.is_file() else Side()
-    if unknown := {p.file for p in side.planar} - {s.file for s in log.sources}:
-        raise ConfigError(side_file, f"planar: {MANIFEST} has no sensor with the file {min(unknown)!r}")
-    truth = read_truth(log, side.truth) if side.truth else None
-    with TemporaryDirectory(prefix="sitegrid-") as folder:
-        made = {planar.file: str(convert(log, planar, Path(folder))) for planar in side.planar}
-        log.sources = tuple(replace(source, file=made.get(source.file, source.file)) for source in log.sources)
-        yield log, truth
+
+def parse_pattern(kind: str, first_s: float, second_s: float) -> Pattern:
+    """What `--withhold` means: `/` off and period, `,` start and length."""
+    if kind == "/":
+        return Periodic(period_s=second_s, off_s=first_s)
+    return Outage(first_s, second_s) if kind == "," else None
 
 
 def run(
-    log: LogFolder,
-    truth: Truth | None,
-    row: Configuration,
-    patterns: Sequence[tuple[float, float]] = WITHHOLD,
+    manifest: Path,
+    data: Path | None,
+    options: LocalisationConfig,
+    patterns: Sequence[Pattern] = WITHHOLD,
+    choose: Callable[[MachineConfig], MachineConfig] = lambda machine: machine,
     on_progress: Callable[[str], None] = lambda _: None,
 ) -> Report:
-    """Replay a log once per pattern of withheld GPS: (seconds off, period). refused: readings by reason."""
+    """Replay a log once per pattern of withheld GPS. refused: readings by reason, and where the first of each stands.
+
+    choose: which sensors of the machine are in use.
+    """
+    log = open_log(manifest, data)
+    log = refitted(log, choose(log.machine))
+    require_place(log.machine, options)
+    truth = read_log_truth(log, manifest if manifest.is_dir() else manifest.parent)
     readings = list(log.readings())
+    _require_time(log, truth, readings, patterns)
     rows = []
-    for off_s, period_s in patterns:
-        on_progress(f"{log.name}: {withheld_name(off_s, period_s)}")
-        rows.append(_row(log, truth, row, readings, (off_s, period_s)))
-    described = {"log": log.name, "filter": row.filter, "profile": row.profile, "gps": row.gps}
-    return {**described, "readings": len(readings), "refused": dict(log.refused), "rows": rows}
+    for pattern in patterns:
+        on_progress(f"{log.name}: {pattern or 'none'}")
+        rows.append(_row(log, truth, options, readings, pattern))
+        if not rows[-1]["covered"]:
+            on_progress(
+                f"{log.name}: no pose, as the heading never showed: that takes wheels, fixes and 12 m of driving"
+            )
+    described = {"log": log.name, "filter": options.filter, "profile": options.profile}
+    used = [sensor.name for sensor in log.machine.sensors if sensor.use]
+    counted = {"readings": len(readings), "refused": dict(log.refused), "first_refused": dict(log.first_refused)}
+    return {**described, "gps": receivers(log.machine), "sensors": used, **counted, "rows": rows}
+
+
+def measurements(rows: Sequence[Row]) -> list[Row]:
+    """Of each row and sensor: measurements that the filter used and refused, and how consistent it is with fixes."""
+    listed = []
+    for row in rows:
+        counters = row["counters"]
+        for name in (counter.removesuffix("_used") for counter in counters if counter.endswith("_used")):
+            consistency = row["consistency"].get(name, {})
+            figures = {key: consistency.get(key) for key in ("nis", "correlation", "good")}
+            counted = {key: counters.get(f"{name}_{key}", 0) for key in ("used", "gated", "relocked")}
+            listed.append(rounded({"withhold": row["withhold"], "measurement": name, **counted, **figures}, 2))
+    return listed
+
+
+def chosen(machine: MachineConfig, sensors: Collection[str] = (), gps: int | Collection[str] = ()) -> MachineConfig:
+    """The machine with these sensors in use and no others, and of its receivers so many, or these; empty: as it is."""
+    if sensors:
+        machine = _using(machine, sensors, [s.name for s in machine.sensors])
+    if isinstance(gps, int):
+        return select(machine, gps=gps)
+    return _using(machine, gps, [s.name for s in machine.sensors if s.kind == "gps"]) if gps else machine
 
 
 def refitted(log: LogFolder, machine: MachineConfig) -> LogFolder:
@@ -121,73 +134,66 @@ def receivers(machine: MachineConfig) -> int:
     return sum(sensor.use and sensor.kind == "gps" for sensor in machine.sensors)
 
 
-def withheld_name(off_s: float, period_s: float) -> str:
-    """As the command line has it."""
-    return f"{off_s:g}/{period_s:g}" if off_s else "none"
+def _using(machine: MachineConfig, names: Collection[str], among: Sequence[str]) -> MachineConfig:
+    """The machine with only some of these sensors in use; the others stay as they are."""
+    if unknown := [name for name in names if name not in among]:
+        raise ConfigError(machine.name, f"has no {unknown[0]!r}, but {', '.join(among) or 'no receiver'}")
+    sensors = (replace(s, use=s.name in names) if s.name in among else s for s in machine.sensors)
+    return replace(machine, sensors=tuple(sensors))
 
 
-def read_truth(log: LogFolder, described: TruthFile) -> Truth:
-    """The true track that a log's side file names."""
-    rows, scale = _read(log.data / described.file), stamp_scale(described.stamp_unit)
-    try:
-        stamps = [log.start_ns + stamp_ns(row[described.stamp], scale) for row in rows]
-        places = [(float(row[described.x_m]), float(row[described.y_m])) for row in rows]
-    except (KeyError, ValueError, TypeError) as error:
-        raise LogFolderError(log.data / described.file, f"is no truth as described: {error}") from None
-    return Truth(np.array(stamps, np.int64), np.array(places))
-
-
-def convert(log: LogFolder, planar: PlanarFile, folder: Path) -> Path:
-    """Write a copy of a GPS file with latitude and longitude, by the projection of the log's site; returns its path."""
-    source = log.data / planar.file
-    rows = _read(source)
-    try:
-        x, y = (np.array([float(row[name]) for row in rows]) for name in (planar.x_m, planar.y_m))
-    except (KeyError, ValueError, TypeError) as error:
-        raise LogFolderError(source, f"has no planar fixes as described: {error}") from None
-    places = Projection(log.site).to_geodetic_many(x, y, np.zeros(len(x)))
-    path = folder / f"{source.name.split('.')[0]}.csv"
-    with path.open("w", encoding="utf-8", newline="") as text:
-        writer = csv.DictWriter(text, [*(rows[0] if rows else ()), "lat_deg", "lon_deg"])
-        writer.writeheader()
-        for row, lat, lon in zip(rows, places[0], places[1], strict=True):
-            writer.writerow({**row, "lat_deg": repr(float(lat)), "lon_deg": repr(float(lon))})
-    return path
+def _require_time(
+    log: LogFolder, truth: LogTruth | None, readings: Sequence[Reading], patterns: Sequence[Pattern]
+) -> None:
+    """Refuse what lies outside of the log's time."""
+    if not readings:
+        raise LogFolderError(log.data, "no sensor in use has a reading")
+    first_ns, seconds = readings[0].stamp_ns, (readings[-1].stamp_ns - readings[0].stamp_ns) * 1e-9
+    for pattern in patterns:
+        if isinstance(pattern, Outage) and pattern.start_s >= seconds:
+            raise ConfigError(f"--withhold {pattern}", f"the log ends after {seconds:.0f} s")
+    if truth:
+        begins_s, ends_s = (float(truth.track.stamp_ns[i] - first_ns) * 1e-9 for i in (0, -1))
+        if ends_s < 0 or begins_s > seconds:
+            where = f"from {begins_s:.0f} to {ends_s:.0f} s of the log, which lasts from 0 to {seconds:.0f} s"
+            raise LogFolderError(log.data, f"the truth is {where}: look at its stamps and their unit")
 
 
 def _row(
-    log: LogFolder, truth: Truth | None, row: Configuration, readings: Sequence[Reading], pattern: tuple[float, float]
+    log: LogFolder,
+    truth: LogTruth | None,
+    options: LocalisationConfig,
+    readings: Sequence[Reading],
+    pattern: Pattern,
 ) -> Row:
-    """Errors [m] against the withheld fixes, from `HoldoutConfig.settle_s` on, and against the truth if known."""
-    off_s, period_s = pattern
-    config = HoldoutConfig(period_s=period_s, off_s=off_s) if off_s else None
-    holdout = Holdout(log.site, log.machine, config) if config else None
-    pipeline = Pipeline(log.site, log.machine, row.options)
-    trace = replay(pipeline, readings, holdout)
-    health = pipeline.health()
+    """Errors [m] against the withheld fixes, and against the truth if known.
+
+    Of periodic outages those count from `agents.holdout.SETTLE_S` on, of a placed one all.
+    """
+    settle = {"settle_s": 0.0} if isinstance(pattern, Outage) else {}
+    holdout = Holdout(log.site, log.machine, pattern, **settle) if pattern else None
+    core = Positioning(log.site, log.machine, PipelineConfig(localisation=options))
+    trace = replay(core, readings, holdout)
+    consistency = core.localiser.consistency.items()
     return {
-        "withhold": withheld_name(*pattern),
-        **(holdout.report() if holdout else NOTHING_WITHHELD),
+        "withhold": str(pattern or "none"),
+        **(holdout.report() if holdout else NOTHING),
+        "covered": round(covered(trace), 4),
         "us_per_second": round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None,
-        "counters": health["counters"],
-        "consistency": health["consistency"],
-        **(_against_truth(trace, truth, pattern) if truth else {}),
+        "counters": dict(core.counters),
+        "consistency": {name: {**asdict(value), "good": value.is_good} for name, value in consistency},
+        **(_against_truth(trace.moved(truth.lever_m), truth.track, pattern) if truth else {}),
     }
 
 
-def _against_truth(trace: Trace, truth: Truth, pattern: tuple[float, float]) -> Row:
-    """Errors from the first pose on; truth_withheld_m: of the times without GPS."""
-    overall = vars(score(trace, truth))
+def _against_truth(trace: Trace, truth: Truth, pattern: Pattern) -> Row:
+    """Errors from the first pose on; truth_withheld_m: of the times without GPS; truth_end_m: of the last of each."""
+    scored = score(trace, truth)
     off = np.hypot(*errors(trace, truth).T)
-    dark = np.isfinite(off) & (trace.since_start_s % pattern[1] < pattern[0])
-    values = {name: overall[name] for name in TRUTH_FIGURES} | {"withheld_m": root_mean_square(off[dark])}
+    dark = np.array([pattern is not None and pattern.withholds(s) for s in trace.since_start_s], bool)
+    ends = dark & ~np.append(dark[1:], False)
+    values = {name: getattr(scored, name) for name in TRUTH_FIGURES}
+    known = np.isfinite(off)
+    values |= {"known": float(known.mean()) if len(off) else 0.0, "nees_95": [scored.nees_low, scored.nees_high]}
+    values |= {"withheld_m": root_mean_square(off[dark & known]), "end_m": root_mean_square(off[ends & known])}
     return rounded({f"truth_{name}": value for name, value in values.items()}, 4)
-
-
-def _read(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file, by column."""
-    try:
-        with open_text(path) as text:
-            return list(csv.DictReader(text))
-    except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
-        raise LogFolderError(path, f"cannot be read: {error}") from None

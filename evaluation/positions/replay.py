@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -29,14 +30,27 @@ HOLE = 3  # times the usual interval between poses: nothing was believed in a lo
 
 @dataclass(frozen=True)
 class Track:
-    """Where a machine is said to have been: stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2) in `map`."""
+    """Where a machine is said to have been.
+
+    stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2), heading_rad: (n,) in `map`.
+    """
 
     stamp_ns: Ints
     position_m: Floats
     covariance_m2: Floats
+    heading_rad: Floats
+
+    def moved(self, lever_m: Floats) -> Self:
+        """Of another point of the machine, lever_m (3,) off in `base_link`, as a machine on the plane has it.
+
+        The covariance stays: what the heading adds, its standard deviation times the lever, is small beside it.
+        """
+        c, s, (ahead, left, _) = np.cos(self.heading_rad), np.sin(self.heading_rad), lever_m
+        off = np.stack([c * ahead - s * left, s * ahead + c * left], axis=1)
+        return replace(self, position_m=self.position_m + off)
 
 
-NOWHERE = Track(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+NOWHERE = Track(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -61,6 +75,10 @@ class Trace(Track):
     def since_start_s(self) -> Floats:
         """Stamps (n,) as seconds after the first reading."""
         return np.asarray(self.stamp_ns - self.first_ns, float) * 1e-9
+
+    def moved(self, lever_m: Floats) -> Self:
+        """Of another point of the machine, as of any track."""
+        return replace(super().moved(lever_m), smoothed=self.smoothed.moved(lever_m))
 
 
 @dataclass(frozen=True)
@@ -151,6 +169,7 @@ def _track(poses: Sequence[PoseBelief] | Sequence[SmoothedPose]) -> Track:
         stamp_ns=np.array([p.stamp_ns for p in poses], np.int64),
         position_m=np.array([(p.x_m, p.y_m) for p in poses]).reshape(-1, 2),
         covariance_m2=np.array([p.covariance_m2 for p in poses]).reshape(-1, 2, 2),
+        heading_rad=np.array([p.heading_rad for p in poses]),
     )
 
 

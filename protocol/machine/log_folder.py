@@ -4,50 +4,42 @@ The manifest may lie apart from the data, so that logs of others are described w
 """
 
 import csv
-import gzip
 import heapq
-import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from protocol.config import from_table, section, toml_lines
-from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal
+from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal, RowError
 from protocol.files import load_toml
+from protocol.machine.csv_file import Column, CsvFile, Row, opened_rows, parse_column, require, stamp_reader, take_file
+from protocol.machine.log_columns import ReadingColumns, reading_columns
 from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
 from protocol.machine.readings import Reading, columns, parse_reading
 from protocol.site.site_config import SiteConfig, site_toml
-from protocol.units import factor, stamp_ns, stamp_scale
 
 MANIFEST = "log.toml"
-MAX_LINE = 2**20  # characters of a CSV file
-
-
-@dataclass(frozen=True)
-class Column:
-    """Where one field of a reading comes from: a CSV column in a unit, or a constant."""
-
-    column: str = ""
-    unit: str = ""
-    value: float = 0.0
 
 
 @dataclass(frozen=True)
 class SensorFile:
-    """The CSV file of one sensor. fields: reading field -> Column; `stamp` is the time column."""
+    """The CSV file of one sensor: its time column, and the columns of its readings."""
 
     sensor: SensorConfig
-    file: str
+    file: CsvFile
     stamp: Column
-    fields: dict[str, Column]
+    columns: ReadingColumns
 
 
 @dataclass
 class LogFolder:
-    """A described recording. `refused` counts the rows that were skipped while it is read, by reason."""
+    """A described recording.
+
+    refused: how many rows were skipped while it is read, by reason; first_refused: file, line and problem of the first.
+    """
 
     name: str
     data: Path
@@ -56,10 +48,12 @@ class LogFolder:
     machine: MachineConfig
     sources: tuple[SensorFile, ...]
     refused: Counter[str] = field(default_factory=Counter)
+    first_refused: dict[str, str] = field(default_factory=dict)
 
     def readings(self) -> Iterator[Reading]:
         """All readings of the sensors in use, in the order of `known_ns`; counts `refused` anew."""
         self.refused.clear()
+        self.first_refused.clear()
         streams = [self._read(source) for source in self.sources if source.sensor.use]
         return heapq.merge(*streams, key=self.known_ns)
 
@@ -73,34 +67,40 @@ class LogFolder:
         return {s.name: s.true_ns(0) for s in (source.sensor for source in self.sources) if s.delay_s < 0}
 
     def _read(self, source: SensorFile) -> Iterator[Reading]:
-        path = self.data / source.file
-        try:
-            with open_text(path) as text:
-                yield from self._parse(text, source, path)
-        except (OSError, EOFError, zlib.error, ValueError, csv.Error) as error:  # ValueError: no UTF-8, or no path
-            raise LogFolderError(path, f"cannot be read: {error}") from None
+        path, parse = self.data / source.file.file, self._parser(source)
+        with opened_rows(source.file, self.data) as rows:
+            for column in (source.stamp, *source.columns.described.values()):
+                require(column.weights, rows, path)
+            newest, problem = 0, ""
+            for row in rows:
+                try:
+                    reading = parse(row)
+                    if reading.stamp_ns < newest:  # the merge of the files needs each of them in order
+                        raise RowError("stamp_goes_back", "it is older than the row before it")
+                except RowError as error:
+                    problem = problem or f"line {rows.line_num}: {error}"
+                    self.refused[error.reason] += 1
+                    self.first_refused.setdefault(error.reason, f"{path.name} line {rows.line_num}: {error}")
+                else:
+                    newest = reading.stamp_ns
+                    yield reading
+        if problem and not newest:
+            raise LogFolderError(path, f"none of its rows can be used; {problem}")
 
-    def _parse(self, text: IO[str], source: SensorFile, path: Path) -> Iterator[Reading]:
-        rows = csv.DictReader(_lines(text, path))
-        header = rows.fieldnames or ()
-        picks = [_pick(name, source.fields[name], header, path) for name in columns(source.sensor.kind)]
-        stamp_column, scale = _require(source.stamp.column, header, path), stamp_scale(source.stamp.unit or "s")
-        newest = 0
-        for row in rows:
+    def _parser(self, source: SensorFile) -> Callable[[Row], Reading]:
+        """What makes a reading of a row; raises RowError."""
+        sensor, stamp, values = source.sensor, stamp_reader(source.stamp), source.columns.reader(self.site)
+
+        def parse(row: Row) -> Reading:
             try:
-                stamp = self.start_ns + stamp_ns(row[stamp_column], scale)
-                values = tuple(float(row[c]) * k if c else k for c, k in picks)
-                reading = parse_reading(source.sensor.kind, source.sensor.name, stamp, values)
-            except (ValueError, TypeError, OverflowError):
-                self.refused[Refusal.WRONG_TYPE] += 1
+                source.file.check(row)
+                return parse_reading(sensor.kind, sensor.name, self.start_ns + stamp(row), values(row))
             except MessageError as error:
-                self.refused[error.reason] += 1
-            else:
-                if stamp < newest:  # the merge of the files needs each of them in order
-                    self.refused["stamp_goes_back"] += 1
-                    continue
-                newest = stamp
-                yield reading
+                raise RowError(error.reason, str(error)) from None
+            except (ValueError, TypeError, OverflowError):
+                raise RowError(Refusal.WRONG_TYPE, "a value is missing, or is not a number") from None
+
+        return parse
 
 
 def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
@@ -111,19 +111,19 @@ def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
     table = load_toml(manifest)
     log = section(table, "log", where)
     machine = section(table, "machine", where)
-    site = section(table, "site", where)
+    site_table = section(table, "site", where)
     tables = table.pop("sensor", [])
     if table:
         raise ConfigError(where, f"unknown key `{next(iter(table))}`; known: log, site, machine, sensor")
     if not isinstance(tables, list) or not tables:
         raise ConfigError(where, "no [[sensor]] is described")
-    sources = tuple(_parse_source(t, f"{where} [[sensor]] {i + 1}") for i, t in enumerate(tables))
-    header = from_table(_Header, log, f"{where} [log]")
+    header, site = from_table(_Header, log, f"{where} [log]"), from_table(SiteConfig, site_table, f"{where} [site]")
+    sources = tuple(_parse_source(t, site, f"{where} [[sensor]] {i + 1}") for i, t in enumerate(tables))
     return LogFolder(
         name=header.name,
         data=data or manifest.parent,
         start_ns=header.start_ns,
-        site=from_table(SiteConfig, site, f"{where} [site]"),
+        site=site,
         machine=parse_machine(machine, tuple(s.sensor for s in sources), where),
         sources=sources,
     )
@@ -137,71 +137,17 @@ class _Header:
     start_ns: int = 0
 
 
-def _parse_source(table: Any, where: str) -> SensorFile:
+def _parse_source(table: Any, site: SiteConfig, where: str) -> SensorFile:
     if not isinstance(table, dict):
         raise ConfigError(where, "a table is expected")
     table = dict(table)
-    file, mapping = table.pop("file", None), section(table, "columns", where)
+    mapping, file = section(table, "columns", where), take_file(table, where)
     sensor = from_table(SensorConfig, table, where)
-    if not isinstance(file, str):
-        raise ConfigError(where, "key `file` is missing")
-    parsed = {name: _parse_column(value, f"{where} columns.{name}") for name, value in mapping.items()}
-    known = ("stamp", *columns(sensor.kind))
-    if unknown := sorted(set(parsed) - set(known)):
-        raise ConfigError(where, f"unknown column `{unknown[0]}`; a {sensor.kind} has {', '.join(known)}")
-    if missing := [name for name in known if name not in parsed]:
-        raise ConfigError(where, f"column `{missing[0]}` is not described")
-    if not parsed["stamp"].column:
-        raise ConfigError(f"{where} columns.stamp", "a column is expected, not a constant")
-    for name, column in parsed.items():
-        _check_unit(name, column, f"{where} columns.{name}")
-    return SensorFile(sensor, file, parsed.pop("stamp"), parsed)
-
-
-def _parse_column(value: Any, where: str) -> Column:
-    table = {"column": value} if isinstance(value, str) else value
-    if isinstance(table, dict) and ("column" in table) != ("value" in table) and table.get("column") != "":
-        return from_table(Column, table, where)
-    raise ConfigError(where, 'write "name", { column = "name", unit = "deg" } or { value = 0.01 }')
-
-
-def _check_unit(name: str, column: Column, where: str) -> None:
-    try:
-        if name == "stamp":
-            stamp_scale(column.unit or "s")
-        elif column.unit:
-            factor(column.unit, name)
-    except ValueError as error:
-        raise ConfigError(where, str(error)) from None
-
-
-def _pick(name: str, column: Column, header: Sequence[str], path: Path) -> tuple[str, float]:
-    """Return a CSV column and the factor to the field's unit; or no column and a constant."""
-    scale = factor(column.unit, name) if column.unit else 1.0
-    if not column.column:
-        return "", column.value * scale
-    return _require(column.column, header, path), scale
-
-
-def _require(column: str, header: Sequence[str], path: Path) -> str:
-    if column not in header:
-        raise LogFolderError(path, f"has no column `{column}`; it has {', '.join(header)}")
-    return column
-
-
-def open_text(path: Path) -> IO[str]:
-    """Open a text file for reading, compressed if its name ends in .gz; raises OSError."""
-    if path.suffix == ".gz":
-        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
-    return path.open(encoding="utf-8-sig", newline="")  # with or without the mark that spreadsheets write
-
-
-def _lines(text: IO[str], path: Path) -> Iterator[str]:
-    """Lines, refused where one is too long: a small compressed file can hold a line of many gigabytes."""
-    while line := text.readline(MAX_LINE):
-        if len(line) == MAX_LINE:
-            raise LogFolderError(path, f"cannot be read: a line is longer than {MAX_LINE} characters")
-        yield line
+    described = {name: parse_column(value, name, f"{where} columns.{name}") for name, value in mapping.items()}
+    if "stamp" not in described:
+        raise ConfigError(where, "column `stamp` is not described")
+    stamp = described.pop("stamp")
+    return SensorFile(sensor, file, stamp, reading_columns(sensor, described, site, where))
 
 
 def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig, readings: Iterable[Reading]) -> None:

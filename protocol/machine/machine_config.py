@@ -126,7 +126,8 @@ class MachineConfig:
     """Nominal body of a machine; `base_link` is its rear frame, on the ground below the rear axle's centre.
 
     load_centre_m: how far ahead of `base_link` the wheel loads' centre lies. rotating_mass_factor: mass plus the
-    wheels' inertia over mass. A machine without a drive torque sensor needs no mass.
+    wheels' inertia over mass. A machine without a drive torque sensor needs no mass. machine_share: share of the slow
+    variance that its GPS receivers have in common, None to estimate it.
 
     The rest, 0 where not known: wheelbase_m: from the rear axle to the front one, straight ahead. axle_stiffness_npm:
     vertical, of the two tyres of one axle together. cog_height_m: of the empty machine's centre of mass above the
@@ -139,6 +140,7 @@ class MachineConfig:
     wheel_radius_m: float = 0.75
     load_centre_m: float = 1.5
     rotating_mass_factor: float = 1.07
+    machine_share: float | None = None
     wheelbase_m: float = 0.0
     axle_stiffness_npm: float = 0.0
     cog_height_m: float = 0.0
@@ -153,6 +155,8 @@ class MachineConfig:
             raise ValueError("mass_kg and wheel_radius_m must be positive")
         if self.rotating_mass_factor < 1:
             raise ValueError("rotating_mass_factor: below 1")
+        if self.machine_share is not None and not 0 <= self.machine_share <= 1:
+            raise ValueError(f"machine_share: {self.machine_share} is not between 0 and 1")
         for name in ("wheelbase_m", "axle_stiffness_npm", "cog_height_m", "payload_z_m"):
             if not 0 <= getattr(self, name) < math.inf:  # also false for NaN
                 raise ValueError(f"{name}: {getattr(self, name)!r} is not a positive number, nor 0 for not known")

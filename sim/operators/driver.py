@@ -1,4 +1,7 @@
-"""Drivers: pure pursuit along routes, forwards and in reverse, a speed controller, stops, and waiting for others."""
+"""Drivers: pure pursuit along routes, forwards and in reverse, a speed controller, stops, and waiting for others.
+
+They follow their routes as near as their habits let them.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from sim.operators.course import BEYOND_M, Course, Crew, Start
+from sim.operators.habits import Habits
 from sim.state import FleetState
 
 DRIVER_STEPS = 5  # of the world: drivers act at 20 Hz
@@ -30,7 +34,8 @@ class Drivers:
     """Memory of n drivers: leg and distance along it [m], speed aimed at [m/s], integral of the controller [N].
 
     waited_s: how long they have stood at the end of their leg. payload_kg: what they carry. clear_m: distance
-    ahead that is free of other machines.
+    ahead that is free of other machines. driven_m: distance driven so far. stops: how many of their own they have made;
+    stop_m, stood_s: the distance driven at which the next one is, and how long they have stood there.
     """
 
     leg: Ints
@@ -40,6 +45,10 @@ class Drivers:
     waited_s: Floats
     payload_kg: Floats
     clear_m: Floats
+    driven_m: Floats
+    stops: Ints
+    stop_m: Floats
+    stood_s: Floats
 
 
 @dataclass(frozen=True)
@@ -52,9 +61,9 @@ class Commands:
     payload_kg: Floats
 
 
-def at_start(starts: Sequence[Start]) -> Drivers:
+def at_start(starts: Sequence[Start], habits: Habits) -> Drivers:
     """Drivers before the first step."""
-    zero = np.zeros(len(starts))
+    zero, none = np.zeros(len(starts)), np.zeros(len(starts), np.int64)
     return Drivers(
         leg=np.array([start.leg for start in starts]),
         distance_m=np.array([start.distance_m for start in starts]),
@@ -63,6 +72,10 @@ def at_start(starts: Sequence[Start]) -> Drivers:
         waited_s=zero,
         payload_kg=np.array([start.payload_kg for start in starts]),
         clear_m=np.full(len(starts), np.inf),
+        driven_m=zero,
+        stops=none,
+        stop_m=habits.stop(none)[0],
+        stood_s=zero,
     )
 
 
@@ -72,7 +85,9 @@ def no_commands(machines: int) -> Commands:
     return Commands(zero, zero, zero, zero)
 
 
-def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float) -> tuple[Drivers, Commands]:
+def drive(
+    course: Course, crew: Crew, habits: Habits, old: Drivers, state: FleetState, dt: float
+) -> tuple[Drivers, Commands]:
     """Drive one step; returns the drivers' next memory and their commands."""
     # Where on the leg the machine is; at its end it stops, waits, loads, and takes up the next leg.
     position = crew.joint_m(state)
@@ -86,28 +101,46 @@ def drive(course: Course, crew: Crew, old: Drivers, state: FleetState, dt: float
     arrived &= ~done
     travel = course.travel[leg]
 
-    # Steer for a point ahead.
+    # Now and then it stops where the driver wants to.
+    driven = old.driven_m + np.abs(state.speed_mps) * dt
+    at_stop = old.stop_m - driven < STOP_M
+    stood = np.where(at_stop & standing, old.stood_s + dt, 0.0)
+    rested = stood > habits.stop(old.stops)[1]
+    stops = old.stops + rested
+    stop = np.where(rested, driven + habits.stop(stops)[0], old.stop_m)
+    at_stop &= ~rested
+
+    # Steer for a point ahead, as far beside the line as they happen to keep there.
     speed = travel * state.speed_mps
-    target = course.at(leg, distance + LOOK_AHEAD_M + LOOK_AHEAD_S * np.abs(speed))[0] - position
+    target_distance = distance + LOOK_AHEAD_M + LOOK_AHEAD_S * np.abs(speed)
+    point, direction = course.at(leg, target_distance)
+    lateral = travel * habits.lateral_m(driven + target_distance - distance)
+    target = point + lateral[:, None] * np.stack([-direction[:, 1], direction[:, 0]], axis=-1) - position
     wheelbase = crew.rear_to_joint_m + crew.front_to_joint_m
     heading = state.yaw_rad + state.articulation_rad * crew.rear_to_joint_m / wheelbase
     steer = travel * pursue(crew, target, np.where(travel < 0, heading + np.pi, heading))
+    steer = np.where(at_stop, state.articulation_rad, steer)  # who steers while he stands folds the machine up
 
     # Keep the speed that the leg allows; gently up, and at once down.
     limit = np.where(travel < 0, REVERSE_SHARE, 1.0) * course.limit(leg, distance + LOOK_AHEAD_S * speed)
     to_go = np.where(course.closed[leg], np.inf, course.length_m[leg] - distance)
+    to_go = np.minimum(to_go, stop - driven)
     limit = np.minimum(limit, np.sqrt(2 * STOP_MPS2 * np.maximum(to_go - 0.5 * STOP_M, 0.05)))
-    limit = np.where(arrived, 0.0, np.minimum(limit, np.sqrt(2 * START_MPS2 * old.clear_m)))
+    limit = np.where(arrived | at_stop, 0.0, np.minimum(limit, np.sqrt(2 * START_MPS2 * old.clear_m)))
     aim = np.minimum(limit, np.maximum(old.aim_mps, 0.0) + START_MPS2 * dt)
     halt = (aim < STANDING_MPS) & (np.abs(speed) < 5 * STANDING_MPS)
-    force, integral = hold_speed(crew, aim, speed, np.where(halt | done, 0.0, old.integral_n), dt)
+    # At a stop of their own they go on as they came, so the torque against a slope is kept for the start.
+    afresh = (halt & ~at_stop) | done
+    force, integral = hold_speed(crew, aim, speed, np.where(afresh, 0.0, old.integral_n), dt)
     commands = Commands(
         steer_rad=steer,
         drive_n=np.where(halt, 0.0, travel * force),
         brake_n=np.where(halt, crew.max_brake_n, 0.0),
         payload_kg=payload,
     )
-    return Drivers(leg, distance, aim, integral, np.where(done, 0.0, waited), payload, old.clear_m), commands
+    waited = np.where(done, 0.0, waited)
+    stood = np.where(rested, 0.0, stood)
+    return Drivers(leg, distance, aim, integral, waited, payload, old.clear_m, driven, stops, stop, stood), commands
 
 
 def look_out(course: Course, crew: Crew, old: Drivers, state: FleetState) -> Drivers:

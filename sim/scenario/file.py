@@ -45,15 +45,16 @@ def load_scenario(name: str) -> Scenario:
 def check(scenario: Scenario, where: str) -> None:
     """Refuse what does not fit together: a ConfigError names the place."""
     routes = {route.name: route.build() for route in scenario.route}
+    margin_m = MARGIN_M + scenario.driving.widest_m
     for name, route in routes.items():
         place = f'{where} [[route]] "{name}"'
         _check_joints(route, place)
         points = np.vstack([leg.points for leg in route.legs])
-        outside = points[~scenario.ground.contains(points, MARGIN_M)]
+        outside = points[~scenario.ground.contains(points, margin_m)]
         if len(outside):
             x, y = outside[0]
             size = f"{scenario.ground.width_m:g} x {scenario.ground.depth_m:g} m"
-            raise ConfigError(place, f"leaves the map at ({x:.0f}, {y:.0f}): keep {MARGIN_M:g} m inside its {size}")
+            raise ConfigError(place, f"leaves the map at ({x:.0f}, {y:.0f}): keep {margin_m:g} m inside its {size}")
     scenario.bases()  # raises where a preset is not known
     for fleet in scenario.fleet:
         place = f'{where} [[fleet]] "{fleet.name}"'

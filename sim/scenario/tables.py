@@ -13,6 +13,7 @@ from protocol.config import require_between
 from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import NAME, SiteConfig
 from sim.machines.model import load_model
+from sim.operators.habits import DrivingConfig
 from sim.operators.routes import ROUNDING_M, Leg, Route, open_leg, tour
 from sim.scenario.ground import GroundConfig, Point, ZoneConfig
 from sim.sensors.presets import Preset, load_preset
@@ -157,7 +158,7 @@ class ScheduledChange:
 
 @dataclass(frozen=True)
 class Scenario:
-    """What is simulated. world: pybullet, or fast. give_way: drivers wait for machines ahead of them."""
+    """What is simulated. world: pybullet, or fast. give_way: drivers wait for machines ahead; driving: their habits."""
 
     description: str
     site: SiteConfig
@@ -168,6 +169,7 @@ class Scenario:
     seed: int = 0
     seconds: float = 120.0
     give_way: bool = True
+    driving: DrivingConfig = field(default_factory=DrivingConfig)
     fault: tuple[FaultConfig, ...] = ()
     change: tuple[ScheduledChange, ...] = ()
     presets: Mapping[str, Preset] = field(default_factory=dict)

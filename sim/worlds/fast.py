@@ -27,15 +27,18 @@ _SOILS = np.array([C_RR, TRACTION, SLIP_STIFFNESS])
 
 # One machine in the state array (n,): what `FleetState` explains, and what the next step needs beside it.
 # grip: the most drive force. crab: how far a machine moves off its heading to the left, because tyres push sideways
-# only while they slip sideways. ride: how high the body's centre is. *_aim: where ride, pitch and roll would settle.
+# only while they slip sideways. centre, ride: acceleration of the body's centre ahead, and how high it is. *_aim: where
+# ride, pitch and roll would settle if the tyres gave way as under the empty machine.
 _IN_BOTH = [field.name for field in fields(FleetState) if field.name not in ("mass_kg", "payload_kg")]
-_BESIDE = ("grip_n", "crab_rad", "ride_m", "ride_mps", "ride_aim_m", "pitch_aim_rad", "roll_aim_rad")
+_BESIDE = ("grip_n", "crab_rad", "centre_mps2", "ride_m", "ride_mps", "ride_aim_m", "pitch_aim_rad", "roll_aim_rad")
 _AXES = {"rates_radps": 3, "rates_dot_radps2": 3, "force_mps2": 3, "wheel_radps": 2, "wheel_rad": 2}
 STATE = np.dtype([(name, "f8", _AXES.get(name, ())) for name in (*_IN_BOTH, *_BESIDE)])
 
-# One machine's parameters, as `chassis.Chassis` and `chassis.Weight` explain them.
+# One machine's parameters, as `chassis.Chassis` and `chassis.Weight` explain them. level_*: how far an axle's tyres
+# give way under the nominal machine, empty, which stands level on them.
 _OF_TYRES = ("tyre_stiffness_npm", "tyre_damping_nspm", "wheel_radius_m", "wheel_inertia_kgm2")
-_FIGURES = ("rear_to_joint_m", "front_to_joint_m", "half_track_m", *_OF_TYRES, *chassis.Weight._fields)
+_OF_BODY = ("rear_to_joint_m", "front_to_joint_m", "half_track_m", "level_front_m", "level_rear_m")
+_FIGURES = (*_OF_BODY, *_OF_TYRES, *chassis.Weight._fields)
 MACHINE = np.dtype([("rolls_with_front", "?"), *((name, "f8") for name in _FIGURES)])
 
 
@@ -46,6 +49,9 @@ class FastWorld:
         n = len(models)
         self._terrain, self._bodies, self._chassis = terrain, bodies, chassis.chassis_of(models)
         self._payload_kg = np.zeros(n)
+        sunk_m = 0.5 * np.array([m.mass_kg for m in models]) * GRAVITY_MPS2 / self._chassis.tyre_stiffness_npm
+        share = self._chassis.front_share
+        self._level_m = {"level_front_m": share * sunk_m, "level_rear_m": (1 - share) * sunk_m}
         self._weigh()
         self._rows = np.zeros(n, STATE)
         self._rows["x_m"], self._rows["y_m"], self._rows["yaw_rad"] = starts.T
@@ -80,7 +86,7 @@ class FastWorld:
 
     def _weigh(self) -> None:
         self._weight = chassis.weigh(self._chassis, self._bodies, self._payload_kg)
-        values = vars(self._bodies) | self._chassis._asdict() | self._weight._asdict()
+        values = vars(self._bodies) | self._chassis._asdict() | self._weight._asdict() | self._level_m
         self._machines = np.empty(len(self._payload_kg), MACHINE)
         for name in MACHINE.names or ():
             self._machines[name] = values[name]

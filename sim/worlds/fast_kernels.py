@@ -69,7 +69,8 @@ class Contact(NamedTuple):
 class Rates(NamedTuple):
     """How a machine moves.
 
-    turning: of the rear frame. accel, force_left: acceleration ahead and specific force to the left, of the last step.
+    turning: of the rear frame. accel: of the body's centre, ahead, and force_left: specific force to the left, both of
+    the last step.
     lifting: acceleration of its centre off the ground. riding: how fast the centre rises. pitch, pitching: nose down.
     """
 
@@ -87,8 +88,9 @@ class Rates(NamedTuple):
 class Forces(NamedTuple):
     """Forces along the track, and what follows from them.
 
-    grip: the most drive force that spins up no wheel. tyres: the tyres' force under drive and brakes. crab: angle by
-    which all wheels slip sideways. wheel_ratio: wheel speed over ground speed.
+    grip: the most drive force that spins up no wheel. tyres: the tyres' force under drive and brakes. accel, centre: of
+    `base_link` and of the body's centre. crab: angle by which all wheels slip sideways. wheel_ratio: wheel speed over
+    ground speed.
     """
 
     load: float
@@ -96,6 +98,7 @@ class Forces(NamedTuple):
     grip: float
     tyres: float
     accel: float
+    centre: float
     crab: float
     wheel_ratio: float
 
@@ -116,11 +119,11 @@ def advance(
         m, before, now = machines[i], old[i], new[i]
         moved = _move(k.dt_s, m, before, steering[i])
         ground = _touch(m, grid, moved)
-        _ride(k.dt_s, m, ground, before, now)
+        _ride(k, m, ground, before, now)
         rates = Rates(
             speed=moved.speed,
             turning=moved.turning,
-            accel=before.accel_mps2,
+            accel=before.centre_mps2,
             force_left=before.force_mps2[1],
             lifting=(now.ride_mps - before.ride_mps) / k.dt_s + before.accel_mps2 * math.sin(now.pitch_aim_rad),
             riding=now.ride_mps,
@@ -131,10 +134,10 @@ def advance(
         forces = _forces(k, soils, m, ground, rates, drive[i], brake[i])
 
         now.x_m, now.y_m, now.yaw_rad = moved.x, moved.y, moved.yaw
-        now.z_m = ground.z + now.ride_m - now.ride_aim_m
+        now.z_m = now.ride_m + m.front_share * (m.rear_to_joint_m + m.front_to_joint_m) * math.tan(now.pitch_rad)
         now.articulation_rad, now.articulation_radps = moved.bend, steering[i]
         now.articulation_radps2 = (steering[i] - before.articulation_radps) / k.dt_s
-        now.speed_mps, now.accel_mps2 = moved.speed, forces.accel
+        now.speed_mps, now.accel_mps2, now.centre_mps2 = moved.speed, forces.accel, forces.centre
         now.drive_n, now.torque_nm, now.grip_n = drive[i], forces.tyres * m.wheel_radius_m, forces.grip
         now.load_n, now.c_rr, now.crab_rad = forces.load, forces.c_rr, forces.crab
         now.grade_e, now.grade_n = ground.grade_e, ground.grade_n
@@ -162,7 +165,7 @@ def _move(dt: float, m: Record, before: Record, steering: float) -> Moved:
     rear, front = m.rear_to_joint_m, m.front_to_joint_m
     bend, speed = before.articulation_rad + dt * steering, before.speed_mps + dt * before.accel_mps2
     turning = (speed * math.sin(bend) - front * steering) / (front + rear * math.cos(bend))
-    level, heading = dt * speed * math.cos(before.pitch_rad), before.yaw_rad + 0.5 * dt * turning + before.crab_rad
+    level, heading = dt * speed * math.cos(before.pitch_aim_rad), before.yaw_rad + 0.5 * dt * turning + before.crab_rad
     x, y = before.x_m + level * math.cos(heading), before.y_m + level * math.sin(heading)
     return Moved(x, y, before.yaw_rad + dt * turning, bend, speed, turning)
 
@@ -254,9 +257,8 @@ def _forces(
     ratio = 1 / slower if tyres * speed > 0 else slower
     fl, fr, rl, rr = ground.zones
     least = min(min(soils[1, fl], soils[1, fr]), min(soils[1, rl], soils[1, rr]))
-    return Forces(
-        load, resistance / load, k.traction_use * least * load, tyres, (tyres - against) / inertia, crab, ratio
-    )
+    grip, accel = k.traction_use * least * load, (tyres - against) / inertia
+    return Forces(load, resistance / load, grip, tyres, accel, accel + tipping / m.mass_kg, crab, ratio)
 
 
 @_compiled
@@ -279,7 +281,7 @@ def _turn_wheels(dt: float, radps_per_mps: float, half_track: float, at: Moved, 
 
 @_compiled
 def _aim(m: Record, ground: Contact, now: Record) -> None:
-    """Where the body would settle on the plane that carries it."""
+    """Where the body would settle on the plane that carries it, if its tyres gave way as under the empty machine."""
     slope = math.sqrt(1 + ground.slope_ahead**2)
     now.pitch_aim_rad = -math.atan(ground.slope_ahead)
     now.roll_aim_rad = math.atan(ground.slope_left / slope)
@@ -287,28 +289,47 @@ def _aim(m: Record, ground: Contact, now: Record) -> None:
 
 
 @_compiled
-def _ride(dt: float, m: Record, ground: Contact, old: Record, now: Record) -> None:
+def _ride(k: Constants, m: Record, ground: Contact, old: Record, now: Record) -> None:
     """Let the body bounce, pitch and roll on its tyres; the joint leaves roll to the wheels of one axle."""
     _aim(m, ground, now)
     wheelbase = m.rear_to_joint_m + m.front_to_joint_m
     ahead = m.front_share * wheelbase
     along, across = 2 * (ahead**2 + (wheelbase - ahead) ** 2), 2 * m.half_track_m**2
+    sunk_front, sunk_rear = _sunk(k, m, ground, old.centre_mps2)
+    nose_up = (sunk_rear - sunk_front) / wheelbase
     ride = (old.ride_m, old.ride_mps, old.ride_aim_m)
     pitch = (old.pitch_rad, old.pitch_radps, old.pitch_aim_rad)
     roll = (old.roll_rad, old.roll_radps, old.roll_aim_rad)
-    now.ride_m, now.ride_mps = _spring(dt, m, 4 / m.mass_kg, ride, now.ride_aim_m)
-    now.pitch_rad, now.pitch_radps = _spring(dt, m, along / m.pitch_inertia_kgm2, pitch, now.pitch_aim_rad)
-    now.roll_rad, now.roll_radps = _spring(dt, m, across / m.roll_inertia_kgm2, roll, now.roll_aim_rad)
+    sunk = sunk_rear - ahead * nose_up
+    now.ride_m, now.ride_mps = _spring(k.dt_s, m, 4 / m.mass_kg, ride, now.ride_aim_m, -sunk)
+    now.pitch_rad, now.pitch_radps = _spring(
+        k.dt_s, m, along / m.pitch_inertia_kgm2, pitch, now.pitch_aim_rad, -nose_up
+    )
+    now.roll_rad, now.roll_radps = _spring(k.dt_s, m, across / m.roll_inertia_kgm2, roll, now.roll_aim_rad, 0.0)
 
 
 @_compiled
-def _spring(dt: float, m: Record, ease: float, old: tuple[float, float, float], aim: float) -> tuple[float, float]:
+def _sunk(k: Constants, m: Record, ground: Contact, accel: float) -> tuple[float, float]:
+    """How far the front and the rear tyres give way under a body at rest on them, beyond those of the empty machine."""
+    slope = math.sqrt(1 + ground.slope_ahead**2)
+    level = m.mass_kg * k.gravity / slope
+    shifted = (level * ground.slope_ahead + m.mass_kg * accel) * m.centre_height_m
+    front = m.front_share * level - shifted / (m.rear_to_joint_m + m.front_to_joint_m)
+    axle = 2 * m.tyre_stiffness_npm
+    return front / axle - m.level_front_m, (level - front) / axle - m.level_rear_m
+
+
+@_compiled
+def _spring(
+    dt: float, m: Record, ease: float, old: tuple[float, float, float], aim: float, pushed: float
+) -> tuple[float, float]:
     """One step of a value on tyres, towards an aim that moves; returns the value and its rate.
 
-    old: value, rate and aim. ease: lever arms of the tyres squared, over inertia.
+    old: value, rate and aim. ease: lever arms of the tyres squared, over inertia. pushed: how far from its aim the
+    weight on the tyres holds it.
     """
     value, rate, old_aim = old
-    force = m.tyre_stiffness_npm * (aim - value) + m.tyre_damping_nspm * ((aim - old_aim) / dt - rate)
+    force = m.tyre_stiffness_npm * (aim + pushed - value) + m.tyre_damping_nspm * ((aim - old_aim) / dt - rate)
     rate += dt * ease * force
     return value + dt * rate, rate
 

@@ -92,7 +92,9 @@ def run(arguments: Namespace) -> int:
 
 def _machine(arguments: Namespace, joined: _Joined, stop: threading.Event) -> tuple[Agent | BaseAgent, Serve]:
     from agents.agent import Agent, Places
+    from agents.config import require_place
 
+    require_place(joined.machine, joined.config.pipeline.localisation)
     places = Places(arguments.spool, arguments.audit, _calibration(arguments))
     key, check, withhold = signer(arguments.keys), reply_check(arguments.keys), arguments.withhold
     sign = key.sign if key else None

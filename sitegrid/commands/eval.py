@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from sitegrid.options.groups import add_action
 from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import count, positive, seed, withhold
+from sitegrid.options.values import count, count_or_names, names, positive, seed, setting, shares, withhold
 from sitegrid.process.lifetime import note, plain, raise_interrupts, say, tell
 from sitegrid.process.progress import Display
 
@@ -22,6 +22,7 @@ HELP = "run the accuracy experiments"
 EXTRA = "eval"
 Report = dict[str, Any]  # plain values by name; lists of rows are tables
 MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side
+SCENARIOS = ("paper_site", "paper_site_driven", "haul_road_driven")  # of the paper's table; one machine drives alone
 SHOWN = (list, dict)  # values of a row that a table for people has no room for
 
 
@@ -51,7 +52,11 @@ def add_options(parser: ArgumentParser) -> None:
     for action, seconds in ((table, 1200.0), (ground, 600.0)):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
+    scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
+    table.add_argument("--scenario", choices=SCENARIOS, default=SCENARIOS[0], help=scenario)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
+    shared = "shares of slow GPS errors that the receivers have in common, comma-separated (default: as recorded)"
+    table.add_argument("--shares", type=shares, default=(None,), help=shared)
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
@@ -59,12 +64,20 @@ def add_options(parser: ArgumentParser) -> None:
 def _add_log(log: ArgumentParser) -> None:
     log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
     log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
-    off = "OFF seconds without GPS in every PERIOD seconds; may be repeated (default none, 1/10, 10/30, 30/60)"
-    log.add_argument("--withhold", action="append", type=withhold, metavar="OFF/PERIOD", help=off)
-    log.add_argument("--gps", type=count, help="number of GPS receivers to use")
+    off = (
+        "OFF/PERIOD: no GPS for OFF seconds in every PERIOD; START,LENGTH: once, for LENGTH seconds; none: all of it; "
+        "may be repeated, a row each (default none, 1/10, 10/30, 30/60)"
+    )
+    log.add_argument("--withhold", action="append", type=withhold, metavar="WHEN", help=off)
+    sensors = "names of the sensors to use, comma-separated, and no others (default: as the manifest says)"
+    log.add_argument("--sensors", type=names, default=(), metavar="NAMES", help=sensors)
+    receivers = "of the GPS receivers, how many to use, or which, by name, comma-separated"
+    log.add_argument("--gps", type=count_or_names, default=(), metavar="N|NAMES", help=receivers)
     log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="filter (default %(default)s)")
     profile = "filter profile (default %(default)s)"
     log.add_argument("--profile", choices=("default", "paper"), default="default", help=profile)
+    option = "an option of [pipeline.localisation] in agent.toml, as start=[0,0,1.57]; may be repeated"
+    log.add_argument("--set", action="append", type=setting, default=[], metavar="NAME=VALUE", help=option)
 
 
 def run(arguments: Namespace) -> int:
@@ -81,7 +94,7 @@ def run(arguments: Namespace) -> int:
     if arguments.json:
         say(plain(report))
     else:
-        tell("\n\n".join(_lines(report)))
+        tell("\n\n".join(_lines(plain(report))))
     return 0
 
 
@@ -92,11 +105,14 @@ def _physics(arguments: Namespace) -> Report:
 
 
 def _localisation(arguments: Namespace) -> Report:
+    from evaluation.campaign.recordings import SETUPS
     from evaluation.positions import table
     from evaluation.positions.configurations import HEADLINE, SENSORS, configurations
 
-    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS)
-    work = partial(table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows)
+    rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS, arguments.shares)
+    work = partial(
+        table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows, setup=SETUPS[arguments.scenario]
+    )
     return _experiment(arguments, "machines drive, filters follow", work, "evaluation.positions.plots")
 
 
@@ -134,13 +150,16 @@ def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple
 
 
 def _log(arguments: Namespace) -> Report:
+    from agents.localisation.localiser import LocalisationConfig
     from evaluation.positions import real_logs
-    from evaluation.positions.configurations import Configuration, select
+    from protocol.config import from_table
 
-    with real_logs.opened(arguments.manifest, arguments.data) as (log, truth):
-        log = real_logs.refitted(log, select(log.machine, gps=arguments.gps))
-        row = Configuration(arguments.filter, real_logs.receivers(log.machine), 1, arguments.profile)
-        return real_logs.run(log, truth, row, arguments.withhold or real_logs.WITHHOLD, on_progress=note)
+    named = {"filter": arguments.filter, "profile": arguments.profile, **dict(arguments.set)}
+    options = from_table(LocalisationConfig, named, "--set")
+    patterns = [real_logs.parse_pattern(*words) for words in arguments.withhold or ()] or real_logs.WITHHOLD
+    choose = partial(real_logs.chosen, sensors=arguments.sensors, gps=arguments.gps)
+    report = real_logs.run(arguments.manifest, arguments.data, options, patterns, choose, on_progress=note)
+    return report if arguments.json else {**report, "measurements": real_logs.measurements(report["rows"])}
 
 
 def _parity(arguments: Namespace) -> Report:

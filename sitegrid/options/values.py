@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import tomllib
 from argparse import ArgumentTypeError
+from typing import Any
 
 
 def count(text: str) -> int:
@@ -35,6 +38,13 @@ def not_negative(text: str) -> float:
     return float(text)
 
 
+def shares(text: str) -> tuple[float, ...]:
+    """Shares of 0 to 1, comma-separated; the least first."""
+    values = tuple(sorted(set(map(float, text.split(",")))))
+    _require(all(0 <= value <= 1 for value in values), f"{text} is not from 0 to 1")
+    return values
+
+
 def address(text: str) -> tuple[str, int]:
     """`9464`, of this host alone, or `0.0.0.0:9464`; port 0 takes a free one."""
     host, _, port = text.rpartition(":")
@@ -43,17 +53,42 @@ def address(text: str) -> tuple[str, int]:
     return host or "127.0.0.1", int(port)
 
 
-def withhold(text: str) -> tuple[float, float]:
-    """Seconds off and period: `10/30`; `none` withholds nothing."""
+def withhold(text: str) -> tuple[str, float, float]:
+    """Seconds off and period, `10/30`; or start and length, `120,60`; `none` withholds nothing."""
     if text == "none":
-        return 0.0, 1.0
-    off, _, period = text.partition("/")
+        return text, 0.0, 0.0
+    sign = "/" if "/" in text else ","
+    one, _, other = text.partition(sign)
     try:
-        off_s, period_s = float(off), float(period)
+        first_s, second_s = float(one), float(other)
     except ValueError:
-        off_s = period_s = 0.0
-    _require(0 < off_s < period_s < float("inf"), f"{text!r} is neither OFF/PERIOD in seconds, as 10/30, nor none")
-    return off_s, period_s
+        first_s = second_s = -1.0
+    is_right = 0 < first_s < second_s < math.inf if sign == "/" else 0 <= first_s < math.inf and 0 < second_s < math.inf
+    problem = f"{text!r} is neither OFF/PERIOD in seconds, as 10/30, nor START,LENGTH, as 120,60, nor none"
+    _require(is_right, problem)
+    return sign, first_s, second_s
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Names, comma-separated."""
+    listed = tuple(name.strip() for name in text.split(","))
+    _require(all(listed), f"{text!r} is no list of names, as gps-1,imu")
+    return listed
+
+
+def count_or_names(text: str) -> int | tuple[str, ...]:
+    """A whole number of 1 or more, or names, comma-separated."""
+    return count(text) if text.lstrip("+-").isdecimal() else names(text)
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """An option and its value as a file has it: `slip=0.1`, `start=[1, 2, 0.5]`; a word needs no quotes."""
+    name, equals, value = text.partition("=")
+    _require(bool(name and equals and value), f"{text!r} is not NAME=VALUE, as slip=0.1")
+    try:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, value
 
 
 def _require(is_so: bool, problem: str) -> None:  # noqa: FBT001 - a condition

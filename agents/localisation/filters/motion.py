@@ -5,7 +5,7 @@ Over a step dt, with R = map_from_base and E the matrix from body rates to the r
 
     position += R (velocity dt + acceleration dt^2 / 2)        attitude += E rate dt
     velocity += acceleration dt                                rate, acceleration, biases, scale stay
-    GPS error *= exp(-dt / tau)
+    GPS error *= exp(-dt / tau), of its own tau; what several receivers see, such as one sky, moves all their errors
 
 `velocity` is that of base_link's origin in its own axes and `acceleration` its rate of change; what an accelerometer
 measures besides (rate x velocity, gravity) belongs to the measurement. On a plane (two_d_mode of robot_localization)
@@ -57,21 +57,21 @@ BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a
 
 @dataclass(frozen=True)
 class GpsError:
-    """A receiver's slow error: a stationary Gauss-Markov process per axis, of that variance and correlation time."""
+    """A receiver's slow error: a stationary Gauss-Markov process per axis, of that variance and correlation time.
+
+    common_m2: the parts of the variance that come from sources which other receivers see too, source by source, as many
+    for all receivers. Of each source two receivers have the smaller part in common, since it is one error in metres.
+    """
 
     variance_m2: float
     time_s: float
+    common_m2: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not (0 < self.variance_m2 < math.inf and 0 < self.time_s < math.inf):
             raise ValueError("variance_m2 and time_s must be positive and finite")
-
-
-@dataclass(frozen=True)
-class BaseError(GpsError):
-    """The slow error of a base station. share: its correlation with that of the machine."""
-
-    share: float = 0.0
+        if not (all(part >= 0 for part in self.common_m2) and sum(self.common_m2) < self.variance_m2):
+            raise ValueError("common_m2 must not be negative, nor in sum as large as variance_m2")
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,6 @@ class MotionModel:
     gps_errors: tuple[GpsError, ...] = ()
     traction: float = 0.0
     turn_error_radps: float = 0.0
-    base: BaseError | None = None
 
     def __post_init__(self) -> None:
         if len(self.gps_errors) != self.layout.receivers:
@@ -98,18 +97,13 @@ class MotionModel:
 def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     """The motion over dt_s from a belief, whose attitude and velocity direct the slip noise."""
     layout = model.layout
-    keep, walks, errors = _constants(layout, on_plane=model.on_plane)
+    keep, walks = _constants(layout, on_plane=model.on_plane)
     scale, Q = keep.copy(), walks * dt_s
     if model.on_plane:
         Q[OFF_PLANE, OFF_PLANE] = OFF_PLANE_VARIANCE
-    for error, states in zip(model.gps_errors, errors, strict=True):
-        fading = math.exp(-dt_s / error.time_s)
-        # exact for steps of any length: what fades is renewed, so that the variance stays
-        renewal = error.variance_m2 * -math.expm1(-2 * dt_s / error.time_s)
-        for state in states:
-            scale[state], Q[state, state] = fading, renewal
-    if model.base:
-        _add_base(model, scale, Q, dt_s)
+    if model.gps_errors:
+        gps = layout.gps_errors
+        scale[gps], Q[gps, gps] = _gps_motion(model.gps_errors, dt_s)
     of_position = Q[POSITION, POSITION]
     of_position += _slip(belief.x * scale, dt_s, _slip_variance_m2(model.traction * float(belief.x[SPEED]), dt_s))
     if model.turn_error_radps:
@@ -125,16 +119,19 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     return Motion(f, jacobian, Q, ANGLES)
 
 
-def _add_base(model: MotionModel, scale: Floats, Q: Floats, dt_s: float) -> None:
-    layout, base, machine = model.layout, model.base, model.gps_errors[0]
-    b, e = layout.base_error, layout.gps_error(0)
-    scale[b] = math.exp(-dt_s / base.time_s)
-    variances, times = (base.variance_m2, machine.variance_m2), (base.time_s, machine.time_s)
-    Q[b, b] = np.eye(2) * (base.variance_m2 * -math.expm1(-2 * dt_s / base.time_s))
-    most = 0.99 * 2 * math.sqrt(times[0] * times[1]) / sum(times)
-    both = min(base.share, most) * math.sqrt(variances[0] * variances[1])
-    both *= -math.expm1(-dt_s * (1 / times[0] + 1 / times[1]))
-    Q[b, e] = Q[e, b] = np.eye(2) * both
+@lru_cache
+def gps_covariance(errors: tuple[GpsError, ...]) -> Floats:
+    """Covariance (k, k) of the slow errors of k receivers, per axis [m2].
+
+    What they have in common answers to one noise: with correlation times t and u, 2 sqrt(t u) / (t + u) of it is left.
+    """
+    times = np.array([error.time_s for error in errors])
+    parts = np.array([error.common_m2 for error in errors]).reshape(len(errors), -1)
+    common = np.minimum(parts[:, None], parts).sum(axis=2)
+    covariance: Floats = common * 2 * np.sqrt(np.outer(times, times)) / np.add.outer(times, times)
+    np.fill_diagonal(covariance, [error.variance_m2 for error in errors])
+    covariance.setflags(write=False)
+    return covariance
 
 
 def map_from_base(attitude: Floats) -> Floats:
@@ -250,11 +247,21 @@ def _slip(x: Floats, dt_s: float, along_m2: float) -> Floats:
 
 
 @lru_cache
-def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats, tuple[range, ...]]:
+def _gps_motion(errors: tuple[GpsError, ...], dt_s: float) -> tuple[Floats, Floats]:
+    """Factors (2 k,) by which the errors of k receivers fade in a step, and their noise (2 k, 2 k).
+
+    Exact for steps of any length: what fades is renewed, so that the covariance stays.
+    """
+    fading = np.array([-dt_s / error.time_s for error in errors])  # logarithms
+    renewal = gps_covariance(errors) * -np.expm1(np.add.outer(fading, fading))
+    return np.exp(fading).repeat(2), np.kron(renewal, EYE[:2, :2])
+
+
+@lru_cache
+def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats]:
     """What every motion of a layout begins with.
 
-    Factor (n,) that sets the states off the plane to zero, covariance (n, n) of the random walks of a second, and the
-    states of each GPS error.
+    Factor (n,) that sets the states off the plane to zero, and covariance (n, n) of the random walks of a second.
     """
     keep, deviation = np.ones(layout.n), np.zeros(layout.n)
     if on_plane:
@@ -271,4 +278,4 @@ def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats, tuple
     walks = np.diag(deviation**2)
     for shared in (keep, walks):
         shared.setflags(write=False)
-    return keep, walks, tuple(range(layout.n)[layout.gps_error(i)] for i in range(layout.receivers))
+    return keep, walks

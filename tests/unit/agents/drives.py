@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from agents.dead_reckoning import DeadReckoning
 from agents.estimation.balance import front_share, squat_rad
 from agents.localisation.filters.belief import Belief, PoseBelief
 from agents.localisation.localiser import STEP_S, LocalisationConfig, Localiser
+from agents.stream_order import by_stamp
 from protocol.arrays import Floats, Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu, Payload, Reading, Torque
@@ -257,9 +260,9 @@ def made_up_samples(n: int, seed: int = 0) -> Table:
 def reckoned(vehicle: MachineConfig, readings: Iterable[Reading], slip: float = 0.0) -> DeadReckoning:
     """Dead reckoning after all readings."""
     dead_reckoning = DeadReckoning(vehicle, slip)
-    for reading in readings:
-        sensor = vehicle.sensor(reading.sensor)
-        dead_reckoning.update(reading, sensor)
+    for group in by_stamp(readings):
+        for reading in group:
+            dead_reckoning.update(reading, vehicle.sensor(reading.sensor))
     return dead_reckoning
 
 
@@ -272,19 +275,21 @@ class RunLocaliser(Localiser):
         self._vehicle = vehicle
 
     def run(self, readings: Iterable[Reading]) -> list[PoseBelief]:
-        """Poses that readings made possible or changed."""
+        """Poses that readings made possible or changed; neighbours of one stamp come together."""
         poses: list[PoseBelief] = []
-        for reading in readings:
-            sensor = self._vehicle.sensor(reading.sensor)
-            self.dead_reckoning.update(reading, sensor)
-            poses += self.update(reading, sensor, self.dead_reckoning)
+        for _, neighbours in groupby(readings, key=attrgetter("stamp_ns")):
+            (group,) = by_stamp(neighbours)
+            sensed = [(reading, self._vehicle.sensor(reading.sensor)) for reading in group]
+            for reading, sensor in sensed:
+                self.dead_reckoning.update(reading, sensor)
+            poses += self.update(sensed, self.dead_reckoning)
         return poses
 
     def beliefs(self, readings: Iterable[Reading]) -> list[Belief]:
-        """The newest beliefs, as they were known after each reading."""
+        """The newest beliefs, as they were known after the readings of each stamp."""
         beliefs: list[Belief] = []
-        for reading in readings:
-            self.run([reading])
+        for _, group in groupby(readings, key=attrgetter("stamp_ns")):
+            self.run(group)
             if self.belief and (not beliefs or self.belief.stamp_ns > beliefs[-1].stamp_ns):
                 beliefs.append(self.belief)
         return beliefs

@@ -6,9 +6,11 @@ import pytest
 
 from agents.dead_reckoning import DeadReckoning, WheelTracker
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Encoder, Odometry, Torque
+from protocol.machine.readings import Encoder, Imu, Odometry, Steering, Torque
 from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, VEHICLE, Leg, changed_sensor, drive, machine, reckoned
+
+DOUBLE = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("imu-2", "imu"), SensorConfig("wheels-2", "encoder")))
 
 
 @pytest.mark.parametrize("rate_hz", [10, 20, 100])
@@ -46,15 +48,47 @@ def test_tracker_equals_least_squares_of_a_parabola_with_fading_weights() -> Non
     assert tracker.accel_mps2 == pytest.approx(2 * half_accel, abs=1e-5), f"seed={seed}"
 
 
-def test_tracker_starts_anew_after_a_pause_and_ignores_time_that_stands_still() -> None:
+@pytest.mark.parametrize("rate_hz", [5, 20, 100])
+def test_tracker_starts_in_motion_with_the_first_readings(rate_hz: int) -> None:
+    """A parabola of travel is followed from the third reading on, whatever came before a pause."""
+    tracker = WheelTracker()
+    tracker.update(START_NS - 10**10, 900.0, speed_mps=-7.0)
+    for i in range(2 * rate_hz):
+        t = i / rate_hz
+        tracker.update(START_NS + round(t * 1e9), 30.0 + 4.0 * t + 0.4 * t**2)
+        if i >= 2:
+            assert tracker.speed_mps == pytest.approx(4.0 + 0.8 * t, abs=1e-5)
+            assert tracker.accel_mps2 == pytest.approx(0.8, abs=1e-3)
+    assert tracker.is_settled
+
+
+def test_tracker_is_settled_once_ticks_no_longer_show() -> None:
+    """Speed of 4 m/s by ticks of 47 mm, 50 times a second, at every phase of the ticks."""
+    worst = 0.0
+    for phase in range(20):
+        tracker = WheelTracker()
+        for i in range(200):
+            tracker.update(START_NS + i * 20_000_000, math.floor(4.0 * i / 50 / 0.047 + phase / 20) * 0.047)
+            if tracker.is_settled:
+                worst = max(worst, abs(tracker.speed_mps - 4.0))
+    assert 0 < worst < 0.25
+
+
+def test_tracker_starts_with_the_speed_that_odometry_states() -> None:
+    tracker = WheelTracker()
+    tracker.update(START_NS, 0.0, speed_mps=5.0)
+    assert (tracker.speed_mps, tracker.is_settled) == (5.0, True)
+
+
+def test_tracker_forgets_in_a_pause_and_ignores_time_that_stands_still() -> None:
     tracker = WheelTracker()
     for i in range(1, 100):
         tracker.update(START_NS + i * 50_000_000, 0.1 * i)
     speed = tracker.speed_mps
     tracker.update(START_NS + 99 * 50_000_000, 50.0)
-    assert tracker.speed_mps == speed
+    assert (tracker.speed_mps, tracker.is_settled) == (speed, True)
     tracker.update(START_NS + 10**10, 50.0)
-    assert tracker.speed_mps == speed
+    assert (tracker.speed_mps, tracker.accel_mps2, tracker.is_settled) == (0.0, 0.0, False)
 
 
 def test_dead_reckoning_closes_a_circle() -> None:
@@ -117,12 +151,52 @@ def test_braking_makes_the_wheels_slower_than_the_machine() -> None:
 
 
 def test_second_imu_and_second_wheel_sensor_do_not_count_twice() -> None:
-    more = replace(
-        VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("imu-2", "imu"), SensorConfig("wheels-2", "encoder"))
-    )
     legs = [Leg(4, 0.5), Leg(2, 0.0, 0.2)]
-    one, two = reckoned(VEHICLE, drive(legs, VEHICLE).readings), reckoned(more, drive(legs, more).readings)
-    assert (two.travel_m, two.angle_rad) == (one.travel_m, one.angle_rad)
+    one, two = reckoned(VEHICLE, drive(legs, VEHICLE).readings), reckoned(DOUBLE, drive(legs, DOUBLE).readings)
+    assert (two.travel_m, two.angle_rad) == pytest.approx((one.travel_m, one.angle_rad))
+
+
+def test_several_sensors_of_a_kind_count_as_their_mean_and_one_that_dies_leaves_the_other() -> None:
+    """The second gyro is off by 0.02 rad/s, the second wheels turn 10 % too far, and both fall silent after 6 s."""
+    silent_ns, readings = START_NS + 6 * 10**9, []
+    for r in drive([Leg(4, 0.5), Leg(8)], DOUBLE).readings:
+        if r.sensor == "imu-2":
+            r = replace(r, gyro_z_radps=r.gyro_z_radps + 0.02)
+        elif r.sensor == "wheels-2":
+            r = replace(r, left_ticks=1.1 * r.left_ticks, right_ticks=1.1 * r.right_ticks)
+        readings += [] if r.stamp_ns > silent_ns and r.sensor.endswith("-2") else [r]
+    reckoning = reckoned(DOUBLE, readings)
+    assert reckoning.angle_rad == pytest.approx(0.01 * 6, rel=0.02)
+    assert reckoning.travel_m == pytest.approx(1.05 * 8 + 12 - 1.0, abs=0.2)  # half a second's way waits in vain
+    assert reckoning.wheels.speed_mps == pytest.approx(2.0)
+
+
+def test_wheels_that_speak_again_do_not_count_what_others_counted() -> None:
+    pause_ns = START_NS + 5 * 10**9, START_NS + 9 * 10**9
+    made = drive([Leg(4, 0.5), Leg(8)], DOUBLE).readings
+    readings = [r for r in made if r.sensor != "wheels-2" or not pause_ns[0] < r.stamp_ns < pause_ns[1]]
+    assert reckoned(DOUBLE, readings).travel_m == pytest.approx(20.0, abs=2.1)
+    assert reckoned(DOUBLE, readings).wheels.speed_mps == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("offset_m", [-0.76, 0.0, 0.76])
+@pytest.mark.parametrize("turn", ["imu", "steering"])
+def test_a_wheel_off_the_middle_of_its_axle_shows_the_way_of_the_middle(offset_m: float, turn: str) -> None:
+    """In a bend to the left of 8 m, a wheel 0.76 m left of the middle rolls a tenth less."""
+    wheels = SensorConfig("wheels", "odometry", Mount((0.0, offset_m, 0.0)), measures=("speed",))
+    vehicle = MachineConfig("truck", wheelbase_m=2.5, sensors=(wheels, SensorConfig("turn", turn)))
+    speed, rate, readings = 2.0, 0.25, []
+    for i in range(101):
+        stamp_ns = START_NS + i * 50_000_000
+        turned = Imu("turn", stamp_ns, 0, 0, rate, 0, 0, 9.81) if turn == "imu" else None
+        readings.append(turned or Steering("turn", stamp_ns, math.atan(2.5 * rate / speed)))
+        readings.append(Odometry("wheels", stamp_ns, speed - rate * offset_m, 0.0, 0.0))
+    reckoning = reckoned(vehicle, readings)
+    assert reckoning.travel_m == pytest.approx(10.0)
+    assert reckoning.angle_rad == pytest.approx(1.25)
+    ahead, left = 8 * math.sin(1.25), 8 * (1 - math.cos(1.25))
+    assert (reckoning.pose.x_m, reckoning.pose.y_m) == pytest.approx((ahead, left), abs=0.01)
+    assert (reckoning.wheels.speed_mps, reckoning.wheels.offset_m) == pytest.approx((speed - rate * offset_m, offset_m))
 
 
 def test_restarted_tick_counter_moves_nothing() -> None:

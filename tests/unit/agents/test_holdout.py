@@ -104,7 +104,7 @@ def test_velocities_are_withheld_with_the_fixes_and_judged_by_nobody(made: Drive
 
 @pytest.mark.slow
 def test_report_without_a_judged_fix_says_so(vehicle: MachineConfig, made: Drive) -> None:
-    none = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None}
+    none = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None, "end_m": None}
     assert run(vehicle, made.readings[:100])[1] == none
     assert run(vehicle, made.readings, settle_s=1000.0)[1] == none
 

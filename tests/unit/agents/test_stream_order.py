@@ -1,7 +1,7 @@
 import pytest
 
-from agents.stream_order import LATE_LIMIT, Decision, StreamOrder
-from protocol.machine.readings import Articulation, Reading
+from agents.stream_order import LATE_LIMIT, Decision, StreamOrder, by_stamp
+from protocol.machine.readings import Articulation, Encoder, Odometry, Reading
 
 MS = 1_000_000
 T0 = 10**18
@@ -79,3 +79,31 @@ def test_late_sensor_among_punctual_ones_never_restarts(order: StreamOrder) -> N
         assert order.decide(at(i * 10)) is Decision.ACCEPT
         order.decide(at(i * 10 - 2000, "b"))
     assert "clock_back_restarts" not in order.counters
+
+
+# --- what belongs to one time ----------------------------------------------------------------------------------------
+
+
+def gathered(order: StreamOrder, readings: list[Reading]) -> list[list[Reading]]:
+    groups = [order.gather(reading, reading.stamp_ns) for reading in readings]
+    return [group for group in [*groups, order.rest()] if group]
+
+
+def test_readings_of_a_time_are_held_until_one_of_another_time_comes() -> None:
+    readings = [at(0), at(0, "b"), at(10, "b"), at(5), at(10)]
+    assert gathered(StreamOrder(), readings) == [readings[:2], [readings[2]], [readings[3]], [readings[4]]]
+
+
+def test_one_reading_of_a_sensor_is_held_and_a_second_is_counted() -> None:
+    """A clock that stands still fills no memory."""
+    order = StreamOrder()
+    assert gathered(order, [at(0), *[at(0)] * 1000, at(10)]) == [[at(0)], [at(10)]]
+    assert order.counters == {"reading_duplicate": 1000}
+
+
+def test_those_of_a_stamp_come_together_by_name_and_wheels_last() -> None:
+    stamp = T0 + 10 * MS
+    wheels: list[Reading] = [Encoder("a", stamp, 0, 0), Odometry("b", stamp, 0, 0, 0)]
+    others = [at(10, "c"), at(10, "z")]
+    groups = list(by_stamp([wheels[1], others[1], at(20), wheels[0], others[0], at(0)]))
+    assert groups == [[at(0)], [*others, *wheels], [at(20)]]

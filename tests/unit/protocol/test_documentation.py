@@ -113,8 +113,10 @@ def test_example_of_a_manifest_is_read(tmp_path):
     (tmp_path / "log.toml").write_text(re.search(r"```toml\n(.*?)```", LOGS, re.DOTALL)[1])
     (tmp_path / "gps.csv").write_text("")
     log = open_log(tmp_path)
-    assert [source.file for source in log.sources] == ["gps.csv.gz", "wheels.csv"]
-    assert [s.use for s in log.machine.sensors] == [True, False]
+    assert [source.file.file for source in log.sources] == [
+        *("gps.csv.gz", "tracker.txt", "gps.csv.gz", "can.csv", "wheels.csv")
+    ]
+    assert [s.use for s in log.machine.sensors] == [True] * 4 + [False]
 
 
 def test_example_of_known_ground_is_read():

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.dead_reckoning import DeadReckonedPose
+from agents.dead_reckoning import DeadReckonedPose, WheelSpeed
 from agents.localisation.alignment import DISTANCE_M, align, align_fixes, align_start, start_belief
 from agents.localisation.filters.state import ATTITUDE, SPEED, YAW, Layout
 from agents.localisation.gps import Fix
@@ -53,7 +53,9 @@ def test_heading_is_not_taken_from_too_little(collected: list[Fix], distance_m: 
 
 
 def step(force: tuple[float, float, float] | None = None) -> tuple[FilterStep, list[Any]]:
-    first = FilterStep(9, DeadReckonedPose(9, 0.0, 0.3, 0.0, 0.0), {}, {}, 1.5, True, 0.0, 0.0)
+    first = FilterStep(
+        9, DeadReckonedPose(9, 0.0, 0.3, 0.0, 0.0), {}, {}, WheelSpeed(1.5, is_known=True), True, 0.0, 0.0
+    )
     return first, [np.array(force)] if force else []
 
 

@@ -7,6 +7,7 @@ import pytest
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.filters.motion import map_from_base
 from agents.localisation.imu_steps import FilterStep, StepGatherer
+from agents.stream_order import by_stamp
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Torque
@@ -20,10 +21,11 @@ MOUNTS = [(0.0, 0.0, 0.0), (180.0, 0.0, 0.0), (0.0, 0.0, 90.0), (20.0, -35.0, 11
 
 def gather(gatherer: StepGatherer, vehicle: MachineConfig, readings: Iterable[Reading]) -> list[FilterStep]:
     dead_reckoning, steps = DeadReckoning(vehicle, 0.0), []
-    for reading in readings:
-        sensor = vehicle.sensor(reading.sensor)
-        dead_reckoning.update(reading, sensor)
-        step = gatherer.gather(reading, sensor, dead_reckoning)
+    for group in by_stamp(readings):
+        sensed = [(reading, vehicle.sensor(reading.sensor)) for reading in group]
+        for reading, sensor in sensed:
+            dead_reckoning.update(reading, sensor)
+        step = gatherer.gather(sensed, dead_reckoning)
         steps += [step] if step else []
     return steps
 
@@ -188,7 +190,7 @@ def test_a_step_holds_speed_and_traction() -> None:
     readings: list[Reading] = [Torque("torque", START_NS, torque)]
     readings += [Encoder("wheels", START_NS + i * 50 * MS, 2.0 * i, 2.0 * i) for i in range(60)]
     step = gather(StepGatherer(vehicle, 0.1), vehicle, readings)[-1]
-    assert step.speed_mps == pytest.approx(turn_m * 2.0 / 100 / 0.05, abs=1e-4)
+    assert step.wheels.speed_mps == pytest.approx(turn_m * 2.0 / 100 / 0.05, abs=1e-4)
     assert step.traction == pytest.approx(0.2)
 
 
@@ -204,21 +206,15 @@ def test_still_since_the_last_travel() -> None:
 
 @pytest.mark.parametrize("kind", ["encoder", "odometry"])
 def test_a_step_shows_whether_wheels_were_read(kind: str) -> None:
-    """Silent wheels have no speed, and stand for nothing."""
+    """Silent wheels have no speed, and stand for nothing; ticks show one only once there are enough of them."""
     vehicle = with_imu(more=(SensorConfig("w", kind),))
 
     def wheels(ms: int) -> Reading:
         stamp_ns = START_NS + ms * MS
         return Encoder("w", stamp_ns, 0.0, 0.0) if kind == "encoder" else Odometry("w", stamp_ns, 0.0, 0.0, 0.0)
 
-    readings: list[Reading] = [imu(t, (0, 0, 0)) for t in range(0, 601, 50)]
-    readings += [wheels(t) for t in (20, 120, 420)]
-    readings.sort(key=lambda r: r.stamp_ns)
-    assert [s.rolled for s in gather(StepGatherer(vehicle, 0.1), vehicle, readings)] == [
-        True,
-        True,
-        False,
-        False,
-        True,
-        False,
-    ]
+    readings: list[Reading] = [imu(t, (0, 0, 0)) for t in range(0, 1601, 50)]
+    readings += [wheels(t) for t in (*range(20, 1121, 20), 1420)]
+    shown = [s.rolled for s in gather(StepGatherer(vehicle, 0.1), vehicle, readings)]
+    settling = 6 if kind == "encoder" else 0
+    assert shown == [False] * settling + [True] * (12 - settling) + [False, False, True, False]

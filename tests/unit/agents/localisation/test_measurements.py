@@ -41,7 +41,7 @@ def every_kind(layout: Layout) -> list[Measurement]:
         measurements.standstill(0),
         measurements.velocity(0, "gps-2", np.zeros(2), np.eye(2), LEVER_M, 4.0),
         measurements.rotation(0, "ahrs", np.zeros(3), np.eye(3), 6.0),
-        measurements.turn(0, 0.0, 0.02, layout.gyro_bias(1) if augmented else None, 3.0, 6.0),
+        measurements.turn(0, "turn", 0.0, 0.02, layout.gyro_bias(1) if augmented else None, 3.0, 6.0),
         measurements.orientation(
             0, "ahrs", np.zeros(3), np.eye(3), 6.0, layout.heading_errors.start if augmented else None
         ),

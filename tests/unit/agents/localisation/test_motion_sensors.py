@@ -6,23 +6,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.dead_reckoning import DeadReckonedPose
+from agents.dead_reckoning import DeadReckonedPose, WheelSpeed
 from agents.localisation import measurements
-from agents.localisation.filters.state import Layout
+from agents.localisation.filters.state import VELOCITY, YAW_RATE, Layout
 from agents.localisation.headings import UNKNOWN_STD
 from agents.localisation.imu_steps import FilterStep, ImuMean, Turn
 from agents.localisation.motion_sensors import ROLLING_S, STANDSTILL_S, MotionSensors, machine_speed, rolling_resistance
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.units import GRAVITY_MPS2
 
-STEP = FilterStep(7, DeadReckonedPose(7, 0.0, 0.0, 0.0, 0.0), {}, {}, 2.0, True, 0.1, 0.0)
+STEP = FilterStep(7, DeadReckonedPose(7, 0.0, 0.0, 0.0, 0.0), {}, {}, WheelSpeed(2.0, is_known=True), True, 0.1, 0.0)
 FORCE = np.array([0.06 * GRAVITY_MPS2, 0.0, GRAVITY_MPS2])
 IMU_STEP = replace(STEP, imu_means={"imu": ImuMean(np.zeros(3), FORCE)})
 
 
-def sensors(*configured: SensorConfig, slip: float = 0.0, slip_soft: float = 0.0) -> MotionSensors:
+def sensors(
+    *configured: SensorConfig, slip: float = 0.0, slip_soft: float = 0.0, on_plane: bool = False
+) -> MotionSensors:
     machine = MachineConfig("truck", wheelbase_m=3.0, sensors=configured)
-    return MotionSensors(machine, Layout(imus=1, wheel_scale=True), 10.0, slip, slip_soft)
+    return MotionSensors(machine, Layout(imus=1, wheel_scale=True), 10.0, (slip, slip_soft), on_plane=on_plane)
 
 
 def deviations(R: Any) -> list[float]:
@@ -44,6 +46,24 @@ def test_an_imu_is_as_sure_as_it_is_configured(options: dict[str, Any], rate: fl
     assert deviations(measurement.R) == pytest.approx([rate] * 3 + [force] * 3)
     assert measurement.z[3:].tolist() == FORCE.tolist()
     assert len(sensors(imu).forces(IMU_STEP)) == ("measures" not in options or "force" in options["measures"])
+
+
+def test_on_a_plane_an_imu_measures_the_turn_alone() -> None:
+    step = replace(IMU_STEP, imu_means={"imu": ImuMean(np.array([0.3, -0.2, 0.1]), FORCE)})
+    (measurement,) = sensors(SensorConfig("imu", "imu", std={"rate": 0.1}), on_plane=True).inertial(step)
+    assert (measurement.sensor, measurement.z.tolist(), deviations(measurement.R)) == ("imu", [0.1], [0.1])
+    assert measurement.jacobian(np.zeros(17))[0].nonzero()[0].tolist() == [YAW_RATE, Layout(imus=1).gyro_bias(0)]
+    assert sensors(SensorConfig("imu", "imu", measures=("force",)), on_plane=True).inertial(step) == []
+
+
+def test_several_wheels_are_their_mean_as_unsure_as_the_least_sure() -> None:
+    pair = [SensorConfig("left", "encoder", std={"speed": 0.3}), SensorConfig("right", "encoder", gate_sigma=9.0)]
+    step = replace(STEP, wheels=WheelSpeed(2.0, offset_m=0.4, is_known=True))
+    (measurement,) = sensors(*pair).wheels(step)
+    assert (deviations(measurement.R)[0], measurement.gate_sigma) == (0.3, 9.0)
+    x = np.zeros(17)
+    x[VELOCITY.start], x[YAW_RATE] = 2.0, 0.5
+    assert measurement.h(x[None])[0].tolist() == pytest.approx([2.0 - 0.5 * 0.4, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(("gate_sigma", "expected"), [(0.0, measurements.GATE_SIGMA), (2.5, 2.5)])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.dead_reckoning import DeadReckoning, turn_source
+from agents.dead_reckoning import turn_source
 from agents.localisation.filters.belief import Belief
 from agents.localisation.filters.motion import motion
 from agents.localisation.filters.state import YAW, YAW_RATE, Layout
@@ -15,6 +15,7 @@ from agents.localisation.imu_steps import FilterStep, StepGatherer
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Odometry, Reading, Steering
 from tests.unit.agents.drives import LEVER_M, START_NS, Drive, Leg, RunLocaliser, drive, localiser, reckoned
+from tests.unit.agents.localisation.test_imu_steps import gather
 
 WHEELBASE_M = 2.5
 EIGHT = [Leg(6, 0.5), Leg(4), *[Leg(25, 0, 0.25), Leg(25, 0, -0.25)] * 2]  # at 3 m/s, circles of 12 m
@@ -145,12 +146,7 @@ def test_old_steering_angle_turns_nothing() -> None:
 
 
 def steps_of(vehicle: MachineConfig, readings: list[Reading]) -> list[FilterStep]:
-    gatherer, reckoning, steps = StepGatherer(vehicle, 0.1), DeadReckoning(vehicle, 0.0), []
-    for reading in readings:
-        sensor = vehicle.sensor(reading.sensor)
-        reckoning.update(reading, sensor)
-        steps += [step] if (step := gatherer.gather(reading, sensor, reckoning)) else []
-    return steps
+    return gather(StepGatherer(vehicle, 0.1), vehicle, readings)
 
 
 def test_a_step_tells_the_turn_of_a_bicycle_whose_error_grows_with_speed() -> None:

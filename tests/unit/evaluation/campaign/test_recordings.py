@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from evaluation.campaign import recordings
-from evaluation.campaign.recordings import PAPER, PlannedDrive
+from evaluation.campaign.recordings import PAPER, SETUPS, PlannedDrive
 from evaluation.ground.experiment import LOADING
 
 DRIVE = PlannedDrive(3, 0.5, setup=replace(PAPER, world="fast"))
@@ -27,6 +27,17 @@ def test_a_machine_has_the_sensors_and_the_route_of_its_setup():
     assert "gps-3" not in sensors
     assert 'base = "loading"' in drive.scenario_toml
     assert 'routes = ["yard"]' in drive.scenario_toml
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_drives_of_the_table_have_the_habits_and_the_shared_errors_of_their_scenario(name: str):
+    setup = SETUPS[name]
+    drive = PlannedDrive(3, 1.0, setup.preset, setup)
+    gps = drive.scenario.preset(drive.preset).gps
+    people = name.endswith("_driven")
+    assert (drive.scenario.driving.wander_m > 0) == (drive.scenario.driving.stop_every_m is not None) == people
+    assert (gps.machine_share, gps.site_share) == ((0.8, 0.5) if people else (0.0, 0.0))
+    assert len([s for s in drive.machine.sensors if s.kind in ("gps", "imu", "attitude")]) == 9
 
 
 @pytest.mark.slow

@@ -20,6 +20,14 @@ def test_the_table_has_every_configuration_of_the_paper_in_both_profiles_and_one
     assert Configuration("ukf", 3, 1, "paper").published_net_m is None
 
 
+def test_shares_repeat_the_rows_that_have_receivers_the_first_share_first():
+    rows = table.configurations(shares=(0.0, 0.5))
+    assert len(rows) == len(set(rows)) == len({row.name for row in rows}) == 36 + 32
+    assert [row.machine_share for row in rows] == [0.0] * 36 + [0.5] * 32
+    assert {row.gps for row in rows[36:]} == {1, 2, 3}
+    assert {row.machine_share for row in table.configurations()} == {None}
+
+
 def test_sensors_of_a_row_are_in_use_and_no_others():
     machine = PlannedDrive(0, 1.0).machine
     rest = {"torque", "wheels", "articulation"}

@@ -1,23 +1,25 @@
-"""Real logs: withheld fixes, truth, planar fixes; on made-up logs, and on real ones where they are at hand."""
+"""Real logs: withheld fixes, truth, choice of sensors; on made-up logs, and on real ones where they are at hand."""
 
 import math
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from agents.localisation.localiser import LocalisationConfig
 from evaluation.campaign.figures import Report
 from evaluation.positions import real_logs
-from evaluation.positions.configurations import Configuration, select
+from evaluation.positions.configurations import UnsupportedError
+from evaluation.positions.log_truth import read_log_truth
+from evaluation.positions.real_logs import Outage, Pattern, Periodic, chosen
 from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import open_log
-from protocol.machine.readings import Gps
-from protocol.site.site_config import Projection
 from tests.paths import ROOT
 from tests.paths import SHARED_DATA as DATA
 
 LOGS = ROOT / "evaluation" / "logs"
-ROW = Configuration("ukf", 1, 1, "default")
 MANIFEST = """
 log = { name = "circle", start_ns = 1700000000000000000 }
 site = { name = "yard", origin_lat_deg = 50.0, origin_lon_deg = 8.0 }
@@ -26,19 +28,17 @@ machine = { name = "mower" }
 name = "wheels"
 kind = "odometry"
 file = "odom.csv"
-columns = { stamp = "t", speed_x_mps = "v", speed_y_mps = { value = 0.0 }, rate_z_radps = "w" }
+columns = { stamp = "t", speed_x_mps = "v", rate_z_radps = "w" }
 [[sensor]]
 name = "gyro"
 kind = "imu"
+measures = ["rate"]
 file = "odom.csv"
 [sensor.columns]
 stamp = "t"
 gyro_x_radps = { value = 0.0 }
 gyro_y_radps = { value = 0.0 }
 gyro_z_radps = "w"
-force_x_mps2 = { value = 0.0 }
-force_y_mps2 = { value = 0.0 }
-force_z_mps2 = { value = 9.81 }
 """
 GPS = """
 [[sensor]]
@@ -46,22 +46,10 @@ name = "gps-{i}"
 kind = "gps"
 file = "gps{i}.csv"
 use = {use}
-[sensor.columns]
-stamp = "t"
-lat_deg = "lat_deg"
-lon_deg = "lon_deg"
-height_m = {{ value = 0.0 }}
-var_e_m2 = {{ value = 1.0 }}
-var_n_m2 = {{ value = 1.0 }}
-var_u_m2 = {{ value = 1.0 }}
+std = {{ position = 1.0 }}
+columns = {{ stamp = "t", x_m = "x", y_m = "y" }}
 """
-SIDE = """
-truth = { file = "truth.csv", stamp = "t", x_m = "east", y_m = "north" }
-[[planar]]
-file = "gps1.csv"
-x_m = "x"
-y_m = "y"
-"""
+SIDE = 'truth = { file = "truth.csv", stamp = "t", x_m = "east", y_m = "north" }'
 RADIUS_M, RATE_RADPS = 20.0, 0.1
 
 
@@ -81,21 +69,21 @@ def circle(tmp_path: Path) -> Path:
     write(tmp_path / "odom.csv", "t,v,w", [(t, RADIUS_M * RATE_RADPS, RATE_RADPS) for t in times])
     write(tmp_path / "truth.csv", "t,east,north", [(t, *at(t)) for t in times])
     write(tmp_path / "gps1.csv", "t,x,y", [(t, *at(t, 2.0)) for t in times[::2]])
-    write(tmp_path / "gps2.csv", "t,lat_deg,lon_deg", [])
+    write(tmp_path / "gps2.csv", "t,x,y", [])
     gps = [GPS.format(i=i, use=use) for i, use in ((1, "true"), (2, "false"))]
     (tmp_path / "log.toml").write_text("".join([MANIFEST, *gps]))
     (tmp_path / "evaluation.toml").write_text(SIDE)
     return tmp_path
 
 
-def run(folder: Path, *patterns: tuple[float, float], data: Path | None = None) -> Report:
-    with real_logs.opened(folder, data) as (log, truth):
-        return real_logs.run(log, truth, ROW, patterns or real_logs.WITHHOLD)
+def run(folder: Path, *patterns: Pattern, data: Path | None = None, **choice: Any) -> Report:
+    options, choose = LocalisationConfig(filter="ekf"), partial(chosen, **choice)
+    return real_logs.run(folder, data, options, patterns or real_logs.WITHHOLD, choose)
 
 
 @pytest.mark.slow
 def test_errors_against_fixes_and_against_truth_stand_apart(circle: Path):
-    none, often = run(circle, (0.0, 1.0), (10.0, 30.0))["rows"]
+    none, often = run(circle, None, Periodic(30.0, 10.0))["rows"]
     assert (none["withhold"], none["fixes"], none["rms_m"]) == ("none", 0, None)
     assert (often["withhold"], often["fixes"]) == ("10/30", 100)  # 5 Hz for 10 s in 30, from 40 s on
     assert often["rms_m"] < 0.8
@@ -103,49 +91,99 @@ def test_errors_against_fixes_and_against_truth_stand_apart(circle: Path):
         assert row["truth_net_m"] == pytest.approx(2.0, abs=0.6)
         assert row["truth_rmse_x_m"] == pytest.approx(2.0, abs=0.6)
         assert row["truth_rmse_y_m"] < 0.8
+        assert row["truth_known"] == 1.0
+        assert row["truth_nees_95"][0] < 2 < row["truth_nees_95"][1]
+        assert 0 <= row["truth_coverage95"] <= 1
     assert often["truth_withheld_m"] == pytest.approx(2.0, abs=0.6)
+    assert often["truth_end_m"] == pytest.approx(2.0, abs=0.6)
     assert math.isnan(none["truth_withheld_m"])
-    assert none["truth_covered"] > often["truth_covered"] > 0.7
+    assert none["covered"] > often["covered"] > 0.7
+
+
+@pytest.mark.slow
+def test_an_outage_is_placed_and_judged_wherever_it_is(circle: Path):
+    """Wheels that are a tenth too large: the error grows with the time without fixes."""
+    rows = (circle / "odom.csv").read_text().splitlines()
+    grown = [
+        line.replace(f",{RADIUS_M * RATE_RADPS:.6f},", f",{RADIUS_M * RATE_RADPS * (1.1 if i > 300 else 1):.6f},")
+        for i, line in enumerate(rows)
+    ]
+    (circle / "odom.csv").write_text("\n".join(grown) + "\n")
+    early, short, long = run(circle, Outage(20.0, 5.0), Outage(30.0, 5.0), Outage(30.0, 25.0))["rows"]
+    assert [row["withhold"] for row in (early, short, long)] == ["20,5", "30,5", "30,25"]
+    assert [row["fixes"] for row in (early, short, long)] == [25, 25, 125]
+    assert long["end_m"] > 2 * short["end_m"]
+    assert long["end_m"] > 2 * early["end_m"]
+    assert long["rms_m"] < long["end_m"] <= long["max_m"]
 
 
 def test_without_a_side_file_there_is_no_truth(circle: Path):
     (circle / "evaluation.toml").unlink()
-    write(circle / "gps1.csv", "t,lat_deg,lon_deg", [(0.2 * i, 50.0, 8.0) for i in range(9)])
-    row = run(circle, (1.0, 10.0))["rows"][0]
+    row = run(circle, Periodic(10.0, 1.0))["rows"][0]
     assert not any(name.startswith("truth") for name in row)
 
 
-def test_planar_fixes_come_back_as_the_metres_that_they_were(circle: Path):
-    with real_logs.opened(circle / "log.toml") as (log, _):
-        to_map = Projection(log.site).to_map
-        fixes = [r for r in log.readings() if isinstance(r, Gps)]
-        places = np.array([to_map(f.lat_deg, f.lon_deg, 0.0)[:2] for f in fixes])
-    expected = np.array([at((f.stamp_ns - log.start_ns) * 1e-9, 2.0) for f in fixes])
-    assert places == pytest.approx(expected, abs=1e-5)
-    names = "evaluation.toml gps1.csv gps2.csv log.toml odom.csv truth.csv"
-    assert sorted(p.name for p in circle.iterdir()) == names.split()
+@pytest.mark.slow
+def test_a_log_of_one_rate_is_covered_from_the_heading_on(circle: Path):
+    """5 Hz, where a share of steps of 100 ms could reach a half at most."""
+    rows = (circle / "odom.csv").read_text().splitlines()
+    (circle / "odom.csv").write_text("\n".join([rows[0], *rows[1::2]]) + "\n")
+    (row,) = run(circle, None)["rows"]
+    assert 0.85 < row["covered"] < 1  # the heading takes 12 m
 
 
-def test_receivers_in_use_are_counted_and_chosen(circle: Path):
-    with real_logs.opened(circle) as (log, _):
-        assert real_logs.receivers(log.machine) == 1
-        assert real_logs.receivers(select(log.machine, gps=2)) == 2
+@pytest.mark.slow
+def test_bad_rows_are_named_with_their_lines_and_measurements_are_counted_by_sensor(circle: Path):
+    with (circle / "gps1.csv").open("a") as file:
+        file.write("200,nan,1\n")
+    report = run(circle, None)
+    assert report["refused"] == {"not_finite": 1}
+    assert report["first_refused"]["not_finite"].startswith("gps1.csv line 502: x_m: nan is not within 100 km")
+    listed = {row["measurement"]: row for row in real_logs.measurements(report["rows"])}
+    assert set(listed) == {"gps-1", "gyro", "wheels"}
+    assert listed["gps-1"]["used"] > 400
+    assert listed["gps-1"]["nis"] is not None
+    assert listed["wheels"]["nis"] is None
+
+
+# --- what is chosen --------------------------------------------------------------------------------------------------
+
+
+def test_sensors_are_chosen_by_name_and_receivers_by_number_too(circle: Path):
+    machine = open_log(circle).machine
+
+    def used(**choice: Any) -> list[str]:
+        return [sensor.name for sensor in chosen(machine, **choice).sensors if sensor.use]
+
+    assert used() == ["wheels", "gyro", "gps-1"]
+    assert used(gps=2) == ["wheels", "gyro", "gps-1", "gps-2"]
+    assert used(gps=("gps-2",)) == ["wheels", "gyro", "gps-2"]
+    assert used(sensors=("gps-2", "wheels")) == ["wheels", "gps-2"]
+    assert used(sensors=("gps-1", "gps-2", "wheels"), gps=1) == ["wheels", "gps-1"]
+    assert real_logs.receivers(chosen(machine, gps=2)) == 2
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "problem"),
+    ("choice", "problem"),
     [
-        ('file = "gps1.csv"', 'file = "gps9.csv"', "no sensor with the file 'gps9.csv'"),
-        ('x_m = "east"', 'x_m = "west"', "no truth as described: 'west'"),
-        ('x_m = "x"', 'x_m = "z"', "no planar fixes as described: 'z'"),
-        ('file = "truth.csv"', 'file = "lost.csv"', "cannot be read"),
-        ("truth =", "truht =", "unknown key `truht`"),
+        ({"gps": ("gps-9",)}, "mower: has no 'gps-9', but gps-1, gps-2"),
+        ({"gps": ("wheels",)}, "mower: has no 'wheels', but gps-1, gps-2"),
+        ({"gps": 3}, "mower has 2 GPS receivers, not 3"),
+        ({"sensors": ("gps-1", "weels")}, "mower: has no 'weels', but wheels, gyro, gps-1, gps-2"),
+        ({"sensors": ("wheels", "gyro")}, "mower: no sensor in use shows its place"),
+        ({"gps": ("gps-2",), "sensors": ("gps-2",)}, "no sensor in use has a reading"),
     ],
 )
-def test_a_wrong_side_file_is_refused_in_one_line(circle: Path, old: str, new: str, problem: str):
-    (circle / "evaluation.toml").write_text(SIDE.replace(old, new))
-    with pytest.raises((ConfigError, LogFolderError), match=problem), real_logs.opened(circle):
-        pass
+def test_what_cannot_be_chosen_is_refused_in_one_line(circle: Path, choice: dict[str, Any], problem: str):
+    with pytest.raises((ConfigError, LogFolderError, UnsupportedError)) as caught:
+        run(circle, None, **choice)
+    assert problem in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_outage_after_the_end_is_refused(circle: Path):
+    with pytest.raises(ConfigError, match=r"--withhold 300,5: the log ends after 100 s"):
+        run(circle, Outage(300.0, 5.0))
 
 
 def beside(folder: str) -> Path:
@@ -157,21 +195,20 @@ def beside(folder: str) -> Path:
 
 @pytest.mark.parametrize("folder", sorted(p.name for p in LOGS.iterdir()))
 def test_every_manifest_is_valid(folder: str):
-    log = open_log(LOGS / folder)
-    assert log.name == folder
-    side = LOGS / folder / real_logs.SIDE_FILE
-    assert not side.exists() or "truth" in side.read_text()
+    assert open_log(LOGS / folder).name == folder
 
 
 @pytest.mark.parametrize("folder", sorted(p.name for p in LOGS.iterdir()))
 def test_every_row_of_a_real_log_is_read(folder: str):
-    with real_logs.opened(LOGS / folder, beside(folder)) as (log, _):
-        sensors = {r.sensor for r in log.readings()}
-        assert sensors == {s.name for s in log.machine.sensors if s.use}
-        assert not log.refused
+    log = open_log(LOGS / folder, beside(folder))
+    sensors = {r.sensor for r in log.readings()}
+    assert sensors == {s.name for s in log.machine.sensors if s.use}
+    assert not log.refused
+    truth = read_log_truth(log, LOGS / folder)
+    assert (truth is not None) == (folder == "plaza2_mower")
 
 
 @pytest.mark.slow
 def test_mower_against_its_truth():
-    (row,) = run(LOGS / "plaza2_mower", (0.0, 1.0), data=beside("plaza2_mower"))["rows"]
+    (row,) = run(LOGS / "plaza2_mower", None, data=beside("plaza2_mower"), gps=1)["rows"]
     assert row["truth_net_m"] < 3.0  # one fix of the first receiver alone is off by 3.3 m

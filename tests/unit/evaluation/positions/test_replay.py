@@ -27,7 +27,7 @@ def trace_of(error_m: Sequence[tuple[float, float]], std_m: float = 1.0, before:
     true = np.stack([np.arange(before + n + 1) * 0.1, np.zeros(before + n + 1)], axis=1)
     believed = true[before + 1 :] + np.array(error_m)
     covariance = np.broadcast_to(np.eye(2) * std_m**2, (n, 2, 2))
-    trace = Trace(stamps[before + 1 :], believed, covariance, START_NS, int(stamps[-1]), cpu_s=0.01)
+    trace = Trace(stamps[before + 1 :], believed, covariance, np.zeros(n), START_NS, int(stamps[-1]), cpu_s=0.01)
     return trace, Truth(stamps, true)
 
 
@@ -71,7 +71,9 @@ def test_time_without_a_pose_is_stated_and_not_counted_as_error():
 def poses_at(times_s: Sequence[float], seconds: float) -> Trace:
     """Poses at these times of readings that last so long."""
     stamps, n = START_NS + np.round(np.array(times_s) * 1e9).astype(np.int64), len(times_s)
-    return Trace(stamps, np.zeros((n, 2)), np.zeros((n, 2, 2)), START_NS, START_NS + round(seconds * 1e9), 0.0)
+    return Trace(
+        stamps, np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros(n), START_NS, START_NS + round(seconds * 1e9), 0.0
+    )
 
 
 @pytest.mark.parametrize("rate_hz", [0.5, 1.0, 5.0, 7.3, 10.0])
@@ -100,7 +102,10 @@ def test_smoothed_poses_are_judged_at_their_own_stamps():
     every = slice(None, None, 10)
     off_m = np.array([(0.0, 1.0)] * 4)
     smoothed = Track(
-        trace.stamp_ns[every], trace.position_m[every] - (3.0, 0.0) + off_m, trace.covariance_m2[every] / 4
+        trace.stamp_ns[every],
+        trace.position_m[every] - (3.0, 0.0) + off_m,
+        trace.covariance_m2[every] / 4,
+        trace.heading_rad[every],
     )
     result = score(replace(trace, smoothed=smoothed), truth)
     assert (result.net_m, result.nees) == pytest.approx((3.0, 2.25))

@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.campaign.experiment import Runner
 from evaluation.campaign.figures import Report
-from evaluation.campaign.recordings import PAPER
+from evaluation.campaign.recordings import PAPER, PlannedDrive, load
 from evaluation.positions import table
 from evaluation.positions.configurations import Configuration
 from evaluation.positions.replay import Score
@@ -17,7 +17,8 @@ from evaluation.positions.table import paired_ratio, ratios, summarise
 from protocol.machine.machine_config import MachineConfig
 
 FAST = replace(PAPER, world="fast")
-ONE, TWO, NONE = (Configuration("ukf", gps, 1, "default") for gps in (1, 2, 0))
+ONE, TWO, NONE = (Configuration("ukf", gps, 1, "default", 0.0) for gps in (1, 2, 0))
+SHARED = replace(TWO, machine_share=0.95)
 NEVER = Configuration("ukf", 9, 1, "default")
 SECONDS = 14.0
 
@@ -62,6 +63,16 @@ def test_ratios_are_of_profiles_and_of_filters_that_were_both_run():
     assert ratios({ONE: [score(1.0)]}) == []
 
 
+def test_one_more_receiver_is_compared_on_the_same_fixes():
+    """Of shares, each with its own: receivers that share all they err are worth no more than one."""
+    nets = {ONE: 2.0, TWO: 1.5, replace(ONE, machine_share=0.95): 2.0, SHARED: 1.9}
+    pairs = ratios({row: [score(net), score(2 * net)] for row, net in nets.items()})
+    assert [(r["ratio"], r["gps"], r["machine_share"], r["net"]) for r in pairs] == [
+        ("one more receiver", 2, 0.0, 0.75),
+        ("one more receiver", 2, 0.95, 0.95),
+    ]
+
+
 def test_smoothed_poses_stand_beside_the_live_ones_of_the_same_drives():
     runs = [score(2.0, smoothed=(1.5, 1.8, 0.96)), score(4.0, smoothed=(3.3, 2.2, 0.94))]
     row = summarise(ONE, runs)
@@ -80,28 +91,42 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
 
 @pytest.fixture(scope="module")
 def result(runner: Runner) -> tuple[Report, list[table.Outcome]]:
-    return table.run(runner, (3,), SECONDS, (ONE, TWO, NONE, NEVER), FAST)
+    return table.run(runner, (3,), SECONDS, (replace(ONE, machine_share=None), TWO, NONE, SHARED, NEVER), FAST)
 
 
 @pytest.mark.slow
 def test_rows_are_scored_on_one_recording_and_what_cannot_run_is_named(result, runner: Runner):
     report, outcomes = result
     rows = report["rows"]
-    assert [(row["gps"], row["paper_net_m"]) for row in rows] == [(1, 2.3234), (2, 1.7217), (0, 65.4774)]
-    assert all(0.05 < row["net_m"] < 8 and 0.3 < row["covered"] < 1 for row in rows[:2])
+    shown = [(row["gps"], row["machine_share"], row["paper_net_m"]) for row in rows]
+    assert shown == [(1, 0, 2.3234), (2, 0, 1.7217), (0, 0, 65.4774), (2, 0.95, 1.7217)]
+    assert all(0.05 < row["net_m"] < 8 and 0.3 < row["covered"] < 1 for row in (*rows[:2], rows[3]))
+    assert rows[1]["net_m"] != rows[3]["net_m"]
+    assert all(0.05 < row["smoothed_net_m"] < 8 and row["smoothed_coverage95"] > 0.3 for row in rows[:2])
     assert rows[2]["covered"] == 1  # without GPS its start is given
     assert all(row["us_per_second"] > 100 for row in rows)
     assert [row["gps"] for row in report["missing"]] == [9]
     assert "9" in report["missing"][0]["why"]
     assert len(list(runner.cache.glob("paper-seed3-*"))) == 1
     assert len(outcomes[0].run.time_s) > 4
-    assert [outcome.row for outcome in outcomes] == [ONE, TWO, NONE]
-    assert list(rows[0])[:5] == ["filter", "gps", "imu", "profile", "rmse_x_m"]
-    assert all(0.05 < row["smoothed_net_m"] < 8 and row["smoothed_coverage95"] > 0.3 for row in rows[:2])
+    assert [outcome.row for outcome in outcomes] == [ONE, TWO, NONE, SHARED]
+    assert list(rows[0])[:6] == ["filter", "gps", "imu", "profile", "machine_share", "rmse_x_m"]
+
+
+@pytest.mark.slow
+def test_the_share_that_was_recorded_is_the_recording_itself(runner: Runner, result):
+    """And another one changes what all receivers read, but not when: the drive and the seed are the same."""
+    drive = result[1][0].drive
+    recording = load(drive.folder(runner.cache))
+    assert table._with_share(table.replay_task(TWO, drive), runner.cache) == recording
+    shared = table._with_share(table.replay_task(SHARED, drive), runner.cache)
+    pairs = list(zip(recording.readings, shared.readings, strict=True))
+    assert all(a.stamp_ns == b.stamp_ns and a.sensor == b.sensor for a, b in pairs)
+    assert {a.sensor for a, b in pairs if a != b} == {"gps-1", "gps-2", "gps-3"}
 
 
 def test_the_report_says_how_slow_gps_errors_are():
-    error = table.gps_error("paper")
+    error = table.gps_error(PlannedDrive(0, 1.0))
     assert (error["slow_variance_share"], error["correlation_time_s"]) == (0.9, 45.0)
 
 

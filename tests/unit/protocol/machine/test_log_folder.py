@@ -59,7 +59,10 @@ def test_column_may_be_plain_or_constant(tmp_path, column, expected):
     manifest = MANIFEST.replace('{ column = "angle", unit = "deg" }', column)
     log = open_log(folder(tmp_path, manifest, joint="t,angle\n0,90\n"))
     if expected > math.pi:
-        assert list(log.readings()) == []  # 90 rad is no angle of a joint: counted
+        with pytest.raises(
+            LogFolderError, match=r"line 2: joint.angle_rad: 90\.0 is not between"
+        ):  # no angle of a joint
+            list(log.readings())
         assert log.refused == {Refusal.OUT_OF_RANGE: 1}
     else:
         assert [r.angle_rad for r in log.readings()] == pytest.approx([expected])

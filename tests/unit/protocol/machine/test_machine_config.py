@@ -79,8 +79,19 @@ def test_every_option_of_a_machine_is_written_and_read_back():
     body = {
         f.name: 1.25 + i for i, f in enumerate(dataclasses.fields(MachineConfig)) if f.name not in ("name", "sensors")
     }
-    machine = MachineConfig("a", **body)
+    machine = MachineConfig("a", **{**body, "machine_share": 0.5})
     assert parse_machine(tomllib.loads(machine_toml(machine))["machine"], (), "x") == machine
+
+
+def test_a_machine_share_is_a_share_or_not_stated():
+    for share in (None, 0.0, 1.0):
+        machine = dataclasses.replace(MACHINE, machine_share=share)
+        table = tomllib.loads(machine_toml(machine))["machine"]
+        assert ("machine_share" in table) == (share is not None)
+        assert parse_machine(table, MACHINE.sensors, "x") == machine
+    for bad in (-0.1, 1.01, math.nan):
+        with pytest.raises(ValueError, match="machine_share"):
+            dataclasses.replace(MACHINE, machine_share=bad)
 
 
 @pytest.mark.parametrize("name", ["wheelbase_m", "axle_stiffness_npm", "cog_height_m", "payload_z_m"])

@@ -1,3 +1,4 @@
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,19 @@ def test_haul_road_is_two_kilometres_and_its_trucks_carry_loads() -> None:
     assert {rig.model.name for rig in scenario.rigs()} == {"dump_truck", "wheel_loader"}
     assert any(leg.reverse for route, _, _ in scenario.journeys() for leg in route.legs)
     assert speed > 5
+
+
+@pytest.mark.parametrize("name", ["paper_site", "haul_road"])
+def test_driven_scenarios_differ_from_their_bases_in_drivers_and_shared_errors_alone(name: str) -> None:
+    base, driven = load_scenario(name), load_scenario(f"{name}_driven")
+    changed = ("description", "driving", "fleet", "presets")
+    assert all(getattr(driven, f.name) == getattr(base, f.name) for f in fields(base) if f.name not in changed)
+    for fleet, before in zip(driven.fleet, base.fleet, strict=True):
+        assert replace(fleet, preset=before.preset) == before
+        gps = driven.preset(fleet.preset).gps
+        assert 0.3 <= gps.site_share <= gps.machine_share <= 0.95
+    assert driven.driving.wander_m >= 0.3
+    assert driven.driving.stop_every_m
 
 
 def test_busy_site_has_a_hundred_machines_in_the_fast_world_both_ways_round() -> None:

@@ -65,4 +65,4 @@ def test_generators_are_the_spawned_ones() -> None:
     assert generator(SEED, 2, "gps-1").random() == np.random.Generator(np.random.SFC64(spawned)).random()
     assert STREAMS[:4] == ("body", "gps-1", "gps-2", "gps-3")
     assert STREAMS.index("outage") == 10
-    assert STREAMS[11:] == ("imu-4", *(f"attitude-{i}" for i in (1, 2, 3, 4)), "payload", "receivers")
+    assert STREAMS[11:] == ("imu-4", *(f"attitude-{i}" for i in (1, 2, 3, 4)), "payload", "receivers", "driver")

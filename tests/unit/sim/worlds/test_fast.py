@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from protocol.machine.machine_config import Mount
+from protocol.units import GRAVITY_MPS2
 from sim.machines.model import MachineModel
 from sim.state import STEP_S, FleetState, stack
 from sim.terrain.soil import C_RR
@@ -26,6 +27,17 @@ def wheels(model: MachineModel, state: FleetState) -> np.ndarray:
     return np.array([front_axle + left_front, front_axle - left_front, rear_axle + left, rear_axle - left])
 
 
+def sunk_m(model: MachineModel, slope_rad: float) -> tuple[float, float]:
+    """How far the front and rear tyres of a parked empty machine give way on a slope, beyond those on the level."""
+    weight_n, level = model.mass_kg * GRAVITY_MPS2, model.front_share()
+    uphill = model.centre_height_m() / model.wheelbase_m * math.sin(slope_rad)
+    front_n, rear_n = (
+        weight_n * (share * math.cos(slope_rad) + to_rear - share)
+        for share, to_rear in ((level, -uphill), (1 - level, uphill))
+    )
+    return front_n / (2 * model.tyre_stiffness_npm), rear_n / (2 * model.tyre_stiffness_npm)
+
+
 @BOTH
 def test_neither_axle_slips_sideways_while_the_joint_turns(model: MachineModel) -> None:
     with placed(FastWorld, plane(0), model, starts=[(500, 500, 0.4)]) as world:
@@ -41,12 +53,15 @@ def test_neither_axle_slips_sideways_while_the_joint_turns(model: MachineModel) 
 
 @BOTH
 def test_the_estimators_equation_holds_at_every_instant(model: MachineModel) -> None:
-    # F/m - f_x - (lambda-1) dv = c g cos(theta): the accelerometer contains gravity's share
+    # F/m - (f_x - g squat) - (lambda-1) dv = c g cos(theta): the accelerometer contains gravity's share
+    slope = math.atan(0.1 * math.cos(0.4) + 0.05 * math.sin(0.4))
     rolling = 4 * model.wheel_inertia_kgm2 / model.wheel_radius_m**2
     with placed(FastWorld, plane(3, 0.1, 0.05), model, starts=[(500, 500, 0.4)]) as world:
         for state in cruise(world, 3.0, 6.0)[300:]:
             force = state.torque_nm[0] / model.wheel_radius_m - rolling * state.accel_mps2[0]
-            left = force / model.mass_kg - state.force_mps2[0, 0]
+            squat = -state.pitch_rad[0] - slope
+            nodding = model.centre_height_m() * state.rates_dot_radps2[0, 1]  # of the centre, against `base_link`
+            left = force / model.mass_kg - state.force_mps2[0, 0] - nodding + GRAVITY_MPS2 * squat
             assert left == pytest.approx(0.06 * state.load_n[0] / model.mass_kg, abs=1e-3)
 
 
@@ -66,8 +81,11 @@ def test_machines_rest_on_three_points_of_rough_ground(model: MachineModel, stee
     c, s = math.cos(state.yaw_rad[0]), math.sin(state.yaw_rad[0])
     seen = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ up / np.linalg.norm(up)
     pitch, roll = state.pitch_rad[0], state.roll_rad[0]
-    np.testing.assert_allclose([math.tan(pitch), math.sin(roll)], [seen[0] / seen[2], -seen[1]], atol=1e-6)
-    assert state.z_m[0] == pytest.approx(rear[2])
+    slope = -math.atan(seen[0] / seen[2])
+    sunk = sunk_m(model, slope)  # the tyres give way where the slope puts the weight
+    squat = (sunk[1] - sunk[0]) / model.wheelbase_m
+    np.testing.assert_allclose([pitch, math.sin(roll)], [-slope - squat, -seen[1]], atol=1e-6)
+    assert state.z_m[0] == pytest.approx(rear[2] - sunk[1], abs=2e-5)
 
     left = points[0] - points[1] + points[2] - points[3]
     through_all = np.cross(front - rear, left)

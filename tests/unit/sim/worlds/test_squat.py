@@ -9,16 +9,16 @@ from protocol.units import GRAVITY_MPS2
 from sim.sensors.presets import load_preset
 from sim.sensors.rigs import machine_config
 from sim.state import stack
-from sim.worlds.bullet import BulletWorld
-from tests.unit.sim.planes import LOADER, TRUCK, Lane, cruise, idle, lanes, of_each
+from tests.unit.sim.planes import EACH, LOADER, TRUCK, Lane, cruise, idle, lanes, of_each
 
 
 @pytest.mark.slow
+@EACH
 @pytest.mark.parametrize("slope_deg", [0, 15])
-def test_squat_at_steady_speed_is_that_of_the_axles_loads(slope_deg: int) -> None:
+def test_squat_at_steady_speed_is_that_of_the_axles_loads(kind: type, slope_deg: int) -> None:
     cases = [Lane(model, 1, yaw) for model in (LOADER, TRUCK) for yaw in (0.0, 0.0, math.pi, math.pi)]
     payload_kg = of_each(cases, "payload_kg") * ([0, 1] * 4)  # empty and full
-    with lanes(BulletWorld, cases, math.tan(math.radians(slope_deg))) as world:
+    with lanes(kind, cases, math.tan(math.radians(slope_deg))) as world:
         for i, payload in enumerate(payload_kg.tolist()):
             world.set_payload(i, payload)
         idle(world, 3.0, of_each(cases, "max_brake_n"))

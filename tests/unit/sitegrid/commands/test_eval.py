@@ -48,21 +48,51 @@ def test_options_of_an_experiment_reach_it(monkeypatch, capsys):
     assert default_options["seconds"] == 1200.0
 
 
+@pytest.mark.slow
+def test_the_table_is_made_on_the_scenario_that_is_asked_for(monkeypatch, capsys):
+    from evaluation.campaign.recordings import SETUPS
+    from evaluation.positions import table
+
+    assert tuple(SETUPS) == command.SCENARIOS
+    asked = []
+    monkeypatch.setattr(table, "run", lambda _, **options: (asked.append(options["setup"]), ({"rows": []}, []))[1])
+    for words in ((), ("--scenario", "haul_road_driven")):
+        assert cli.main(["eval", "localisation", *words, "--json"]) == 0
+    assert asked == [SETUPS["paper_site"], SETUPS["haul_road_driven"]]
+    with pytest.raises(SystemExit):
+        parse("localisation", "--scenario", "loading")
+    assert "invalid choice: 'loading'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [("--json", "physics"), ("physics", "--json")])
 def test_json_stands_before_or_behind_what_is_run(words: tuple[str, ...]):
     assert parse(*words).json
     assert not parse("physics").json
 
 
-def test_withheld_time_is_given_as_seconds_of_a_period():
-    assert parse("log", "m", "--withhold", "10/30", "--withhold", "none").withhold == [(10.0, 30.0), (0.0, 1.0)]
+def test_withheld_time_is_given_as_seconds_of_a_period_or_as_start_and_length():
+    words = ("--withhold", "10/30", "--withhold", "none", "--withhold", "0,60.5")
+    assert parse("log", "m", *words).withhold == [("/", 10.0, 30.0), ("none", 0.0, 0.0), (",", 0.0, 60.5)]
     assert parse("log", "m").withhold is None
+
+
+def test_receivers_are_given_as_a_number_or_by_name_and_options_as_files_have_them():
+    given = parse(
+        "log", "m", "--gps", "2", "--sensors", "imu, gps-1", "--set", "start=[1, 2, 0.5]", "--set", "filter=ekf"
+    )
+    assert (given.gps, given.sensors) == (2, ("imu", "gps-1"))
+    assert given.set == [("start", [1, 2, 0.5]), ("filter", "ekf")]
+    assert parse("log", "m", "--gps", "gps-1,gps-3").gps == ("gps-1", "gps-3")
 
 
 @pytest.mark.parametrize(
     "words",
     [
         *(("log", "m", "--withhold", bad) for bad in ("30/10", "10", "a/b", "0/10", "1/inf", "nan/3")),
+        *(("log", "m", "--withhold", bad) for bad in ("-1,5", "5,0", "1,inf", "nan,3", "1,2,3", ",", "")),
+        *(("log", "m", "--gps", bad) for bad in ("0", "-1", "", "gps-1,")),
+        *(("log", "m", "--set", bad) for bad in ("slip", "=3", "slip=")),
+        ("log", "m", "--sensors", ","),
         ("localisation", "--seeds", "0"),
         ("localisation", "--first-seed", "-1"),
         ("localisation", "--seconds", "0"),
@@ -80,6 +110,12 @@ def test_a_log_that_the_pipeline_cannot_run_is_one_line(tmp_path: Path, capsys):
     (tmp_path / "wheels.csv").write_text("t,l,r\n1,0,0\n")
     assert cli.main(["eval", "log", str(tmp_path), "--gps", "1"]) == 1
     assert capsys.readouterr().err == "sitegrid: mower has 0 GPS receivers, not 1\n"
+    assert cli.main(["eval", "log", str(tmp_path), "--set", "slip=wet"]) == 1
+    assert capsys.readouterr().err == "sitegrid: --set slip: float is expected, not str ('wet')\n"
+    assert cli.main(["eval", "log", str(tmp_path), "--set", "slid=1"]) == 1
+    assert "--set: unknown key `slid`; known: filter, profile, start" in capsys.readouterr().err
+    assert cli.main(["eval", "log", str(tmp_path)]) == 1
+    assert "mower: no sensor in use shows its place" in capsys.readouterr().err
     assert cli.main(["eval", "log", str(tmp_path / "none.toml"), "--json"]) == 1
     assert "no such file" in json.loads(capsys.readouterr().err)["error"]
 

@@ -14,6 +14,7 @@ from agents.localisation.filters.motion import (
     SLIP_TIME_S,
     GpsError,
     MotionModel,
+    gps_covariance,
     map_from_base,
     motion,
 )
@@ -168,6 +169,58 @@ def test_gps_errors_fade_exactly_and_keep_their_variance() -> None:
     variance = np.array([3.0, 3.0, 1.5, 1.5])
     for fade, Q in ((decay, one.Q), (short, part.Q)):
         np.testing.assert_allclose(fade**2 * variance + np.diag(Q)[errors], variance)
+
+
+SHARED = (GpsError(3.0, 45.0, (1.0, 1.5)), GpsError(1.5, 20.0, (0.6, 0.0)))
+
+
+def test_what_receivers_share_moves_both_and_lasts_as_the_covariance_says() -> None:
+    """Their errors stay as wide, and as much alike, as they are; ten short steps equal a long one."""
+    x, errors = np.ones(FULL.n), FULL.gps_errors
+    S = np.kron(gps_covariance(SHARED), np.eye(2))
+    long, short = (motion(MotionModel(FULL, gps_errors=SHARED), at(x), dt_s) for dt_s in (5.0, 0.5))
+    for moves in (long, short):
+        F = moves.jacobian(x)[errors, errors]
+        np.testing.assert_allclose(F @ S @ F.T + moves.Q[errors, errors], S, atol=1e-12)
+    F, P = short.jacobian(x)[errors, errors], np.zeros((4, 4))
+    for _ in range(10):
+        P = F @ P @ F.T + short.Q[errors, errors]
+    np.testing.assert_allclose(P, long.Q[errors, errors], atol=1e-12)
+    assert S[0, 2] == pytest.approx(0.6 * 2 * math.sqrt(45 * 20) / (45 + 20))
+
+
+def test_errors_of_equal_times_are_those_of_a_common_process_and_own_ones() -> None:
+    """The same as states for common and own errors apart: their sum fades alike, and its noise is the sum of theirs."""
+    share, variance_m2, dt_s = 0.8, 2.5, 3.0
+    model = MotionModel(FULL, gps_errors=(GpsError(variance_m2, 45.0, (share * variance_m2,)),) * 2)
+    moves = motion(model, at(np.zeros(FULL.n)), dt_s)
+    added_m2 = variance_m2 * -math.expm1(-2 * dt_s / 45.0)
+    sums = np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])  # common + own, of each
+    parts = np.diag([share, 1 - share, 1 - share]) * added_m2
+    east = FULL.gps_errors.start + np.array([0, 2])
+    np.testing.assert_allclose(moves.Q[np.ix_(east, east)], sums @ parts @ sums.T, rtol=1e-12)
+    np.testing.assert_array_equal(moves.Q[np.ix_(east, east + 1)], 0.0)
+
+
+def test_any_parts_and_times_make_a_definite_covariance_and_noise() -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(200):
+        variances, times = 10 ** rng.uniform(-4, 2, 4), 10 ** rng.uniform(0, 3, 4)
+        shares = 0.999 * rng.dirichlet((1, 1, 0.05), 4)[:, :2]
+        rows = zip(variances.tolist(), times.tolist(), shares.tolist(), strict=True)
+        errors = tuple(GpsError(v, t, tuple(v * part for part in parts)) for v, t, parts in rows)
+        S = gps_covariance(errors)
+        scale = np.sqrt(np.outer(variances, variances))
+        fading = np.exp(-0.2 / times)
+        for covariance in (S, S * (1 - np.outer(fading, fading))):
+            assert np.linalg.eigvalsh(covariance / scale).min() > -1e-12
+        np.testing.assert_array_equal(np.diag(S), variances)
+
+
+@pytest.mark.parametrize("common_m2", [(-0.1,), (3.0,), (1.5, 1.5), (math.nan,)])
+def test_receivers_share_no_more_than_they_err(common_m2: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="common_m2"):
+        GpsError(3.0, 45.0, common_m2)
 
 
 def test_at_a_standstill_nothing_slips() -> None:

@@ -1,0 +1,173 @@
+"""CSV files of logs: how a manifest describes a file and its columns, and what its rows hold (docs/log-folders.md)."""
+
+import csv
+import gzip
+import math
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import IO, Any
+
+from protocol.config import from_table
+from protocol.errors import ConfigError, LogFolderError, RowError
+from protocol.units import factor, stamp_ns, stamp_scale
+
+MAX_LINE = 2**20  # characters of a CSV file
+SPACES = " "  # as a delimiter: any number of spaces and tabs
+DELIMITERS = (",", ";", "\t", SPACES)
+Row = Mapping[str, str]  # texts by column
+
+
+@dataclass(frozen=True)
+class CsvFile:
+    """A CSV file of the data folder.
+
+    names: of its columns, where its first line does not name them; lines that begin with # are comments then. at_least:
+    the least values of columns that say whether a row counts, as a receiver's kind of fix does.
+    """
+
+    file: str
+    names: tuple[str, ...] = ()
+    delimiter: str = ","
+    at_least: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        if self.delimiter not in DELIMITERS:
+            raise ValueError(f"delimiter: {self.delimiter!r} is none of {', '.join(map(repr, DELIMITERS))}")
+        if twice := [name for name in self.names if not name or self.names.count(name) > 1]:
+            raise ValueError(f"names: {twice[0]!r} is empty, or stands there twice")
+
+    def check(self, row: Row) -> None:
+        """Raise RowError on a row that does not count, ValueError where that cannot be known."""
+        for name, least in self.at_least.items():
+            if not float(row[name]) >= least:  # also true for NaN
+                raise RowError("below_least", f"{name}: {row[name]} is below {least:g}")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A value of a row: the sum of CSV columns times their weights, plus an offset, in a unit; it may be constant."""
+
+    weights: Mapping[str, float] = field(default_factory=dict, hash=False)
+    unit: str = ""
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Written:
+    """A column as the manifest has it, if it is not a mere name."""
+
+    column: str | None = None
+    columns: Mapping[str, float] | None = None
+    value: float | None = None
+    unit: str = ""
+    offset: float = 0.0
+
+
+def take_file(table: dict[str, Any], where: str) -> CsvFile:
+    """Take the keys of a CSV file out of a table."""
+    return from_table(CsvFile, {f.name: table.pop(f.name) for f in fields(CsvFile) if f.name in table}, where)
+
+
+def parse_column(value: Any, name: str, where: str) -> Column:
+    """Parse what a manifest writes for a field of that name; raises ConfigError, also on a unit that does not fit."""
+    column = Column({value: 1.0}) if isinstance(value, str) and value else _parse_table(value, where)
+    try:
+        stamp_reader(column) if name == "stamp" else number_reader(column, name)
+    except ValueError as error:
+        raise ConfigError(where, str(error)) from None
+    return column
+
+
+def _parse_table(value: Any, where: str) -> Column:
+    written = from_table(_Written, value, where) if isinstance(value, dict) else _Written()
+    given = (written.column, written.columns, written.value)
+    if (
+        sum(one is not None for one in given) != 1
+        or written.column == ""
+        or (written.value is not None and written.offset)
+    ):
+        forms = '{ column = "name", unit = "deg", offset = 1.5 }, { columns = { left = 0.5, right = 0.5 } }'
+        raise ConfigError(where, f'write "name", {forms} or {{ value = 0.01 }}')
+    if written.value is not None:
+        return Column({}, written.unit, written.value)
+    weights = {written.column: 1.0} if written.column else dict(written.columns or {})
+    if not weights or not all(weights.values()):
+        raise ConfigError(where, "columns: names with weights other than 0 are expected")
+    return Column(weights, written.unit, written.offset)
+
+
+def number_reader(column: Column, name: str) -> Callable[[Row], float]:
+    """What makes the value of a field of a row, in the unit of the field's suffix.
+
+    Raises ValueError if the unit is not known or does not fit; so does what it returns on a text that is no number.
+    """
+    scale = factor(column.unit, name) if column.unit else 1.0
+    offset, weights = column.offset * scale, [(c, w * scale) for c, w in column.weights.items()]
+    if len(weights) == 1 and not offset:
+        ((only, weight),) = weights
+        return lambda row: float(row[only]) * weight
+    return lambda row: sum((float(row[c]) * w for c, w in weights), offset)
+
+
+def stamp_reader(column: Column) -> Callable[[Row], int]:
+    """What makes nanoseconds of a row's time, exactly where all its numbers are whole; raises ValueError.
+
+    Seconds and nanoseconds may stand in two columns, of weights 1.0 and 1e-9.
+    """
+    unit_ns = stamp_scale(column.unit or "s")
+    if not column.weights or column.offset:
+        raise ValueError("a column is expected, neither a constant nor an offset: times count from `start_ns`")
+    scales = {name: round(weight * unit_ns) for name, weight in column.weights.items()}
+    for name, weight in column.weights.items():
+        if not scales[name] or not math.isclose(scales[name], weight * unit_ns, rel_tol=1e-9):
+            raise ValueError(f"{weight:g} of `{name}` is no whole number of nanoseconds")
+    return lambda row: sum(stamp_ns(row[name], scale) for name, scale in scales.items())
+
+
+@contextmanager
+def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str]"]:
+    """The rows of a file; raises LogFolderError where it cannot be read."""
+    path = folder / csv_file.file
+    try:
+        with open_text(path) as text:
+            rows = csv.DictReader(
+                _lines(text, path, csv_file),
+                fieldnames=csv_file.names or None,
+                delimiter="," if csv_file.delimiter == SPACES else csv_file.delimiter,
+            )
+            require(csv_file.at_least, rows, path)
+            yield rows
+    except (OSError, EOFError, zlib.error, ValueError, csv.Error) as error:  # ValueError: no UTF-8, or no path
+        raise LogFolderError(path, f"cannot be read: {error}") from None
+
+
+def require(names: Mapping[str, float], rows: "csv.DictReader[str]", path: Path) -> None:
+    """Refuse a file that lacks a column."""
+    header = rows.fieldnames or ()
+    for name in names:
+        if name not in header:
+            raise LogFolderError(path, f"has no column `{name}`; it has {', '.join(header)}")
+
+
+def open_text(path: Path) -> IO[str]:
+    """Open a text file for reading, compressed if its name ends in .gz; raises OSError."""
+    if path.suffix == ".gz":
+        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
+    return path.open(encoding="utf-8-sig", newline="")  # with or without the mark that spreadsheets write
+
+
+def _lines(text: IO[str], path: Path, csv_file: CsvFile) -> Iterator[str]:
+    """Lines, refused where one is too long: a small compressed file can hold a line of many gigabytes.
+
+    Comments become empty lines, so that the reader counts them and does not read them.
+    """
+    while line := text.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            raise LogFolderError(path, f"cannot be read: a line is longer than {MAX_LINE} characters")
+        if csv_file.names and line.startswith("#"):
+            yield "\n"
+        else:
+            yield ",".join(line.split()) + "\n" if csv_file.delimiter == SPACES else line
