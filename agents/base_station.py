@@ -21,7 +21,7 @@ from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import Correction, Gps, Reading
 from protocol.site.site_config import Projection
 
-SPAN_NS = 200_000_000  # fixes of so long make one correction: five a second
+SPAN_NS = 200_000_000  # one correction in so long, as soon as all receivers have spoken
 SILENT_NS = 5_000_000_000  # a receiver without fixes for so long counts no more
 FAR_M = 1000.0  # a fix further off is no fix of this place
 PINNED = 25  # equal fixes in a row: a receiver that holds its place while it stands shows no error
@@ -66,7 +66,7 @@ class LastingError:
         """Learn from the error at a later stamp."""
         if not self._stamp_ns:
             self._P = np.diag([slow_m2, OFFSET_STD_M**2])
-        dt_s = (stamp_ns - (self._stamp_ns or stamp_ns)) * 1e-9
+        dt_s = max(stamp_ns - (self._stamp_ns or stamp_ns), 0) * 1e-9  # a clock may have been set back
         self._stamp_ns = stamp_ns
         fade = math.exp(-dt_s / time_s)
         self._x = self._x * [fade, 1.0]
@@ -97,13 +97,12 @@ class BaseStation:
         self._sensors = {s.name: s for s in sensors if s.kind == Gps.kind and s.use}
         self._antennas = {n: np.array(place_m) + s.mount.xyz_m[:2] for n, s in self._sensors.items()}
         self._order = StreamOrder()
-        self._span: dict[str, list[_Fix]] = {}
-        self._span_number = 0
+        self._span: dict[str, _Fix] = {}  # the first fix of each receiver
+        self._span_number, self._is_said = 0, False
         self._heard_ns: dict[str, int] = {}
         self._last: dict[str, tuple[float, float]] = {}
         self._pinned: Counter[str] = Counter()
         self._lasting = LastingError()
-        self._published_ns = 0
 
     def step(self, readings: Sequence[Reading]) -> list[Correction]:
         """Take in readings in the order of their stamps; returns the corrections of the spans that they complete."""
@@ -136,15 +135,17 @@ class BaseStation:
         fix = self._fix(reading)
         if fix is None:
             return None
+        if not self._heard_ns:  # at first all receivers are waited for
+            self._heard_ns = dict.fromkeys(self._sensors, fix.stamp_ns)
         if fix.stamp_ns // SPAN_NS != self._span_number:
-            made = self._close()
-            self._span_number = fix.stamp_ns // SPAN_NS
-        else:
-            made = None
+            self._span, self._span_number, self._is_said = {}, fix.stamp_ns // SPAN_NS, False
         self._heard_ns[reading.sensor] = fix.stamp_ns
         self._heard_ns = {n: ns for n, ns in self._heard_ns.items() if fix.stamp_ns - ns < SILENT_NS}
-        self._span.setdefault(reading.sensor, []).append(fix)
-        return made or self._close()
+        self._span.setdefault(reading.sensor, fix)
+        if self._is_said or set(self._span) != set(self._heard_ns):
+            return None
+        self._is_said = True
+        return self._correction(list(self._span.values()))
 
     def _fix(self, reading: Reading) -> _Fix | None:
         """What a fix is off; None of a reading that does not count."""
@@ -156,7 +157,7 @@ class BaseStation:
         if decision is Decision.REFUSE:
             return None
         if decision is Decision.RESTART:
-            self._span, self._heard_ns, self._lasting = {}, {}, LastingError()
+            self._heard_ns = {}  # what it learnt of its lasting error stays
         place = reading.lat_deg, reading.lon_deg
         self._pinned[sensor.name] = self._pinned[sensor.name] + 1 if self._last.get(sensor.name) == place else 0
         self._last[sensor.name] = place
@@ -175,23 +176,14 @@ class BaseStation:
         white_m2 = max((1 - sensor.drift_share) * stated_m2, least_m2)
         return _Fix(reading.stamp_ns, off_m, white_m2, max(sensor.drift_share * stated_m2, MIN_DRIFT_M2))
 
-    def _close(self) -> Correction | None:
-        """The correction of the span, once all receivers that are heard have spoken."""
-        if not self._span or set(self._span) != set(self._heard_ns):
-            return None
-        fixes = [fix for several in self._span.values() for fix in several]
-        self._span = {}
-        if self._published_ns >= max(f.stamp_ns for f in fixes):
-            return None
+    def _correction(self, fixes: Sequence[_Fix]) -> Correction:
+        """The mean of one fix of each receiver. What is slow in them they are taken to have in common."""
         n = len(fixes)
         stamp_ns = fixes[0].stamp_ns + sum(f.stamp_ns - fixes[0].stamp_ns for f in fixes) // n
         off_m = sum((f.off_m for f in fixes), np.zeros(2)) / n
         white_m2, slow_m2 = sum(f.white_m2 for f in fixes) / n**2, sum(f.slow_m2 for f in fixes) / n
-        time_s = min(self._sensors[name].drift_time_s for name in self._heard_ns)
+        time_s = min(self._sensors[name].drift_time_s for name in self._span)
         self._lasting.update(stamp_ns, off_m, white_m2, slow_m2, time_s)
-        self._published_ns = stamp_ns
         self.counters["corrections"] += 1
-        offset_m, variance_m2 = self._lasting.offset_m, self._lasting.variance_m2
-        return Correction(
-            self._name, stamp_ns, *off_m.tolist(), white_m2, slow_m2, time_s, *offset_m.tolist(), variance_m2
-        )
+        offset_m, offset_m2 = self._lasting.offset_m.tolist(), self._lasting.variance_m2
+        return Correction(self._name, stamp_ns, *off_m.tolist(), white_m2, slow_m2, time_s, *offset_m, offset_m2)

@@ -212,6 +212,7 @@ class Pipeline:
                 name: {**asdict(value), "good": value.is_good} for name, value in localiser.consistency.items()
             },
             "machine_share": localiser.machine_share,
+            "base": localiser.base_report(),
         }
 
     def _take(self, stamps: Iterable[Accepted]) -> list[Table]:

@@ -31,6 +31,7 @@ MAX_AGE_S = 30.0  # older ones are refused: by then a slow GPS error has mostly 
 MAX_AHEAD_S = 10.0  # so far ahead of the machine's own readings they wait for these; beyond that a clock is wrong
 REPEATS = 5  # the same error so often in a row is no measurement any more
 GATE_SIGMA = 4.0  # as of fixes
+TRUST = 0.95  # of the share found: the heading that it is judged by has followed the corrections a little
 LEAST_SHARE = 0.05  # a smaller one is none
 UNKNOWN = GpsError(1.0, 45.0)
 
@@ -97,7 +98,7 @@ class Corrections:
     @property
     def site_share(self) -> float:
         """How much of the slow variance machine and base have in common; rounded, so that it does not always change."""
-        return round(self._share.share, 2) if self._accepted else 0.0
+        return round(TRUST * self._share.share, 2) if self._accepted else 0.0
 
     def measurement(self, belief: Belief) -> Measurement | None:
         """The newest correction that is due, as a measurement at the belief's stamp; None where none is.

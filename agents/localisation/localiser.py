@@ -86,6 +86,7 @@ class Localiser:
         self._receivers = Receivers(
             machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
         )
+        self._base = machine.base
         self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
         self._references = References(machine.sensors, layout)
         source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
@@ -116,8 +117,10 @@ class Localiser:
 
     def base_report(self) -> dict[str, Any] | None:
         """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
-        now_ns = self._fusion.belief.stamp_ns if self._fusion else 0
-        return self._corrections.report(now_ns) if self._corrections else None
+        if self._corrections:
+            return self._corrections.report(self._fusion.belief.stamp_ns if self._fusion else 0)
+        why = "the profile `paper` uses none" if self._config.profile == "paper" else "no GPS receiver shows places"
+        return {"name": self._base.name, "used": False, "why_not": why} if self._base else None
 
     @property
     def machine_share(self) -> float | None:

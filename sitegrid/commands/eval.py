@@ -36,8 +36,9 @@ def add_options(parser: ArgumentParser) -> None:
     )
     table = add_action(what, "localisation", "repeat the paper's table on simulated recordings")
     ground = add_action(what, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work")
+    base = add_action(what, "base", "measure what a base station brings, also one that fails")
     merge = add_action(what, "merge", "compare this map merge with other methods")
-    for action, seeds in ((physics, 3), (table, 12), (ground, 12), (merge, 12)):
+    for action, seeds in ((physics, 3), (table, 12), (ground, 12), (base, 12), (merge, 12)):
         action.add_argument("--seeds", type=count, default=seeds, help="number of seeds (default %(default)s)")
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
@@ -49,7 +50,9 @@ def add_options(parser: ArgumentParser) -> None:
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
         action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
-    for action, seconds in ((table, 1200.0), (ground, 600.0)):
+    base.add_argument("--out", type=FOLDER, default="eval-output", help=out)
+    base.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
+    for action, seconds in ((table, 1200.0), (ground, 600.0), (base, 1200.0)):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
     scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
@@ -86,6 +89,7 @@ def run(arguments: Namespace) -> int:
         "physics": _physics,
         "localisation": _localisation,
         "ground": _ground,
+        "base": _base,
         "merge": _merge,
         "log": _log,
         "parity": _parity,
@@ -123,6 +127,13 @@ def _ground(arguments: Namespace) -> Report:
     return _experiment(arguments, "loaders work, estimators follow", work, "evaluation.ground.plots")
 
 
+def _base(arguments: Namespace) -> Report:
+    from evaluation.positions import base_station
+
+    work = partial(base_station.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    return _experiment(arguments, "machines drive beside a base station", work)
+
+
 def _merge(arguments: Namespace) -> Report:
     from evaluation.maps import experiment
     from evaluation.maps.cases import select
@@ -132,8 +143,10 @@ def _merge(arguments: Namespace) -> Report:
     return _experiment(arguments, "machines drive, their samples are merged", work, "evaluation.maps.plots")
 
 
-def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str) -> Report:
-    """Run an experiment with its progress shown, and draw its pictures where they are asked for."""
+def _experiment(
+    arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str = ""
+) -> Report:
+    """Run an experiment with its progress shown, and draw its pictures where there are any and they are asked for."""
     from evaluation.campaign.experiment import Runner
     from evaluation.campaign.workers import cores
 
@@ -143,7 +156,7 @@ def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple
         report, outcomes = work(runner)
     if not arguments.json:
         note(f"recordings and results are in {arguments.out}")
-    if arguments.plots:
+    if plots and arguments.plots:
         pictures = import_module(plots)  # imported here: only pictures need matplotlib
         report = {**report, "plots": list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))}
     return report

@@ -39,7 +39,9 @@ def grant(role: str, site: str, name: str) -> Grant:
     """What the holder of a role may do under its name."""
     map_all, poses, health = _whole(site, "map"), keys.poses_all(site), keys.health_all(site)
     asks, alive = keys.map_queries_all(site), (keys.alive(site, name),)
-    visitor = Grant(subscribe=(map_all, poses, health), query=(asks,), watch=(keys.alive_all(site),))
+    visitor = Grant(
+        subscribe=(map_all, poses, health, keys.corrections_all(site)), query=(asks,), watch=(keys.alive_all(site),)
+    )
     grants = {
         "machine": Grant(
             publish=(_whole(site, "machine", name),),
