@@ -37,7 +37,8 @@ class BaseAgent:
     ) -> None:
         """machine: name and receivers of the base."""
         projection = Projection(site)
-        x_m, y_m, _ = projection.to_map(*config.place, site.origin_height_m)
+        latitude_deg, longitude_deg = config.place
+        x_m, y_m, _ = projection.to_map(latitude_deg, longitude_deg, site.origin_height_m)
         self._frame = site.frame
         self._station = BaseStation(machine.name, machine.sensors, (x_m, y_m), projection)
         self._presence = Presence(session, site.name, machine.name, owner)

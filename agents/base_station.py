@@ -185,5 +185,6 @@ class BaseStation:
         time_s = min(self._sensors[name].drift_time_s for name in self._span)
         self._lasting.update(stamp_ns, off_m, white_m2, slow_m2, time_s)
         self.counters["corrections"] += 1
-        offset_m, offset_m2 = self._lasting.offset_m.tolist(), self._lasting.variance_m2
-        return Correction(self._name, stamp_ns, *off_m.tolist(), white_m2, slow_m2, time_s, *offset_m, offset_m2)
+        (east_m, north_m), (offset_e_m, offset_n_m) = off_m.tolist(), self._lasting.offset_m.tolist()
+        offset = offset_e_m, offset_n_m, self._lasting.variance_m2
+        return Correction(self._name, stamp_ns, east_m, north_m, white_m2, slow_m2, time_s, *offset)

@@ -97,7 +97,7 @@ class Positioning:
             self._counters["reading_unknown_sensor"] += 1
             return
         if isinstance(reading, Correction):  # of another one's clock, and late: it takes effect with the next readings
-            self.localiser.take(self._undelayed(reading))
+            self.localiser.take(replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)))
             return
         known_ns = max(reading.stamp_ns, sensor.true_ns(reading.stamp_ns))  # never before it was true
         yield from self._accept(self._order.gather(reading, known_ns))

@@ -168,15 +168,16 @@ class Localiser:
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
     def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
-        """Beliefs that an event changed."""
+        """Beliefs that an event changed, and then a correction that is due."""
+        beliefs = self._filter_own(fusion, event)
+        return beliefs + self._correct(fusion, self._corrections, event) if self._corrections else beliefs
+
+    def _filter_own(self, fusion: Fusion, event: Event) -> list[Belief]:
+        """Beliefs that an event of the machine's own sensors changed."""
         if isinstance(event, Measurement):
             return fusion.add([event])
         if isinstance(event, Fix):
-            beliefs = self._filter_modal(fusion, self._receivers, event)
-            if self._corrections:
-                white_m2, error = self._receivers.expected(event)
-                self._corrections.compare(event, fusion.belief, white_m2, error)
-            return beliefs
+            return self._filter_modal(fusion, self._receivers, event)
         fusion.model = replace(fusion.model, traction=event.traction)
         beliefs: list[Belief] = []
         for orientation in self._references.own_stamped(event):
@@ -187,20 +188,22 @@ class Localiser:
             *self._body.turn(event),
             *self._body.wheels(event),
         ]
-        beliefs += fusion.add(measurements) if measurements else []
-        if self._corrections:
-            self._corrections.follow(fusion.belief)
-        return beliefs + self._correct(fusion)
+        return beliefs + (fusion.add(measurements) if measurements else [])
 
-    def _correct(self, fusion: Fusion) -> list[Belief]:
-        """Beliefs that a base station's correction changed, if one is due."""
-        measurement = self._corrections.measurement(fusion.belief) if self._corrections else None
-        if measurement is None or self._corrections is None:
+    def _correct(self, fusion: Fusion, corrections: Corrections, event: Event) -> list[Belief]:
+        """Beliefs that a base station's corrections changed, as of what the event shows."""
+        if isinstance(event, Fix):
+            corrections.compare(event, fusion.belief, *self._receivers.expected(event))
+        if not isinstance(event, FilterStep):
+            return []
+        corrections.follow(fusion.belief)
+        measurement = corrections.measurement(fusion.belief)
+        if measurement is None:
             return []
         fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
         beliefs = fusion.add([measurement])
         if beliefs:
-            self._corrections.confirm(fusion.last[measurement.sensor])
+            corrections.confirm(fusion.last[measurement.sensor])
         return beliefs
 
     def _gps_errors(self) -> tuple[GpsError, ...]:

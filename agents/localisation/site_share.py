@@ -84,12 +84,12 @@ class SiteShareEstimator:
 
     def add_fix(self, receiver: str, stamp_ns: int, off_m: Floats, white_m2: float, error: GpsError) -> None:
         """Take in what a fix is off from the antenna by dead reckoning (2,)."""
-        if receiver != self._receiver:
-            if stamp_ns - self._heard_ns < SILENT_NS and self._receiver:
-                return
-            self._receiver, self._driven_m = receiver, UNKNOWN_M2 / RECKONED_M2_PER_M  # another slow error
-        self._heard_ns = stamp_ns
+        if self._receiver not in (receiver, "") and stamp_ns - self._heard_ns < SILENT_NS:
+            return
         self._reach(stamp_ns)
+        if self._receiver != receiver:  # another slow error: it counts from anywhere
+            self._receiver, self._driven_m = receiver, UNKNOWN_M2 / RECKONED_M2_PER_M
+        self._heard_ns = stamp_ns
         self._machine = error
         self._fixes.add(off_m, white_m2)
 

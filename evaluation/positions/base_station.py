@@ -149,8 +149,12 @@ def _solve(task: Task[BaseCase], cache: Path) -> BaseRun:
     positioning = Positioning(recording.site, machine, PipelineConfig())
     trace = replay(positioning, readings)
     counters, state = positioning.counters, positioning.localiser.base_report()
-    taken = {"used": counters["base_used"], "gated": counters["base_gated"], "share": state["share"] if state else 0.0}
-    return BaseRun(**vars(score(trace, recording.truth)), **taken)
+    return BaseRun(
+        **vars(score(trace, recording.truth)),
+        used=counters["base_used"],
+        gated=counters["base_gated"],
+        share=state["share"] if state else 0.0,
+    )
 
 
 def corrections(
