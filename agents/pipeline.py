@@ -19,9 +19,9 @@ from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.localisation.imu_steps import Sensed
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
+from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler, Samples, joined
+from agents.smoothed_track import SmoothedTrack
 from agents.stream_order import Decision, StreamOrder, by_stamp
-from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction, Reading
 from protocol.site.site_config import Projection, SiteConfig
@@ -163,7 +163,7 @@ class Pipeline:
     ) -> None:
         """calibration: of the ground estimator, from before."""
         self._site, self._machine = site, in_name_order(machine)
-        self._config = config
+        self._config, self._smooths = config, config.localisation.smoothing_s > 0
         self._positioning = Positioning(site, machine, config)
         self._counters: Counter[str] = Counter()
         self._newest_ns = 0
@@ -178,19 +178,25 @@ class Pipeline:
         """Pose at a recent stamp, None where it is not known."""
         return self._positioning.pose_at(stamp_ns)
 
-    def step(self, readings: Sequence[Reading]) -> Table:
-        """Take in readings in the order of their stamps; returns the samples (n,) that they made possible."""
-        return _joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
+    @property
+    def pending(self) -> int:
+        """How many samples are not final yet."""
+        return self._sampler.pending
 
-    def finish(self) -> Table:
-        """Samples (n,) of what still waits, as the stream ends."""
-        return _joined([*self._take(self._positioning.finish()), self._remainder()])
+    def step(self, readings: Sequence[Reading]) -> Samples:
+        """Take in readings in the order of their stamps; returns the samples that they made possible."""
+        return joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
 
-    def _remainder(self) -> Table:
-        """Samples (n,) of what waits and can be sampled; the rest never will be."""
-        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
+    def settle(self) -> Samples:
+        """Samples of all that is known now, all of them final: no reading may come for long."""
+        rest = self._take(self._positioning.finish())
+        return joined([*rest, self._settle(self._positioning.remaining())])
+
+    def finish(self) -> Samples:
+        """The same, as the stream ends; what has no place then is counted."""
+        samples = self.settle()
         self._sampler.withheld["no_pose"] += self._sampler.waiting
-        return rows
+        return samples
 
     @property
     def calibration(self) -> Calibration:
@@ -215,19 +221,20 @@ class Pipeline:
             "base": localiser.base_report(),
         }
 
-    def _take(self, stamps: Iterable[Accepted]) -> list[Table]:
-        return [rows for accepted in stamps for rows in self._take_one(accepted)]
+    def _take(self, stamps: Iterable[Accepted]) -> list[Samples]:
+        return [samples for accepted in stamps for samples in self._take_one(accepted)]
 
-    def _take_one(self, accepted: Accepted) -> list[Table]:
-        readings, poses, _, restarts = accepted
-        made: list[Table] = []
+    def _take_one(self, accepted: Accepted) -> list[Samples]:
+        readings, poses, smoothed, restarts = accepted
+        self._track.append(smoothed)
+        made: list[Samples] = []
         if restarts:
-            made.append(self._remainder())
-            self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
+            made.append(self._settle(()))
+            self._count_withheld()
             self._start(self._estimator.calibration)
         for pose in poses:  # each at once: after a late alignment they are more than the history holds
             self._positioning.poses.append(pose)
-            made.append(self._due_samples())
+            made += self._due_samples()
         stamp_ns = readings[0][0].stamp_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
@@ -236,10 +243,25 @@ class Pipeline:
             self._estimator.update(reading, sensor, dead_reckoning, self._known_c_rr())
             distance_m = self._odometer.update(reading, dead_reckoning.distance_m, speed_mps)
         self._sampler.mark(stamp_ns, distance_m)
-        return [*made, self._due_samples()]
+        made += self._due_samples()
+        if smoothed:
+            made.append(Samples(NOTHING, self._sampler.final_samples(self._track.corrected)))
+        return made
 
-    def _due_samples(self) -> Table:
-        return self._sampler.due_samples(self._newest_ns, self._estimator.at)
+    def _due_samples(self) -> list[Samples]:
+        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at)
+        if not len(rows):
+            return []
+        return [Samples(rows, NOTHING if self._smooths else self._sampler.final_samples(lambda pose: pose))]
+
+    def _settle(self, remaining: Sequence[SmoothedPose]) -> Samples:
+        """Samples of all that is known. remaining: smoothed poses that are not final."""
+        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
+        return Samples(rows, self._sampler.final_samples(lambda pose: self._track.corrected_by_now(pose, remaining)))
+
+    def _count_withheld(self) -> None:
+        self._sampler.withheld["no_pose"] += self._sampler.waiting
+        self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
 
     def _known_c_rr(self) -> float | None:
         """Resistance of the ground here, where the site states it and the position is sure enough."""
@@ -256,16 +278,12 @@ class Pipeline:
         self._estimator = GroundEstimator(machine, config.estimation, known)
         self._sampler = Sampler(self._positioning.poses, machine.load_centre_m)
         self._odometer = Odometer()
+        self._track = SmoothedTrack()
 
 
 def in_name_order(machine: MachineConfig) -> MachineConfig:
     """The machine with its sensors by name: the order of their tables in a file must not change any result."""
     return replace(machine, sensors=tuple(sorted(machine.sensors, key=attrgetter("name"))))
-
-
-def _joined(tables: Sequence[Table]) -> Table:
-    made = [rows for rows in tables if len(rows)]
-    return np.concatenate(made) if made else NOTHING
 
 
 PoseSource = Positioning | Pipeline  # what locates a machine

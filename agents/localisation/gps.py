@@ -6,6 +6,7 @@ and yaw (navsat_transform): on the way back into the map the rotations cancel, a
 """
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,6 +17,7 @@ from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation import measurements
 from agents.localisation.consistency import Consistency, InnovationMonitor
 from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, anchor_states
+from agents.localisation.filters.late_measurements import RELOCK
 from agents.localisation.filters.motion import GpsError, gps_covariance
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
@@ -27,7 +29,7 @@ from protocol.site.site_config import Projection
 
 MIN_FIX_STD_M = 0.3  # receivers state less than their error; one whose std is configured may be better
 GATE_SIGMA = 4.0  # fixes further off are refused: outliers of GPS are common
-AGREED_NS = 3_000_000_000  # a receiver that was accepted so lately says that the filter is not lost
+AGREED_NS = 3_000_000_000  # so old a fix may be to say whether its receiver agrees with the filter
 MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
 
 
@@ -90,7 +92,9 @@ class Receivers(ModalSensors[Fix]):
         self._estimator = ShareEstimator(len(absolute))
         self._configured = machine_share
         self._monitors = {name: InnovationMonitor() for name in self._sensors}
-        self._accepted_ns: dict[str, int] = {}
+        self._judged: dict[str, tuple[int, bool]] = {}  # stamp of the last fix of each, and whether it was accepted
+        self._refused: Counter[str] = Counter()  # in a row
+        self._jumps: dict[str, tuple[int, float]] = {}  # stamp, and how far off the receiver was by itself [m2]
         self._shifts: dict[str, Floats] = {}  # of relative ones, and how unsure the believed antenna was then [m2]
         self._anchor_m2: dict[str, float] = {}
 
@@ -144,9 +148,13 @@ class Receivers(ModalSensors[Fix]):
         super().confirm(fix, result)
         name = fix.sensor.name
         self._monitors[name].note(result)
+        self._judged[name] = (fix.stamp_ns, result.accepted)
         if not result.accepted:
+            self._refused[name] += 1
+            if self._refused[name] % RELOCK == 0 and self._is_outvoted(fix):
+                self._jumps[name] = (fix.stamp_ns, float((result.innovation**2).mean()))
             return
-        self._accepted_ns[name] = max(fix.stamp_ns, self._accepted_ns.get(name, 0))
+        self._refused[name] = 0
         if len(self._compared) > 1 and name in self._compared:
             white_m2, slow_m2, time_s = float(self._white(fix).mean()), self._drift_m2[name], fix.sensor.drift_time_s
             i, antenna = self._compared[name], fix.reckoned_antenna_m
@@ -159,6 +167,9 @@ class Receivers(ModalSensors[Fix]):
         common_m2 = min(self.machine_share or 0.0, MOST_SHARED) * drift_m2
         # of a relative one both the error now and that of the first fix count, and where the filter was wrong then
         variance_m2 = drift_m2 if anchor_m2 is None else 2 * drift_m2 + anchor_m2
+        if name in self._jumps:  # it errs as far as it jumped, for as long as its errors last
+            jumped_ns, jump_m2 = self._jumps[name]
+            variance_m2 += jump_m2 * math.exp((jumped_ns - self._judged[name][0]) * 1e-9 / time_s)
         site_m2 = site_share * drift_m2
         return GpsError(variance_m2, time_s, (max(common_m2 - site_m2, 0.0), site_m2))
 
@@ -172,14 +183,15 @@ class Receivers(ModalSensors[Fix]):
             if sensor.name not in self._confirmed:  # a receiver brings its own unknown error
                 change = self._joining(fix, error)
         R = np.diag(self._white(fix))
-        opens = error if error and self._others_agree(fix) else measurements.PLACE
+        opens = error if error and self._is_outvoted(fix) else measurements.PLACE
         gate = sensor.gate(GATE_SIGMA)
         return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
 
-    def _others_agree(self, fix: Fix) -> bool:
-        """Whether another receiver was accepted lately: then the filter is not lost, should this one be refused."""
-        before_ns = fix.stamp_ns - AGREED_NS
-        return any(name != fix.sensor.name and ns > before_ns for name, ns in self._accepted_ns.items())
+    def _is_outvoted(self, fix: Fix) -> bool:
+        """Whether as many other receivers agree with the filter as do not: then a refused one errs, not the filter."""
+        since_ns = fix.stamp_ns - AGREED_NS
+        votes = [accepted for name, (ns, accepted) in self._judged.items() if ns > since_ns and name != fix.sensor.name]
+        return sum(votes) > votes.count(False)
 
     def _joining(self, fix: Fix, states: slice) -> Change:
         """What gives the receiver's error its first value, by those of the receivers before it."""

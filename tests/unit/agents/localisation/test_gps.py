@@ -1,0 +1,240 @@
+"""Receivers that share their errors: a machine at rest, many draws of what its receivers err, and single faults."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agents.localisation import measurements
+from agents.localisation.filters.belief import Belief
+from agents.localisation.filters.ekf import Ekf
+from agents.localisation.filters.late_measurements import Fusion
+from agents.localisation.filters.motion import MotionModel
+from agents.localisation.filters.state import POSITION, VELOCITY, Layout
+from agents.localisation.filters.ukf import Ukf
+from agents.localisation.gps import Receivers
+from agents.localisation.localiser import _layout_of
+from protocol.arrays import Floats
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Gps, Reading
+from tests.unit.agents.drives import (
+    PROJECTION,
+    S_BEND,
+    START_NS,
+    Leg,
+    after,
+    changed_sensor,
+    drive,
+    fix,
+    localiser,
+    machine,
+)
+from tests.unit.agents.localisation.test_shared_errors import slow_errors
+
+SECOND = 1_000_000_000
+STATED_M2 = 4.0  # of a fix: three quarters of it slow
+PLACE_STD_M = 6.0
+ENGINES = {"ekf": Ekf(), "ukf": Ukf()}
+
+
+def at_rest(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: str = "ekf") -> Belief:
+    """What is believed of a machine at rest, by one fix in a second with these errors (n, receivers, 2) each."""
+    layout = _layout_of(vehicle)
+    receivers = Receivers(vehicle.sensors, PROJECTION, layout, slow=True, machine_share=vehicle.machine_share)
+    reckoned = localiser(vehicle).dead_reckoning.pose
+    variance = np.full(layout.n, 1e-6)
+    variance[POSITION], variance[VELOCITY] = PLACE_STD_M**2, 1e-4
+    model = MotionModel(layout, True, receivers.errors)
+    fusion = Fusion(ENGINES[engine], model, Belief(START_NS, np.zeros(layout.n), np.diag(variance)))
+    sensors = [s for s in vehicle.sensors if s.kind == "gps"]
+    for i, row in enumerate(errors_m):
+        stamp = START_NS + (i + 1) * SECOND
+        fusion.add([measurements.standstill(stamp)])
+        for sensor, error in zip(sensors, row, strict=True):
+            x, y = place_m + error
+            one = receivers.fix(fix(sensor, stamp, float(x), float(y), 0.0, STATED_M2), reckoned)
+            if receivers.needs_anchor(one):
+                receivers.anchor(one, fusion.at(stamp))
+            measurement = receivers.measurement(one)
+            if measurement is None:
+                continue
+            fusion.model = replace(fusion.model, gps_errors=receivers.errors)
+            fusion.add([measurement])
+            receivers.confirm(one, fusion.last[sensor.name])
+    return fusion.belief
+
+
+def sharing(receivers: int, share: float | None, **options: str) -> MachineConfig:
+    vehicle = machine(receivers=receivers, machine_share=share)
+    for name in [s.name for s in vehicle.sensors if s.kind == "gps"]:
+        vehicle = changed_sensor(vehicle, name, **options)
+    return vehicle
+
+
+def judged(vehicle: MachineConfig, share: float, runs: int, seconds: int, engine: str = "ekf") -> Floats:
+    """NEES (runs,) of the place of machines whose receivers truly share so much."""
+    count, nees = sum(s.kind == "gps" for s in vehicle.sensors), []
+    for seed in range(runs):
+        rng = np.random.default_rng(1000 + seed)
+        slow = slow_errors(seed, seconds, count, share, slow_m2=0.75 * STATED_M2)[::5]
+        white = math.sqrt(0.25 * STATED_M2) * rng.standard_normal(slow.shape)
+        place = PLACE_STD_M * rng.standard_normal(2)
+        belief = at_rest(vehicle, slow + white, place, engine)
+        off = belief.x[:2] - place
+        nees.append(off @ np.linalg.solve(belief.P[:2, :2], off))
+    return np.array(nees)
+
+
+# --- many draws ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "engine"), [(0.0, "ekf"), (0.5, "ukf"), (0.95, "ekf")])
+def test_a_filter_with_the_true_share_is_consistent(share: float, engine: str) -> None:
+    runs = 60
+    nees = judged(sharing(3, share), share, runs, 30, engine)
+    assert nees.mean() == pytest.approx(2.0, abs=4 * 2 / math.sqrt(runs))
+    assert (nees < 5.99).mean() > 0.95 - 4 * math.sqrt(0.05 * 0.95 / runs)
+
+
+@pytest.mark.slow
+def test_receivers_that_share_nearly_all_deceive_a_filter_that_takes_them_apart_and_no_other() -> None:
+    deceived, estimating = (judged(sharing(3, share), 0.95, 60, 45) for share in (0.0, None))
+    assert (deceived < 5.99).mean() < 0.8 < (estimating < 5.99).mean()
+    assert deceived.mean() > 1.4 * estimating.mean()
+
+
+def test_the_more_is_shared_the_less_is_known_and_all_shared_is_one_receiver() -> None:
+    nothing, place = np.zeros((60, 3, 2)), np.zeros(2)
+    variance = [at_rest(sharing(3, share), nothing, place).P[0, 0] for share in (0.0, 0.3, 0.6, 0.9, 1.0)]
+    assert variance == sorted(variance)
+    one = at_rest(sharing(1, None), nothing[:, :1], place).P[0, 0]
+    assert variance[0] < 0.5 * one
+    assert 0.85 * one < variance[-1] < one
+
+
+@pytest.mark.parametrize("mode", ["relative", "differential"])
+def test_receivers_without_a_place_share_errors_too(mode: str) -> None:
+    """What they have in common is counted once, not twice: of relative ones, and of the changes that others show."""
+    nothing, place = np.zeros((60, 2, 2)), np.zeros(2)
+    apart, alike = (at_rest(sharing(2, share, mode=mode), nothing, place).P[0, 0] for share in (0.0, 0.95))
+    assert alike > apart
+
+
+def test_differential_receivers_that_share_all_are_together_as_good_as_one() -> None:
+    def noise(receivers: int, share: float) -> float:
+        vehicle = sharing(receivers, share, mode="differential", drift_share=1.0, std={"position": 2.0})
+        gps = Receivers(vehicle.sensors, PROJECTION, Layout(), slow=True, machine_share=share)
+        reckoned = localiser(vehicle).dead_reckoning.pose
+        fixes = [fix(vehicle.sensor("gps-1"), START_NS + i * SECOND, 0.0, 0.0, 0.0) for i in range(2)]
+        made = [gps.measurement(gps.fix(one, reckoned)) for one in fixes]
+        return made[1].R[0, 0]
+
+    one = noise(1, 1.0)
+    assert noise(2, 0.0) == pytest.approx(one)
+    assert [noise(n, 1.0) / n for n in (2, 3)] == pytest.approx([one, one], rel=1e-4)
+
+
+# --- a receiver's first fix ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [("gps-1", "gps-2", "gps-3"), ("gps-3", "gps-1", "gps-2")])
+def test_a_receiver_that_joins_errs_as_the_others_do_by_their_share(order: tuple[str, ...]) -> None:
+    """Whoever comes first: the errors of all have the covariance that they keep from then on."""
+    share, variance = 0.8, 0.75 * STATED_M2
+    vehicle = sharing(3, share)
+    layout = _layout_of(vehicle)
+    receivers = Receivers(vehicle.sensors, PROJECTION, layout, slow=True, machine_share=share)
+    belief = Belief(START_NS, np.zeros(layout.n), np.eye(layout.n))
+    first_m = np.array([2.0, -1.0])
+    for name in order:
+        sensor = vehicle.sensor(name)
+        one = receivers.fix(fix(sensor, START_NS, 0.0, 0.0, 0.0, STATED_M2), localiser(vehicle).dead_reckoning.pose)
+        measurement = receivers.measurement(one)
+        belief = measurement.change(belief)
+        if name == order[0]:
+            belief.x[layout.gps_error(int(name[-1]) - 1)] = first_m
+        receivers.confirm(one, Ekf().condition(belief, measurement))
+    errors = layout.gps_errors
+    expected = np.kron(variance * (share * np.ones((3, 3)) + (1 - share) * np.eye(3)), np.eye(2))
+    np.testing.assert_allclose(belief.P[errors, errors], expected, atol=1e-12)
+    believed = belief.x[errors].reshape(3, 2)
+    for name in order[1:]:
+        np.testing.assert_allclose(believed[int(name[-1]) - 1], share * first_m, atol=1e-12)
+
+
+# --- faults ----------------------------------------------------------------------------------------------------------
+
+
+def moved(
+    readings: list[Reading], north_m: float, sensors: tuple[str, ...], from_s: float, to_s: float
+) -> list[Reading]:
+    def is_moved(r: Reading) -> bool:
+        return r.sensor in sensors and after(r, from_s) and not after(r, to_s)
+
+    return [
+        replace(r, lat_deg=r.lat_deg + north_m / 111_200) if isinstance(r, Gps) and is_moved(r) else r for r in readings
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 0.95, None])
+@pytest.mark.parametrize("off_m", [5.0, 40.0])
+def test_a_receiver_that_goes_off_for_long_does_not_take_the_place_with_it(share: float | None, off_m: float) -> None:
+    """It is accepted again, as its own error, and once more when it comes back; the others say where the machine is."""
+    vehicle = sharing(3, share)
+    made = drive([*S_BEND, Leg(30)], vehicle)
+    located = localiser(vehicle)
+    off = []
+    for pose in located.run(moved(made.readings, off_m, ("gps-2",), 20, 45)):
+        x, y, _ = made.at(pose.stamp_ns)
+        off.append(math.dist((pose.x_m, pose.y_m), (x, y)))
+    assert max(off) < 1.8
+    assert off[-1] < 1.0
+    assert located.counters["gps-1_relocked"] == located.counters["gps-3_relocked"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 0.95])
+def test_receivers_that_go_off_together_are_followed(share: float) -> None:
+    vehicle = sharing(2, share)
+    made = drive([*S_BEND, Leg(20)], vehicle)
+    located = localiser(vehicle)
+    pose = located.run(moved(made.readings, 60.0, ("gps-1", "gps-2"), 20, 1e9))[-1]
+    x, y, _ = made.at(pose.stamp_ns)
+    assert math.dist((pose.x_m, pose.y_m), (x, y + 60)) < 4.0
+
+
+# --- the share -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_share_is_estimated_from_two_absolute_receivers_on_else_as_configured() -> None:
+    vehicle = sharing(2, None)
+    made = drive([*S_BEND, Leg(30)], vehicle)
+    estimated = localiser(vehicle)
+    first = estimated.machine_share
+    estimated.run(made.readings)  # without any error: so they share whatever they state
+    assert estimated.machine_share > 0.85 > first
+    configured = localiser(replace(vehicle, machine_share=0.3))
+    configured.run(made.readings)
+    assert configured.machine_share == 0.3
+    assert localiser(machine()).machine_share is None
+    assert localiser(vehicle, profile="paper").machine_share is None
+    relative = localiser(changed_sensor(vehicle, "gps-2", mode="relative"))
+    relative.run(made.readings)
+    assert relative.machine_share == first
+
+
+@pytest.mark.slow
+def test_two_right_receivers_outvote_a_wrong_one_that_the_filter_believes() -> None:
+    """Two are away while the third jumps, so that the filter follows it; then they come back."""
+    vehicle = sharing(3, 0.5)
+    made = drive([*S_BEND, Leg(20)], vehicle)
+    away = [r for r in made.readings if r.sensor not in ("gps-1", "gps-3") or not after(r, 18) or after(r, 32)]
+    located = localiser(vehicle)
+    pose = located.run(moved(away, 60.0, ("gps-2",), 20, 1e9))[-1]
+    x, y, _ = made.at(pose.stamp_ns)
+    assert located.counters["gps-2_relocked"] >= 1
+    assert math.dist((pose.x_m, pose.y_m), (x, y)) < 4.0
