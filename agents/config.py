@@ -41,7 +41,7 @@ class AgentConfig:
             raise ValueError(f"place: a base needs its surveyed latitude and longitude [deg]; {why}")
         if self.role == MACHINE and self.place:
             raise ValueError('place: a machine moves; only with role = "base"')
-        if self.place and not (abs(self.place[0]) <= 90 and abs(self.place[1]) <= 180):  # also false for NaN
+        if self.place and not (abs(self.place[0]) <= 90 and abs(self.place[1]) <= 180):
             raise ValueError(f"place: {list(self.place)} is no latitude and longitude [deg]")
         if self.linger_s < 0:
             raise ValueError("linger_s: negative")
