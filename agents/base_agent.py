@@ -15,7 +15,7 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire import keys
-from protocol.wire.codec import encode_correction
+from protocol.wire.correction_codec import encode_correction
 from protocol.wire.messages import SiteCorrection
 from protocol.wire.owners import Owner
 

@@ -11,7 +11,7 @@ from protocol.errors import MessageError
 from protocol.machine.readings import Reading
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
-from protocol.wire.codec import decode_correction
+from protocol.wire.correction_codec import decode_correction
 
 QUEUE_CORRECTIONS = 1000  # 200 s of them; beyond it the oldest are dropped and counted
 

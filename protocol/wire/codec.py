@@ -10,20 +10,10 @@ import msgpack
 import numpy as np
 
 from protocol.errors import MessageError, Refusal
-from protocol.machine.readings import KINDS, MAX_STAMP_NS, Correction, Reading, columns, parse_reading
+from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples, empty
 from protocol.site.site_config import NAME
-from protocol.wire.messages import (
-    VERSION,
-    Ack,
-    Health,
-    PackedBatch,
-    Pose,
-    Refused,
-    SampleBatch,
-    SensorBundle,
-    SiteCorrection,
-)
+from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
 
 MAX_BATCH_BYTES = 4 * 2**20
 MAX_BATCH_SAMPLES = 20_000
@@ -104,7 +94,8 @@ def _take_int(table: dict[str, Any], name: str, low: int, high: int, reason: Ref
     return value
 
 
-def _take_name(table: dict[str, Any], field: str = "machine") -> str:
+def take_name(table: dict[str, Any], field: str = "machine") -> str:
+    """Take a name."""
     name: str = take(table, field, str)
     if not NAME.fullmatch(name):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{name[:70]!r} is not a name", field=field)
@@ -119,7 +110,8 @@ def take_store(table: dict[str, Any], name: str = "store", *, optional: bool = F
     return text
 
 
-def _take_stamp(table: dict[str, Any]) -> int:
+def take_stamp(table: dict[str, Any]) -> int:
+    """Take `stamp_ns`."""
     return _take_int(table, "stamp_ns", 1, MAX_STAMP_NS)
 
 
@@ -163,7 +155,7 @@ def unpack_batch(data: bytes) -> PackedBatch:
     first_seq = _take_int(table, "first_seq", 1, MAX_SEQ, Refusal.FIRST_SEQ)
     lost_before = _take_int({"lost_before": 0, **table}, "lost_before", 0, first_seq - 1)
     batch = SampleBatch(
-        machine=_take_name(table),
+        machine=take_name(table),
         spool_id=_take_int(table, "spool_id", 1, MAX_U64),
         first_seq=first_seq,
         rows=_NO_ROWS,
@@ -240,7 +232,7 @@ def decode_bundle(data: bytes) -> SensorBundle:
         readings += _decode_group(group, refused)
     readings.sort(key=lambda r: r.stamp_ns)
     return SensorBundle(
-        machine=_take_name(table),
+        machine=take_name(table),
         counter=_take_int(table, "counter", 1, MAX_SEQ),
         readings=tuple(readings),
         last=take(table, "last", bool, default=False),
@@ -249,7 +241,7 @@ def decode_bundle(data: bytes) -> SensorBundle:
 
 
 def _decode_group(group: dict[str, Any], refused: Counter[str]) -> list[Reading]:
-    sensor, kind = _take_name(group, "sensor"), take(group, "kind", str)
+    sensor, kind = take_name(group, "sensor"), take(group, "kind", str)
     if kind not in KINDS:
         raise MessageError(Refusal.OUT_OF_RANGE, f"{kind[:40]!r} is none of {', '.join(KINDS)}", field="kind")
     n, cols = _take_int(group, "n", 0, MAX_BATCH_SAMPLES), take(group, "cols", dict)
@@ -268,31 +260,6 @@ def _decode_group(group: dict[str, Any], refused: Counter[str]) -> list[Reading]
     return readings
 
 
-# --- corrections -----------------------------------------------------------------------------------------------------
-
-
-def encode_correction(message: SiteCorrection) -> bytes:
-    """What a base station says of its site's GPS errors."""
-    correction = message.correction
-    values = {name: getattr(correction, name) for name in columns(Correction.kind)}
-    return pack({"base": correction.sensor, "frame": message.frame, "stamp_ns": correction.stamp_ns, **values})
-
-
-def decode_correction(data: bytes, frame: str) -> SiteCorrection:
-    """Undo `encode_correction`; refused where a value is not plausible, or is of another frame than this one."""
-    table = unpack(data, MAX_SMALL_BYTES)
-    base, stamp_ns, of_base = _take_name(table, "base"), _take_stamp(table), take(table, "frame", str)
-    if of_base != frame:
-        problem = (
-            f"corrections of {base} are in frame {of_base[:40]!r}, this site's is {frame!r}: compare the site files"
-        )
-        raise MessageError(Refusal.WRONG_FRAME, problem, field="frame")
-    values = tuple(take(table, name, float) for name in columns(Correction.kind))
-    correction = parse_reading(Correction.kind, base, stamp_ns, values)
-    assert isinstance(correction, Correction)
-    return SiteCorrection(of_base, correction)
-
-
 # --- live pose and health --------------------------------------------------------------------------------------------
 
 
@@ -305,7 +272,7 @@ def decode_pose(data: bytes) -> Pose:
     """Undo `encode_pose`."""
     table = unpack(data, MAX_SMALL_BYTES)
     numbers = (take(table, name, float) for name in list(Pose.__dataclass_fields__)[2:])
-    return Pose(_take_name(table), _take_stamp(table), *numbers)
+    return Pose(take_name(table), take_stamp(table), *numbers)
 
 
 def encode_health(health: Health) -> bytes:
@@ -317,4 +284,4 @@ def decode_health(data: bytes) -> Health:
     """Undo `encode_health`."""
     table = unpack(data, MAX_SMALL_BYTES)
     stamp_ns = _take_int(table, "stamp_ns", 0, MAX_STAMP_NS)  # 0: nothing was read yet
-    return Health(_take_name(table), stamp_ns, take_plain(table, "values"))
+    return Health(take_name(table), stamp_ns, take_plain(table, "values"))

@@ -10,7 +10,7 @@ import zenoh
 from protocol.errors import MessageError
 from protocol.machine.readings import Correction
 from protocol.wire import keys
-from protocol.wire.codec import decode_correction
+from protocol.wire.correction_codec import decode_correction
 from sitegrid.doctor import Finding, Level, skipped
 
 CORRECTION_S = 1.5  # they come five times a second

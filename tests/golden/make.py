@@ -31,7 +31,7 @@ from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
-from protocol.wire import codec
+from protocol.wire import codec, correction_codec
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle, SiteCorrection
 
 FOLDER = Path(__file__).parent
@@ -107,7 +107,7 @@ def decode_info_table(data: bytes) -> dict[str, Any]:
 
 def decode_correction(data: bytes) -> SiteCorrection:
     """Decode with the frame of the golden site."""
-    return codec.decode_correction(data, "0123abcd")
+    return correction_codec.decode_correction(data, "0123abcd")
 
 
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
@@ -192,7 +192,7 @@ GOLDEN: dict[str, Golden] = {
         codec.decode_bundle,
     ),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
-    "correction.bin": Golden(CORRECTION, codec.encode_correction, decode_correction),
+    "correction.bin": Golden(CORRECTION, correction_codec.encode_correction, decode_correction),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),

@@ -12,7 +12,8 @@ import pytest
 
 from protocol.site.site_file import load_site
 from protocol.wire import keys
-from protocol.wire.codec import decode_correction, decode_health
+from protocol.wire.codec import decode_health
+from protocol.wire.correction_codec import decode_correction
 from protocol.wire.messages import SiteCorrection
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig

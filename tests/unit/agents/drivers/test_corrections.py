@@ -10,7 +10,7 @@ from typing import Any
 from agents.drivers.corrections import QUEUE_CORRECTIONS, WithCorrections
 from protocol.machine.readings import Correction, Encoder, Reading
 from protocol.wire import keys
-from protocol.wire.codec import encode_correction
+from protocol.wire.correction_codec import encode_correction
 from protocol.wire.messages import SiteCorrection
 from tests.unit.agents.drives import SITE, START_NS
 

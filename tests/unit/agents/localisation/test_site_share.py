@@ -50,12 +50,12 @@ def follow(estimator: SiteShareEstimator, machine: np.ndarray, base: np.ndarray,
 )
 @pytest.mark.slow
 def test_share_is_found_in_ten_minutes(share: float, low: float, high: float) -> None:
-    found = []
+    shares = []
     for seed in range(3):
         estimator = SiteShareEstimator()
         follow(estimator, *errors(share, 600, seed), seed)
-        found.append(estimator.share)
-    assert low <= np.mean(found) <= high, found
+        shares.append(estimator.share)
+    assert low <= np.mean(shares) <= high, shares
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from protocol.machine.readings import KINDS, Encoder, Imu, columns
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries.answers import PointAnswer, Region
-from protocol.wire import codec
+from protocol.wire import codec, correction_codec
 from protocol.wire.codec import decode_batch, encode_batch
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -332,17 +332,17 @@ def test_group_that_is_no_map_is_refused(group):
     ],
 )
 def test_bad_correction_is_refused_and_its_field_named(golden, fields, reason, field):
-    table = msgpack.unpackb(codec.encode_correction(golden.CORRECTION))
+    table = msgpack.unpackb(correction_codec.encode_correction(golden.CORRECTION))
     with pytest.raises(MessageError) as caught:
-        codec.decode_correction(msgpack.packb(table | fields), golden.CORRECTION.frame)
+        correction_codec.decode_correction(msgpack.packb(table | fields), golden.CORRECTION.frame)
     assert (caught.value.reason, caught.value.field) == (reason, field)
 
 
 def test_correction_of_any_length_but_its_own_is_refused(golden):
-    data = codec.encode_correction(golden.CORRECTION)
+    data = correction_codec.encode_correction(golden.CORRECTION)
     for cut in (data[:-1], data + b"\0", b""):
         with pytest.raises(MessageError):
-            codec.decode_correction(cut, golden.CORRECTION.frame)
+            correction_codec.decode_correction(cut, golden.CORRECTION.frame)
 
 
 @pytest.mark.parametrize("stamp", [0, -1, 2**63])
