@@ -22,8 +22,8 @@ from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler, Samples, joined
 from agents.smoothed_track import SmoothedTrack
 from agents.stream_order import Decision, StreamOrder, by_stamp
-from protocol.machine.machine_config import MachineConfig
-from protocol.machine.readings import Correction, Reading
+from protocol.machine.machine_config import ABSOLUTE, MachineConfig
+from protocol.machine.readings import Correction, Gps, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 
@@ -53,7 +53,7 @@ class Positioning:
 
     def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
         self._machine, self._config = in_name_order(machine), config.localisation
-        self._projection = Projection(site)
+        self._projection, self._extent_m = Projection(site), site.extent_m
         self._sensors = {s.name: s for s in machine.sensors if s.use}
         self._order = StreamOrder()
         self._counters: Counter[str] = Counter()
@@ -99,6 +99,9 @@ class Positioning:
         if isinstance(reading, Correction):  # of another one's clock, and late: it takes effect with the next readings
             self.localiser.take(replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)))
             return
+        if isinstance(reading, Gps) and sensor.mode == ABSOLUTE and not self._is_on_site(reading):
+            self._counters["fix_outside_site"] += 1
+            return
         known_ns = max(reading.stamp_ns, sensor.true_ns(reading.stamp_ns))  # never before it was true
         yield from self._accept(self._order.gather(reading, known_ns))
 
@@ -110,6 +113,11 @@ class Positioning:
         for group in by_stamp(map(self._undelayed, readings)):
             if accepted := self._take(group):
                 yield accepted
+
+    def _is_on_site(self, fix: Gps) -> bool:
+        """Whether a fix may be: receivers without one state places on the equator; and sites are mistaken."""
+        x_m, y_m, _ = self._projection.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
+        return max(abs(x_m), abs(y_m)) <= self._extent_m
 
     def _undelayed(self, reading: Reading) -> Reading:
         sensor = self._sensors[reading.sensor]

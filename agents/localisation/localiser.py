@@ -131,6 +131,12 @@ class Localiser:
         return self._receivers.machine_share
 
     @property
+    def wheel_scale(self) -> float | None:
+        """How much further the wheels turn than the machine moves [-], as believed; None where it is no state."""
+        states = self._model.layout.wheel_scales
+        return float(self.belief.x[states.start]) if self.belief and states.stop > states.start else None
+
+    @property
     def belief(self) -> Belief | None:
         """The whole state, once it is known."""
         return self._fusion.belief if self._fusion else None

@@ -179,6 +179,7 @@ def _row(
         "withhold": str(pattern or "none"),
         **(holdout.report() if holdout else NOTHING),
         "covered": round(covered(trace), 4),
+        "wheel_scale": rounded(core.localiser.wheel_scale, 4),
         "us_per_second": round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None,
         "counters": dict(core.counters),
         "consistency": {name: {**asdict(value), "good": value.is_good} for name, value in consistency},

@@ -21,7 +21,18 @@ from protocol.machine.samples import SAMPLE_DTYPE, check_samples
 from protocol.site.site_config import KnownGround, SiteConfig
 from sim.config import SimConfig
 from sim.recorder import record
-from tests.unit.agents.drives import S_BEND, SITE, START_NS, VEHICLE, Ground, Leg, changed_sensor, drive, simulated
+from tests.unit.agents.drives import (
+    S_BEND,
+    SITE,
+    START,
+    START_NS,
+    VEHICLE,
+    Ground,
+    Leg,
+    changed_sensor,
+    drive,
+    simulated,
+)
 
 SECOND = 10**9
 
@@ -558,3 +569,31 @@ def test_sensor_whose_stamps_are_too_early_is_as_one_in_time(
     """A negative delay; by more than any window too, for a reading comes when it was true whatever its stamp says."""
     early = [replace(r, stamp_ns=r.stamp_ns - round(early_s * 1e9)) if r.sensor == "gps-1" else r for r in recorded]
     assert run(changed_sensor(vehicle, "gps-1", delay_s=-early_s), early) == base
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [(0.0, 0.0), (8.4, 49.01)], ids=["equator", "swapped"])
+def test_fixes_far_from_the_site_are_refused_and_counted(place: tuple[float, float]) -> None:
+    """A receiver without a fix yet states the equator; they would turn the heading that is found from fixes."""
+    made = drive(S_BEND, VEHICLE)
+    first = {r.stamp_ns for r in [r for r in made.readings if isinstance(r, Gps)][:25]}
+    lost = [
+        replace(r, lat_deg=place[0], lon_deg=place[1]) if isinstance(r, Gps) and r.stamp_ns in first else r
+        for r in made.readings
+    ]
+    pipeline = Positioning(SITE, VEHICLE, PipelineConfig())
+    pipeline.step(lost)
+    assert pipeline.counters["fix_outside_site"] == 25
+    assert pipeline.pose
+    assert math.dist((pipeline.pose.x_m, pipeline.pose.y_m), made.at(pipeline.pose.stamp_ns)[:2]) < 0.5
+
+
+@pytest.mark.slow
+def test_a_receiver_that_counts_from_its_first_fix_may_be_anywhere() -> None:
+    vehicle = changed_sensor(VEHICLE, "gps-1", mode="differential")
+    made = drive((Leg(4, 0.5), Leg(4)), vehicle)
+    far = [replace(r, lat_deg=r.lat_deg - 2.0) if isinstance(r, Gps) else r for r in made.readings]
+    pipeline = Positioning(SITE, vehicle, PipelineConfig(LocalisationConfig(start=START)))
+    pipeline.step(far)
+    assert "fix_outside_site" not in pipeline.counters
+    assert pipeline.counters["gps-1_used"] > 20
