@@ -13,6 +13,10 @@ from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig, parse_machine
 
+# Of samples behind their stamps: where a machine's are 300 s behind those of others, the map server takes its clock for
+# wrong, and excludes it.
+MOST_LAG_S = 180.0
+
 
 @dataclass(frozen=True)
 class AgentConfig:
@@ -27,6 +31,9 @@ class AgentConfig:
     def __post_init__(self) -> None:
         if self.linger_s < 0:
             raise ValueError("linger_s: negative")
+        if self.pipeline.localisation.smoothing_s > MOST_LAG_S:
+            problem = f"at most {MOST_LAG_S:g} s: the map server would take the clock for wrong"
+            raise ValueError(f"pipeline.localisation.lag_s: {problem}")
 
 
 def require_place(machine: MachineConfig, config: LocalisationConfig) -> None:
