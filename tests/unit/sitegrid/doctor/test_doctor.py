@@ -41,6 +41,7 @@ from sitegrid.doctor import Finding, Level, disk, network
 from sitegrid.doctor.disk import SpoolState, StoreState
 from sitegrid.doctor.keys import Certificate, check_certificate, read_certificate
 from sitegrid.doctor.network import RouterLink
+from sitegrid.doctor.positions import check_positions
 from tests.unit.records import map_info
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
@@ -108,6 +109,11 @@ def spool(depth: int, dropped: int = 0, quarantined: int = 0, *, oldest_ns: int 
 
 def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
     return disk.check_store(replace(STORE, **change), site)
+
+
+def positions(**verdicts: str) -> Finding:
+    receivers = {name: {"verdict": verdict} for name, verdict in verdicts.items()}
+    return check_positions("loader-1", {"pipeline": {"consistency": receivers}})
 
 
 @pytest.mark.parametrize(
@@ -195,6 +201,12 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (disk.check_health("loader-1", {}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {"spool": 7, "uplink": "no"}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {"spool": [], "spool_problem": None}), PASS, "? samples wait"),
+        (positions(a="consistent", b="consistent"), PASS, "loader-1: a consistent, b consistent"),
+        (positions(a="cannot_tell"), PASS, "a cannot tell; a slow GPS error that is larger than stated would not show"),
+        (positions(a="consistent", b="inconsistent"), WARN, "b inconsistent; fixes are further off than"),
+        (positions(), SKIP, "loader-1 has had too few fixes"),
+        (check_positions("loader-1", {"pipeline": {"consistency": {"a": 7}}}), SKIP, "too few fixes"),
+        (check_positions("loader-1", {"pipeline": 7}), SKIP, "too few fixes"),
         (store(), PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
         (store(None, checkpoints=3, checkpoint_bytes=2 * 10**8), PASS, "ago; 3 checkpoints of the past, 0.2 GB"),
         (store(None, damaged_checkpoints=1), PASS, "; 1 damaged, the server makes them again"),
