@@ -1,13 +1,13 @@
 """One machine's process: driver -> pipeline -> spool -> uplink; it publishes pose and health too."""
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import zenoh
 
 from agents.config import AgentConfig
@@ -15,22 +15,22 @@ from agents.delivery.audit import AuditLog
 from agents.delivery.spool import Spool
 from agents.delivery.uplink import Uplink
 from agents.delivery.uplink_thread import Check, Sign, UplinkThread, linger
+from agents.delivery.write_buffer import WriteBuffer
 from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Presence
-from protocol.arrays import Table
+from agents.sampling import Samples
 from protocol.errors import StoreError
 from protocol.machine.machine_config import MachineConfig
-from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
 from protocol.wire.owners import Owner
 
 log = logging.getLogger("agents.agent")
 
-HEALTH_S = 1.0
-MOST_UNSAVED = 100_000  # samples that wait in memory while the disk is full or fails
+EVERY_S = 1.0  # samples are written, and health is shown: a write costs a sync of the disk
+SILENT_S = 10.0  # real time without a new pose after which no smoother's word is waited for: the machine may be off
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Agent:
         self._presence = Presence(session, site.name, machine.name, owner)
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
-        self._unsaved, self._given_up, self._spool_problem = empty(), 0, ""
+        self._unsaved, self._spool_problem = WriteBuffer(), ""
         self._readings = 0
         self._samples = 0
         self._newest_ns = 0
@@ -83,19 +83,25 @@ class Agent:
         wait: Callable[[float], object] = time.sleep,
     ) -> dict[str, Any]:
         """Take readings until the stream ends or `is_stopped`; returns a report in plain values."""
-        health_s = clock()
+        second_s = moved_s = clock()
         while not is_stopped():
             readings = driver.read(0.2)
             if readings is None:
                 break
-            self._step(list(readings))
-            if clock() >= health_s:
-                health_s = clock() + HEALTH_S
+            if self._step(list(readings)):
+                moved_s = clock()
+            elif clock() - moved_s > SILENT_S:
+                self._take(self._pipeline.settle())
+                moved_s = math.inf  # once is enough: without a pose there is no sample
+            if clock() >= second_s:
+                second_s = clock() + EVERY_S
+                self._write()
                 self._calibration_file.write(self._pipeline.calibration)
                 self._yield_name()
                 self._presence.show_health(self._newest_ns, self.report(driver))
         driver.close()
-        self._deliver(self._pipeline.finish())
+        self._take(self._pipeline.finish())
+        self._write()
         self._calibration_file.write(self._pipeline.calibration)
         delivered = linger(self._is_delivered, wait, clock, 0.0 if is_stopped() else self._config.linger_s)
         report = {**self.report(driver), "delivered": delivered}
@@ -112,7 +118,7 @@ class Agent:
             "samples": self._samples,
             "driver": dict(driver.counters()),
             "pipeline": self._pipeline.health(),
-            "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._given_up},
+            "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._unsaved.given_up},
             "spool_problem": self._spool_problem,
             "spool_damage": self._spool.damage,
             "calibration_problem": self._calibration_file.problem,
@@ -130,30 +136,34 @@ class Agent:
         self._presence.close()
         self._spool.close()
 
-    def _step(self, readings: list[Any]) -> None:
+    def _step(self, readings: list[Any]) -> bool:
+        """Take in readings; returns whether they made a new pose."""
         self._readings += len(readings)
         if readings:
             self._newest_ns = max(self._newest_ns, readings[-1].stamp_ns)
-        rows = self._pipeline.step(self._holdout.split(readings) if self._holdout else readings)
+        before = self._pipeline.pose
+        self._take(self._pipeline.step(self._holdout.split(readings) if self._holdout else readings))
         if self._holdout:
             self._holdout.compare(self._pipeline)
-        self._deliver(rows)
-        if pose := self._pipeline.pose:
+        pose = self._pipeline.pose
+        if pose:
             self._presence.show_pose(pose)
+        return pose is not before
 
-    def _deliver(self, rows: Table) -> None:
-        """Write samples to the spool; while the disk is full or fails they wait here, and the machine goes on."""
-        waiting = np.concatenate([self._unsaved, rows])
-        if not len(waiting):
+    def _take(self, made: Samples) -> None:
+        """Have samples written at the end of the second."""
+        self._unsaved.add(made.pending, made.final)
+
+    def _write(self) -> None:
+        """Write to the spool; while the disk is full or fails samples wait in memory, and the machine goes on."""
+        if self._unsaved.is_clean:
             return
         try:
-            self._spool.record(waiting)
+            self._samples += self._unsaved.write(self._spool)
         except StoreError as error:
-            self._unsaved, self._spool_problem = waiting[-MOST_UNSAVED:], str(error)
-            self._given_up += len(waiting) - len(self._unsaved)
+            self._spool_problem = str(error)
             return
-        self._unsaved, self._spool_problem = empty(), ""
-        self._samples += len(waiting)
+        self._spool_problem = ""
         self._uplink_thread.wake()
 
     def _yield_name(self) -> None:
@@ -164,5 +174,5 @@ class Agent:
         )
 
     def _is_delivered(self) -> bool:
-        self._deliver(empty())  # samples that are not on disk yet
-        return not len(self._unsaved) and self._spool.is_settled()
+        self._write()  # samples that are not on disk yet
+        return self._unsaved.is_clean and self._spool.is_settled()

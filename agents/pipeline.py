@@ -5,7 +5,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -19,11 +19,11 @@ from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.localisation.imu_steps import Sensed
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler
+from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler, Samples, joined
+from agents.smoothed_track import SmoothedTrack
 from agents.stream_order import Decision, StreamOrder, by_stamp
-from protocol.arrays import Table
-from protocol.machine.machine_config import MachineConfig
-from protocol.machine.readings import Reading
+from protocol.machine.machine_config import ABSOLUTE, MachineConfig
+from protocol.machine.readings import Gps, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 
@@ -53,7 +53,7 @@ class Positioning:
 
     def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
         self._machine, self._config = in_name_order(machine), config.localisation
-        self._projection = Projection(site)
+        self._projection, self._extent_m = Projection(site), site.extent_m
         self._sensors = {s.name: s for s in machine.sensors if s.use}
         self._order = StreamOrder()
         self._counters: Counter[str] = Counter()
@@ -96,6 +96,9 @@ class Positioning:
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
             return
+        if isinstance(reading, Gps) and sensor.mode == ABSOLUTE and not self._is_on_site(reading):
+            self._counters["fix_outside_site"] += 1
+            return
         known_ns = max(reading.stamp_ns, sensor.true_ns(reading.stamp_ns))  # never before it was true
         yield from self._accept(self._order.gather(reading, known_ns))
 
@@ -107,6 +110,11 @@ class Positioning:
         for group in by_stamp(map(self._undelayed, readings)):
             if accepted := self._take(group):
                 yield accepted
+
+    def _is_on_site(self, fix: Gps) -> bool:
+        """Whether a fix may be: receivers without one state places on the equator; and sites are mistaken."""
+        x_m, y_m, _ = self._projection.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
+        return max(abs(x_m), abs(y_m)) <= self._extent_m
 
     def _undelayed(self, reading: Reading) -> Reading:
         sensor = self._sensors[reading.sensor]
@@ -160,7 +168,7 @@ class Pipeline:
     ) -> None:
         """calibration: of the ground estimator, from before."""
         self._site, self._machine = site, in_name_order(machine)
-        self._config = config
+        self._config, self._smooths = config, config.localisation.smoothing_s > 0
         self._positioning = Positioning(site, machine, config)
         self._counters: Counter[str] = Counter()
         self._newest_ns = 0
@@ -175,19 +183,25 @@ class Pipeline:
         """Pose at a recent stamp, None where it is not known."""
         return self._positioning.pose_at(stamp_ns)
 
-    def step(self, readings: Sequence[Reading]) -> Table:
-        """Take in readings in the order of their stamps; returns the samples (n,) that they made possible."""
-        return _joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
+    @property
+    def pending(self) -> int:
+        """How many samples are not final yet."""
+        return self._sampler.pending
 
-    def finish(self) -> Table:
-        """Samples (n,) of what still waits, as the stream ends."""
-        return _joined([*self._take(self._positioning.finish()), self._remainder()])
+    def step(self, readings: Sequence[Reading]) -> Samples:
+        """Take in readings in the order of their stamps; returns the samples that they made possible."""
+        return joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
 
-    def _remainder(self) -> Table:
-        """Samples (n,) of what waits and can be sampled; the rest never will be."""
-        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
+    def settle(self) -> Samples:
+        """Samples of all that is known now, all of them final: no reading may come for long."""
+        rest = self._take(self._positioning.finish())
+        return joined([*rest, self._settle(self._positioning.remaining())])
+
+    def finish(self) -> Samples:
+        """The same, as the stream ends; what has no place then is counted."""
+        samples = self.settle()
         self._sampler.withheld["no_pose"] += self._sampler.waiting
-        return rows
+        return samples
 
     @property
     def calibration(self) -> Calibration:
@@ -205,25 +219,24 @@ class Pipeline:
             "withheld": dict(self._sampler.withheld),
             "without_resistance": dict(self._sampler.without_resistance),
             "ground": self._estimator.health(),
-            "consistency": {
-                name: {**asdict(value), "good": value.is_good} for name, value in localiser.consistency.items()
-            },
+            "consistency": {name: value.report for name, value in localiser.consistency.items()},
             "machine_share": localiser.machine_share,
         }
 
-    def _take(self, stamps: Iterable[Accepted]) -> list[Table]:
-        return [rows for accepted in stamps for rows in self._take_one(accepted)]
+    def _take(self, stamps: Iterable[Accepted]) -> list[Samples]:
+        return [samples for accepted in stamps for samples in self._take_one(accepted)]
 
-    def _take_one(self, accepted: Accepted) -> list[Table]:
-        readings, poses, _, restarts = accepted
-        made: list[Table] = []
+    def _take_one(self, accepted: Accepted) -> list[Samples]:
+        readings, poses, smoothed, restarts = accepted
+        self._track.append(smoothed)
+        made: list[Samples] = []
         if restarts:
-            made.append(self._remainder())
-            self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
+            made.append(self._settle(()))
+            self._count_withheld()
             self._start(self._estimator.calibration)
         for pose in poses:  # each at once: after a late alignment they are more than the history holds
             self._positioning.poses.append(pose)
-            made.append(self._due_samples())
+            made += self._due_samples()
         stamp_ns = readings[0][0].stamp_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
@@ -232,10 +245,25 @@ class Pipeline:
             self._estimator.update(reading, sensor, dead_reckoning, self._known_c_rr())
             distance_m = self._odometer.update(reading, dead_reckoning.distance_m, speed_mps)
         self._sampler.mark(stamp_ns, distance_m)
-        return [*made, self._due_samples()]
+        made += self._due_samples()
+        if smoothed:
+            made.append(Samples(NOTHING, self._sampler.final_samples(self._track.corrected)))
+        return made
 
-    def _due_samples(self) -> Table:
-        return self._sampler.due_samples(self._newest_ns, self._estimator.at)
+    def _due_samples(self) -> list[Samples]:
+        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at)
+        if not len(rows):
+            return []
+        return [Samples(rows, NOTHING if self._smooths else self._sampler.final_samples(lambda pose: pose))]
+
+    def _settle(self, remaining: Sequence[SmoothedPose]) -> Samples:
+        """Samples of all that is known. remaining: smoothed poses that are not final."""
+        rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
+        return Samples(rows, self._sampler.final_samples(lambda pose: self._track.corrected_by_now(pose, remaining)))
+
+    def _count_withheld(self) -> None:
+        self._sampler.withheld["no_pose"] += self._sampler.waiting
+        self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
 
     def _known_c_rr(self) -> float | None:
         """Resistance of the ground here, where the site states it and the position is sure enough."""
@@ -252,16 +280,12 @@ class Pipeline:
         self._estimator = GroundEstimator(machine, config.estimation, known)
         self._sampler = Sampler(self._positioning.poses, machine.load_centre_m)
         self._odometer = Odometer()
+        self._track = SmoothedTrack()
 
 
 def in_name_order(machine: MachineConfig) -> MachineConfig:
     """The machine with its sensors by name: the order of their tables in a file must not change any result."""
     return replace(machine, sensors=tuple(sorted(machine.sensors, key=attrgetter("name"))))
-
-
-def _joined(tables: Sequence[Table]) -> Table:
-    made = [rows for rows in tables if len(rows)]
-    return np.concatenate(made) if made else NOTHING
 
 
 PoseSource = Positioning | Pipeline  # what locates a machine

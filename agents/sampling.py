@@ -1,14 +1,16 @@
 """Samples: one per stretch driven, at the place where the machine was, with the estimate of the ground there.
 
-A sample is made LAG_S later than the machine was there, so that the estimator has seen what came next.
+A sample is made LAG_S later than the machine was there, so that the estimator has seen what came next. It has the
+filter's position then, and is pending; once the smoother has its word on that place, it is made again, final.
 """
 
 import math
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +38,26 @@ class Mark:
 
     stamp_ns: int
     distance_m: float
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a sample is made of: its mark, where the filter saw the machine, and the ground there."""
+
+    mark: Mark
+    pose: PoseBelief
+    estimate: GroundEstimate
+
+
+class Samples(NamedTuple):
+    """Samples that a step made, in the order of their stamps.
+
+    pending: (n,), new ones at the filter's position. final: (k,), the last words on those that were made first and had
+    none so far; they may be of the same step.
+    """
+
+    pending: Table
+    final: Table
 
 
 class PoseHistory:
@@ -101,11 +123,17 @@ class Sampler:
         self._marked_m = 0.0
         self._marks: deque[Mark] = deque()  # wait for the estimator
         self._estimated: deque[tuple[Mark, GroundEstimate]] = deque()  # wait for a pose
+        self._pending: deque[Place] = deque()  # sampled, wait for the smoother
 
     @property
     def waiting(self) -> int:
         """How many marks are not sampled yet."""
         return len(self._marks) + len(self._estimated)
+
+    @property
+    def pending(self) -> int:
+        """How many samples are not final yet."""
+        return len(self._pending)
 
     def mark(self, stamp_ns: int, distance_m: float) -> None:
         """Note the distance driven so far, up in reverse too: every EVERY_M a sample becomes due."""
@@ -122,30 +150,51 @@ class Sampler:
         newest = self._poses.newest
         if not self._estimated or not newest or self._estimated[0][0].stamp_ns > newest.stamp_ns:
             return NOTHING
-        rows = []
+        made: list[Place] = []
         while self._estimated and self._estimated[0][0].stamp_ns <= newest.stamp_ns:
             mark, estimate = self._estimated.popleft()
-            if pose := self._poses.at(mark.stamp_ns):
-                rows += self._sample(mark, pose, estimate)
-            else:
+            pose = self._poses.at(mark.stamp_ns)
+            if pose and self._is_usable(pose, estimate):
+                made.append(Place(mark, pose, estimate))
+            elif not pose:
                 self.withheld["no_pose"] += 1
-        return np.array(rows, SAMPLE_DTYPE)
+        self._pending += made
+        return np.array([self._row(place, place.pose) for place in made], SAMPLE_DTYPE)
 
-    def _sample(self, mark: Mark, pose: PoseBelief, e: GroundEstimate) -> list[tuple[float, ...]]:
-        (xx, xy), (_, yy) = pose.covariance_m2
+    def final_samples(self, corrected: Callable[[PoseBelief], PoseBelief | None]) -> Table:
+        """Final values (n,) of the oldest pending samples. corrected: a pose as smoothed, None while not known."""
+        rows = []
+        while self._pending and (pose := corrected(self._pending[0].pose)):
+            rows.append(self._row(self._pending.popleft(), pose))
+        return np.array(rows, SAMPLE_DTYPE) if rows else NOTHING
+
+    def _is_usable(self, pose: PoseBelief, e: GroundEstimate) -> bool:
+        """Whether a sample can be made of it; counts why not, and what it lacks."""
+        (xx, _), (_, yy) = pose.covariance_m2
         if max(xx, yy) > MAX_STD_M**2:
             self.withheld["unsure_position"] += 1
-            return []
+            return False
         if e.is_blurred:
             self.withheld[e.reason] += 1
-            return []
+            return False
         if e.reason:
             self.without_resistance[e.reason] += 1
+        return True
+
+    def _row(self, place: Place, pose: PoseBelief) -> tuple[float, ...]:
+        """The sample of a place, with the machine in this pose: load centre and gradient turn with its heading."""
+        mark, e = place.mark, place.estimate
+        (xx, xy), (_, yy) = pose.covariance_m2
         c, s = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         x, y = pose.x_m + c * self._load_centre_m, pose.y_m + s * self._load_centre_m
         grade = (c * e.slope_x - s * e.slope_y, s * e.slope_x + c * e.slope_y, e.slope_var)
-        place = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)
-        return [(*place, e.c_rr, e.c_rr_var, *grade)]
+        at = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)
+        return (*at, e.c_rr, e.c_rr_var, *grade)
+
+
+def joined(made: Sequence[Samples]) -> Samples:
+    """Samples of several steps in one."""
+    return Samples(*map(np.concatenate, zip(*made, strict=True))) if made else Samples(NOTHING, NOTHING)
 
 
 def _interpolate(a: PoseBelief, b: PoseBelief, stamp_ns: int) -> PoseBelief:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.delivery.audit import read_audit
+from agents.delivery.audit import Contents, read_audit
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence import snapshot
@@ -51,12 +51,12 @@ class AuditResult:
     unrecorded: int
 
 
-def read_audits(audits: Mapping[str, Path]) -> dict[SampleKey, str]:
-    """Content hash of every recorded sample; audits: machine -> file."""
+def read_audits(audits: Mapping[str, Path]) -> dict[SampleKey, Contents]:
+    """Content hashes of every recorded sample; audits: machine -> file."""
     return {
-        (machine, spool, seq): content
+        (machine, spool, seq): contents
         for machine, path in audits.items()
-        for (spool, seq), content in read_audit(path).items()
+        for (spool, seq), contents in read_audit(path).items()
     }
 
 
@@ -71,7 +71,7 @@ def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, conf
 
 
 def compare(
-    recorded: Mapping[SampleKey, str],
+    recorded: Mapping[SampleKey, Contents],
     rows: Iterable[JournalRow],
     grid: Grid,
     site: SiteConfig,
@@ -92,7 +92,7 @@ def compare(
             content = content_hash(sample)
             hashes.setdefault((row.machine, row.spool_id, row.first_seq + i), []).append(content)
             contents[row.machine, content] += 1
-    lost = sum(content not in hashes.get(identity, ()) for identity, content in recorded.items())
+    lost = sum(not set(may_be) & set(hashes.get(identity, ())) for identity, may_be in recorded.items())
     by_identity = sum(len(each) - 1 for each in hashes.values())
     by_content = sum(n - 1 for n in contents.values())
     short, over = grid_difference(refolded.state(), grid.state())

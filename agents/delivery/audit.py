@@ -1,9 +1,11 @@
 """The audit file: what an agent recorded, line by line at recording time, to compare with the server's journal.
 
-`+ <spool_id> <seq> <hash>` is a recorded sample (a later line for the same sample replaces it), `- <spool_id> <seq>`
-one whose identity is void because it was numbered anew. A line is written after its sample is committed; lines that a
-crash prevented are added when the spool is opened again. So no line claims a sample that was never on disk, and a disk
-that loses committed samples shows as a loss.
+`+ <spool_id> <seq> <hash>` is a recorded sample (a later line for the same sample replaces it: its final value),
+`- <spool_id> <seq>` one whose identity is void because it was numbered anew. A line is written after its sample is
+committed; lines that a crash prevented are added when the spool is opened again. So no line claims a sample that was
+never on disk, and a disk that loses committed samples shows as a loss. `? <spool_id> <seq> <hash>` is what the disk had
+then of a noted sample, where that is something else: a damaged disk may go back to the value before the final one,
+which may have been delivered already. Either counts.
 """
 
 from collections.abc import Iterable
@@ -13,6 +15,7 @@ from protocol.arrays import Table
 from protocol.machine.samples import content_hash
 
 Identity = tuple[int, int]  # spool_id, seq
+Contents = tuple[str, ...]  # hashes of which each counts: one but after a damage
 
 
 class AuditLog:
@@ -42,9 +45,9 @@ class AuditLog:
             self._write([" # cut off"])
         noted = parse(_whole_lines(text))
         self._write(
-            f"+ {spool_id:016x} {seq} {content}"
+            f"{'?' if (spool_id, seq) in noted else '+'} {spool_id:016x} {seq} {content}"
             for spool_id, seq, row in spooled
-            if noted.get((spool_id, seq)) != (content := content_hash(row))
+            if (content := content_hash(row)) not in noted.get((spool_id, seq), ())
         )
 
     def close(self) -> None:
@@ -56,18 +59,21 @@ class AuditLog:
         self._file.flush()
 
 
-def read_audit(path: Path) -> dict[Identity, str]:
-    """Hash of every sample that an agent recorded, by identity."""
+def read_audit(path: Path) -> dict[Identity, Contents]:
+    """What every sample that an agent recorded may be, by identity."""
     return parse(_whole_lines(path.read_text(encoding="ascii")))
 
 
-def parse(lines: Iterable[str]) -> dict[Identity, str]:
-    """Hash by identity, of audit lines; malformed lines are skipped."""
-    recorded: dict[Identity, str] = {}
+def parse(lines: Iterable[str]) -> dict[Identity, Contents]:
+    """Hashes by identity, of audit lines; malformed lines are skipped."""
+    recorded: dict[Identity, Contents] = {}
     for line in lines:
         match line.split() if "#" not in line else []:
             case ["+", spool_id, seq, content]:
-                recorded[int(spool_id, 16), int(seq)] = content
+                recorded[int(spool_id, 16), int(seq)] = (content,)
+            case ["?", spool_id, seq, content]:
+                identity = int(spool_id, 16), int(seq)
+                recorded[identity] = (*recorded.get(identity, ()), content)
             case ["-", spool_id, seq]:
                 recorded.pop((int(spool_id, 16), int(seq)), None)
     return recorded

@@ -3,8 +3,12 @@
 Samples are numbered through in the file. What is recorded between one opening and the next is a **run**, with a random
 `spool_id` of its own; `seq` counts 1, 2, 3... within a run, so that seq = number - base. A file that was copied,
 cloned, restored from a backup or set back by a disk that lies about its syncs therefore never gives one identity to two
-samples: what copies have in common has the same identity and the same bytes, what they record from then on has another
-spool_id.
+samples: what copies have in common has the same identity and the same bytes (but for positions that were pending), what
+they record from then on has another spool_id.
+
+The newest samples may be **pending**: they have the filter's position, and wait for the smoother's. They are on disk,
+and not sent. Only memory knows that they are pending: whoever opens the file again takes them as they are, since a
+coarse place is better than none.
 
 It is one module because every method is a transaction over the same few tables, and they must agree.
 """
@@ -34,7 +38,10 @@ KEPT_RUNS = 16  # earlier runs that are declared again: so a server that was res
 
 @dataclass(frozen=True)
 class SpoolConfig:
-    """max_samples: beyond so many the oldest are dropped, counted, and declared lost to the server."""
+    """max_samples: beyond so many the oldest are dropped, counted, and declared lost to the server.
+
+    Pending ones, which are never more than the smoother's lag holds, do not count.
+    """
 
     max_samples: int = 2_000_000
 
@@ -68,7 +75,7 @@ class _Meta:
     gone: int
 
 
-_SampleRow = tuple[int, bytes, int, int]  # number, sample, whether it is final, checksum
+_SampleRow = tuple[int, bytes, int]  # number, sample, checksum
 
 
 def random_id() -> int:
@@ -122,11 +129,12 @@ class Spool:
         return self._runs[-1].acknowledged
 
     def counters(self) -> dict[str, int]:
-        """Depth, and what never reached the server."""
+        """Depth, how many of these are pending, and what never reached the server."""
         with self._lock:  # kept, not counted: that would take long in a full spool
             meta = self._meta
             return {
                 "depth": self._depth,
+                "pending": self._held_back,
                 "dropped": meta.dropped,
                 "put_aside": self._quarantined,
                 "recorded": meta.recorded,
@@ -138,31 +146,27 @@ class Spool:
         with self._lock:
             return self._depth == 0 and self._sending == len(self._runs) - 1
 
-    def record(self, rows: Table, *, final: bool = True) -> int:
-        """Write samples durably; returns the sequence number of the first.
+    def record(self, rows: Table, *, pending: int = 0, finals: Table | None = None) -> int:
+        """Write samples durably, all together; returns the sequence number of the first new one.
 
-        Pending ones (not final) are not sent before they are made final.
+        rows: new ones, of which the last `pending` wait for their final values. finals: those of the samples that have
+        been pending longest, in their order. ValueError if a sample would be final before an earlier one.
         """
+        finals = empty() if finals is None else finals
+        left = self._pending - len(finals)
+        if left < 0 or not 0 <= pending <= len(rows) or (left and pending < len(rows)):
+            new = f"{pending} of {len(rows)} new ones"
+            raise ValueError(f"{len(finals)} final values for {self._pending} pending samples and {new}")
         with self._access():
-            first = self.newest + 1
-            self._insert(rows, final=final)
+            base, first, oldest = self._runs[-1].base, self.newest + 1, self.newest - self._pending + 1
+            gone = max(0, self.acknowledged + 1 - oldest)  # a copy of the file has delivered these as they were
+            self._write(rows, finals[gone:], base + oldest + gone, left + pending)
+            self._note(oldest + gone, finals[gone:])
             self._note(first, rows)
             return first
 
-    def finalise(self, first_seq: int, rows: Table) -> None:
-        """Replace pending samples of this run by their final values; those that are final stay as they are."""
-        with self._access():
-            base = self._runs[-1].base
-            pending = [i for i in range(len(rows)) if self._is_pending(base + first_seq + i)]
-            with transaction(self._db):
-                data = {base + first_seq + i: rows[i].tobytes() for i in pending}
-                values = [(row, checksum(number, row), number) for number, row in data.items()]
-                self._db.executemany("UPDATE sample SET row = ?, crc32 = ?, final = 1 WHERE number = ?", values)
-            for i in pending:
-                self._note(first_seq + i, rows[i : i + 1])
-
     def head(self, limit: int) -> Head | None:
-        """What to send next, at most `limit` samples without a hole between them; None if there is nothing.
+        """What to send next, at most `limit` final samples without a hole between them; None if there is nothing.
 
         Runs come one after the other; one that has no samples left is closed with an empty head.
         """
@@ -174,10 +178,9 @@ class Spool:
             if not oldest:
                 return Head(run.spool_id, end + 1, empty(), end, store=run.store) if newest is None else None
             first = oldest[0][0]
-            n = next((i for i, (number, _, final, _) in enumerate(oldest) if final == 0 or number != first + i), None)
-            seq, rows = first - run.base, _table(row for _, row, _, _ in oldest[:n])
-            lost = seq - 1 - run.acknowledged
-            return Head(run.spool_id, seq, rows, lost, newest, run.store) if len(rows) else None
+            n = next((i for i, (number, _, _) in enumerate(oldest) if number != first + i), None)
+            seq, rows = first - run.base, _table(row for _, row, _ in oldest[:n])
+            return Head(run.spool_id, seq, rows, seq - 1 - run.acknowledged, newest, run.store)
 
     def acknowledge(self, spool_id: int, watermark: int, store: str = "") -> None:
         """Delete what the server has on disk, of one run, which is bound to that store from then on."""
@@ -210,6 +213,11 @@ class Spool:
                 self._save_run(new)
             self._runs[at], self._sending = new, 0
             self._mark.write(self._run_end(at).values())
+
+    def declare_again(self) -> None:
+        """Close all earlier runs once more, each with what was acknowledged of it: the server may have lost some."""
+        with self._lock:
+            self._sending = 0
 
     def start_new_run(self) -> None:
         """Give what is not acknowledged of this run a new identity: another agent sends under the present one."""
@@ -264,8 +272,6 @@ class Spool:
         """Make or read the file, name what it has lost, and start a run."""
         with transaction(self._db):  # all together: a kill leaves all or nothing
             make_or_check(self._db)
-            # After a crash pending samples are sent as they are: a coarse place is better than none.
-            self._db.execute("UPDATE sample SET final = 1 WHERE final IS NOT 1")
             self._meta = _Meta(**{k: int(v) for k, v in self._db.execute("SELECT key, value FROM meta")})
             self._runs = self._runs_of_file()
             self.damage = self._compare(traces)
@@ -273,6 +279,7 @@ class Spool:
         with contextlib.suppress(OSError):  # it stays behind, which is no alarm
             self._mark.replace({k: n for i in range(len(self._runs)) for k, n in self._run_end(i).values().items()})
         self._sending = 0  # index of the run that is being sent
+        self._pending = 0  # of this run: its newest samples
         self._depth = int(self._db.execute("SELECT COUNT(*) FROM sample").fetchone()[0])
         self._quarantined = int(self._db.execute("SELECT COUNT(*) FROM quarantine").fetchone()[0])
         if self._audit:
@@ -325,6 +332,15 @@ class Spool:
         is_last = at == len(self._runs) - 1
         return (self._meta.newest if is_last else self._runs[at + 1].base) - self._runs[at].base
 
+    @property
+    def _held_back(self) -> int:
+        """Samples of the file that are pending."""
+        return min(self._pending, self.newest - self.acknowledged)
+
+    def _last_final(self, at: int) -> int:
+        """The last seq of a run that may be sent."""
+        return self._end(at) - (self._pending if at == len(self._runs) - 1 else 0)
+
     def _run_end(self, at: int) -> RunEnd:
         run = self._runs[at]
         return RunEnd(run.spool_id, self._end(at % len(self._runs)), run.acknowledged)
@@ -332,27 +348,26 @@ class Spool:
     def _index(self, spool_id: int) -> int:
         return next(i for i, run in enumerate(self._runs) if run.spool_id == spool_id)
 
-    def _insert(self, rows: Table, *, final: bool) -> None:
+    def _write(self, rows: Table, finals: Table, oldest: int, pending: int) -> None:
+        """Add samples, and give others, from that number on, their final values; then so many are pending."""
         old, n = self._meta, len(rows)
-        values = [
-            (number, data, int(final), checksum(number, data))
-            for number, data in enumerate((row.tobytes() for row in rows), old.newest + 1)
-        ]
-        excess = max(0, self._depth + n - self._config.max_samples)
+        added, replaced = _numbered(rows, old.newest + 1), _numbered(finals, oldest)
+        excess = max(0, self._depth + n - min(pending, self.newest + n - self.acknowledged) - self._config.max_samples)
         with transaction(self._db):
-            self._db.executemany("INSERT INTO sample VALUES (?, ?, ?, ?)", values)
+            self._db.executemany("UPDATE sample SET row = ?2, crc32 = ?3 WHERE number = ?1", replaced)
+            self._db.executemany("INSERT INTO sample VALUES (?, ?, ?)", added)
             if excess:
-                oldest = "SELECT number FROM sample ORDER BY number LIMIT ?"
-                self._db.execute(f"DELETE FROM sample WHERE number IN ({oldest})", (excess,))  # noqa: S608 - no input
+                oldest_ones = "SELECT number FROM sample ORDER BY number LIMIT ?"
+                self._db.execute(f"DELETE FROM sample WHERE number IN ({oldest_ones})", (excess,))  # noqa: S608 - no input
             new = replace(old, newest=old.newest + n, dropped=old.dropped + excess, recorded=old.recorded + n)
             self._save(new)
-        self._meta = new
+        self._meta, self._pending = new, pending
         self._mark.write(self._run_end(-1).values())
         self._depth += n - excess
 
     def _oldest(self, limit: int) -> list[_SampleRow]:
-        """Rows of the run that is being sent."""
-        base, end = self._runs[self._sending].base, self._end(self._sending)
+        """Final rows of the run that is being sent."""
+        base, end = self._runs[self._sending].base, self._last_final(self._sending)
         query = "SELECT * FROM sample WHERE number > ? AND number <= ? ORDER BY number LIMIT ?"
         return self._db.execute(query, (base, base + end, limit)).fetchall()
 
@@ -368,14 +383,13 @@ class Spool:
         self._depth -= len(values)
 
     def _note(self, first_seq: int, rows: Table) -> None:
-        """Write the audit, if there is one: lines that a full disk prevents are added at the next opening."""
-        if self._audit:
+        """Write the audit, if there is one, before they can be sent.
+
+        Lines that a full disk prevents are added at the next opening.
+        """
+        if self._audit and len(rows):
             with contextlib.suppress(OSError):
                 self._audit.recorded(self.spool_id, first_seq, rows)
-
-    def _is_pending(self, number: int) -> bool:
-        query = "SELECT 1 FROM sample WHERE number = ? AND final = 0"
-        return self._db.execute(query, (number,)).fetchone() is not None
 
     def _save(self, meta: _Meta) -> None:
         values = [(key, str(value)) for key, value in asdict(meta).items()]
@@ -388,7 +402,7 @@ class Spool:
 
 def _damaged(rows: list[_SampleRow]) -> list[tuple[int, bytes]]:
     """Those that are not what was written."""
-    return [(number, row) for number, row, _, crc32 in rows if not _is_sound(number, row, crc32)]
+    return [(number, row) for number, row, crc32 in rows if not _is_sound(number, row, crc32)]
 
 
 def _is_sound(number: int, row: object, crc32: int) -> bool:
@@ -400,6 +414,11 @@ def _run_from(base: int, spool_id: str, acknowledged: int, closed: int, store: s
     if crc32 != checksum_of(base, spool_id, acknowledged, closed, store):
         raise ValueError(f"what it knows of samples from {base} on is damaged; move the file away")
     return SpoolRun(base, int(spool_id, 16), acknowledged, bool(closed), store)
+
+
+def _numbered(rows: Table, first: int) -> list[_SampleRow]:
+    """Rows as the file has them, numbered from `first` on."""
+    return [(number, data, checksum(number, data)) for number, data in enumerate(map(np.void.tobytes, rows), first)]
 
 
 def _table(rows: Iterable[bytes]) -> Table:

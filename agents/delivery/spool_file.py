@@ -9,12 +9,12 @@ from pathlib import Path
 from agents.delivery.spool_mark import RunEnd
 from protocol.files import make_private
 
-SCHEMA = 4
+SCHEMA = 5
 LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
 _TABLES = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
     "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INT, closed INT, store TEXT, crc32 INT)",
-    "CREATE TABLE sample (number INTEGER PRIMARY KEY, row BLOB NOT NULL, final INTEGER NOT NULL, crc32 INTEGER)",
+    "CREATE TABLE sample (number INTEGER PRIMARY KEY, row BLOB NOT NULL, crc32 INTEGER)",
     "CREATE TABLE quarantine (spool_id TEXT NOT NULL, seq INTEGER NOT NULL, row BLOB NOT NULL, problem TEXT NOT NULL)",
     "INSERT INTO meta VALUES ('newest', '0'), ('dropped', '0'), ('recorded', '0'), ('gone', '0')",
     f"PRAGMA user_version={SCHEMA}",

@@ -6,6 +6,8 @@ Each event returns the next action; whoever carries it out (uplink_thread.py, or
 
 What holds through kills of router, server and agent is a query with payload, a reply after the commit, a watermark, and
 a deletion after the reply. An empty reply means "no server" or "denied", never "done".
+
+It is one module because an action and the event that it leads to are read together.
 """
 
 import math
@@ -121,6 +123,11 @@ class LowerWatermark:
 
 
 @dataclass(frozen=True)
+class DeclareAgain:
+    """Close all earlier runs once more: the server has lost journal rows, and does not know of which runs."""
+
+
+@dataclass(frozen=True)
 class StartNewRun:
     """Give what is not acknowledged of the present run a new identity: another agent sends under the present one."""
 
@@ -141,7 +148,7 @@ class Wait:
     for_samples: bool = False
 
 
-SpoolAction = Delete | LowerWatermark | StartNewRun | Quarantine  # when done, `on_stored` is called
+SpoolAction = Delete | LowerWatermark | DeclareAgain | StartNewRun | Quarantine  # when done, `on_stored` is called
 Action = ReadHead | Send | SpoolAction | Wait
 
 
@@ -175,6 +182,8 @@ class Uplink:
         self._head: Head | None = None  # of the batch under way
         self._took_s = 0.0  # by its exchange
         self._unacknowledged_s = 0.0  # since samples were sent that no acknowledgement has answered
+        self._newest_row = ("", 0)  # store, and the last row that it has named
+        self._declares = False  # all runs again, once the present exchange is done
 
     def start_exchange(self) -> ReadHead | Wait:
         """Begin: at the start, and after each pause."""
@@ -200,16 +209,21 @@ class Uplink:
             return self._on_silence()
         return self._on_refused(reply) if isinstance(reply, Refused) else self._on_ack(reply)
 
-    def on_stored(self, action: SpoolAction) -> Wait:
+    def on_stored(self, action: SpoolAction) -> SpoolAction | Wait:
         """End the exchange: the spool has done what was asked of it."""
-        if isinstance(action, LowerWatermark | Quarantine):
+        if isinstance(action, LowerWatermark | DeclareAgain | Quarantine):
             return Wait(0.0)
         pause_s = 0.0
         if isinstance(action, Delete) and self._head and (n := len(self._head.rows)):
             has_sent_all = n < self._limit and self._head.newest is not None
             pause_s = self._pacing.gather_s if has_sent_all else 0.0
             self._adapt(n)
-        return self._succeed(pause_s)
+        wait = self._succeed(pause_s)
+        if not self._declares:
+            return wait
+        self._declares = False
+        self.counters["declared_again"] += 1
+        return DeclareAgain()
 
     def on_disk_error(self, error: Exception) -> Wait:
         """The spool could not be read or written."""
@@ -244,6 +258,7 @@ class Uplink:
             self.problem = f"store {ack.store} acknowledges samples whose predecessors are in store {head.store}"
             self.stuck = self.problem
             return self._back_off()
+        self._compare_row(ack, head)
         if not len(head.rows):  # an earlier run is closed, even if the server is older than the run
             return Delete(head.spool_id, max(ack.watermark, head.first_seq - 1), ack.store)
         if head.newest is not None and ack.watermark > head.newest:
@@ -256,6 +271,16 @@ class Uplink:
         self.counters["batches"] += 1
         self.ack_s_max = max(self.ack_s_max, waited_s)
         return Delete(head.spool_id, ack.watermark, ack.store)
+
+    def _compare_row(self, ack: Ack, head: Head) -> None:
+        """See whether the journal has lost rows: it goes on behind one that it has named, or gives its number again.
+
+        What it lost of this run it will ask for itself. Of earlier runs only this agent knows.
+        """
+        store, row = self._newest_row
+        is_new = len(head.rows) > ack.trimmed
+        self._declares = self._declares or (ack.store == store and (ack.row < row or (is_new and ack.row == row)))
+        self._newest_row = (ack.store, ack.row)
 
     def _on_refused(self, refused: Refused) -> SpoolAction | Wait:
         head = self._head

@@ -8,7 +8,18 @@ from collections.abc import Callable
 import zenoh
 
 from agents.delivery.spool import Spool
-from agents.delivery.uplink import Action, Delete, LowerWatermark, Quarantine, ReadHead, Send, StartNewRun, Uplink, Wait
+from agents.delivery.uplink import (
+    Action,
+    DeclareAgain,
+    Delete,
+    LowerWatermark,
+    Quarantine,
+    ReadHead,
+    Send,
+    StartNewRun,
+    Uplink,
+    Wait,
+)
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply
@@ -36,6 +47,9 @@ def perform(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
             case LowerWatermark(spool_id, watermark):
                 log.warning("the map server has lost samples run=%016x until=%d", spool_id, watermark)
                 spool.lower_watermark(spool_id, watermark)
+            case DeclareAgain():
+                log.warning("the map server has lost journal rows: all runs are declared again")
+                spool.declare_again()
             case StartNewRun():
                 spool.start_new_run()
             case Quarantine(head, problem):

@@ -71,13 +71,16 @@ class LocalisationConfig:
 
 
 class Localiser:
-    """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order."""
+    """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order.
+
+    engine: the filter; an evaluation may put one that watches it in its place, before the first reading.
+    """
 
     def __init__(
         self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, step_s: float = STEP_S
     ) -> None:
         self._config = config
-        self._engine = _engine(config)
+        self.engine = _engine(config)
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
         self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
@@ -114,6 +117,12 @@ class Localiser:
     def machine_share(self) -> float | None:
         """Share of the slow variance that the receivers have in common, as it is taken for; None of fewer than two."""
         return self._receivers.machine_share
+
+    @property
+    def wheel_scale(self) -> float | None:
+        """How much further the wheels turn than the machine moves [-], as believed; None where it is no state."""
+        states = self._model.layout.wheel_scales
+        return float(self.belief.x[states.start]) if self.belief and states.stop > states.start else None
 
     @property
     def belief(self) -> Belief | None:
@@ -198,7 +207,7 @@ class Localiser:
         first, layout = self._steps[0], self._model.layout
         belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
         belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
-        self._fusion = Fusion(self._engine, self._model, belief)
+        self._fusion = Fusion(self.engine, self._model, belief)
         beliefs = [belief]
         events: list[Event] = [*list(self._steps)[1:], *self._fixes, *self._velocities]
         for event in sorted(events, key=lambda e: e.stamp_ns):

@@ -168,7 +168,8 @@ def _estimate(task: Task[GroundConfiguration], cache: Path) -> PipelineOutput:
     recording = task.recording(cache)
     pipeline, readings = Pipeline(recording.site, recording.machine, task.variant.options), recording.readings
     began_s = time.process_time()
-    samples = np.concatenate([pipeline.step(readings[i : i + CHUNK]) for i in range(0, len(readings), CHUNK)])
+    made = [pipeline.step(readings[i : i + CHUNK]).final for i in range(0, len(readings), CHUNK)]
+    samples = np.concatenate([*made, pipeline.finish().final])
     cpu_s = time.process_time() - began_s
     seconds = (readings[-1].stamp_ns - readings[0].stamp_ns) * 1e-9
     return PipelineOutput(samples, pipeline.health()["withheld"], cpu_s * 1e6 / seconds if seconds else math.nan)

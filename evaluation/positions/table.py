@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.pipeline import Positioning
+from agents.pipeline import PipelineConfig, Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Report, Row, half_width, rounded
 from evaluation.campaign.recordings import PAPER, PlannedDrive, RecordedDrive, Setup
@@ -23,6 +23,7 @@ from evaluation.positions.replay import Score, errors, replay, score
 from evaluation.positions.substitution import gps_errors, true_motion, with_gps_errors
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Reading
 from sim.sensors.presets import GpsNoise
 
 TRACE_S = 1.0  # between two points of the curves that plots draw
@@ -188,12 +189,7 @@ def values(scores: Sequence[Score], name: str) -> Floats:
 
 def _replay(task: Task[Configuration], cache: Path) -> ScoredRun:
     """Run one configuration on one recording."""
-    recording = _with_share(task, cache)
-    machine, options = select(recording.machine, task.variant.gps, task.variant.imu), task.variant.options
-    if not task.variant.gps:
-        options = replace(options, localisation=replace(options.localisation, start=recording.start))
-    in_use = {sensor.name for sensor in machine.sensors if sensor.use}
-    readings = [reading for reading in recording.readings if reading.sensor in in_use]
+    recording, machine, options, readings = prepared(task, cache)
     trace = replay(Positioning(recording.site, machine, options), readings)
     _, pick = np.unique(trace.since_start_s // TRACE_S, return_index=True)
     variances = np.linalg.eigvalsh(trace.covariance_m2[pick])
@@ -204,6 +200,18 @@ def _replay(task: Task[Configuration], cache: Path) -> ScoredRun:
         error_m=errors(trace, recording.truth)[pick],
         std_m=np.sqrt(variances[:, -1]),
     )
+
+
+def prepared(
+    task: Task[Configuration], cache: Path
+) -> tuple[RecordedDrive, MachineConfig, PipelineConfig, list[Reading]]:
+    """Recording, machine, options and readings of one configuration on one recording."""
+    recording = _with_share(task, cache)
+    machine, options = select(recording.machine, task.variant.gps, task.variant.imu), task.variant.options
+    if not task.variant.gps:
+        options = replace(options, localisation=replace(options.localisation, start=recording.start))
+    in_use = {sensor.name for sensor in machine.sensors if sensor.use}
+    return recording, machine, options, [reading for reading in recording.readings if reading.sensor in in_use]
 
 
 def _with_share(task: Task[Configuration], cache: Path) -> RecordedDrive:

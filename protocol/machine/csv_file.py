@@ -76,7 +76,7 @@ def parse_column(value: Any, name: str, where: str) -> Column:
     column = Column({value: 1.0}) if isinstance(value, str) and value else _parse_table(value, where)
     try:
         stamp_reader(column) if name == "stamp" else number_reader(column, name)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:  # a weight that no number holds
         raise ConfigError(where, str(error)) from None
     return column
 

@@ -35,28 +35,34 @@ def add_options(parser: ArgumentParser) -> None:
         "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
     )
     table = add_action(what, "localisation", "repeat the paper's table on simulated recordings")
+    budget = add_action(what, "budget", "show what each kind of error costs, by the truth in its place")
     ground = add_action(what, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work")
     merge = add_action(what, "merge", "compare this map merge with other methods")
-    for action, seeds in ((physics, 3), (table, 12), (ground, 12), (merge, 12)):
+    lag = add_action(what, "lag", "compare the maps of four loaders at work with and without the smoother's lag")
+    for action, seeds in ((physics, 3), (table, 12), (budget, 12), (ground, 12), (merge, 12), (lag, 12)):
         action.add_argument("--seeds", type=count, default=seeds, help="number of seeds (default %(default)s)")
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
+    for action in (table, budget, ground, merge, lag):
+        action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
+        action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
         (table, "errors over time, tracks and the table"),
         (ground, "estimates along the track, errors by place"),
         (merge, "the maps of the first seed and the table"),
     ):
-        action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
-        action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
         action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
-    for action, seconds in ((table, 1200.0), (ground, 600.0)):
+    for action, seconds in ((table, 1200.0), (budget, 1200.0), (ground, 600.0), (lag, 900.0)):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
     scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
-    table.add_argument("--scenario", choices=SCENARIOS, default=SCENARIOS[0], help=scenario)
+    for action in (table, budget):
+        action.add_argument("--scenario", choices=SCENARIOS, default=SCENARIOS[0], help=scenario)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
     shared = "shares of slow GPS errors that the receivers have in common, comma-separated (default: as recorded)"
     table.add_argument("--shares", type=shares, default=(None,), help=shared)
+    judged = "compare the EKF of the profile default with the batch optimum of the same runs, by GTSAM (extra oracle)"
+    table.add_argument("--oracle", action="store_true", help=judged)
     merge.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
@@ -85,8 +91,10 @@ def run(arguments: Namespace) -> int:
     evaluations = {
         "physics": _physics,
         "localisation": _localisation,
+        "budget": _budget,
         "ground": _ground,
         "merge": _merge,
+        "lag": _lag,
         "log": _log,
         "parity": _parity,
     }
@@ -113,7 +121,30 @@ def _localisation(arguments: Namespace) -> Report:
     work = partial(
         table.run, seeds=_seeds(arguments), seconds=arguments.seconds, rows=rows, setup=SETUPS[arguments.scenario]
     )
-    return _experiment(arguments, "machines drive, filters follow", work, "evaluation.positions.plots")
+    judged = _with_oracle(work) if arguments.oracle else work
+    return _experiment(arguments, "machines drive, filters follow", judged, "evaluation.positions.plots")
+
+
+def _with_oracle(table: Callable[[Runner], tuple[Report, Any]]) -> Callable[[Runner], tuple[Report, Any]]:
+    """The same experiment, and its EKF judged by the batch optimum."""
+    from evaluation.positions import oracle
+
+    oracle.require()
+
+    def work(runner: Runner) -> tuple[Report, Any]:
+        report, outcomes = table(runner)
+        return {**report, "oracle": oracle.run(runner, outcomes)}, outcomes
+
+    return work
+
+
+def _budget(arguments: Namespace) -> Report:
+    from evaluation.campaign.recordings import SETUPS
+    from evaluation.positions import budget
+
+    setup = SETUPS[arguments.scenario]
+    work = partial(budget.run, seeds=_seeds(arguments), seconds=arguments.seconds, setup=setup)
+    return _experiment(arguments, "machines drive, filters are given the truth", work)
 
 
 def _ground(arguments: Namespace) -> Report:
@@ -132,8 +163,17 @@ def _merge(arguments: Namespace) -> Report:
     return _experiment(arguments, "machines drive, their samples are merged", work, "evaluation.maps.plots")
 
 
-def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str) -> Report:
-    """Run an experiment with its progress shown, and draw its pictures where they are asked for."""
+def _lag(arguments: Namespace) -> Report:
+    from evaluation.ground import lag
+
+    work = partial(lag.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    return _experiment(arguments, "loaders work, their samples are smoothed and merged", work)
+
+
+def _experiment(
+    arguments: Namespace, title: str, work: Callable[[Runner], tuple[Report, Any]], plots: str = ""
+) -> Report:
+    """Run an experiment with its progress shown, and draw its pictures, if it has any and they are asked for."""
     from evaluation.campaign.experiment import Runner
     from evaluation.campaign.workers import cores
 
@@ -143,7 +183,7 @@ def _experiment(arguments: Namespace, title: str, work: Callable[[Runner], tuple
         report, outcomes = work(runner)
     if not arguments.json:
         note(f"recordings and results are in {arguments.out}")
-    if arguments.plots:
+    if plots and arguments.plots:
         pictures = import_module(plots)  # imported here: only pictures need matplotlib
         report = {**report, "plots": list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))}
     return report

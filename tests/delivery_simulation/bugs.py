@@ -14,7 +14,10 @@ from agents.delivery import uplink_thread
 from agents.delivery.spool import Spool, SpoolRun
 from agents.delivery.uplink import Action, Send, Uplink
 from agents.delivery.uplink_thread import Ask
+from agents.delivery.write_buffer import WriteBuffer
 from mapserver.journal.rows import Admission
+from protocol.errors import StoreError
+from protocol.machine.samples import empty
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from tests.delivery_simulation import servers
 from tests.delivery_simulation.faults import Fault
@@ -108,16 +111,45 @@ def one_identity_for_ever(patch: pytest.MonkeyPatch) -> None:
 
 def commit_is_assumed(patch: pytest.MonkeyPatch) -> None:
     """The spool counts its numbers on although the disk took nothing."""
-    insert = Spool._insert
+    write = Spool._write
 
-    def count_first(self: Spool, rows: Any, *, final: bool) -> None:
+    def count_first(self: Spool, rows: Any, *more: Any) -> None:
         try:
-            insert(self, rows, final=final)
+            write(self, rows, *more)
         except Exception:
             self._meta = replace(self._meta, newest=self._meta.newest + len(rows))
             raise
 
-    patch.setattr(Spool, "_insert", count_first)
+    patch.setattr(Spool, "_write", count_first)
+
+
+def pending_are_sent(patch: pytest.MonkeyPatch) -> None:
+    """The uplink sends what has no final value yet."""
+    patch.setattr(Spool, "_last_final", Spool._end)
+
+
+def final_values_find_others(patch: pytest.MonkeyPatch) -> None:
+    """Final values go to the newest pending samples, not to the oldest."""
+    write = Spool._write
+
+    def misplace(self: Spool, rows: Any, finals: Any, oldest: int, pending: int) -> None:
+        write(self, rows, finals, self._meta.newest - len(finals) + 1, pending)
+
+    patch.setattr(Spool, "_write", misplace)
+
+
+def final_values_are_given_up(patch: pytest.MonkeyPatch) -> None:
+    """A final value that a full disk does not take is forgotten: its sample stays pending and blocks all later ones."""
+    write = WriteBuffer.write
+
+    def forget(self: WriteBuffer, spool: Spool) -> int:
+        try:
+            return write(self, spool)
+        except StoreError:
+            self._finals = empty()
+            raise
+
+    patch.setattr(WriteBuffer, "write", forget)
 
 
 def failed_commit_stays_open(patch: pytest.MonkeyPatch) -> None:
@@ -147,5 +179,6 @@ _PLANTS: tuple[Plant, ...] = (
     *(ack_before_commit, watermark_one_too_low, watermark_one_too_high, delete_before_ack),
     *(trim_whole_batch, trim_nothing, gap_is_accepted, one_identity_for_ever),
     *(commit_is_assumed, failed_commit_stays_open, drops_are_silent),
+    *(pending_are_sent, final_values_find_others, final_values_are_given_up),
 )
 BUGS = {plant.__name__: plant for plant in _PLANTS}

@@ -41,12 +41,13 @@ class FaultPlan:
     fault: Fault | None = None
     left: int = 0
     killed: bool = False
+    struck: bool = False  # since it was armed
 
     def arm(self, fault: Fault, left: int) -> None:
         self.fault, self.left = fault, left
 
     def disarm(self) -> None:
-        self.fault = None
+        self.fault, self.struck = None, False
 
     def due(self, statement: str) -> Fault | None:
         if self.killed:
@@ -56,7 +57,7 @@ class FaultPlan:
         self.left -= 1
         if self.left > 0:
             return None
-        fault, self.fault = self.fault, None
+        fault, self.fault, self.struck = self.fault, None, True
         self.killed = fault in KILLS
         return fault
 
@@ -143,9 +144,9 @@ def draw_rates(rng: random.Random) -> Rates:
         twice=some(0.4),
         reply_lost=some(0.5),
         server_fault=some(0.4),
-        spool_fault=some(0.3),
+        spool_fault=some(0.4),
         bad_sample=some(0.15),
-        pending=rng.random() < 0.3,
+        pending=rng.random() < 0.6,
         copies=rng.random() < 0.5,
         server_backups=rng.random() < 0.3,
         max_samples=rng.choice((10_000, 10_000, 20, 6)),

@@ -21,6 +21,7 @@ from agents.delivery.uplink import Uplink, UplinkConfig, Wait
 from agents.delivery.uplink_thread import UplinkThread
 from agents.localisation.filters.belief import PoseBelief
 from agents.presence import PATIENCE, Presence, find_namesake
+from agents.sampling import Samples
 from mapserver.config import ServerConfig
 from mapserver.server import Server
 from protocol.errors import LinkError
@@ -220,11 +221,12 @@ def test_bug_does_not_end_delivery_silently(
 
 
 def test_agent_goes_on_while_its_disk_takes_nothing(opened: Opened, tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("agents.agent.MOST_UNSAVED", 8)
+    monkeypatch.setattr("agents.delivery.write_buffer.MOST_UNSAVED", 8)
     agent = Agent(opened(), SITE, MACHINE, AgentConfig(linger_s=0), Places(tmp_path / "spool.db"))
     agent._spool._db.execute("PRAGMA query_only = ON")
     for _ in range(5):
-        agent._deliver(made_up_samples(2))
+        agent._take(Samples(made_up_samples(2), made_up_samples(2)))
+        agent._write()
     report = agent.report(Silent(1))
     assert (report["samples"], report["spool"]["unsaved"], report["spool"]["given_up"]) == (0, 8, 2)
     assert "look at the machine's disk" in report["spool_problem"]
@@ -242,7 +244,7 @@ def test_samples_that_the_disk_takes_only_after_the_end_are_delivered(
     with server_at(endpoint, tmp_path / "store"):
         agent = Agent(opened(), SITE, MACHINE, AgentConfig(linger_s=WAIT_S), Places(tmp_path / "spool.db"))
         agent._spool._db.execute("PRAGMA query_only = ON")
-        agent._deliver(made_up_samples(5))
+        agent._take(Samples(made_up_samples(5), made_up_samples(5)))
 
         def mend(seconds: float) -> None:
             agent._spool._db.execute("PRAGMA query_only = OFF")

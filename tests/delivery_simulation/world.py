@@ -21,10 +21,11 @@ import numpy as np
 from agents.delivery import uplink_thread
 from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import Action, Pacing, Uplink, UplinkConfig, Wait
+from agents.delivery.write_buffer import WriteBuffer
 from mapserver.ingest.store import Incoming
 from protocol.arrays import Table
 from protocol.errors import StoreError
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import SAMPLE_DTYPE, empty
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_reply, encode_reply
 from protocol.wire.messages import Ack, Refused
@@ -46,11 +47,15 @@ class SimulatedAgent:
         self.spool: FaultySpool | None = None
         self.uplink: Uplink | None = None
         self.plan = FaultPlan()
-        self.unsaved: list[bytes] = []  # the disk was full; the agent keeps them and tries again
-        self.in_doubt: list[bytes] = []  # it was killed while it wrote them
-        self.before_drop: set[int] = set()
-        self.pending: tuple[int, list[bytes]] = (0, [])
         self.clock_ns = 0
+        self.start()
+
+    def start(self) -> None:
+        """Memory of a process that has just begun, and what it may have left on its disk."""
+        self.buffer = WriteBuffer()
+        self.pending: list[bytes] = []  # samples that it will make final, in their order
+        self.unwritten: dict[int, bytes] = {}  # values that may be on disk or not, by stamp
+        self.before_drop: set[int] = set()
 
 
 @dataclass
@@ -92,7 +97,8 @@ class World:
             SimulatedAgent(f"agent-{i}", f"loader-{i}", folder / f"{i}.db") for i in range(self.rates.machines)
         ]
         self._copies: dict[str, Path] = {}
-        self._contents: dict[int, set[bytes]] = {}  # of every recorded sample, by stamp; coarse and final
+        self._contents: dict[int, bytes] = {}  # the value of every recorded sample that is to be sent, by stamp
+        self._copied: dict[int, set[bytes]] = {}  # values that a copy may send in its place
         self._explained: set[int] = set()
         self._faults = True
         self._numbers = iter(range(10**9))
@@ -130,7 +136,7 @@ class World:
             self._deliver_late: 5,
             self._end: 4,
             self._start: 6,
-            self._finalise: 3,
+            self._finalise: 8,
             self._step_clock: 1,
             self._change_server: 4,
             self._copy_or_restore: 2,
@@ -138,36 +144,38 @@ class World:
         self.rng.choices(list(weights), list(weights.values()))[0](agent)
 
     def _record(self, agent: SimulatedAgent) -> None:
+        """The agent makes samples; final at once, or pending."""
         if not agent.spool:
             return
-        rows = agent.unsaved + [self._sample(agent) for _ in range(self.rng.randint(1, 6))]
-        final = not (self.rates.pending and self.rng.random() < 0.5)
-        before = self._present(agent) | {_stamp(row) for row in rows}
-        agent.in_doubt, agent.unsaved = rows, []
-        with self._spool_faults(agent):
-            first = agent.spool.record(_table(rows), final=final)
-            agent.in_doubt = []
-            self._is_recorded(rows)
-            self._explained |= before - self._present(agent)  # the bounded spool dropped them
-            self.note(f"{agent.name} recorded {first}..{first + len(rows) - 1} final={final}")
-            if not final:
-                agent.pending = (first, rows)
-        if agent.in_doubt and agent.spool:
-            agent.unsaved, agent.in_doubt = agent.in_doubt, []
-        agent.before_drop = before if agent.in_doubt else set()
+        rows = [self._sample(agent) for _ in range(self.rng.randint(1, 6))]
+        is_final = not (self.rates.pending or agent.pending)
+        agent.buffer.add(_table(rows), _table(rows) if is_final else empty())
+        agent.pending += [] if is_final else rows
+        agent.unwritten |= {_stamp(row): row for row in rows}
+        self._write(agent)
 
-    def _finalise(self, agent: SimulatedAgent) -> None:
-        first, rows = agent.pending
-        if not agent.spool or not rows:
+    def _finalise(self, agent: SimulatedAgent, n: int = 0) -> None:
+        """The agent learns more about the n oldest of its pending samples; 0: about some."""
+        if not agent.spool or not agent.pending:
             return
-        better = _table(rows).copy()
+        n = n or self.rng.randint(1, len(agent.pending))
+        better = _table(agent.pending[:n]).copy()
         better["x_m"] += 0.25
-        for row in better:
-            self._contents[_stamp(row.tobytes())].add(row.tobytes())
+        del agent.pending[:n]
+        agent.buffer.add(empty(), better)
+        agent.unwritten |= {_stamp(row.tobytes()): row.tobytes() for row in better}
+        self._write(agent)
+
+    def _write(self, agent: SimulatedAgent) -> None:
+        """The agent writes what it has to its disk; in vain where that is full."""
+        assert agent.spool
+        before = self._present(agent) | agent.unwritten.keys()
         with self._spool_faults(agent):
-            agent.spool.finalise(first, better)
-            agent.pending = (0, [])
-            self.note(f"{agent.name} finalised {first}..{first + len(rows) - 1}")
+            agent.before_drop = before
+            n = agent.buffer.write(agent.spool)
+            self.note(f"{agent.name} wrote {n} and {len(agent.unwritten) - n} final values, {agent.spool.counters()}")
+            self._is_recorded(agent)
+            self._explained |= before - self._present(agent)  # the bounded spool dropped them
 
     def _exchange(self, agent: SimulatedAgent) -> float:
         """One exchange of the uplink; returns the pause that it wants [s]."""
@@ -243,16 +251,19 @@ class World:
             return
         agent.uplink = Uplink(agent.machine, self._frame, TIMEOUT_S, PACING, np.random.default_rng(0))
         present = self._present(agent)
-        self._end_doubt(agent, present)
-        agent.pending = (0, [])
+        self._end_doubt(agent, self._rows(agent.path))
         self.note(f"{agent.name} started with {len(present)} samples, spool_id={agent.spool.spool_id:x}")
 
-    def _end_doubt(self, agent: SimulatedAgent, present: set[int]) -> None:
-        """See whether the transaction in which a process was killed had been done."""
-        if _stamp_set(agent.in_doubt) & present:
-            self._is_recorded(agent.in_doubt)
-            self._explained |= agent.before_drop - present
-        agent.in_doubt, agent.before_drop = [], set()
+    def _end_doubt(self, agent: SimulatedAgent, present: dict[int, bytes]) -> None:
+        """See whether the transaction in which a process was killed had been done; begin with an empty memory.
+
+        What the file has then is what will be sent: also of samples whose final values did not come to the disk.
+        """
+        for stamp in agent.unwritten.keys() & present.keys():
+            self._contents[stamp] = present[stamp]
+        if any(present.get(stamp) == row for stamp, row in agent.unwritten.items()):
+            self._explained |= agent.before_drop - present.keys()
+        agent.start()
 
     def _end(self, agent: SimulatedAgent, orderly: bool | None = None) -> None:
         if agent.spool:
@@ -260,7 +271,7 @@ class World:
             self.note(f"{agent.name} ends orderly={orderly}")
             self.outcome.events["agent_ends"] += 1
             agent.spool.close() if orderly else agent.spool.kill()
-            agent.spool, agent.uplink, agent.unsaved = None, None, []
+            agent.spool, agent.uplink = None, None
 
     def _copy_or_restore(self, agent: SimulatedAgent) -> None:
         """Keep a copy of the spool; put it back later; or start a second process of the machine from it."""
@@ -268,13 +279,16 @@ class World:
             return
         copy = self._copies.get(agent.machine)
         if copy is None:
-            self._copies[agent.machine] = self._copy(agent.path, self._folder / f"copy-{next(self._numbers)}.db")
+            copy = self._copy(agent.path, self._folder / f"copy-{next(self._numbers)}.db")
+            self._copies[agent.machine] = copy
+            for stamp, row in self._rows(copy).items():  # of a pending sample the copy never learns the final value
+                self._copied.setdefault(stamp, set()).add(row)
             self.note(f"{agent.name} copied")
         elif self.rng.random() < 0.5:
             # Gone with the disk that is thrown away; what was quarantined there is declared lost, the copy's too.
             self._explained |= self._held(agent.path) - self._held(copy) | self._quarantined(agent.path)
             self._end(agent, orderly=False)
-            self._end_doubt(agent, self._held(agent.path))
+            self._end_doubt(agent, self._rows(agent.path))
             self._copy(copy, agent.path)
             self.outcome.events["spool_restores"] += 1
             self.note(f"{agent.name} restored from a copy")
@@ -318,7 +332,8 @@ class World:
             self._deliver_late()
         for agent in self._agents:
             self._start(agent)
-            self._finalise(agent)
+            self._finalise(agent, len(agent.pending))
+            self._write(agent)
         self._deliver_all()
         for agent in self._agents:  # the next start declares what was quarantined or dropped at the end of a run
             self._end(agent, orderly=True)
@@ -331,19 +346,8 @@ class World:
             if not waiting:
                 return
             agent = self.rng.choice(waiting)  # two of one name alternate
-            if self._ends_pending(agent):
-                continue
             self._now_ns += int(self._exchange(agent) * 1e9)
         self.outcome.problems.append(f"not settled after {MOST_ROUNDS} rounds")
-
-    def _ends_pending(self, agent: SimulatedAgent) -> bool:
-        """Nothing finalises what an earlier call left pending: a restart sends it as it is."""
-        assert agent.spool
-        if agent.spool.head(1) is None and agent.spool.counters()["depth"]:
-            self._end(agent, orderly=True)
-            self._start(agent)
-            return True
-        return False
 
     def _judge(self) -> None:
         outcome = self.outcome
@@ -353,7 +357,7 @@ class World:
         outcome.double = max(sum(n - 1 for n in counts.values()) for counts in (by_stamp, by_identity))
         for agent in self._agents:
             self._explained |= self._quarantined(agent.path)
-        right = {_stamp(one.row) for one in samples if one.row in self._contents.get(_stamp(one.row), ())}
+        right = {_stamp(one.row) for one in samples if self._is_right(one.row)}
         missing = self._contents.keys() - right
         outcome.recorded, outcome.journalled = len(self._contents), len(right)
         outcome.explained = len(missing & self._explained)
@@ -403,6 +407,8 @@ class World:
         except StoreError as error:
             self.note(f"{agent.name}: {error}")
             self.outcome.events["disk_full"] += 1
+            if not agent.plan.struck:
+                self.outcome.problems.append(f"{agent.name} cannot use a disk that is sound")
         finally:
             agent.plan.disarm()
 
@@ -419,24 +425,31 @@ class World:
         row["c_rr"] = 99.0 if self.rng.random() < self.rates.bad_sample else 0.05
         return row.tobytes()
 
-    def _is_recorded(self, rows: list[bytes]) -> None:
-        for row in rows:
-            self._contents[_stamp(row)] = {row}
+    def _is_recorded(self, agent: SimulatedAgent) -> None:
+        self._contents |= agent.unwritten
+        agent.unwritten = {}
+
+    def _is_right(self, row: bytes) -> bool:
+        stamp = _stamp(row)
+        return row == self._contents.get(stamp) or row in self._copied.get(stamp, ())
 
     def _present(self, agent: SimulatedAgent) -> set[int]:
         with agent.spool._lock:
             return _stamp_set(row for (row,) in agent.spool._db.execute("SELECT row FROM sample"))
 
-    def _held(self, path: Path, table: str = "sample") -> set[int]:
-        """Read a file, whoever has it open: a copy of it."""
+    def _held(self, path: Path) -> set[int]:
+        return set(self._rows(path))
+
+    def _rows(self, path: Path, table: str = "sample") -> dict[int, bytes]:
+        """Read a file, whoever has it open: a copy of it. Rows by stamp."""
         with contextlib.closing(sqlite3.connect(self._copy(path, self._folder / "look.db"))) as db:
             try:
-                return _stamp_set(row for (row,) in db.execute(f"SELECT row FROM {table}"))
+                return {_stamp(row): row for (row,) in db.execute(f"SELECT row FROM {table}")}
             except sqlite3.OperationalError:  # the process was killed while it made the file
-                return set()
+                return {}
 
     def _quarantined(self, path: Path) -> set[int]:
-        return self._held(path, "quarantine")
+        return set(self._rows(path, "quarantine"))
 
     def _copy(self, source: Path, target: Path) -> Path:
         """Copy a database between two transactions, with its log."""

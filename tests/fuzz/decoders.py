@@ -22,6 +22,7 @@ import numpy as np
 from agents.config import load_agent
 from agents.estimation import calibration_file
 from agents.estimation.calibration import Calibration
+from evaluation.positions.log_truth import read_log_truth
 from mapserver.config import ServerConfig
 from mapserver.journal.archive import FOLDER as ARCHIVE
 from mapserver.journal.archive import next_file
@@ -216,6 +217,19 @@ def _identity(path: Path) -> None:
 # --- logs ------------------------------------------------------------------------------------------------------------
 
 MACHINE = MachineConfig("loader-1", sensors=(SensorConfig("imu-1", "imu"), SensorConfig("gps-1", "gps")))
+METRES = b'''x_m = { columns = { lat_deg = 0.5, lon_deg = 0.5 }, offset = 1.5, unit = "mm" }
+y_m = "height_m"'''
+TRUTH = b"""[truth]
+file = "truth.csv"
+names = ["t", "x", "y", "fix"]
+delimiter = ";"
+at_least = { fix = 2 }
+mount = { xyz_m = [1.0, 0.5, 2.0] }
+stamp = { columns = { t = 1.0 }, unit = "ms" }
+x_m = "x"
+y_m = "y"
+"""
+PLACES = b"1000;0.5;0.25;2\n1100;0.75;nan;2\n9000;3;4;3\n"
 READINGS = [
     *(Imu("imu-1", T0 + i * 10**7, 0.001, -0.002, 0.25, 0.1, -0.2, 9.80665) for i in range(8)),
     *(Gps("gps-1", T0 + i * 10**9, 49.5, 8.25, 112.5, 1.5, 1.5, 4.0) for i in range(4)),
@@ -232,8 +246,16 @@ def _logs() -> Iterator[Decoder]:
     manifest, csv = (log / "log.toml").read_bytes(), (log / "imu-1.csv").read_bytes()
     (packed / "log.toml").write_bytes(manifest.replace(b"imu-1.csv", b"imu-1.csv.gz"))
     converted = manifest.replace(b'gyro_x_radps = "', b'gyro_x_radps = { value = 0.5, unit = "deg/s" }\n#"')
+    metres = manifest.replace(b'lat_deg = "lat_deg"\nlon_deg = "lon_deg"', METRES).replace(
+        b"delay_s = 0.0", b"delay_s = -0.5"
+    )
+    assert b"\nx_m = {" in metres
     errors, seeds = (ConfigError, LogFolderError), (gzip.compress(csv, mtime=0),)
-    yield Decoder("manifest", (manifest, converted), partial(_log, log, "log.toml"), errors, texts, str(log))
+    yield Decoder("manifest", (manifest, converted, metres), partial(_log, log, "log.toml"), errors, texts, str(log))
+    (log / "truth.csv").write_bytes(PLACES)
+    (plain / "evaluation.toml").write_bytes(TRUTH)
+    yield Decoder("truth", (TRUTH,), partial(_truth, log, "evaluation.toml"), errors, texts, str(log))
+    yield Decoder("truth_csv", (PLACES,), partial(_truth, plain, "truth.csv"), errors[1:], texts, "truth.csv")
     yield Decoder("csv", (csv,), partial(_log, plain, "imu-1.csv"), errors[1:], texts, "imu-1.csv")
     yield Decoder("csv_gzip", seeds, partial(_log, packed, "imu-1.csv.gz"), errors[1:], files, "imu-1.csv.gz")
 
@@ -241,8 +263,15 @@ def _logs() -> Iterator[Decoder]:
 def _log(folder: Path, file: str, data: bytes) -> None:
     (folder / file).write_bytes(data)
     log = open_log(folder)
-    stamps = [reading.stamp_ns for reading in log.readings()]
-    assert stamps == sorted(stamps)
+    known = [log.known_ns(reading) for reading in log.readings()]
+    assert known == sorted(known)
+
+
+def _truth(folder: Path, file: str, data: bytes) -> None:
+    """Of a log, described beside it and read."""
+    (folder / file).write_bytes(data)
+    truth = read_log_truth(open_log(folder), folder)
+    assert truth is None or (np.diff(truth.track.stamp_ns) >= 0).all()
 
 
 # --- what is kept on disk --------------------------------------------------------------------------------------------

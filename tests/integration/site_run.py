@@ -13,18 +13,22 @@ from sitegrid import Client, connect
 from sitegrid.process.children import Child, Children, wait_until
 
 READY_S = 120.0  # a first start in a new folder compiles kernels
+LAG_S = 4.0  # of the smoother: most drives here are shorter than its usual lag, and tests wait for samples
 
 
 class SiteRun:
     """Router, map server, agents and simulator of one site."""
 
-    def __init__(self, folder: Path, children: Children, endpoint: str, sim: SimConfig) -> None:
+    def __init__(self, folder: Path, children: Children, endpoint: str, sim: SimConfig, lag_s: float = LAG_S) -> None:
         self.folder = folder
         self.children = children
         self.endpoint = endpoint
         self.sim = sim
         self.site = resolve(sim).site.name
         self.configs = write_configs(sim, folder)
+        for config in self.configs:
+            with config.open("a", encoding="utf-8") as text:
+                text.write(f"\n[pipeline.localisation]\nlag_s = {lag_s}\n")
         self.agents: dict[str, Child] = {}
 
     @property

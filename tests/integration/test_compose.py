@@ -32,6 +32,7 @@ def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
     for name, value in compose_run.image_environment(root / "Dockerfile").items():
         monkeypatch.setenv(name, value.replace("/tmp/", f"{tmp_path}/tmp/"))
     services = compose_run.load(root / "compose.yaml")
+    services["sim"]["command"] += ["--speed", "4"]  # samples come after the smoother's lag of a minute and a half
     run = compose_run.ComposeRun(services, tmp_path, children)
     run.up()
     order = list(run.started)

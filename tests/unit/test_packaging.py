@@ -35,6 +35,7 @@ def test_it_is_never_uploaded_and_has_its_extras(root: Path):
             "export",
             "ros",
             "bench",
+            "oracle",
             "paper",
             "security",
             "all",

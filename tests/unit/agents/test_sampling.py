@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -146,6 +147,43 @@ def test_nothing_is_lost_while_no_pose_is_known() -> None:
     rows = sampled(sampler, now_s=10.0)
     assert rows["x_m"] == pytest.approx(np.arange(1, 21) * 0.5)
     assert not sampler.withheld
+
+
+# --- pending and final -----------------------------------------------------------------------------------------------
+
+
+def moved(by_m: float, turn_rad: float, variance_m2: float) -> Callable[[PoseBelief], PoseBelief]:
+    def corrected(p: PoseBelief) -> PoseBelief:
+        place = (p.x_m + by_m, p.y_m, p.heading_rad + turn_rad)
+        return PoseBelief(p.stamp_ns, *place, p.speed_mps, variance_m2 * np.eye(2))
+
+    return corrected
+
+
+def test_final_sample_is_that_of_the_corrected_pose() -> None:
+    """Load centre and gradient turn with the heading; what was measured at the place stays."""
+    sampler = PlacedSampler(1.5)
+    (pending,) = drive(sampler)[:1]
+    (final,) = sampler.final_samples(lambda p: moved(3.0, 0.5, 0.25)(p) if p.x_m < 0.75 else None)
+    c, s = math.cos(0.5), math.sin(0.5)
+    assert (final["x_m"], final["y_m"]) == pytest.approx((0.5 + 3.0 + 1.5 * c, 5.0 + 1.5 * s))
+    assert (final["grade_e"], final["grade_n"]) == pytest.approx((0.2 * c - 0.1 * s, 0.2 * s + 0.1 * c))
+    assert [final[name] for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")] == [0.25, 0.0, 0.25]
+    assert final["heading_rad"] == pytest.approx(0.5)
+    same = ("stamp_ns", "speed_mps", "distance_m", "c_rr", "c_rr_var", "grade_var")
+    assert [final[name] for name in same] == [pending[name] for name in same]
+
+
+def test_samples_become_final_once_each_and_in_their_order() -> None:
+    sampler = PlacedSampler()
+    pending = drive(sampler)
+    assert sampler.pending == len(pending) == 20
+    first = sampler.final_samples(lambda p: p if p.stamp_ns <= pending["stamp_ns"][6] else None)
+    assert first.tobytes() == pending[:7].tobytes()
+    assert sampler.pending == 13
+    assert sampler.final_samples(lambda p: p).tobytes() == pending[7:].tobytes()
+    assert not len(sampler.final_samples(lambda p: p))
+    assert sampler.pending == 0
 
 
 # --- what is withheld ------------------------------------------------------------------------------------------------

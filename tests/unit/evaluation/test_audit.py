@@ -184,7 +184,7 @@ def test_renumbered_samples_count_once_under_their_new_identity(clean, journal, 
     log.renumbered(5, [1, 2], 6, rows)
     log.close()
     recorded = read_audits({"c": tmp_path / "c.audit"})
-    assert recorded == {("c", 6, i + 1): content_hash(row) for i, row in enumerate(rows)}
+    assert recorded == {("c", 6, i + 1): (content_hash(row),) for i, row in enumerate(rows)}
 
 
 def test_an_empty_store_has_lost_everything(clean, tmp_path):

@@ -8,6 +8,7 @@ from dataclasses import fields
 
 import pytest
 
+from evaluation.positions.log_truth import read_log_truth
 from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.machine.log_folder import open_log
@@ -117,6 +118,18 @@ def test_example_of_a_manifest_is_read(tmp_path):
         *("gps.csv.gz", "tracker.txt", "gps.csv.gz", "can.csv", "wheels.csv")
     ]
     assert [s.use for s in log.machine.sensors] == [True] * 4 + [False]
+
+
+def test_example_of_a_log_of_ones_own_is_read(tmp_path):
+    page = (DOCS / "evaluation.md").read_text()
+    _, manifest, truth = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "log.toml").write_text(manifest)
+    (tmp_path / "evaluation.toml").write_text(truth)
+    (tmp_path / "groundtruth.csv").write_text("1326030975000000,1,2,3,0,0,0\n")
+    log = open_log(tmp_path)
+    assert [source.file.file for source in log.sources] == ["gps.csv", "imu.csv", "wheels.csv"]
+    read = read_log_truth(log, tmp_path)
+    assert read.track.position_m.tolist() == [[2.0, 1.0]]
 
 
 def test_example_of_known_ground_is_read():

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.delivery.audit import AuditLog, parse, read_audit
+from agents.delivery.audit import AuditLog, Contents, parse, read_audit
 from agents.delivery.spool import Spool, SpoolConfig
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
@@ -18,8 +18,8 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "logs" / "audit.txt"
 
 
-def numbered(spool_id: int, first: int, hashes: list[str]) -> dict[tuple[int, int], str]:
-    return {(spool_id, first + i): h for i, h in enumerate(hashes)}
+def numbered(spool_id: int, first: int, hashes: list[str]) -> dict[tuple[int, int], Contents]:
+    return {(spool_id, first + i): (h,) for i, h in enumerate(hashes)}
 
 
 def test_what_is_recorded_is_read_back(path: Path) -> None:
@@ -58,12 +58,16 @@ def test_what_a_crash_kept_from_being_noted_is_added(path: Path) -> None:
 
 
 def test_sample_that_is_on_disk_with_another_content_is_noted_so(path: Path) -> None:
-    """It was pending when the process was killed: its final value never came to the disk, or was not noted."""
+    """Its final value was not noted, or is gone with a damaged log; who knows which of the two has been delivered?"""
     audit = AuditLog(path)
     audit.recorded(7, 1, ROWS[:3])
-    audit.complete([(7, 2, ROWS[12])])
+    for _ in range(2):
+        audit.complete([(7, 2, ROWS[12])])
+    assert read_audit(path) == numbered(7, 1, HASHES[:3]) | {(7, 2): (HASHES[1], HASHES[12])}
+    assert path.read_text().count("\n") == 4
+    audit.recorded(7, 2, ROWS[13:14])
     audit.close()
-    assert read_audit(path) == numbered(7, 1, [HASHES[0], HASHES[12], HASHES[2]])
+    assert read_audit(path) == numbered(7, 1, [HASHES[0], HASHES[13], HASHES[2]])
 
 
 @pytest.mark.parametrize("cut", [1, 5, 10, 18])
@@ -91,20 +95,22 @@ def test_void_line_that_was_cut_off_voids_no_other_sample(path: Path) -> None:
 
 def test_other_lines_are_skipped() -> None:
     assert parse(["", "+", "# a remark", "+ 07 1", "- 07", "* 07 1 aa", "+ 07 1 aa", "+ 07 2 bb # cut off"]) == {
-        (7, 1): "aa"
+        (7, 1): ("aa",)
     }
 
 
 def test_spool_notes_what_it_records_finalises_and_numbers_anew(tmp_path: Path, path: Path) -> None:
     spool = Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([5, 6]).__next__)
     spool.record(ROWS[:2])
-    spool.record(ROWS[2:4], final=False)
-    spool.finalise(3, ROWS[12:14])
-    spool.finalise(1, ROWS[15:16])  # is final already
-    assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14]])
+    spool.record(ROWS[2:5], pending=3)
+    assert read_audit(path) == numbered(5, 1, HASHES[:5])
+    spool.record(ROWS[:0], finals=ROWS[12:14])
+    assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14], HASHES[4]])
     spool.acknowledge(5, 1)
     spool.start_new_run()
-    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14]])
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14], HASHES[4]])
+    spool.record(ROWS[:0], finals=ROWS[14:15])
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:15]])
     spool.close()
 
 

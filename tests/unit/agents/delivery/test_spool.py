@@ -20,6 +20,7 @@ from tests.paths import ROOT
 from tests.unit.agents.drives import made_up_samples
 
 ROWS = made_up_samples(60)
+EMPTY = {"depth": 0, "pending": 0, "dropped": 0, "put_aside": 0, "recorded": 0, "gone": 0}
 
 
 def opened(path: Path, max_samples: int = 1000, audit: AuditLog | None = None) -> Spool:
@@ -197,7 +198,7 @@ def test_spool_survives_kill_in_the_middle_of_writing(tmp_path: Path) -> None:
     assert hashes(head.rows) == hashes(made_up_samples(100_000)[: len(head.rows)])
     assert len(head.rows) == spool.counters()["recorded"]
     spool.close()
-    assert list(read_audit(tmp_path / "audit.txt").values()) == hashes(head.rows)
+    assert list(read_audit(tmp_path / "audit.txt").values()) == [(content,) for content in hashes(head.rows)]
 
 
 def test_kill_while_the_file_is_made_leaves_no_broken_spool(tmp_path: Path) -> None:
@@ -214,44 +215,124 @@ def test_kill_while_the_file_is_made_leaves_no_broken_spool(tmp_path: Path) -> N
 # --- pending and final -----------------------------------------------------------------------------------------------
 
 
+def better(rows: np.ndarray) -> np.ndarray:
+    rows = rows.copy()
+    rows["x_m"] += 1
+    return rows
+
+
 def test_pending_samples_wait_until_they_are_final(spool: Spool) -> None:
-    spool.record(ROWS[:3], final=False)
+    assert spool.record(ROWS[:3], pending=3) == 1
     assert spool.head(99) is None
-    better = ROWS[:2].copy()
-    better["x_m"] += 1
-    spool.finalise(1, better)
+    assert spool.counters()["pending"] == 3
+    assert spool.record(ROWS[3:5], pending=2, finals=better(ROWS[:2])) == 4
     head = spool.head(99)
-    assert hashes(head.rows) == hashes(better)
-
-
-def test_final_samples_never_overtake_pending_ones(spool: Spool) -> None:
-    spool.record(ROWS[:2])
-    spool.record(ROWS[2:4], final=False)
-    spool.record(ROWS[4:6])
-    head = spool.head(99)
-    assert len(head.rows) == 2
+    assert hashes(head.rows) == hashes(better(ROWS[:2]))
+    assert (head.first_seq, head.newest) == (1, 5)
+    assert spool.counters()["pending"] == 3
     spool.acknowledge(spool.spool_id, 2)
     assert spool.head(99) is None
-    spool.finalise(3, ROWS[2:4])
-    head = spool.head(99)
-    assert (head.first_seq, len(head.rows)) == (3, 4)
+    assert not spool.is_settled()
+    spool.record(ROWS[:0], finals=better(ROWS[2:5]))
+    assert hashes(spool.head(99).rows) == hashes(better(ROWS[2:5]))
+    spool.acknowledge(spool.spool_id, 5)
+    assert spool.is_settled()
 
 
-def test_what_is_final_stays_as_it_is(spool: Spool) -> None:
-    spool.record(ROWS[:1])
-    spool.finalise(1, ROWS[5:6])
-    head = spool.head(1)
-    assert hashes(head.rows) == hashes(ROWS[:1])
+def test_new_samples_of_one_write_may_be_final_and_pending(spool: Spool) -> None:
+    spool.record(ROWS[:2], pending=2)
+    spool.record(ROWS[2:6], pending=1, finals=better(ROWS[:2]))
+    assert hashes(spool.head(99).rows) == hashes(np.concatenate([better(ROWS[:2]), ROWS[2:5]]))
+    assert spool.counters()["pending"] == 1
+
+
+@pytest.mark.parametrize(("n", "pending", "finals"), [(1, 0, 1), (0, 0, 3), (1, 2, 0), (2, 1, 0), (0, -1, 0)])
+def test_no_sample_is_final_before_an_earlier_one(spool: Spool, n: int, pending: int, finals: int) -> None:
+    spool.record(ROWS[:2], pending=2)
+    with pytest.raises(ValueError, match="pending samples"):
+        spool.record(ROWS[:n], pending=pending, finals=ROWS[:finals])
+    assert spool.counters() == {**EMPTY, "depth": 2, "pending": 2, "recorded": 2}
 
 
 def test_pending_samples_are_final_after_a_crash(tmp_path: Path) -> None:
     spool = opened(tmp_path)
-    spool.record(ROWS[:3], final=False)
+    spool.record(ROWS[:3], pending=3)
+    spool.record(ROWS[3:5], pending=2, finals=better(ROWS[:1]))
     kill(spool)
     again = opened(tmp_path)
+    assert again.counters()["pending"] == 0
     head = again.head(99)
-    assert hashes(head.rows) == hashes(ROWS[:3])
+    assert hashes(head.rows) == hashes(np.concatenate([better(ROWS[:1]), ROWS[1:5]]))
+    assert head.newest is None, "it is an earlier run now"
     again.close()
+
+
+def test_pending_samples_keep_their_place_under_a_new_identity(spool: Spool) -> None:
+    spool.record(ROWS[:2])
+    spool.record(ROWS[2:6], pending=4)
+    old = spool.spool_id
+    spool.acknowledge(old, 1)
+    spool.start_new_run()
+    spool.record(ROWS[:0], finals=better(ROWS[2:4]))
+    closing = spool.head(99)
+    head = closing if closing.spool_id == spool.spool_id else spool.head(99)
+    assert head.spool_id != old
+    assert (head.first_seq, hashes(head.rows)) == (1, hashes(np.concatenate([ROWS[1:2], better(ROWS[2:4])])))
+
+
+def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(tmp_path: Path) -> None:
+    """Whoever opens a copy takes them as they are, and sends them under the numbers that they have here."""
+    spool = opened(tmp_path, 2, AuditLog(tmp_path / "audit"))
+    spool.record(ROWS[:6], pending=6)
+    spool.acknowledge(spool.spool_id, 4)
+    assert (spool.acknowledged, spool.counters()["depth"], spool.counters()["pending"]) == (4, 2, 2)
+    spool.record(ROWS[6:8], pending=2, finals=better(ROWS[:3]))
+    assert spool.head(99) is None
+    assert spool.counters() == {**EMPTY, "depth": 4, "pending": 4, "recorded": 8}
+    spool.record(ROWS[:0], finals=better(ROWS[3:7]))
+    head = spool.head(99)
+    assert (head.first_seq, head.lost_before, hashes(head.rows)) == (6, 1, hashes(better(ROWS[5:7])))
+    spool.close()
+    rows = np.concatenate([ROWS[:4], better(ROWS[4:7]), ROWS[7:8]])
+    assert list(read_audit(tmp_path / "audit").values()) == [(content,) for content in hashes(rows)]
+
+
+def test_damage_of_a_pending_sample_is_mended_by_its_final_value(spool: Spool) -> None:
+    spool.record(ROWS[:2], pending=2)
+    spool._db.execute("UPDATE sample SET row = zeroblob(68) WHERE number = 1")
+    assert spool.head(99) is None
+    spool.record(ROWS[:0], finals=better(ROWS[:2]))
+    assert hashes(spool.head(99).rows) == hashes(better(ROWS[:2]))
+    assert spool.counters()["put_aside"] == 0
+
+
+@pytest.mark.parametrize("limit", [1, 3])
+def test_full_spool_drops_no_pending_sample(tmp_path: Path, limit: int) -> None:
+    """They do not count: else a spool that holds less than the lag would drop each sample before it may be sent."""
+    spool = opened(tmp_path, limit)
+    spool.record(ROWS[:10], pending=10)
+    assert (spool.counters()["depth"], spool.counters()["dropped"]) == (10, 0)
+    spool.record(ROWS[10:12], pending=2, finals=better(ROWS[:6]))
+    assert (spool.counters()["depth"], spool.counters()["dropped"]) == (6 + limit, 6 - limit)
+    head = spool.head(99)
+    assert (head.first_seq, head.lost_before) == (7 - limit, 6 - limit)
+    assert hashes(head.rows) == hashes(better(ROWS[6 - limit : 6]))
+    spool.close()
+
+
+def test_a_write_that_fails_leaves_what_is_pending_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spool = SpoolOnFullDisk(tmp_path / "spool.db", SpoolConfig())
+    spool.record(ROWS[:3], pending=3)
+    for statement in ("UPDATE sample", "INSERT INTO sample", "COMMIT"):
+        with monkeypatch.context() as patch:
+            patch.setattr(FullDisk, "full_at", statement)
+            with pytest.raises(StoreError):
+                spool.record(ROWS[3:5], pending=1, finals=better(ROWS[:3]))
+        assert spool.head(99) is None
+        assert spool.counters() == {**EMPTY, "depth": 3, "pending": 3, "recorded": 3}
+    spool.record(ROWS[3:5], pending=1, finals=better(ROWS[:3]))
+    assert hashes(spool.head(99).rows) == hashes(np.concatenate([better(ROWS[:3]), ROWS[3:4]]))
+    spool.close()
 
 
 # --- holes, bounds, and samples that the server refuses --------------------------------------------------------------
@@ -281,7 +362,7 @@ def test_full_spool_drops_the_oldest_counts_them_and_declares_them_lost(tmp_path
     head = spool.head(99)
     assert (head.first_seq, head.lost_before) == (61 - limit, 60 - limit)
     assert hashes(head.rows) == hashes(ROWS[-limit:])
-    expected = {"depth": limit, "dropped": 60 - limit, "put_aside": 0, "recorded": 60, "gone": 0}
+    expected = {**EMPTY, "depth": limit, "dropped": 60 - limit, "recorded": 60}
     assert spool.counters() == expected
     spool.close()
     again = opened(tmp_path, limit)
@@ -301,7 +382,7 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     rest = spool.head(99)
     assert (rest.first_seq, rest.lost_before) == (7, 1)
     assert hashes(rest.rows) == hashes(ROWS[6:10])
-    assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 4, "recorded": 10, "gone": 0}
+    assert spool.counters() == {**EMPTY, "depth": 4, "put_aside": 4, "recorded": 10}
     spool.close()
     problem = "damaged on the machine's disk"
     assert [(seq, why) for seq, _, why in quarantined(tmp_path)] == [(seq, problem) for seq in (1, 2, 3, 6)]
@@ -372,7 +453,7 @@ def test_restored_copy_gives_no_identity_twice(tmp_path: Path, restarts: int) ->
     twice = ROWS[30:32] if restarts else ROWS[:0]
     expected = [*hashes(ROWS[:15]), *restarts * hashes(twice), *hashes(ROWS[20:23])]
     assert sorted(journal.values()) == sorted(expected)
-    assert read_audit(audit) == journal
+    assert read_audit(audit) == {identity: (content,) for identity, content in journal.items()}
 
 
 def test_two_clones_that_both_send_lose_and_double_nothing(tmp_path: Path) -> None:
@@ -477,7 +558,7 @@ def test_failed_commit_leaves_no_transaction_open(
     attempts = (
         lambda: spool.acknowledge(spool.spool_id, 2),
         lambda: spool.quarantine(head, "bad"),
-        lambda: spool.finalise(1, ROWS[:1]),
+        lambda: spool.record(ROWS[:1], pending=1),
         lambda: spool.lower_watermark(spool.spool_id, -1),
         spool.start_new_run,
     )
@@ -485,7 +566,7 @@ def test_failed_commit_leaves_no_transaction_open(
     for attempt in attempts:
         with pytest.raises(StoreError, match="disk is full; look at the machine's disk"):
             attempt()
-        assert spool.counters() == {"depth": 4, "dropped": 0, "put_aside": 0, "recorded": 4, "gone": 0}
+        assert spool.counters() == {**EMPTY, "depth": 4, "recorded": 4}
         assert (spool.spool_id, spool.newest, spool.acknowledged) == (identity, 4, 0)
     monkeypatch.setattr(FullDisk, "full_at", "never")
     assert spool.record(ROWS[4:6]) == 5

@@ -47,7 +47,7 @@ class Server:
     def __init__(self) -> None:
         self.watermarks: Counter[int] = Counter()
         self.accepted: Counter[tuple[int, int, str]] = Counter()
-        self.lost = 0
+        self.lost = self.row = 0
 
     def answer(self, payload: bytes) -> Ack | Refused:
         try:
@@ -63,7 +63,8 @@ class Server:
             self.accepted[new.spool_id, new.first_seq + i, content_hash(row)] += 1
         self.lost += admission.lost
         self.watermarks[batch.spool_id] = max(self.watermarks[batch.spool_id], admission.watermark)
-        return Ack(self.watermarks[batch.spool_id], 1, admission.trimmed, FIRST)
+        self.row += len(new.rows) > 0
+        return Ack(self.watermarks[batch.spool_id], self.row, admission.trimmed, FIRST)
 
 
 class Delivery:
@@ -363,7 +364,7 @@ def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
     assert sorted(h for _, _, h in server.accepted) == sorted(good)
     assert set(server.accepted.values()) == {1}
     assert server.lost == (bad < 19)
-    assert d.spool.counters() == {"depth": 0, "dropped": 0, "put_aside": 1, "recorded": 20, "gone": 0}
+    assert d.spool.counters() == {"depth": 0, "pending": 0, "dropped": 0, "put_aside": 1, "recorded": 20, "gone": 0}
     assert d.quarantined == [(bad + 1, content_hash(rows[bad]))]
     assert d.uplink.counters["refused_out_of_range"] >= 1
 
@@ -453,6 +454,44 @@ def test_run_that_is_delivered_is_closed_with_one_empty_batch(tmp_path: Path, wa
     assert d.reply(Ack(watermark, 1)) == 0
     assert d.spool.is_settled()
     assert d.payload() is None
+    d.spool.close()
+
+
+@pytest.mark.parametrize(
+    ("row", "trimmed", "again"),
+    [(9, 0, False), (8, 0, False), (7, 0, True), (7, 3, False), (6, 0, True), (6, 3, True)],
+    ids=["further", "next", "the same row twice", "nothing new", "one back", "one back, nothing new"],
+)
+def test_runs_are_closed_again_when_the_journal_has_lost_rows(
+    tmp_path: Path, row: int, trimmed: int, again: bool
+) -> None:
+    """The server was struck after the earlier run was closed, and before it had a sample of this one."""
+    d, earlier = reopened(tmp_path, 5, acknowledged=5)
+    d.batch()
+    d.reply(Ack(5, 7, 0, FIRST))
+    assert d.spool.is_settled()
+    d.spool.record(ROWS[5:8])
+    assert d.batch().spool_id == d.spool.spool_id
+    d.reply(Ack(3, row, trimmed, FIRST))
+    assert d.counter("depth") == 0
+    assert d.uplink.counters["declared_again"] == again
+    assert d.spool.is_settled() != again
+    if again:
+        batch = d.batch()
+        assert (batch.spool_id, batch.first_seq, len(batch.rows), batch.lost_before) == (earlier, 6, 0, 5)
+        d.reply(Ack(5, row, 0, FIRST))
+        assert d.spool.is_settled()
+    d.spool.close()
+
+
+def test_rows_of_another_store_are_compared_with_none(tmp_path: Path) -> None:
+    d, _ = reopened(tmp_path, 5, acknowledged=5)
+    d.batch()
+    d.reply(Ack(5, 700, 0, FIRST))
+    d.spool.record(ROWS[5:8])
+    d.batch()
+    d.reply(Ack(3, 1, 0, "another", FIRST))
+    assert d.uplink.counters["declared_again"] == 0
     d.spool.close()
 
 
@@ -554,7 +593,7 @@ def test_linger_waits_until_the_spool_is_empty_or_time_is_over() -> None:
 
 def test_samples_gather_after_a_batch_that_left_nothing_behind() -> None:
     d = met(50, first_batch=20, max_batch=20, gather_s=1.5)
-    pauses = [d.reply(Ack(d.batch().last_seq, 1)) for _ in range(3)]
+    pauses = [d.reply(Ack(d.batch().last_seq, row)) for row in (1, 2, 3)]
     assert pauses == [0.0, 0.0, 1.5]
     d.spool.record(ROWS[50:57])
     assert len(d.batch().rows) == 7

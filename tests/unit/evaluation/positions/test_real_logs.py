@@ -117,6 +117,16 @@ def test_an_outage_is_placed_and_judged_wherever_it_is(circle: Path):
     assert long["rms_m"] < long["end_m"] <= long["max_m"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1.0, 3.6])
+def test_wheels_in_another_unit_show_in_their_scale(circle: Path, scale: float):
+    rows = (circle / "odom.csv").read_text().splitlines()
+    v, other = f",{RADIUS_M * RATE_RADPS:.6f},", f",{scale * RADIUS_M * RATE_RADPS:.6f},"
+    (circle / "odom.csv").write_text("\n".join(row.replace(v, other) for row in rows) + "\n")
+    (row,) = run(circle, None)["rows"]
+    assert row["wheel_scale"] == pytest.approx(0.0, abs=0.05) if scale == 1 else row["wheel_scale"] > 0.5
+
+
 def test_without_a_side_file_there_is_no_truth(circle: Path):
     (circle / "evaluation.toml").unlink()
     row = run(circle, Periodic(10.0, 1.0))["rows"][0]

@@ -49,6 +49,24 @@ def test_options_of_an_experiment_reach_it(monkeypatch, capsys):
 
 
 @pytest.mark.slow
+def test_the_budget_has_no_pictures_and_its_report_is_printed(monkeypatch, capsys):
+    from evaluation.campaign.recordings import DRIVEN, PAPER
+    from evaluation.positions import budget
+
+    asked = []
+    report = {"rows": [{"gps": 1, "truth": "none", "net_m": 1.5, "net_by_seed_m": [1.5]}]}
+    monkeypatch.setattr(budget, "run", lambda _, **options: (asked.append(options), (report, {}))[1])
+    assert cli.main(["eval", "budget", "--seeds", "2", "--seconds", "600"]) == 0
+    assert "none" in capsys.readouterr().out
+    assert asked == [{"seeds": range(2), "seconds": 600.0, "setup": PAPER}]
+    assert cli.main(["eval", "budget", "--scenario", "paper_site_driven", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"][0]["net_by_seed_m"] == [1.5]
+    assert asked[1] == {"seeds": range(12), "seconds": 1200.0, "setup": DRIVEN}
+    with pytest.raises(SystemExit):
+        parse("budget", "--plots", "x")
+
+
+@pytest.mark.slow
 def test_the_table_is_made_on_the_scenario_that_is_asked_for(monkeypatch, capsys):
     from evaluation.campaign.recordings import SETUPS
     from evaluation.positions import table

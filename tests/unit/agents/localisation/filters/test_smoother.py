@@ -333,7 +333,7 @@ def test_headings_are_smoothed_across_the_back() -> None:
     belief, groups = start(4.0, yaw=2.9), []
     for i in range(1, 300):
         stamp = START_NS + i * 50_000_000
-        turn = measurements.turn(stamp, TURN_RADPS, 0.003, None, 0.0, 0.0)
+        turn = measurements.turn(stamp, "turn", TURN_RADPS, 0.003, None, 0.0, 0.0)
         yaw = 2.9 + TURN_RADPS * i * 0.05 + 0.02
         seen = measurements.orientation(stamp, "ahrs", np.array([0.0, 0.0, yaw]), np.eye(3) * 0.01, 6.0)
         groups.append([turn, seen])

@@ -1,0 +1,50 @@
+"""Samples on their way to the spool: new ones, and final values of those that lie there as pending.
+
+They are written together once in a while, as each write costs a sync of the machine's disk, and wait here while it
+takes nothing.
+"""
+
+import numpy as np
+
+from agents.delivery.spool import Spool
+from protocol.arrays import Table
+from protocol.machine.samples import empty
+
+MOST_UNSAVED = 100_000  # samples that wait in memory while the disk is full or fails
+
+
+class WriteBuffer:
+    """What is not on disk yet. given_up: samples that memory could not hold either."""
+
+    def __init__(self) -> None:
+        self.given_up = 0
+        self._new, self._final = empty(), 0  # the first so many of the new ones are final
+        self._finals = empty()  # of the oldest pending samples in the spool
+        self._pending = 0  # samples in the spool that have no final value, here neither
+
+    def __len__(self) -> int:
+        return len(self._new)
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether all is on disk."""
+        return not len(self._new) and not len(self._finals)
+
+    def add(self, pending: Table, finals: Table) -> None:
+        """Add new samples, and final values of those that have been pending longest; order is all that joins them."""
+        in_spool = min(len(finals), self._pending)
+        self._finals = np.concatenate([self._finals, finals[:in_spool]])
+        self._pending -= in_spool
+        self._new, end = np.concatenate([self._new, pending]), self._final + len(finals) - in_spool
+        self._new[self._final : end] = finals[in_spool:]
+        self._final = end
+        if (excess := min(len(self._new) - MOST_UNSAVED, self._final)) > 0:
+            self._new, self._final, self.given_up = self._new[excess:], self._final - excess, self.given_up + excess
+
+    def write(self, spool: Spool) -> int:
+        """Write all to the spool; returns how many new samples that were. StoreError if it takes nothing: all stays."""
+        n, pending = len(self._new), len(self._new) - self._final
+        spool.record(self._new, pending=pending, finals=self._finals)
+        self._new, self._final, self._finals = empty(), 0, empty()
+        self._pending += pending
+        return n
