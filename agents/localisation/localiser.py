@@ -1,4 +1,7 @@
-"""The localiser: readings in, poses out. Until it knows its heading it only collects."""
+"""The localiser: readings in, poses out. Until it knows its heading it only collects.
+
+It is one module because every kind of event meets here the one filter that all of them change.
+"""
 
 import math
 from collections import Counter, deque
