@@ -23,7 +23,7 @@ from evaluation.ground.truth import LoadTrack, read_load_track
 from evaluation.maps.methods import soft_votes
 from evaluation.maps.samples import Delivery
 from evaluation.maps.score import score_driven
-from protocol.arrays import Floats, Floats32, Table
+from protocol.arrays import Bools, Floats, Floats32, Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.readings import Reading
 from protocol.queries.answers import MapVersion, Region
@@ -175,7 +175,7 @@ def distance_m(rows: Table, track: LoadTrack) -> Floats:
 
 def at_places(rows: Table, place_m: Floats) -> Table:
     """The samples at other places (n, 2), of which they are sure; those whose place is not known are left away."""
-    known = np.isfinite(place_m).all(axis=-1)
+    known: Bools = np.isfinite(place_m[:, 0])
     rows = rows.copy()
     rows["x_m"], rows["y_m"] = np.where(known[:, None], place_m, 0.0).T
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = TRUE_STD_M**2
