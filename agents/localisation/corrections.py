@@ -33,7 +33,7 @@ REPEATS = 5  # the same error so often in a row is no measurement any more
 GATE_SIGMA = 4.0  # as of fixes
 TRUST = 0.95  # of the share found: the heading that it is judged by has followed the corrections a little
 LEAST_SHARE = 0.05  # a smaller one is none
-UNKNOWN = GpsError(1.0, 45.0)
+UNKNOWN = GpsError(1.0, 45.0)  # the slow error of a base that was not heard yet: any will do
 
 
 class Corrections:
