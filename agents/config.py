@@ -14,6 +14,9 @@ from protocol.files import load_toml
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig, parse_machine
 
 ROLES = MACHINE, BASE = ("machine", "base")
+# Of samples behind their stamps: where a machine's are 300 s behind those of others, the map server takes its clock for
+# wrong, and excludes it.
+MOST_LAG_S = 180.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,9 @@ class AgentConfig:
             raise ValueError(f"place: {list(self.place)} is no latitude and longitude [deg]")
         if self.linger_s < 0:
             raise ValueError("linger_s: negative")
+        if self.pipeline.localisation.smoothing_s > MOST_LAG_S:
+            problem = f"at most {MOST_LAG_S:g} s: the map server would take the clock for wrong"
+            raise ValueError(f"pipeline.localisation.lag_s: {problem}")
 
 
 def require_place(machine: MachineConfig, config: LocalisationConfig) -> None:

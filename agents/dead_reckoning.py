@@ -12,7 +12,7 @@ from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque
 from protocol.units import GRAVITY_MPS2
 
-TURN_KINDS = ("imu", "odometry", "steering")  # sensors that show the turn, the best first
+TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
 STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
 PAUSE_S = 1.0  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
 MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine
@@ -25,8 +25,8 @@ def turn_source(machine: MachineConfig) -> SensorConfig | None:
 
     Of several the one that states the least deviation; one that states none comes last, then the name decides.
     """
-    able = [s for s in machine.sensors if s.kind in TURN_KINDS and s.use and s.provides("rate")]
-    return min(able, key=lambda s: (TURN_KINDS.index(s.kind), s.std.get("rate", math.inf), s.name), default=None)
+    able = [s for s in machine.sensors if s.kind in TURNS and s.use and s.provides(TURNS[s.kind])]
+    return min(able, key=lambda s: ([*TURNS].index(s.kind), s.std.get(TURNS[s.kind], math.inf), s.name), default=None)
 
 
 class WheelTracker:

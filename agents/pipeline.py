@@ -5,7 +5,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -222,9 +222,7 @@ class Pipeline:
             "withheld": dict(self._sampler.withheld),
             "without_resistance": dict(self._sampler.without_resistance),
             "ground": self._estimator.health(),
-            "consistency": {
-                name: {**asdict(value), "good": value.is_good} for name, value in localiser.consistency.items()
-            },
+            "consistency": {name: value.report for name, value in localiser.consistency.items()},
             "machine_share": localiser.machine_share,
             "base": localiser.base_report(),
         }

@@ -69,7 +69,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         {"hours": HOURS, "seconds": 20.0},
     ),
     "sim": (sim.run, "simulated time of small and large fleets, sensors on", {"runs": 5, "seconds": 20.0}),
-    "filter": (filters.run, "steps of the filters, and a whole agent's CPU and memory", {"runs": 5, "steps": 1000}),
+    "filter": (
+        filters.run,
+        "steps of the filters, what the smoother adds, and a whole agent's CPU and memory",
+        {"runs": 5, "steps": 1000},
+    ),
 }
 
 
@@ -78,7 +82,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = vars(_parser().parse_args(words))
     run, as_json = arguments.pop("run"), arguments.pop("json")
     result: Report = run(**arguments)
-    tables = [result[name] for name in ("rows", "decisions", "past", "agent") if name in result]
+    tables = [result[name] for name in ("rows", "decisions", "past", "smoother", "agent") if name in result]
     print(json.dumps(result) if as_json else "\n\n".join(map(table, tables)))
     for variant, remedy in result.get("missing", {}).items():
         print(f"not measured: {variant}; {remedy}", file=sys.stderr)

@@ -3,8 +3,8 @@
 Samples are numbered through in the file. What is recorded between one opening and the next is a **run**, with a random
 `spool_id` of its own; `seq` counts 1, 2, 3... within a run, so that seq = number - base. A file that was copied,
 cloned, restored from a backup or set back by a disk that lies about its syncs therefore never gives one identity to two
-samples: what copies have in common has the same identity and the same bytes, what they record from then on has another
-spool_id.
+samples: what copies have in common has the same identity and the same bytes (but for positions that were pending), what
+they record from then on has another spool_id.
 
 The newest samples may be **pending**: they have the filter's position, and wait for the smoother's. They are on disk,
 and not sent. Only memory knows that they are pending: whoever opens the file again takes them as they are, since a

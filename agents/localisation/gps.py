@@ -15,7 +15,7 @@ import numpy as np
 
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation import measurements
-from agents.localisation.consistency import Consistency, InnovationMonitor
+from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor
 from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, anchor_states
 from agents.localisation.filters.late_measurements import RELOCK
 from agents.localisation.filters.motion import GpsError, gps_covariance
@@ -118,8 +118,11 @@ class Receivers(ModalSensors[Fix]):
     @property
     def consistency(self) -> dict[str, Consistency]:
         """How consistent the filter is with each receiver, of those with enough fixes."""
-        consistency = {name: monitor.consistency() for name, monitor in self._monitors.items()}
-        return {name: value for name, value in consistency.items() if value}
+        speaking = [name for name, monitor in self._monitors.items() if monitor.consistency()]
+        share = self.machine_share
+        checks = share is not None and share <= MAX_SHARE and sum(n in self._states for n in speaking) > 1
+        judged = {n: self._monitors[n].consistency(is_checked=checks and n in self._states) for n in speaking}
+        return {name: value for name, value in judged.items() if value}
 
     def fix(self, gps: Gps, reckoned: DeadReckonedPose) -> Fix:
         """A reading in `map`, with the variances that are configured, else with its own."""
@@ -147,7 +150,7 @@ class Receivers(ModalSensors[Fix]):
         """Note what the filter made of a fix: the receiver's error has its first value now."""
         super().confirm(fix, result)
         name = fix.sensor.name
-        self._monitors[name].note(result)
+        self._monitors[name].note(result, self._believed_error(name, result.belief))
         self._judged[name] = (fix.stamp_ns, result.accepted)
         if not result.accepted:
             self._refused[name] += 1
@@ -160,6 +163,13 @@ class Receivers(ModalSensors[Fix]):
             i, antenna = self._compared[name], fix.reckoned_antenna_m
             shared = SharedFix(i, fix.stamp_ns, fix.position_m, antenna, white_m2, slow_m2, time_s)
             self._estimator.add(shared, float(result.belief.x[YAW]) - fix.reckoned.angle_rad)
+
+    def _believed_error(self, name: str, belief: Belief) -> float | None:
+        """Square of a receiver's slow error as it is believed over its variance, per component; None without states."""
+        if name not in self._states:
+            return None
+        error = belief.x[self._layout.gps_error(self._states[name])]
+        return float(error.dot(error)) / 2 / self._error(name).variance_m2
 
     def _error(self, name: str, site_share: float = 0.0) -> GpsError:
         """The slow error of a receiver, as it is now: with parts that the machine, and the site, have in common."""

@@ -19,7 +19,8 @@ from protocol.units import GRAVITY_MPS2
 # Standard deviations where neither a reading nor the sensor's configuration states one.
 RATE_RADPS = 0.005  # angular rate of an IMU, mean over a filter step
 FORCE_MPS2 = 2.0  # specific force of an IMU: its zero and mounting error do not average out, and are in it
-TURN_RADPS = 0.02  # turn rate of odometry or steering, and its lasting error at first; of steering per m/s
+TURN_RADPS = 0.02  # turn rate of odometry, and its lasting error at first; that of steering per m/s
+STEERING_RAD = 0.01  # steering angle: resolution, play, tyres that do not roll where they point
 SPEED_MPS = 0.04  # of wheels
 SIDE_MPS = 0.04  # how fast a machine slides sideways
 STILL_MPS = 0.005  # of a machine at rest

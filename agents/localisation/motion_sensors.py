@@ -18,13 +18,14 @@ from agents.localisation import measurements
 from agents.localisation.filters.belief import Measurement
 from agents.localisation.filters.state import Layout
 from agents.localisation.headings import UNKNOWN_STD
-from agents.localisation.imu_steps import FilterStep
+from agents.localisation.imu_steps import FilterStep, Turn
 from agents.localisation.measurements import GATE_SIGMA
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.units import GRAVITY_MPS2
 
 STANDSTILL_S = 1.0  # after so long without travel the machine stands; coarse ticks of one that crawls come sooner
+STEERED_S = 1.0  # how long the error of a steering angle stays the same
 ROLLING_S = 0.5  # time constant of the low-pass on the rolling resistance
 
 
@@ -45,6 +46,7 @@ class MotionSensors:
         self._imus = {s.name: s for s in used if s.kind == "imu"}
         self._wheels = [s for s in used if s.kind in ("encoder", "odometry") and s.provides("speed")]
         self._turn_sensor = turn_source(machine)
+        self._turned_ns, self._wheelbase_m = 0, machine.wheelbase_m
 
     @property
     def turn_error_radps(self) -> float:
@@ -71,9 +73,22 @@ class MotionSensors:
         if source is None or step.turn is None:
             return []
         error = layout.gyro_biases.stop - 1 if layout.imus else None
-        rate, per_error = step.turn.rate_radps, step.turn.per_error
-        std, gate = _turn_std(source), source.gate(GATE_SIGMA)
+        rate, per_error, gate = step.turn.rate_radps, step.turn.per_error, source.gate(GATE_SIGMA)
+        dt_s, self._turned_ns = (step.stamp_ns - self._turned_ns) * 1e-9, step.stamp_ns
+        std = self._steered_std(source, step.turn, dt_s) if source.kind == "steering" else _turn_std(source)
         return [measurements.turn(step.stamp_ns, "turn", rate, std, error, per_error, gate)]
+
+    def _steered_std(self, source: SensorConfig, turn: Turn, dt_s: float) -> float:
+        """Standard deviation of a rate by steering, dt_s after the one before: white noise, and the angle's error.
+
+        That is e v / (L cos^2 angle), v the speed, L the wheelbase, and stays for STEERED_S: a coarse angle is wrong
+        by the same for as long as the driver holds it. White noise as strong in the long run has 2 STEERED_S / dt times
+        its variance.
+        """
+        speed = turn.per_error
+        tangent = self._wheelbase_m * turn.rate_radps / speed if speed else 0.0
+        std = source.std.get("angle", measurements.STEERING_RAD) * speed / self._wheelbase_m * (1 + tangent**2)
+        return math.hypot(measurements.RATE_RADPS, std * math.sqrt(max(2 * STEERED_S / dt_s, 1.0)))
 
     def wheels(self, step: FilterStep) -> list[Measurement]:
         """Speed of the wheels less their slip, and a standstill; nothing of wheels that are silent, not at rest."""
@@ -125,4 +140,5 @@ def _gyro_std(imu: SensorConfig) -> float:
 
 
 def _turn_std(source: SensorConfig) -> float:
+    """Standard deviation of the rate of odometry, and of what lasts of its error; of steering only the latter."""
     return source.std.get("rate", measurements.TURN_RADPS)

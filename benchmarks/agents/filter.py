@@ -1,4 +1,4 @@
-"""Microseconds per step of the filters, own and filterpy's stock one, and what a whole agent costs.
+"""Microseconds per step of the filters, own and filterpy's stock one; what the smoother and a whole agent cost.
 
 Stock comes twice: plain, which is wrong where angles cross +-pi, and with the functions for angles that it asks for.
 """
@@ -18,7 +18,7 @@ from agents.localisation.filters.motion import MotionModel, motion
 from agents.localisation.filters.square_root import definite
 from agents.localisation.filters.state import ATTITUDE, POSITION, RATE, VELOCITY, Layout
 from agents.localisation.filters.ukf import Ukf
-from benchmarks.agents import agent
+from benchmarks.agents import agent, smoother
 from benchmarks.measure import Report, machine, medians, timed
 from protocol.arrays import Floats
 
@@ -44,7 +44,7 @@ def run(steps: int, runs: int) -> Report:
         us = round(took_s / steps * 1e6, 1)
         rows.append({"filter": name, "step": step, "us": us, "x_stock": stock, "x_stock_angles": angular})
     result = {"benchmark": "filter", "steps": steps, "runs": runs, **machine(), "rows": rows}
-    return {**result, "agent": [agent.measured(runs)]}
+    return {**result, "smoother": smoother.measured(runs), "agent": [agent.measured(runs)]}
 
 
 def _timer(work: FilterStep, steps: int) -> Callable[[], float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +107,7 @@ def measurements(rows: Sequence[Row]) -> list[Row]:
         counters = row["counters"]
         for name in (counter.removesuffix("_used") for counter in counters if counter.endswith("_used")):
             consistency = row["consistency"].get(name, {})
-            figures = {key: consistency.get(key) for key in ("nis", "correlation", "good")}
+            figures = {key: consistency.get(key) for key in ("nis", "correlation", "verdict")}
             counted = {key: counters.get(f"{name}_{key}", 0) for key in ("used", "gated", "relocked")}
             listed.append(rounded({"withhold": row["withhold"], "measurement": name, **counted, **figures}, 2))
     return listed
@@ -182,7 +182,7 @@ def _row(
         "wheel_scale": rounded(core.localiser.wheel_scale, 4),
         "us_per_second": round(trace.cpu_s * 1e6 / trace.seconds) if trace.seconds else None,
         "counters": dict(core.counters),
-        "consistency": {name: {**asdict(value), "good": value.is_good} for name, value in consistency},
+        "consistency": {name: value.report for name, value in consistency},
         **(_against_truth(trace.moved(truth.lever_m), truth.track, pattern) if truth else {}),
     }
 

@@ -177,6 +177,7 @@ def _agent_health(agents: Mapping[str, ReceivedHealth]) -> Iterable[Metric]:
     return [
         _gauge("sitegrid_agent_heard_timestamp_seconds", "When its health came in.", received_s),
         _gauge("sitegrid_agent_spool_samples", "Samples in its spool.", of_spool("depth")),
+        _gauge("sitegrid_agent_pending_samples", "Those that wait for the smoother.", of_spool("pending")),
         _gauge("sitegrid_agent_unsaved_samples", "Samples its disk has not taken.", of_spool("unsaved")),
         _counter("sitegrid_agent_samples_recorded_total", "Samples in its spool ever.", of_spool("recorded")),
         _counter("sitegrid_agent_samples_dropped_total", "Samples a full spool dropped.", of_spool("dropped")),

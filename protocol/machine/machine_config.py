@@ -25,7 +25,7 @@ QUANTITIES = {
     "attitude": ("tilt", "heading"),
     "odometry": ("speed", "rate"),
     "encoder": ("speed",),
-    "steering": ("rate",),
+    "steering": ("angle",),
 }
 # How values are meant. Differential: successive ones make a rate. Relative: the first is what the filter believes at
 # that moment, later ones count from it (Moore & Stouch, robot_localization).

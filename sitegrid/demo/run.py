@@ -8,6 +8,7 @@ from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
+from agents.localisation.localiser import LocalisationConfig
 from evaluation.audit import AuditResult, audit_store
 from evaluation.campaign.truth import position_rmse
 from evaluation.ground.truth import read_load_track
@@ -35,6 +36,8 @@ from sitegrid.pictures.draw import TrackRecorder, draw, draw_both, draw_differen
 from sitegrid.process.children import Child, Children
 from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
 from sitegrid.process.progress import Display
+
+SAMPLES_FOLLOW = f"samples follow after {LocalisationConfig().lag_s:g} s"  # of the smoother, of site time
 
 
 def run(arguments: Namespace) -> int:
@@ -109,7 +112,7 @@ def _watch(
             simulated_s = line.get("simulated_s", simulated_s)
         display.show(simulated_s, plan.scenario.seconds, _what(client))
         if time.monotonic() >= next_picture_s:
-            draw(client, plan.out / "map.png", _whole(plan), tracks.tracks())
+            draw(client, plan.out / "map.png", _whole(plan), tracks.tracks(), empty=SAMPLES_FOLLOW)
             next_picture_s = time.monotonic() + 3
     if sim.code:
         raise ConfigError("sitegrid demo", f"the simulator ended with {sim.code}; see {plan.work / 'sim.log'}")
@@ -121,7 +124,7 @@ def _what(client: Client) -> str:
         info = client.info()
     except (LinkError, QueryError):  # shown again in a moment
         return "the map server is away"
-    return f"{info.samples_merged} samples, {info.cells} cells"
+    return f"{info.samples_merged} samples, {info.cells} cells" if info.samples_merged else SAMPLES_FOLLOW
 
 
 def _whole(plan: DemoPlan) -> list[float]:

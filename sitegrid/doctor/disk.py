@@ -120,7 +120,8 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     """A running agent, by the values of its health report: of another version, they may be anything."""
     spool, uplink = (_table_of(values, part) for part in ("spool", "uplink"))
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
-    message = f"{machine} runs: {counts[0]}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
+    waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
+    message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
     problems = [uplink.get("problem"), *(values.get(f"{part}_problem") for part in ("spool", "calibration"))]
     advice = "; ".join(str(problem) for problem in (*problems, values.get("spool_damage")) if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""

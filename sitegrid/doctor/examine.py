@@ -19,6 +19,7 @@ from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials
 from sitegrid.doctor import Finding, Level, base, disk, network, skipped
 from sitegrid.doctor.keys import check_certificate, read_certificate
+from sitegrid.doctor.positions import check_positions
 from sitegrid.security.join import join
 
 ANYBODY = "doctor"  # where there are no keys, every name is as good
@@ -136,21 +137,21 @@ def _permission(subject: Subject, session: zenoh.Session, info: MapInfo | None) 
 def _spool(subject: Subject, session: zenoh.Session | None) -> list[Finding]:
     if (path := subject.options.spool) is None:
         return [skipped("spool", "give --spool FILE")]
-    return [_spool_itself(subject, path, session), disk.check_disk("spool", disk.free_bytes(path))]
+    return [*_spool_itself(subject, path, session), disk.check_disk("spool", disk.free_bytes(path))]
 
 
-def _spool_itself(subject: Subject, path: Path, session: zenoh.Session | None) -> Finding:
-    """The file; while an agent has it open, the agent's health report."""
+def _spool_itself(subject: Subject, path: Path, session: zenoh.Session | None) -> list[Finding]:
+    """The file; while an agent has it open, the agent's health report, which has its positions too."""
     try:
-        return disk.check_spool(disk.read_spool(path), time.time_ns())
+        return [disk.check_spool(disk.read_spool(path), time.time_ns())]
     except disk.InUseError:
         name = subject.machine if subject.machine != ANYBODY else ""
         if session and name and (health := network.receive_health(session, subject.site, name)):
-            return disk.check_health(name, health.values)
+            return [disk.check_health(name, health.values), check_positions(name, health.values)]
         reason = f"{name} sends no health" if session and name else "give --machine NAME to receive its health"
-        return skipped("spool", f"an agent has {path} open, and {reason}")
+        return [skipped("spool", f"an agent has {path} open, and {reason}")]
     except StoreError as error:
-        return Finding(Level.FAIL, "spool", str(error))
+        return [Finding(Level.FAIL, "spool", str(error))]
 
 
 def _store(folder: Path | None, site: SiteConfig | None) -> list[Finding]:

@@ -24,6 +24,7 @@ from sitegrid.process.lifetime import note, say, stop_flag
 
 MAX_POSES = 50_000  # of one machine: nearly three hours at 5 Hz
 LAYERS = ("resistance", "grade_east", "grade_north")
+SAMPLES_FOLLOW = "samples follow a minute or two behind"  # the smoother's lag, which only agents know
 
 
 def run(arguments: Namespace) -> int:
@@ -59,11 +60,19 @@ def _draw_if_possible(client: Client, arguments: Namespace, tracks: list[Track])
 
 
 def draw(
-    client: Client, out: Path, bounds: list[float] | None, tracks: list[Track], truth: Path | None = None
+    client: Client,
+    out: Path,
+    bounds: list[float] | None,
+    tracks: list[Track],
+    truth: Path | None = None,
+    empty: str = SAMPLES_FOLLOW,
 ) -> Region:
-    """Ask for the map and write its picture; with a true map the difference beside it."""
+    """Ask for the map and write its picture; with a true map the difference beside it.
+
+    empty: what the title says of a map without any ground, on which machines drive.
+    """
     region = client.region(_bounds(client, bounds), LAYERS)
-    image = side_by_side(draw_both(region, tracks))
+    image = side_by_side(draw_both(region, tracks, empty))
     difference = side_by_side(draw_differences(region, truth)) if truth else None
     write_image(out, image)
     if difference is not None:
@@ -76,11 +85,17 @@ def beside(out: Path) -> Path:
     return out.with_stem(f"{out.stem}-difference")
 
 
-def draw_both(region: Region, tracks: list[Track]) -> list[Image]:
+def draw_both(region: Region, tracks: list[Track], empty: str = SAMPLES_FOLLOW) -> list[Image]:
     """Resistance and grade; the title of a map without any resistance says why."""
-    has_torque = np.isfinite(region["resistance"]).any() or not np.isfinite(region["grade_east"]).any()
-    title = "Rolling resistance" if has_torque else "Rolling resistance: unknown, no machine measures drive torque"
-    return [draw_resistance(region, tracks, title), draw_grade(region, tracks)]
+    return [draw_resistance(region, tracks, _title(region, tracks, empty)), draw_grade(region, tracks)]
+
+
+def _title(region: Region, tracks: list[Track], empty: str) -> str:
+    if np.isfinite(region["resistance"]).any():
+        return "Rolling resistance"
+    if np.isfinite(region["grade_east"]).any():
+        return "Rolling resistance: unknown, no machine measures drive torque"
+    return f"Rolling resistance: {empty}" if tracks else "Rolling resistance"
 
 
 def draw_differences(region: Region, truth: Path) -> list[Image]:

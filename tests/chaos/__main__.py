@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.chaos import bit_flips, damage_faults, disk_faults, reader_faults, site_faults, store_faults
+from tests.chaos import bit_flips, damage_faults, disk_faults, pending_faults, reader_faults, site_faults, store_faults
 from tests.chaos.outcome import Console, FaultOutcome, InterruptError, table
 from tests.chaos.recordings import make
 from tests.chaos.scenario import FaultRun
@@ -47,6 +47,8 @@ FAULTS = (
     ChaosFault("freezes", site_faults.freezes, 0.08),
     ChaosFault("disks", site_faults.disks, 0.08),
     ChaosFault("clocks", site_faults.clocks, 0.08),
+    ChaosFault("window", pending_faults.window),
+    ChaosFault("parked", pending_faults.parked),
     ChaosFault("second_server", store_faults.second_server),
     ChaosFault("far_future", store_faults.far_future),
     ChaosFault("archive_clock", store_faults.archive_clock),

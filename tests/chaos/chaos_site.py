@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from agents.delivery.audit import read_audit
 from benchmarks.measure import memory_mb
 from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
@@ -26,13 +27,22 @@ from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
 from tests.chaos.leashed import Process
 from tests.chaos.outcome import Console, FaultOutcome, TimeSpan, longest_pause
-from tests.chaos.recordings import SECONDS, SPEED, START_NS, Recordings
+from tests.chaos.recordings import IDLE, SECONDS, SPEED, START_NS, Recordings
 
 READY_S = 120.0  # a server's first start in a new folder compiles its kernels
 RESUME_S = 60.0
 ROUTER, SERVER, SECOND = "router", "server", "second"  # the last: a map server with a store of its own
 COMMAND = ("-m", "sitegrid.cli")
 HOUR_S = 3600
+# The cheaper filter, and a short lag: the suite needs many samples that are true to their form and come soon, not good
+# ones. `window` and `parked` have the usual lag.
+AGENT = """
+linger_s = 20.0
+[pipeline.localisation]
+filter = "ekf"
+lag_s = {lag_s}
+"""
+LAG_S = 8.0
 # Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
 SERVER_TOML = "[store]\nsnapshot_s = 2.0\n[trust]\nexclude = false\n"
 ALL_STOPPED = (signal.SIGCONT, signal.SIGTERM)
@@ -66,6 +76,7 @@ class ChaosSite:
         self.env: dict[str, dict[str, str]] = {}
         self.options: dict[str, tuple[str, ...]] = {}
         self.modules: dict[str, tuple[str, ...]] = {}
+        self.speed, self.variant = SPEED, ""  # of the drives
         self.excuses: tuple[str, ...] = ()  # last words with which a process may end, to be started again
         self.outcome = FaultOutcome("")
         self.faults: list[TimeSpan] = []
@@ -77,6 +88,7 @@ class ChaosSite:
         self.name = site.name
         (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
         (folder / "server.toml").write_text(SERVER_TOML, encoding="utf-8")
+        self.set_lag(LAG_S)
 
     def __enter__(self) -> ChaosSite:
         return self
@@ -84,6 +96,10 @@ class ChaosSite:
     def __exit__(self, *_: object) -> None:
         for process in self._running.values():
             process.end()
+
+    def set_lag(self, lag_s: float) -> None:
+        """The smoother's lag of all agents that are started from now on."""
+        (self.folder / "agent.toml").write_text(AGENT.format(lag_s=lag_s), encoding="utf-8")
 
     # --- what runs ---------------------------------------------------------------------------------------------------
 
@@ -103,7 +119,7 @@ class ChaosSite:
         """Start a router, a server, or a machine's agent; idle: one that only delivers what is left."""
         self._starts += 1
         self._starts_of[role] += 1
-        words = self._words(role, idle)
+        words = self._words(role, IDLE if idle else self.variant)
         env = {"PYTHONUNBUFFERED": "1", **self.env.get(role, {})}
         log = self.folder / "log" / f"{self._starts:04d}-{role}"
         self._running[role] = Process(
@@ -184,6 +200,16 @@ class ChaosSite:
             return all(runs[machine] >= self._starts_of[machine] for machine in self.machines)
 
         self._wait(are_there, READY_S, "some runs have no samples")
+
+    def wait_delivered(self) -> None:
+        """Wait until all that the agents have recorded so far is in the journal, while they run."""
+
+        def is_there() -> bool:
+            progress = self.progress()
+            recorded = {machine: len(read_audit(self.folder / "audit" / machine)) for machine in self.machines}
+            return all(progress.get(machine, 0) == n for machine, n in recorded.items())
+
+        self._wait(is_there, RESUME_S, "recorded samples stay with their machines")
 
     def tend(self) -> None:
         """Start again what has ended by itself; only the end of a drive, or one with an excuse, is no problem."""
@@ -304,7 +330,7 @@ class ChaosSite:
                 return
             self.console.wait(0.05)
 
-    def _words(self, role: str, idle: bool) -> list[str]:
+    def _words(self, role: str, variant: str) -> list[str]:
         where, site = ("--endpoint", self.endpoints[role]), ("--site-file", str(self.folder / "site.toml"))
         if role == ROUTER:
             return ["router", "--listen", self.endpoints[role], *self.options.get(role, ())]
@@ -313,8 +339,8 @@ class ChaosSite:
             store = ("--store", str(folder), "--config", str(self.folder / "server.toml"))
             return ["server", *where, *site, *store, *self.options.get(role, ())]
         first_ns = self._first_ns + self._starts * SECONDS * 10**9
-        manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, first_ns, idle=idle)
-        replay = ("--driver", "replay", "--log", manifest, "--data", self._recordings.data(role), "--speed", SPEED)
+        manifest = self._recordings.manifest(self.folder / "log" / f"{self._starts}.toml", role, first_ns, variant)
+        replay = ("--driver", "replay", "--log", manifest, "--data", self._recordings.data(role), "--speed", self.speed)
         files = ("--spool", self.folder / "spool" / f"{role}.db", "--audit", self.folder / "audit" / role)
-        config = ("--config", self._recordings.folder / "agent.toml")
+        config = ("--config", self.folder / "agent.toml")
         return [str(word) for word in ("agent", *where, *site, *config, *replay, *files, "--json")]

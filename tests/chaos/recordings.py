@@ -17,15 +17,8 @@ from sim.simulator import START_NS
 
 SECONDS = 160
 SPEED = 4.0  # times real time: about 25 samples a second and machine
-IDLE = "idle"
-# The cheaper filter, and a short lag: the suite needs many samples that are true to their form and come soon, not good
-# ones. `window` alone has the usual lag.
-AGENT = """
-linger_s = 20.0
-[pipeline.localisation]
-filter = "ekf"
-lag_s = 8.0
-"""
+IDLE, PARKED = "idle", "parked"  # variants of a recording: without a reading; with nothing more for an hour at its end
+HOUR_NS = 3600 * 10**9
 
 
 @dataclass(frozen=True)
@@ -39,12 +32,12 @@ class Recordings:
         """Folder of a machine's CSV files."""
         return self.folder / machine
 
-    def manifest(self, path: Path, machine: str, first_ns: int, *, idle: bool = False) -> Path:
-        """Write a manifest of a drive that begins at first_ns; idle: of a machine that reads nothing."""
+    def manifest(self, path: Path, machine: str, first_ns: int, variant: str = "") -> Path:
+        """Write a manifest of a drive that begins at first_ns. variant: IDLE or PARKED."""
         text = (self.data(machine) / "log.toml").read_text(encoding="utf-8")
         head, rest = text.split("\n[site]", 1)
         text = f"{head}start_ns = {first_ns - START_NS}\n\n[site]{rest}"
-        path.write_text(text.replace(".csv", f".csv.{IDLE}") if idle else text, encoding="utf-8")
+        path.write_text(text.replace(".csv", f".csv.{variant}") if variant else text, encoding="utf-8")
         return path
 
 
@@ -58,5 +51,13 @@ def make(folder: Path, machines: int, seed: int, seconds: float = SECONDS, stop:
         write_log(folder / "nothing" / name, "nothing", log.site, log.machine, ())
         for path in (folder / "nothing" / name).glob("*.csv"):
             path.rename(folder / name / f"{path.name}.{IDLE}")
-    (folder / "agent.toml").write_text(AGENT, encoding="utf-8")
+        for path in list((folder / name).glob("*.csv")):
+            _park(path, path.with_name(f"{path.name}.{PARKED}"))
     return Recordings(folder, names)
+
+
+def _park(source: Path, target: Path) -> None:
+    """A copy whose last reading comes again an hour later: until then a replay waits, as for sensors that are off."""
+    text = source.read_text(encoding="utf-8")
+    stamp, values = text.splitlines()[-1].split(",", 1)
+    target.write_text(f"{text}{int(stamp) + HOUR_NS},{values}\n", encoding="utf-8")

@@ -23,6 +23,7 @@ from tests.chaos import (
     bit_flips,
     damage_faults,
     disk_faults,
+    pending_faults,
     reader_faults,
     site_faults,
     stepped_clock,
@@ -62,6 +63,15 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
     assert 0 < outcome.ack_ms_max < 60_000
     assert len(set(outcome.pids)) >= 4 + 4 + 2, "a process of its own for every start"
     assert not any(Path(f"/proc/{pid}").exists() for pid in outcome.pids)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("fault", [pending_faults.window, pending_faults.parked])
+def test_samples_that_wait_for_the_smoother_outlive_kills_and_silence(tmp_path, fault):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3)
+    outcome = fault(scenario(tmp_path / "run", recordings=recordings, strikes=1))
+    assert (outcome.lost, outcome.double, outcome.declared, outcome.problems) == (0, 0, 0, [])
+    assert outcome.recorded == outcome.merged > 2 * pending_faults.LEAST_PENDING
 
 
 def harmless(tmp_path: Path, fault: Callable[[FaultRun], FaultOutcome]) -> FaultOutcome:

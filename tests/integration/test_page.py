@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 
 from protocol.machine.samples import SAMPLE_DTYPE
-from protocol.wire.codec import encode_batch
-from protocol.wire.messages import SampleBatch
+from protocol.wire import keys
+from protocol.wire.codec import encode_batch, encode_pose
+from protocol.wire.messages import Pose, SampleBatch
 from sitegrid.process.children import Children, wait_until
 from tests.integration.site_run import kill
-from tests.integration.web_site import START_NS, WebSite
+from tests.integration.web_site import NAME, START_NS, WebSite
 from tests.soak import BATCH_S
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -311,6 +312,13 @@ def test_an_empty_map_says_what_to_do(browser, tmp_path: Path):
         tab = Tab(browser, web.url)
         tab.until("document.getElementById('notice').textContent.includes('No ground known yet')")
         assert "sitegrid agent" in tab.page.locator("#notice code").inner_text()
+        for i, x_m in enumerate((400.0, 600.0)):
+            pose = Pose(f"machine-{i}", START_NS, x_m, 300.0, 0.0, 2.0, 1.0, 0.0, 1.0)
+            web.session.put(keys.pose(NAME, pose.machine), encode_pose(pose))
+        tab.until("document.getElementById('notice').textContent.includes('Machines are driving')")
+        places = "[...sitegrid.machines.values()].map((m) => sitegrid.view.toScreen(m.x_m, m.y_m))"
+        assert all(0 < x < 1280 and 0 < y < 800 for x, y in tab.js(places)), "they are in sight"
+        assert "small" in tab.js("document.getElementById('notice').className")
         web.drive(8)
         tab.until("document.getElementById('notice').hidden && sitegrid.map.tiles.size > 0")
         tab.close()

@@ -13,6 +13,7 @@ const SHOWS = [["machines", "Machines", "M"], ["tracks", "Tracks, last minute", 
 const NOTICES = {
   loading: ["Loading the map", "One moment; the first tiles are on their way."],
   empty: ["No ground known yet", "Start a machine's agent; the map fills as it drives.", "sitegrid agent --config loader-1.toml --site-file site.toml --spool spool.db"],
+  driving: ["Machines are driving.", "Their ground follows a minute or two behind them, once their positions are surer.", null, true],
   away: ["No map server answers.", "This is what it said last. Trying again every 2 s.", null, true],
   offline: ["The page's server does not answer.", "This is what it said last. Trying again every 2 s.", null, true],
   refused: ["This link has no permission", "Ask the office for a visitor's token, then open the new link."],
@@ -194,11 +195,11 @@ function setState(state) {
   if (state === page.state && state !== "loading") return;
   page.state = state;
   const empty = state === "live" && !page.map.tiles.size;
-  const kind = empty ? "empty" : state;
+  const kind = !empty ? state : page.machines.size ? "driving" : "empty";
   const [title, text, command, small] = NOTICES[kind] ?? [];
   const notice = byId("notice");
   notice.hidden = !title;
-  notice.classList.toggle("small", Boolean(small) && page.map.tiles.size > 0);
+  notice.classList.toggle("small", Boolean(small) && (page.map.tiles.size > 0 || kind === "driving"));
   if (title) notice.replaceChildren(element("h2", {}, title), element("p", {}, text), ...(command ? [element("code", {}, command)] : []));
   document.body.classList.toggle("blank", kind in NOTICES && !page.map.tiles.size);
   showStatus();
@@ -341,7 +342,7 @@ function help() {
 function fit() {
   const phone = innerWidth <= 720;
   view.margins = phone ? [16, 150, 16, 130] : [272, 66, 24, 96];
-  view.fit(page.map.bounds() ?? [-50, -50, 50, 50]);
+  view.fit(page.map.bounds() ?? aroundMachines() ?? [-50, -50, 50, 50]);
   page.redraw();
   keepLink();
 }
@@ -379,6 +380,11 @@ function linkOf() {
   return `${location.pathname}?${new URLSearchParams(parts)}`;
 }
 
+function aroundMachines() { // where there is no map yet
+  const all = [...page.machines.values()], x = all.map((m) => m.x_m), y = all.map((m) => m.y_m), room_m = 40;
+  return all.length ? [Math.min(...x) - room_m, Math.min(...y) - room_m, Math.max(...x) + room_m, Math.max(...y) + room_m] : null;
+}
+
 function restoreLink() {
   const at = asked.get("at")?.split(",").map(Number), time = Date.parse(asked.get("time")), other = Date.parse(asked.get("other"));
   if (at?.length === 3 && at.every(Number.isFinite)) { [view.x, view.y, view.scale] = at; view.moved = true; } else fit();
@@ -402,12 +408,16 @@ const on = {
     page.redraw();
   },
   poses(poses) {
-    const now_s = performance.now() / 1000;
+    const now_s = performance.now() / 1000, known = page.machines.size;
     for (const pose of poses) {
       const machine = page.machines.get(pose.machine) ?? { track: [] }, seen_s = now_s - pose.age_s;
       machine.track.push({ x_m: pose.x_m, y_m: pose.y_m, seen_s });
       while (machine.track.length && now_s - machine.track[0].seen_s > 60) machine.track.shift();
       page.machines.set(pose.machine, { ...machine, ...pose, seen_s });
+    }
+    if (page.state === "live" && !page.map.tiles.size) { // their ground comes later
+      if (!view.moved) fit();
+      if (!known) { page.state = "loading"; setState("live"); }
     }
     page.redraw();
     showStatus();

@@ -6,9 +6,12 @@ from typing import Any
 
 import pytest
 
-from agents.config import AgentConfig, load_agent
+from agents.config import MOST_LAG_S, AgentConfig, load_agent
 from agents.estimation.ground import NOTHING_KNOWN
 from agents.estimation.plausibility import FAULTS
+from agents.localisation.localiser import LocalisationConfig
+from agents.pipeline import PipelineConfig
+from mapserver.trust.judgement import CLOCK_LIMIT_S
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.site.site_config import SiteConfig
@@ -74,6 +77,13 @@ def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
     assert (config.linger_s, config.pipeline.localisation.slip) == (1.0, 0.2)
 
 
+def test_samples_that_are_late_by_the_lag_are_no_wrong_clock_to_the_server() -> None:
+    """Also beside machines that send at once, and with batches that take a minute."""
+    assert MOST_LAG_S + 60 < CLOCK_LIMIT_S
+    longest = LocalisationConfig(lag_s=MOST_LAG_S)
+    assert AgentConfig(PipelineConfig(longest)).pipeline.localisation.lag_s == MOST_LAG_S
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
@@ -88,6 +98,7 @@ def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
         ("[spool]\nmax_samples = 0", "max_samples"),
         ("[holdout]\noff_s = 11", "off_s"),
         ("linger_s = -1", "linger_s"),
+        ("[pipeline.localisation]\nlag_s = 181", "lag_s: at most 180 s: the map server would take the clock for wrong"),
         ("[machine]\nname = 'No'", "name"),
         ("[machine]\nname = 'a'\nmass_kg = 0", "mass_kg"),
         ("[machine]\nname = 'a'\n[[sensor]]\nname = 'g'\nkind = 'gps'\ndrift_share = 2", "drift_share"),

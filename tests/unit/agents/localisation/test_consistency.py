@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from agents.localisation.consistency import ENOUGH, InnovationMonitor
+from agents.localisation.consistency import CANNOT_TELL, CONSISTENT, ENOUGH, INCONSISTENT, MAX_LEVEL, InnovationMonitor
 from agents.localisation.filters.belief import Belief, Conditioned
+from tests.unit.agents.drives import START_NS
 
 BELIEF = Belief(1, np.zeros(2), np.eye(2))
 
@@ -22,7 +23,7 @@ def white(seed: int = 3, n: int = 150) -> np.ndarray:
 def test_white_innovations_of_the_right_size_are_good() -> None:
     consistency = monitored(white()).consistency()
     assert consistency is not None
-    assert consistency.is_good
+    assert consistency.verdict == CANNOT_TELL
     assert consistency.nis == pytest.approx(1.0, abs=0.25)
     assert abs(consistency.correlation) < 0.25
     assert consistency.gated == 0.0
@@ -42,7 +43,7 @@ def test_what_a_consistent_filter_does_not_see_is_monitored(monitor: InnovationM
     good = monitored(white()).consistency()
     assert consistency is not None
     assert good is not None
-    assert not consistency.is_good
+    assert consistency.verdict == INCONSISTENT
     assert abs(getattr(consistency, name) - getattr(good, name)) > 0.4
 
 
@@ -53,7 +54,7 @@ def test_too_few_say_nothing_and_old_ones_are_forgotten() -> None:
         monitor.note(Conditioned(BELIEF, innovation, np.eye(2), float(innovation @ innovation), accepted=True))
     consistency = monitor.consistency()
     assert consistency is not None
-    assert consistency.is_good
+    assert consistency.verdict == CANNOT_TELL
 
 
 def test_measurements_that_are_no_numbers_say_nothing_of_the_filter() -> None:
@@ -61,3 +62,37 @@ def test_measurements_that_are_no_numbers_say_nothing_of_the_filter() -> None:
     for _ in range(100):
         monitor.note(Conditioned(BELIEF, np.full(2, np.nan), np.eye(2), float("nan"), accepted=False))
     assert monitor.consistency() is None
+
+
+def noted(slow_error: float, seconds: float) -> InnovationMonitor:
+    """Five innovations a second as they should be, with a slow error of this mean square."""
+    monitor = InnovationMonitor()
+    for i, innovation in enumerate(white(n=round(5 * seconds))):
+        belief = Belief(START_NS + i * 200_000_000, np.zeros(2), np.eye(2))
+        result = Conditioned(belief, innovation, np.eye(2), float(innovation @ innovation), accepted=True)
+        monitor.note(result, slow_error)
+    return monitor
+
+
+@pytest.mark.parametrize(
+    ("slow_error", "is_checked", "verdict"),
+    [
+        (0.7, True, CONSISTENT),
+        (0.7, False, CANNOT_TELL),
+        (2 * MAX_LEVEL, True, INCONSISTENT),
+        (2 * MAX_LEVEL, False, INCONSISTENT),
+    ],
+)
+def test_a_slow_error_is_seen_by_its_size_and_denied_by_another_receiver_alone(
+    slow_error: float, is_checked: bool, verdict: str
+) -> None:
+    consistency = noted(slow_error, 600.0).consistency(is_checked=is_checked)
+    assert consistency is not None
+    assert consistency.verdict == verdict
+    assert consistency.slow_error == pytest.approx(slow_error, abs=0.35)
+
+
+def test_a_slow_error_is_no_verdict_before_it_has_lasted() -> None:
+    consistency = noted(2 * MAX_LEVEL, 30.0).consistency()
+    assert consistency is not None
+    assert consistency.verdict == CANNOT_TELL

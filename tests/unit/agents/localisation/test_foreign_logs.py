@@ -11,6 +11,7 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
+from agents.localisation.consistency import CANNOT_TELL, CONSISTENT, INCONSISTENT
 from agents.localisation.filters.belief import Belief, PoseBelief
 from agents.localisation.filters.state import PITCH, ROLL
 from agents.localisation.localiser import LocalisationConfig, Localiser
@@ -31,8 +32,13 @@ def cart(*sensors: SensorConfig) -> MachineConfig:
     return MachineConfig("cart", wheel_radius_m=0.4, sensors=sensors)
 
 
-def readings_of(vehicle: MachineConfig, made: Drive, rate_hz: float, seed: int, from_s: float = 0.0) -> list[Reading]:
-    """What its sensors read so many times a second, all at the same stamps; fixes have slow and white errors."""
+def readings_of(
+    vehicle: MachineConfig, made: Drive, rate_hz: float, seed: int, from_s: float = 0.0, slow_m: float = 1.0
+) -> list[Reading]:
+    """What its sensors read so many times a second, all at the same stamps.
+
+    Fixes have a white error of 0.5 m per axis and a slow one of slow_m.
+    """
     rng, every = np.random.default_rng(seed), round(100 / rate_hz)
     rates = np.gradient(made.heading_rad, 0.01)
     travel = np.cumsum(made.speed_mps) * 0.01
@@ -53,7 +59,7 @@ def readings_of(vehicle: MachineConfig, made: Drive, rate_hz: float, seed: int, 
             elif s.kind == "gps":
                 fade = math.exp(-0.01 * every / s.drift_time_s)
                 slow[s.name] = fade * slow[s.name] + math.sqrt(1 - fade**2) * rng.normal(size=2)
-                east, north = slow[s.name] + 0.5 * rng.normal(size=2)
+                east, north = slow_m * slow[s.name] + 0.5 * rng.normal(size=2)
                 heading = float(made.heading_rad[i])
                 readings.append(fix(s, stamp, made.x_m[i] + east, made.y_m[i] + north, heading, 1.25))
     return readings
@@ -207,3 +213,58 @@ def test_a_gyro_without_accelerometer_does_not_make_the_tilt_wander(engine: str)
     assert max(abs(float(b.x[state])) for b in beliefs for state in (ROLL, PITCH)) < 1e-3
     assert abs(scale_of(positioning, beliefs[-1])[0]) < 0.02
     assert positioning.counters["gyro_gated"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensors", [(GYRO, ODOMETRY), (SensorConfig("odometry", "odometry"),), (IMU, ENCODER)])
+@pytest.mark.parametrize("rate_hz", [5, 20])
+def test_both_filters_agree_where_the_model_is_the_same(sensors: tuple[SensorConfig, ...], rate_hz: float) -> None:
+    """Where nothing but the start's wide heading is far from linear; a log that begins in motion."""
+    vehicle = cart(*sensors, GPS)
+    made = drive(TOUR, vehicle)
+    readings = readings_of(vehicle, made, rate_hz, seed=1, from_s=9.0)
+    (_, ekf, _), (_, ukf, _) = (located(vehicle, readings, engine) for engine in ("ekf", "ukf"))
+    apart = [math.dist((a.x_m, a.y_m), (b.x_m, b.y_m)) for a, b in zip(ekf, ukf, strict=True)]
+    assert max(apart) < 0.1
+    assert net_m(made, ukf) == pytest.approx(net_m(made, ekf), rel=0.05)
+
+
+# --- what nobody can know --------------------------------------------------------------------------------------------
+
+
+def judged(slow_m: float, time_s: float, receivers: int, seed: int) -> tuple[float, set[str], float]:
+    """Share of time in the 95 % ellipse, verdicts on the receivers, and the largest NIS.
+
+    The slow error has this standard deviation and correlation time; stated are 1 m and 45 s.
+    """
+    names = [f"gps-{i + 1}" for i in range(receivers)]
+    vehicle = cart(IMU, ODOMETRY, *(SensorConfig(name, "gps", drift_time_s=time_s) for name in names))
+    legs = (Leg(6, 1.0), Leg(6), *[Leg(12, 0, 0.2), Leg(5), Leg(12, 0, -0.2), Leg(5)] * 10)
+    made = drive(legs, vehicle)
+    stated = replace(vehicle, sensors=tuple(replace(s, drift_time_s=45.0, drift_share=0.8) for s in vehicle.sensors))
+    positioning, poses, _ = located(stated, readings_of(vehicle, made, 5, seed, slow_m=slow_m))
+    off = np.array([(p.x_m, p.y_m) for p in poses]) - [made.at(p.stamp_ns)[:2] for p in poses]
+    nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv([p.covariance_m2 for p in poses]), off)
+    consistency = positioning.localiser.consistency.values()
+    return float((nees < 5.99).mean()), {c.verdict for c in consistency}, max(c.nis for c in consistency)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("receivers", "slow_m", "time_s", "covers", "verdict"),
+    [
+        (1, 1.0, 45.0, True, CANNOT_TELL),
+        (1, 3.0, 405.0, False, CANNOT_TELL),  # innovations are as white and small as before
+        (2, 1.0, 45.0, True, CONSISTENT),
+        (2, 3.0, 405.0, False, INCONSISTENT),  # the receivers disagree by more than they state
+    ],
+)
+def test_an_ellipse_that_misses_the_truth_for_long_is_not_said_to_hold(
+    receivers: int, slow_m: float, time_s: float, *, covers: bool, verdict: str
+) -> None:
+    seed = 5
+    coverage, verdicts, nis = judged(slow_m, time_s, receivers, seed)
+    assert (coverage > 0.8) is covers, f"seed={seed} {coverage}"
+    assert verdict in verdicts, f"seed={seed} {verdicts}"
+    assert (CONSISTENT in verdicts) is (verdict == CONSISTENT), f"seed={seed} {verdicts}"
+    assert nis < 1.3, f"seed={seed}"

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.dead_reckoning import turn_source
+from agents.dead_reckoning import DeadReckonedPose, WheelSpeed, turn_source
 from agents.localisation.filters.belief import Belief
 from agents.localisation.filters.motion import motion
 from agents.localisation.filters.state import YAW, YAW_RATE, Layout
-from agents.localisation.imu_steps import FilterStep, StepGatherer
+from agents.localisation.imu_steps import FilterStep, StepGatherer, Turn
+from agents.localisation.measurements import RATE_RADPS
+from agents.localisation.motion_sensors import STEERED_S, MotionSensors
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Odometry, Reading, Steering
 from tests.unit.agents.drives import LEVER_M, START_NS, Drive, Leg, RunLocaliser, drive, localiser, reckoned
@@ -169,6 +171,43 @@ def test_steering_without_wheels_tells_no_turn() -> None:
     assert [step.turn for step in steps] == [None] * len(steps)
 
 
+def test_of_several_sensors_the_one_that_states_the_least_error_shows_the_turn_in_any_order() -> None:
+    sure, sketchy, silent = (
+        SensorConfig(n, "odometry", std=std) for n, std in (("b", {"rate": 0.01}), ("a", {"rate": 0.2}), ("c", {}))
+    )
+    for sensors in ((sure, sketchy, silent), (silent, sketchy, sure)):
+        assert turn_source(truck(*sensors)) == sure
+        assert turn_source(truck(*(s for s in sensors if s is not sure))) == sketchy
+
+
+@pytest.mark.parametrize(
+    ("speed", "angle", "dt_ms"), [(3.0, 0.0, 50), (-3.0, 0.4, 50), (6.0, 0.2, 200), (0.0, 0.3, 50)]
+)
+def test_the_noise_of_a_steered_turn_is_that_of_its_angle(speed: float, angle: float, dt_ms: int) -> None:
+    """As strong in the long run as an angle that is wrong by the same for a second: e v / (L cos^2 angle)."""
+    vehicle = truck(ENCODER, replace(STEERING, std={"angle": 0.02}))
+    body = MotionSensors(vehicle, Layout(imus=1, wheel_scale=True), 0.05, (0.0, 0.0), on_plane=True)
+    curvature = math.tan(angle) / WHEELBASE_M
+    steps = [
+        FilterStep(
+            START_NS + i * dt_ms * 1_000_000,
+            DeadReckonedPose(0, 0.0, 0.0, 0.0, 0.0),
+            {},
+            {},
+            WheelSpeed(speed, is_known=True),
+            True,
+            0.0,
+            0.0,
+            Turn(speed * curvature, speed),
+        )
+        for i in range(2)
+    ]
+    (measurement,) = [body.turn(step) for step in steps][-1]
+    of_angle = 0.02 * speed / (WHEELBASE_M * math.cos(angle) ** 2)
+    expected = RATE_RADPS**2 + of_angle**2 * 2 * STEERED_S / (dt_ms * 1e-3)
+    assert float(measurement.R[0, 0]) == pytest.approx(expected)
+
+
 # --- what comes of it ------------------------------------------------------------------------------------------------
 
 
@@ -238,6 +277,25 @@ def test_a_machine_whose_turn_is_known_does_not_count_it_as_unknown() -> None:
     assert run(vehicle, driven(vehicle, Wrong(), BEND).readings)[0].counters["turn_unknown"] == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["ekf", "ukf"])
+def test_the_heading_by_a_coarse_steering_angle_is_as_sure_as_it_is_right(engine: str) -> None:
+    """Steps of 3 degrees, bends of 5 s, GPS lost for 30 s of each 90 s."""
+    resolution, rng = math.radians(3), np.random.default_rng(5)
+    vehicle = truck(ENCODER, replace(STEERING, std={"angle": resolution / math.sqrt(12)}))
+    bends = [Leg(5, 0, float(rate)) for rate in rng.uniform(-0.25, 0.25, 50)]
+    made = driven(vehicle, Wrong(), [Leg(6, 1.0), Leg(4), *bends], seed=1)
+    readings: list[Reading] = [
+        replace(r, angle_rad=resolution * round(r.angle_rad / resolution)) if isinstance(r, Steering) else r
+        for r in made.readings
+        if not isinstance(r, Gps) or seconds(r.stamp_ns) % 90 < 60
+    ]
+    _, beliefs = run(vehicle, readings, filter=engine)
+    off = [math.remainder(b.x[YAW] - made.at(b.stamp_ns)[2], math.tau) for b in beliefs]
+    nees = np.square(off) / [b.P[YAW, YAW] for b in beliefs]
+    assert 0.3 < float(nees.mean()) < 3.0
+
+
 # --- options ---------------------------------------------------------------------------------------------------------
 
 
@@ -246,7 +304,8 @@ def test_a_turn_of_a_sensor_that_states_a_larger_error_leaves_the_rate_less_know
     sensors: tuple[SensorConfig, ...],
 ) -> None:
     made = driven(truck(*sensors), Wrong(math.radians(1), 0.01), [Leg(6, 0.5), Leg(10, 0, 0.25)])
-    stated = truck(*(replace(s, std={"rate": 0.1}) if s.kind in ("steering", "odometry") else s for s in sensors))
+    larger = {"steering": {"angle": 0.05}, "odometry": {"rate": 0.1}}
+    stated = truck(*(replace(s, std=larger[s.kind]) if s.kind in larger else s for s in sensors))
     plain, unsure = (run(each, made.readings)[1][-1].P[YAW_RATE, YAW_RATE] for each in (truck(*sensors), stated))
     assert unsure > 2 * plain
 

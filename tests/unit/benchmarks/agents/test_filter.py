@@ -6,7 +6,7 @@ import pytest
 
 from agents.pipeline import Pipeline, PipelineConfig
 from benchmarks.__main__ import main
-from benchmarks.agents import agent
+from benchmarks.agents import agent, smoother
 from benchmarks.agents import filter as filters
 
 STEPS = ("predict", "update position", "update rate")
@@ -15,6 +15,7 @@ STEPS = ("predict", "update position", "update rate")
 @pytest.mark.slow
 def test_filter_prints_one_json_object_with_every_step_of_every_filter(monkeypatch, capsys) -> None:
     monkeypatch.setattr(agent, "SECONDS", 20)
+    monkeypatch.setattr(smoother, "SECONDS", 20)
     assert main(["filter", "--json", "--steps", "3", "--runs", "1"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["benchmark"], result["steps"], result["runs"]) == ("filter", 3, 1)
@@ -23,18 +24,22 @@ def test_filter_prints_one_json_object_with_every_step_of_every_filter(monkeypat
     assert [(row["filter"], row["step"]) for row in rows] == [(kind, step) for kind in kinds for step in STEPS]
     assert all(set(row) == {"filter", "step", "us", "x_stock", "x_stock_angles"} for row in rows)
     assert all(math.isfinite(value) for row in rows for value in row.values() if not isinstance(value, str))
+    assert [(row["filter"], row["lag_s"]) for row in result["smoother"]] == [("ekf", 90.0), ("ukf", 90.0)]
+    assert all(-0.5 < row["smoother_percent"] < row["cpu_percent"] for row in result["smoother"])
     (whole,) = result["agent"]
     assert whole["seconds"] == 20
     assert whole["cpu_percent"] > 0
     assert whole["memory_mb"] > 20
 
 
-def test_filter_prints_two_tables(monkeypatch, capsys) -> None:
+def test_filter_prints_three_tables(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(smoother, "measured", lambda runs: [{"filter": "ekf", "cpu_percent": 0.5}])
     monkeypatch.setattr(agent, "measured", lambda runs: {"seconds": 1, "cpu_percent": 0.5, "memory_mb": 100.0})
     main(["filter", "--steps", "1", "--runs", "1"])
-    steps, whole = capsys.readouterr().out.split("\n\n")
+    steps, smoothing, whole = capsys.readouterr().out.split("\n\n")
     assert steps.splitlines()[0].split() == ["filter", "step", "us", "x_stock", "x_stock_angles"]
     assert len(steps.splitlines()) == 13
+    assert smoothing.split() == ["filter", "cpu_percent", "ekf", "0.5"]
     assert whole.split() == ["seconds", "cpu_percent", "memory_mb", "1", "0.5", "100.0"]
 
 

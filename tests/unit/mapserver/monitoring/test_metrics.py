@@ -50,7 +50,7 @@ INFO: dict[str, Any] = {
     "writer": {"waiting": 3, "waiting_bytes": 4096, "commits": 20, "commit_s": 0.5},
 }
 HEALTH = {
-    "spool": {"depth": 40, "unsaved": 1, "recorded": 90, "dropped": 2, "put_aside": 1, "gone": 6},
+    "spool": {"depth": 40, "pending": 30, "unsaved": 1, "recorded": 90, "dropped": 2, "put_aside": 1, "gone": 6},
     "uplink": {"problem": "no answer"},
     "spool_problem": "",
 }
@@ -131,6 +131,7 @@ def test_agents_are_exposed_as_they_describe_themselves(tmp_path: Path):
     assert agent == {
         "sitegrid_agent_heard_timestamp_seconds": 1e9 + 0.25,
         "sitegrid_agent_spool_samples": 40,
+        "sitegrid_agent_pending_samples": 30,
         "sitegrid_agent_unsaved_samples": 1,
         "sitegrid_agent_samples_recorded_total": 90,
         "sitegrid_agent_samples_dropped_total": 2,

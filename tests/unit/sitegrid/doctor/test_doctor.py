@@ -41,6 +41,7 @@ from sitegrid.doctor import Finding, Level, disk, network
 from sitegrid.doctor.disk import SpoolState, StoreState
 from sitegrid.doctor.keys import Certificate, check_certificate, read_certificate
 from sitegrid.doctor.network import RouterLink
+from sitegrid.doctor.positions import check_positions
 from tests.unit.records import map_info
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
@@ -78,7 +79,7 @@ AHEAD = replace(
     machines={f"loader-{i}": SampleCounts(**COUNTS, newest_ns=NOW_NS + 36_000 * 10**9 * i) for i in (1, 2)},
 )
 STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
-HEALTHY = {"spool": {"depth": 3, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
+HEALTHY = {"spool": {"depth": 3, "pending": 2, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
 
 
 def router(took_s: float | None, **link: bool) -> Finding:
@@ -108,6 +109,11 @@ def spool(depth: int, dropped: int = 0, quarantined: int = 0, *, oldest_ns: int 
 
 def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
     return disk.check_store(replace(STORE, **change), site)
+
+
+def positions(**verdicts: str) -> Finding:
+    receivers = {name: {"verdict": verdict} for name, verdict in verdicts.items()}
+    return check_positions("loader-1", {"pipeline": {"consistency": receivers}})
 
 
 @pytest.mark.parametrize(
@@ -188,13 +194,19 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
         (disk.check_spool(SpoolState(0, 0, 0, 0, damage="a.db-wal is damaged"), NOW_NS), WARN, "a.db-wal is damaged"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "gone": 8}}), WARN, "8 are gone"),
         (disk.check_health("loader-1", {**HEALTHY, "spool_damage": "the log is damaged"}), WARN, "the log is damaged"),
-        (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait"),
+        (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait, 2 of them for the smoother; "),
         (disk.check_health("loader-1", {**HEALTHY, "uplink": {"problem": "no answer"}}), WARN, "; no answer"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
         # what others say may be anything
         (disk.check_health("loader-1", {}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {"spool": 7, "uplink": "no"}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {"spool": [], "spool_problem": None}), PASS, "? samples wait"),
+        (positions(a="consistent", b="consistent"), PASS, "loader-1: a consistent, b consistent"),
+        (positions(a="cannot_tell"), PASS, "a cannot tell; a slow GPS error that is larger than stated would not show"),
+        (positions(a="consistent", b="inconsistent"), WARN, "b inconsistent; fixes are further off than"),
+        (positions(), SKIP, "loader-1 has had too few fixes"),
+        (check_positions("loader-1", {"pipeline": {"consistency": {"a": 7}}}), SKIP, "too few fixes"),
+        (check_positions("loader-1", {"pipeline": 7}), SKIP, "too few fixes"),
         (store(), PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
         (store(None, checkpoints=3, checkpoint_bytes=2 * 10**8), PASS, "ago; 3 checkpoints of the past, 0.2 GB"),
         (store(None, damaged_checkpoints=1), PASS, "; 1 damaged, the server makes them again"),

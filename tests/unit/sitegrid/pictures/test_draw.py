@@ -1,14 +1,15 @@
-"""The true map, cut to the cells of a region."""
+"""The true map, cut to the cells of a region; what a picture says of itself."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from mapserver.pictures.plotter import Track
 from protocol.errors import ConfigError
 from protocol.queries.answers import Region
 from sim.truth import TruthMap
-from sitegrid.pictures.draw import truth_layers
+from sitegrid.pictures.draw import _title, truth_layers
 from tests.unit.records import version
 
 
@@ -40,3 +41,24 @@ def test_beyond_the_simulated_site_nothing_is_known(truth: TruthMap):
 def test_cells_of_another_size_are_refused(truth: TruthMap):
     with pytest.raises(ConfigError, match="cells of 1 m, the map of 2 m"):
         truth_layers(truth, region(10, 20, 2, 2, cell_m=2.0))
+
+
+TRACKS = [Track("loader-1", np.zeros(2), np.zeros(2))]
+
+
+@pytest.mark.parametrize(
+    ("resistance", "grade", "tracks", "title"),
+    [
+        (0.1, 0.0, TRACKS, "Rolling resistance"),
+        (np.nan, 0.0, TRACKS, "Rolling resistance: unknown, no machine measures drive torque"),
+        (np.nan, np.nan, TRACKS, "Rolling resistance: samples follow after 90 s"),
+        (np.nan, np.nan, [], "Rolling resistance"),
+    ],
+)
+def test_a_map_without_resistance_says_why(resistance: float, grade: float, tracks: list[Track], title: str):
+    known = region(0, 0, 2, 2)
+    layers = {"resistance": resistance, "grade_east": grade, "grade_north": grade}
+    known = Region(
+        known.x_m, known.y_m, 1.0, {k: np.full((2, 2), v, np.float32) for k, v in layers.items()}, version(), 0
+    )
+    assert _title(known, tracks, "samples follow after 90 s") == title
