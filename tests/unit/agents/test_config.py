@@ -46,7 +46,9 @@ def test_agent_file_names_every_option() -> None:
 
 def test_agent_file_names_every_option_of_machine_and_sensor() -> None:
     named = table("agent.toml")
-    assert {f.name for f in fields(MachineConfig)} - {"sensors"} == set(named["machine"])
+    estimated = "machine_share"  # without it; so it is in a comment
+    assert {f.name for f in fields(MachineConfig)} - {"sensors", estimated} == set(named["machine"])
+    assert f"\n# {estimated} = " in (CONFIG / "agent.toml").read_text()
     assert {f.name for f in fields(SensorConfig)} == {key for sensor in named["sensor"] for key in sensor}
     assert {f.name for f in fields(Mount)} == set(named["sensor"][0]["mount"])
 
