@@ -170,5 +170,11 @@ class Corrections:
         return reckoned
 
 
+def not_used(base: SensorConfig, profile: str) -> dict[str, Any]:
+    """The report of a machine that names a base and has no use for it."""
+    why = "the profile `paper` uses none" if profile == "paper" else "no GPS receiver shows places"
+    return {"name": base.name, "used": False, "why_not": why}
+
+
 def _begun(belief: Belief, layout: Layout, slow_m2: float, offset_m2: float) -> Belief:
     return reset_states(reset_states(belief, layout.base_error, slow_m2), layout.base_offset, offset_m2)

@@ -41,15 +41,15 @@ def test_case_says_how_far_the_survey_is_off_and_how_long_the_base_stood() -> No
 
 
 def test_base_fails_from_the_middle_on_and_stamps_go_on() -> None:
-    def of(case: str) -> list[float]:
+    def east(case: str) -> list[float]:
         made = list(failing(MADE, case, MIDDLE_NS))
         assert [c.stamp_ns for c in made] == [c.stamp_ns for c in MADE][: len(made)]
         return [c.east_m for c in made]
 
-    assert of("good") == [float(i) for i in range(1, 11)]
-    assert of("dies") == [1.0, 2.0, 3.0, 4.0, 5.0]
-    assert of("repeats") == [1.0, 2.0, 3.0, 4.0, 5.0] * 2
-    assert of("sticks") == [1.0, 2.0, 3.0, 4.0, *[5.0] * 6]
+    assert east("good") == [float(i) for i in range(1, 11)]
+    assert east("dies") == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert east("repeats") == [1.0, 2.0, 3.0, 4.0, 5.0] * 2
+    assert east("sticks") == [1.0, 2.0, 3.0, 4.0, *[5.0] * 6]
 
 
 def test_corrections_arrive_late_and_none_before_the_machine_starts() -> None:
