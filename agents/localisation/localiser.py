@@ -9,7 +9,7 @@ from typing import Any
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
-from agents.localisation.corrections import Corrections
+from agents.localisation.corrections import Corrections, not_used
 from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
@@ -122,8 +122,7 @@ class Localiser:
         """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
         if self._corrections:
             return self._corrections.report(self._fusion.belief.stamp_ns if self._fusion else 0)
-        why = "the profile `paper` uses none" if self._config.profile == "paper" else "no GPS receiver shows places"
-        return {"name": self._base.name, "used": False, "why_not": why} if self._base else None
+        return not_used(self._base, self._config.profile) if self._base else None
 
     @property
     def machine_share(self) -> float | None:
@@ -206,20 +205,17 @@ class Localiser:
         if not isinstance(event, FilterStep):
             return []
         corrections.follow(fusion.belief)
-        measurement = corrections.measurement(fusion.belief)
-        if measurement is None:
+        if (measurement := corrections.measurement(fusion.belief)) is None:
             return []
         fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
         beliefs = fusion.add([measurement])
-        if beliefs:
-            corrections.confirm(fusion.last[measurement.sensor])
+        corrections.confirm(fusion.last[measurement.sensor])
         return beliefs
 
     def _gps_errors(self) -> tuple[GpsError, ...]:
         """Slow errors of the machine's receivers and, where it uses one, of the base station's."""
-        if self._corrections is None:
-            return self._receivers.errors
-        return self._receivers.errors_beside(self._corrections.base_error, self._corrections.site_share)
+        base = self._corrections
+        return self._receivers.errors_beside(base.base_error, base.site_share) if base else self._receivers.errors
 
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
         """Filter a value whose sensor may count from what is believed at its stamp."""
