@@ -27,6 +27,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "ticks": {"_ticks": 1.0},
     "kg": {"_kg": 1.0},
     "t": {"_kg": 1e3},
+    "s": {"_s": 1.0},
 }
 _NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 

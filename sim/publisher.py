@@ -137,14 +137,14 @@ def _drive(
             progress(simulator.simulated_s)
     wall_s = clock() - start
     stopped = planned is None or bundles < planned
-    return SimReport(len(streams), simulator.simulated_s, wall_s, bundles, readings, pace.late_s, stopped)
+    return SimReport(len(simulator.machines), simulator.simulated_s, wall_s, bundles, readings, pace.late_s, stopped)
 
 
 @contextlib.contextmanager
 def _streams(simulator: Simulator, session_config: SessionConfig) -> Iterator[list[Stream]]:
     session: Any = open_session(session_config)
     with contextlib.closing(session), contextlib.ExitStack() as closing:
-        streams = [Stream(session, simulator.site.name, machine.name) for machine in simulator.machines]
+        streams = [Stream(session, simulator.site.name, name) for name in simulator.participants]
         for stream in streams:
             closing.callback(stream.close)
         yield streams

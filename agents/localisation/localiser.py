@@ -4,14 +4,16 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
+from agents.localisation.corrections import Corrections
 from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
-from agents.localisation.filters.motion import MotionModel
+from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import SmoothedPose, nothing_past
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
@@ -22,7 +24,7 @@ from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig
-from protocol.machine.readings import Gps, GpsVelocity
+from protocol.machine.readings import Correction, Gps, GpsVelocity
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
@@ -87,12 +89,14 @@ class Localiser:
         self._receivers = Receivers(
             machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
         )
+        self._base = machine.base
+        self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
         self._references = References(machine.sensors, layout)
         source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
         tyres = config.slip, config.slip_soft
         self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
-        self._model = MotionModel(layout, on_plane, self._receivers.errors, turn_error_radps=turn_error)
+        self._model = MotionModel(layout, on_plane, self._gps_errors(), turn_error_radps=turn_error)
         self._fusion: Fusion | None = None
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
@@ -106,12 +110,20 @@ class Localiser:
     @property
     def counters(self) -> Counter[str]:
         """Measurements used and gated, readings refused."""
-        return self._body.counters + self._gatherer.counters + (self._fusion.counters if self._fusion else Counter())
+        of_parts = [part.counters for part in (self._fusion, self._corrections) if part]
+        return sum(of_parts, self._body.counters + self._gatherer.counters)
 
     @property
     def consistency(self) -> dict[str, Consistency]:
         """How consistent the filter is with each GPS receiver, of those with enough fixes."""
         return self._receivers.consistency
+
+    def base_report(self) -> dict[str, Any] | None:
+        """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
+        if self._corrections:
+            return self._corrections.report(self._fusion.belief.stamp_ns if self._fusion else 0)
+        why = "the profile `paper` uses none" if self._config.profile == "paper" else "no GPS receiver shows places"
+        return {"name": self._base.name, "used": False, "why_not": why} if self._base else None
 
     @property
     def machine_share(self) -> float | None:
@@ -137,6 +149,11 @@ class Localiser:
         """Smoothed poses within the lag, as known by now; the last is the newest belief's. They stay."""
         return self._fusion.remaining() if self._fusion else []
 
+    def take(self, correction: Correction) -> None:
+        """Keep a correction of a base station until it is due, with a later reading."""
+        if self._corrections and self._fusion:
+            self._corrections.take(correction, self._fusion.belief.stamp_ns)
+
     def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in the readings of one stamp, after dead reckoning did; returns poses that became possible or changed.
 
@@ -160,7 +177,12 @@ class Localiser:
         return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
     def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
-        """Beliefs that an event changed."""
+        """Beliefs that an event changed, and then a correction that is due."""
+        beliefs = self._filter_own(fusion, event)
+        return beliefs + self._correct(fusion, self._corrections, event) if self._corrections else beliefs
+
+    def _filter_own(self, fusion: Fusion, event: Event) -> list[Belief]:
+        """Beliefs that an event of the machine's own sensors changed."""
         if isinstance(event, Measurement):
             return fusion.add([event])
         if isinstance(event, Fix):
@@ -177,6 +199,28 @@ class Localiser:
         ]
         return beliefs + (fusion.add(measurements) if measurements else [])
 
+    def _correct(self, fusion: Fusion, corrections: Corrections, event: Event) -> list[Belief]:
+        """Beliefs that a base station's corrections changed, as of what the event shows."""
+        if isinstance(event, Fix):
+            corrections.compare(event, fusion.belief, *self._receivers.expected(event))
+        if not isinstance(event, FilterStep):
+            return []
+        corrections.follow(fusion.belief)
+        measurement = corrections.measurement(fusion.belief)
+        if measurement is None:
+            return []
+        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
+        beliefs = fusion.add([measurement])
+        if beliefs:
+            corrections.confirm(fusion.last[measurement.sensor])
+        return beliefs
+
+    def _gps_errors(self) -> tuple[GpsError, ...]:
+        """Slow errors of the machine's receivers and, where it uses one, of the base station's."""
+        if self._corrections is None:
+            return self._receivers.errors
+        return self._receivers.errors_beside(self._corrections.base_error, self._corrections.site_share)
+
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
         """Filter a value whose sensor may count from what is believed at its stamp."""
         if sensors.needs_anchor(value):
@@ -184,7 +228,7 @@ class Localiser:
         measurement = sensors.measurement(value)
         if measurement is None:
             return []
-        fusion.model = replace(fusion.model, gps_errors=self._receivers.errors)
+        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
         beliefs = fusion.add([measurement])
         if beliefs:
             sensors.confirm(value, fusion.last[measurement.sensor])
@@ -232,7 +276,9 @@ def _layout_of(machine: MachineConfig) -> Layout:
     source = turn_source(machine)
     imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
     turns = imus + (source is not None and source.kind != "imu")
-    return Layout(turns, True, len(drifting(machine.sensors)), len(anchored_headings(machine.sensors)))
+    receivers, references = drifting(machine.sensors), anchored_headings(machine.sensors)
+    base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
+    return Layout(turns, True, len(receivers) + base, len(references), base)
 
 
 def _shows_tilt(machine: MachineConfig, profile: str) -> bool:

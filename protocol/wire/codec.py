@@ -94,7 +94,8 @@ def _take_int(table: dict[str, Any], name: str, low: int, high: int, reason: Ref
     return value
 
 
-def _take_name(table: dict[str, Any], field: str = "machine") -> str:
+def take_name(table: dict[str, Any], field: str = "machine") -> str:
+    """Take a name."""
     name: str = take(table, field, str)
     if not NAME.fullmatch(name):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{name[:70]!r} is not a name", field=field)
@@ -109,7 +110,8 @@ def take_store(table: dict[str, Any], name: str = "store", *, optional: bool = F
     return text
 
 
-def _take_stamp(table: dict[str, Any]) -> int:
+def take_stamp(table: dict[str, Any]) -> int:
+    """Take `stamp_ns`."""
     return _take_int(table, "stamp_ns", 1, MAX_STAMP_NS)
 
 
@@ -153,7 +155,7 @@ def unpack_batch(data: bytes) -> PackedBatch:
     first_seq = _take_int(table, "first_seq", 1, MAX_SEQ, Refusal.FIRST_SEQ)
     lost_before = _take_int({"lost_before": 0, **table}, "lost_before", 0, first_seq - 1)
     batch = SampleBatch(
-        machine=_take_name(table),
+        machine=take_name(table),
         spool_id=_take_int(table, "spool_id", 1, MAX_U64),
         first_seq=first_seq,
         rows=_NO_ROWS,
@@ -230,7 +232,7 @@ def decode_bundle(data: bytes) -> SensorBundle:
         readings += _decode_group(group, refused)
     readings.sort(key=lambda r: r.stamp_ns)
     return SensorBundle(
-        machine=_take_name(table),
+        machine=take_name(table),
         counter=_take_int(table, "counter", 1, MAX_SEQ),
         readings=tuple(readings),
         last=take(table, "last", bool, default=False),
@@ -239,7 +241,7 @@ def decode_bundle(data: bytes) -> SensorBundle:
 
 
 def _decode_group(group: dict[str, Any], refused: Counter[str]) -> list[Reading]:
-    sensor, kind = _take_name(group, "sensor"), take(group, "kind", str)
+    sensor, kind = take_name(group, "sensor"), take(group, "kind", str)
     if kind not in KINDS:
         raise MessageError(Refusal.OUT_OF_RANGE, f"{kind[:40]!r} is none of {', '.join(KINDS)}", field="kind")
     n, cols = _take_int(group, "n", 0, MAX_BATCH_SAMPLES), take(group, "cols", dict)
@@ -270,7 +272,7 @@ def decode_pose(data: bytes) -> Pose:
     """Undo `encode_pose`."""
     table = unpack(data, MAX_SMALL_BYTES)
     numbers = (take(table, name, float) for name in list(Pose.__dataclass_fields__)[2:])
-    return Pose(_take_name(table), _take_stamp(table), *numbers)
+    return Pose(take_name(table), take_stamp(table), *numbers)
 
 
 def encode_health(health: Health) -> bytes:
@@ -282,4 +284,4 @@ def decode_health(data: bytes) -> Health:
     """Undo `encode_health`."""
     table = unpack(data, MAX_SMALL_BYTES)
     stamp_ns = _take_int(table, "stamp_ns", 0, MAX_STAMP_NS)  # 0: nothing was read yet
-    return Health(_take_name(table), stamp_ns, take_plain(table, "values"))
+    return Health(take_name(table), stamp_ns, take_plain(table, "values"))

@@ -85,6 +85,12 @@ def machine_config(
     )
 
 
+def base_config(name: str, preset: Preset) -> MachineConfig:
+    """Describe a base station as its agent knows it: one receiver, whose antenna stands at the place itself."""
+    share, time_s = _slow(preset.gps)
+    return MachineConfig(name, sensors=(SensorConfig("gps-1", "gps", drift_share=share, drift_time_s=time_s),))
+
+
 def draw_bodies(rigs: Sequence[Rig], seed: int) -> Bodies:
     """Draw the true bodies of machines around their nominal ones."""
     mass_kg, radius_m = np.empty(len(rigs)), np.empty(len(rigs))
@@ -105,10 +111,15 @@ def _inertial(kind: str, number: int, model: MachineModel) -> SensorConfig:
 def _receiver(number: int, model: MachineModel, noise: GpsNoise) -> SensorConfig:
     mounts: tuple[Mount, ...] = model.gps_mounts()
     _check_number("gps", number, len(mounts), model)
+    share, time_s = _slow(noise)
+    return SensorConfig(f"gps-{number}", "gps", mounts[number - 1], drift_share=share, drift_time_s=time_s)
+
+
+def _slow(noise: GpsNoise) -> tuple[float, float]:
+    """The slow share of a receiver's variance, and its time."""
     total = math.hypot(noise.drift_std_m, noise.white_std_m)
     share = round((noise.drift_std_m / total) ** 2, 2) if total else 0.0  # no finer than a data sheet
-    name, mount = f"gps-{number}", mounts[number - 1]
-    return SensorConfig(name, "gps", mount, drift_share=share, drift_time_s=noise.drift_time_s)
+    return share, noise.drift_time_s
 
 
 def _check_number(kind: str, number: int, count: int, model: MachineModel) -> None:

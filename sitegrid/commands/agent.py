@@ -1,13 +1,17 @@
-"""`sitegrid agent`: the localisation agent of one machine."""
+"""`sitegrid agent`: the localisation agent of one machine, or the agent of a base station."""
 
 from __future__ import annotations
 
 import dataclasses
+import threading
 import time
 from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 
@@ -24,11 +28,15 @@ from sitegrid.process.lifetime import note, plain, say, stop_flag
 from sitegrid.security.join import join, reply_check, signer
 
 if TYPE_CHECKING:
+    from agents.agent import Agent
+    from agents.base_agent import BaseAgent
     from agents.config import AgentConfig
     from agents.drivers import Driver
     from protocol.wire.owners import Owner
 
-HELP = "run the localisation agent of one machine"
+    Serve = Callable[[Driver, Callable[[], bool]], dict[str, Any]]
+
+HELP = "run the localisation agent of one machine, or the agent of a base station"
 EXTRA = "agent"
 KEPT = OutputFile(makes_folder=True)
 LINK_S = 1.0  # how long to wait for the router before starting without it
@@ -41,7 +49,7 @@ def add_options(parser: ArgumentParser) -> None:
     add("--config", type=Path, help="file with machine, sensors and options (config/agent.toml)")
     add("--site-file", type=Path, help="site file (config/site.toml); not needed with --log")
     add("--name", help="name of the machine (overrides the config file)")
-    add("--spool", type=KEPT, required=True, help="file of the spool")
+    add("--spool", type=KEPT, help="file of the spool; a base station has none")
     add("--audit", type=KEPT, help="file that lists every recorded sample, to prove that none is lost")
     add("--calibration", type=KEPT, help="calibration file (default: beside the spool)")
     add("--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)")
@@ -52,28 +60,53 @@ def add_options(parser: ArgumentParser) -> None:
     add("--withhold", action="store_true", help=withheld)
 
 
+@dataclass(frozen=True)
+class _Joined:
+    """A machine, or a base station, that has joined the network under its name."""
+
+    session: zenoh.Session
+    site: SiteConfig
+    machine: MachineConfig
+    config: AgentConfig
+    owner: Owner
+
+
 def run(arguments: Namespace) -> int:
     """Run until the stream ends or the process is stopped; the router may come and go."""
-    from agents.agent import Agent, Places
-    from agents.config import require_place
-
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
     site, machine, config = _configure(arguments, log)
-    require_place(machine, config.pipeline.localisation)
-    session = _open(join(arguments.endpoint, arguments.keys, role="machine", name=machine.name, site=site.name))
+    session = _open(join(arguments.endpoint, arguments.keys, role=config.role, name=machine.name, site=site.name))
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
-        places = Places(arguments.spool, arguments.audit, _calibration(arguments))
-        key, check, withhold = signer(arguments.keys), reply_check(arguments.keys), arguments.withhold
-        sign = key.sign if key else None
-        agent = Agent(session, site, machine, config, places, withhold=withhold, owner=owner, sign=sign, check=check)
+        joined = _Joined(session, site, machine, config, owner)
+        agent, serve = (_base if config.role == "base" else _machine)(arguments, joined, stop)
         opened.callback(agent.close)
+        driver = _driver(arguments, log, joined)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
-        report = agent.run(_driver(arguments, log, session, site.name, machine.name), stop.is_set, wait=stop.wait)
+        report = serve(driver, stop.is_set)
     say({"ended": plain(report)}) if arguments.json else note(_summary(machine.name, report))
-    return 0 if report["delivered"] or stop.is_set() else 1
+    return 0 if report.get("delivered", True) or stop.is_set() else 1
+
+
+def _machine(arguments: Namespace, joined: _Joined, stop: threading.Event) -> tuple[Agent | BaseAgent, Serve]:
+    from agents.agent import Agent, Places
+    from agents.config import require_place
+
+    require_place(joined.machine, joined.config.pipeline.localisation)
+    places = Places(arguments.spool, arguments.audit, _calibration(arguments))
+    key, check, withhold = signer(arguments.keys), reply_check(arguments.keys), arguments.withhold
+    sign = key.sign if key else None
+    agent = Agent(**vars(joined), places=places, withhold=withhold, sign=sign, check=check)
+    return agent, partial(agent.run, wait=stop.wait)
+
+
+def _base(_: Namespace, joined: _Joined, __: threading.Event) -> tuple[Agent | BaseAgent, Serve]:
+    from agents.base_agent import BaseAgent
+
+    agent = BaseAgent(**vars(joined))
+    return agent, agent.run
 
 
 def _open(settings: SessionConfig) -> zenoh.Session:
@@ -109,6 +142,7 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
     machine = machine or (log.machine if log else None)
     if machine is None:
         raise ConfigError(arguments.config or "sitegrid agent", "no [machine] is described; see config/agent.toml")
+    _check_files(arguments, config.role)
     if arguments.name:
         machine = dataclasses.replace(machine, name=arguments.name)
     if arguments.site_file:
@@ -118,16 +152,32 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
     return log.site, machine, config
 
 
-def _driver(arguments: Namespace, log: LogFolder | None, session: zenoh.Session, site: str, machine: str) -> Driver:
+def _check_files(arguments: Namespace, role: str) -> None:
+    """Refuse a machine without a place for its samples, and a base station with one."""
+    if role == "machine" and not arguments.spool:
+        raise ConfigError("sitegrid agent", "--spool FILE is missing: samples wait there until they are acknowledged")
+    of_samples = [name for name in ("spool", "audit", "calibration", "withhold") if getattr(arguments, name)]
+    if role == "base" and of_samples:
+        raise ConfigError("sitegrid agent", f"--{of_samples[0]}: a base station makes no samples; leave it out")
+
+
+def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Driver:
+    """What readings come from; a log has the corrections that came in when it was recorded."""
+    from agents.drivers.corrections import WithCorrections
     from agents.drivers.replay import Replay
     from agents.drivers.zenoh import ZenohDriver
 
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)
-    return ZenohDriver(session, site, machine)
+    driver = ZenohDriver(joined.session, joined.site.name, joined.machine.name)
+    base = joined.machine.base
+    return WithCorrections(driver, joined.session, joined.site, base.name) if base else driver
 
 
-def _summary(machine: str, report: dict[str, object]) -> str:
+def _summary(machine: str, report: dict[str, Any]) -> str:
+    if base := report.get("base"):
+        made = base["counters"].get("corrections", 0)
+        return f"{machine}: {report['readings']} readings, {made} corrections"
     line = f"{machine}: {report['readings']} readings, {report['samples']} samples"
     withheld = f", withheld fixes {report['holdout']}" if report["holdout"] else ""
     return f"{line}, delivered {report['delivered']}{withheld}"

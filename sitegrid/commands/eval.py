@@ -37,13 +37,14 @@ def add_options(parser: ArgumentParser) -> None:
     table = add_action(what, "localisation", "repeat the paper's table on simulated recordings")
     budget = add_action(what, "budget", "show what each kind of error costs, by the truth in its place")
     ground = add_action(what, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work")
+    base = add_action(what, "base", "measure what a base station brings, also one that fails")
     merge = add_action(what, "merge", "compare this map merge with other methods")
     lag = add_action(what, "lag", "compare the maps of four loaders at work with and without the smoother's lag")
-    for action, seeds in ((physics, 3), (table, 12), (budget, 12), (ground, 12), (merge, 12), (lag, 12)):
+    for action, seeds in ((physics, 3), (table, 12), (budget, 12), (ground, 12), (base, 12), (merge, 12), (lag, 12)):
         action.add_argument("--seeds", type=count, default=seeds, help="number of seeds (default %(default)s)")
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
-    for action in (table, budget, ground, merge, lag):
+    for action in (table, budget, ground, base, merge, lag):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
@@ -52,7 +53,7 @@ def add_options(parser: ArgumentParser) -> None:
         (merge, "the maps of the first seed and the table"),
     ):
         action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
-    for action, seconds in ((table, 1200.0), (budget, 1200.0), (ground, 600.0), (lag, 900.0)):
+    for action, seconds in ((table, 1200.0), (budget, 1200.0), (ground, 600.0), (base, 1200.0), (lag, 900.0)):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
     scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
@@ -93,6 +94,7 @@ def run(arguments: Namespace) -> int:
         "localisation": _localisation,
         "budget": _budget,
         "ground": _ground,
+        "base": _base,
         "merge": _merge,
         "lag": _lag,
         "log": _log,
@@ -152,6 +154,13 @@ def _ground(arguments: Namespace) -> Report:
 
     work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
     return _experiment(arguments, "loaders work, estimators follow", work, "evaluation.ground.plots")
+
+
+def _base(arguments: Namespace) -> Report:
+    from evaluation.positions import base_station
+
+    work = partial(base_station.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    return _experiment(arguments, "machines drive beside a base station", work)
 
 
 def _merge(arguments: Namespace) -> Report:

@@ -21,7 +21,17 @@ from protocol.site.site_file import load_site
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.demo.plan import READY_S, DemoPlan, LogReplay, make_plan, start_agent, start_server, start_sim, start_web
+from sitegrid.demo.plan import (
+    READY_S,
+    DemoPlan,
+    LogReplay,
+    make_plan,
+    start_agent,
+    start_base,
+    start_server,
+    start_sim,
+    start_web,
+)
 from sitegrid.pictures.draw import TrackRecorder, draw, draw_both, draw_differences, truth_layers
 from sitegrid.process.children import Child, Children
 from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
@@ -57,9 +67,10 @@ def run(arguments: Namespace) -> int:
 def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: Display) -> dict[str, Any] | None:
     """Start everything, wait for the end, judge and draw; None if stopped on the way."""
     server = start_server(plan, children, "server", plan.site_file)
+    bases = [start_base(plan, children, base.name) for base in plan.scenario.base_station]
     agents = {path.stem: start_agent(plan, children, path) for path in plan.configs}
     log_replay = LogReplay(plan, plan.log, children) if plan.log else None
-    for child in agents.values():
+    for child in [*bases, *agents.values()]:
         child.expect("ready", READY_S)
     sim = start_sim(plan, children)
     with connect(plan.endpoint, plan.scenario.site.name) as client:
@@ -67,7 +78,7 @@ def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: D
         with display:
             if not _watch(plan, client, tracks, (sim, agents), (stop, display)):
                 return None
-        for child in agents.values():
+        for child in [*bases, *agents.values()]:
             child.expect("ended", READY_S)
         region, pictures = _draw(plan, client, tracks)
         rmse_m = position_rmse(tracks.poses(), plan.truth)

@@ -17,7 +17,7 @@ from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials
-from sitegrid.doctor import Finding, Level, disk, network, skipped
+from sitegrid.doctor import Finding, Level, base, disk, network, skipped
 from sitegrid.doctor.keys import check_certificate, read_certificate
 from sitegrid.doctor.positions import check_positions
 from sitegrid.security.join import join
@@ -76,10 +76,15 @@ def _keys(arguments: Namespace) -> tuple[list[Finding], Subject | None]:
 def _network(subject: Subject) -> list[Finding]:
     link, session = network.open_link(join(subject.options.endpoint, subject.options.keys, network.LINK_S))
     if session is None:
-        rest = [skipped(name, "no way to the router") for name in OF_SERVER]
+        rest = [skipped(name, "no way to the router") for name in (*OF_SERVER, "base")]
         return [network.check_link(link), *rest, *_spool(subject, None)]
     try:
-        return [network.check_link(link), *_server(subject, session), *_spool(subject, session)]
+        return [
+            network.check_link(link),
+            *_server(subject, session),
+            _base(subject, session),
+            *_spool(subject, session),
+        ]
     finally:
         session.close()  # type: ignore[no-untyped-call]
 
@@ -107,6 +112,15 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
             network.check_version(package_version(), info.version),
         ]
     return [*findings, _permission(subject, session, info)]
+
+
+def _base(subject: Subject, session: zenoh.Session) -> Finding:
+    role = subject.identity.role if subject.identity else ""
+    if role and role not in ASKS_MAP:
+        return skipped("base", f"keys of a {role} may not listen")
+    if subject.site_file is None:
+        return skipped("base", "give --site-file FILE to listen to base stations")
+    return base.check_base(base.receive_correction(session, subject.site, subject.site_file.frame))
 
 
 def _permission(subject: Subject, session: zenoh.Session, info: MapInfo | None) -> Finding:

@@ -119,7 +119,7 @@ def judge(outcome: FaultOutcome, promises: str, left: Remains) -> None:
     """Compare what is there with what was promised, and add to the counts."""
     promised = _promised(promises)
     outcome.recorded += len(promised)
-    kept = sum(content in left.contents.get(identity, ()) for identity, content in promised.items())
+    kept = sum(not may_be.isdisjoint(left.contents.get(identity, ())) for identity, may_be in promised.items())
     outcome.merged += kept
     outcome.lost += len(promised) - kept
     outcome.silent += len(promised) - kept
@@ -128,11 +128,14 @@ def judge(outcome: FaultOutcome, promises: str, left: Remains) -> None:
         outcome.problems.append(left.problem)
 
 
-def _promised(promises: str) -> dict[SampleNumber, str]:
-    promised: dict[SampleNumber, str] = {}
+def _promised(promises: str) -> dict[SampleNumber, set[str]]:
+    """What each sample may be."""
+    promised: dict[SampleNumber, set[str]] = {}
     for sign, spool_id, seq, *content in (line.split() for line in promises.splitlines()):
         if sign == "+":
-            promised[int(spool_id, 16), int(seq)] = content[0]
+            promised[int(spool_id, 16), int(seq)] = {content[0]}
+        elif sign == "?":
+            promised[int(spool_id, 16), int(seq)].add(content[0])
         else:
             promised = {at: c for at, c in promised.items() if at[0] != int(spool_id, 16) or at[1] > int(seq)}
     return promised

@@ -1,7 +1,8 @@
 """`python -m tests.chaos.power_worker spool|store FOLDER SEED STEPS`: work on one file store, saying what is promised.
 
 Runs under the disk shim. FOLDER/promises gets a line after each promise, which the shim puts in order with the writes:
-`+ <spool_id> <seq> <hash>` is on disk, `- <spool_id> <seq>` says that samples up to there may be deleted from here on.
+`+ <spool_id> <seq> <hash>` is on disk, `? <spool_id> <seq> <hash>` may take its place from here on,
+`- <spool_id> <seq>` says that samples up to there may be deleted from here on.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ class Promises:
     def close(self) -> None:
         self._file.close()
 
-    def kept(self, spool_id: int, first_seq: int, rows: Table) -> None:
+    def kept(self, spool_id: int, first_seq: int, rows: Table, sign: str = "+") -> None:
         """Say that samples are on disk."""
-        lines = [f"+ {spool_id:x} {first_seq + i} {content_hash(row)}\n" for i, row in enumerate(rows)]
+        lines = [f"{sign} {spool_id:x} {first_seq + i} {content_hash(row)}\n" for i, row in enumerate(rows)]
         self._file.write("".join(lines).encode())
 
     def given_up(self, spool_id: int, upto: int) -> None:
@@ -61,20 +62,30 @@ def drive(rng: np.random.Generator, n: int, first_ns: int) -> Table:
 
 
 def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
-    """Record and acknowledge by chance. careless: with the setting that loses rows (docs/evidence.md)."""
-    rng, chance, spool = np.random.default_rng(seed), random.Random(seed), None
+    """Record, make final and acknowledge by chance. careless: with the setting that loses rows (docs/evidence.md)."""
+    rng, chance, spool, waiting = np.random.default_rng(seed), random.Random(seed), None, empty()
     for step in range(steps):
         with suppress(StoreError, sqlite3.Error):  # a disk that fails: nothing was promised
             spool = spool or Spool(folder / SPOOL_FILE, SpoolConfig())
             _sync(spool._db, careless)
-            rows = drive(rng, chance.randint(1, 12), step * 1000)
-            promises.kept(spool.spool_id, spool.record(rows), rows)
+            rows, finals = (
+                drive(rng, chance.randint(1, 12), step * 1000),
+                waiting[: chance.randint(0, len(waiting))].copy(),
+            )
+            finals["x_m"] += 0.25
+            n, first = chance.choice((0, len(rows))), spool.newest - len(waiting) + 1
+            pending = n if len(finals) == len(waiting) else len(rows)
+            promises.kept(spool.spool_id, first, finals, "?")
+            seq = spool.record(rows, pending=pending, finals=finals)
+            promises.kept(spool.spool_id, first, finals)
+            promises.kept(spool.spool_id, seq, rows)
+            waiting = np.concatenate([waiting[len(finals) :], rows[len(rows) - pending :]])
             if chance.random() < 0.3 and (head := spool.head(chance.randint(1, 30))):
                 promises.given_up(head.spool_id, head.first_seq + len(head.rows) - 1)
                 spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
         if spool and chance.random() < 0.02:
             spool.close()
-            spool = None
+            spool, waiting = None, empty()
     if spool:
         spool._db.close()  # as a kill leaves it
         spool._mark.close()

@@ -88,7 +88,20 @@ def _messages() -> Iterator[Decoder]:
         yield Decoder(name, seeds, partial(_again, name, encode, decode), (MessageError,), messages)
 
 
-_SINGLE = ("bundle", "pose", "health", "point", "region", "history", "tiles", "why", "alive", *PLAIN[1:], "error")
+_SINGLE = (
+    "bundle",
+    "correction",
+    "pose",
+    "health",
+    "point",
+    "region",
+    "history",
+    "tiles",
+    "why",
+    "alive",
+    *PLAIN[1:],
+    "error",
+)
 
 
 def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], Any], data: bytes) -> None:

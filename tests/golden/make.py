@@ -15,14 +15,24 @@ import msgpack
 import numpy as np
 
 from protocol.errors import QueryError, Refusal
-from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, GpsVelocity, Imu, Odometry, Torque
+from protocol.machine.readings import (
+    Articulation,
+    Attitude,
+    Correction,
+    Encoder,
+    Gps,
+    GpsVelocity,
+    Imu,
+    Odometry,
+    Torque,
+)
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
-from protocol.wire import codec
-from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
+from protocol.wire import codec, correction_codec
+from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle, SiteCorrection
 
 FOLDER = Path(__file__).parent
 STORE = "0123456789abcdef"
@@ -95,10 +105,16 @@ def decode_info_table(data: bytes) -> dict[str, Any]:
     return codec.take_plain(codec.unpack(data, codec.MAX_SMALL_BYTES), "info")
 
 
+def decode_correction(data: bytes) -> SiteCorrection:
+    """Decode with the frame of the golden site."""
+    return correction_codec.decode_correction(data, "0123abcd")
+
+
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
 LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60, store=STORE)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
+CORRECTION = SiteCorrection("0123abcd", Correction("base-1", T0, 1.25, -0.5, 0.25, 1.5, 45.0, 0.125, -0.0625, 0.0625))
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
 POINT = records.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, VERSION, T0)
 SPANS = (
@@ -176,6 +192,7 @@ GOLDEN: dict[str, Golden] = {
         codec.decode_bundle,
     ),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
+    "correction.bin": Golden(CORRECTION, correction_codec.encode_correction, decode_correction),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),

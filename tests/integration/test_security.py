@@ -41,7 +41,14 @@ pytestmark = pytest.mark.processes
 
 READY_S = 120.0  # a first start in a new folder compiles kernels
 SITE = "paper"
-ROLES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim"}
+ROLES = {
+    "loader-1": "machine",
+    "loader-2": "machine",
+    "guest": "visitor",
+    "boss": "admin",
+    "sim": "sim",
+    "base-1": "base",
+}
 DAY = timedelta(days=1)
 
 
@@ -360,6 +367,26 @@ def test_a_forged_change_of_the_map_reaches_nobody(guarded: Guarded):
         assert answers(loader, keys.map_query(SITE, "info"))
         put_until(received, b"true", lambda: server.put(keys.changed(SITE), b"true"))
         assert set(received) == {b"true"}, guarded.still_works()
+
+
+def test_only_a_base_publishes_corrections_and_only_its_own(guarded: Guarded):
+    own, others = keys.corrections(SITE, "base-1"), keys.corrections(SITE, "base-2")
+    with (
+        guarded.session("loader-1") as loader,
+        guarded.session("base-1") as base,
+        guarded.session("sim") as sim,
+        guarded.session("guest") as guest,
+        listening(loader, own) as heard,
+        listening(guest, keys.corrections_all(SITE)) as guest_heard,
+    ):
+        for forger in (loader, sim, guest):
+            forger.put(own, b"forged")
+        base.put(others, b"forged")
+        base.put(keys.pose(SITE, "loader-1"), b"forged")
+        put_until(heard, b"true", lambda: base.put(own, b"true"))
+        put_until(guest_heard, b"true", lambda: base.put(own, b"true"))
+        assert set(heard) == set(guest_heard) == {b"true"}, guarded.still_works()
+        assert not acknowledged(base, keys.ingest(SITE, "base-1"), guarded.batch("base-1"))
 
 
 def test_nobody_listens_to_what_is_not_theirs(guarded: Guarded):

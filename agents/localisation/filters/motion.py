@@ -51,6 +51,7 @@ GYRO_BIAS_WALK = 5e-5  # [rad/s/sqrt(s)]
 WHEEL_SCALE_WALK = 2e-4  # [1/sqrt(s)]
 SLIP_STD = 0.08  # of the wheels' slip per traction, which the speed is corrected by
 SLIP_TIME_S = 5.0  # how long a ground's slip stays the same
+BASE_OFFSET_WALK = 5e-3  # [m/sqrt(s)]: after an hour a mean over fixes says no more
 BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a wrong scale makes another in every bend
 
 
@@ -273,6 +274,7 @@ def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats]:
     deviation[layout.gyro_biases] = GYRO_BIAS_WALK
     deviation[layout.wheel_scales] = WHEEL_SCALE_WALK
     deviation[layout.heading_errors] = HEADING_WALK
+    deviation[layout.base_offset] = BASE_OFFSET_WALK
     walks = np.diag(deviation**2)
     for shared in (keep, walks):
         shared.setflags(write=False)

@@ -6,9 +6,12 @@ from typing import Any
 
 import pytest
 
-from agents.config import AgentConfig, load_agent
+from agents.config import MOST_LAG_S, AgentConfig, load_agent
 from agents.estimation.ground import NOTHING_KNOWN
 from agents.estimation.plausibility import FAULTS
+from agents.localisation.localiser import LocalisationConfig
+from agents.pipeline import PipelineConfig
+from mapserver.trust.judgement import CLOCK_LIMIT_S
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.site.site_config import SiteConfig
@@ -43,7 +46,9 @@ def test_agent_file_names_every_option() -> None:
 
 def test_agent_file_names_every_option_of_machine_and_sensor() -> None:
     named = table("agent.toml")
-    assert {f.name for f in fields(MachineConfig)} - {"sensors"} == set(named["machine"])
+    estimated = "machine_share"  # without it; so it is in a comment
+    assert {f.name for f in fields(MachineConfig)} - {"sensors", estimated} == set(named["machine"])
+    assert f"\n# {estimated} = " in (CONFIG / "agent.toml").read_text()
     assert {f.name for f in fields(SensorConfig)} == {key for sensor in named["sensor"] for key in sensor}
     assert {f.name for f in fields(Mount)} == set(named["sensor"][0]["mount"])
 
@@ -74,6 +79,13 @@ def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
     assert (config.linger_s, config.pipeline.localisation.slip) == (1.0, 0.2)
 
 
+def test_samples_that_are_late_by_the_lag_are_no_wrong_clock_to_the_server() -> None:
+    """Also beside machines that send at once, and with batches that take a minute."""
+    assert MOST_LAG_S + 60 < CLOCK_LIMIT_S
+    longest = LocalisationConfig(lag_s=MOST_LAG_S)
+    assert AgentConfig(PipelineConfig(longest)).pipeline.localisation.lag_s == MOST_LAG_S
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
@@ -88,6 +100,7 @@ def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
         ("[spool]\nmax_samples = 0", "max_samples"),
         ("[holdout]\noff_s = 11", "off_s"),
         ("linger_s = -1", "linger_s"),
+        ("[pipeline.localisation]\nlag_s = 181", "lag_s: at most 180 s: the map server would take the clock for wrong"),
         ("[machine]\nname = 'No'", "name"),
         ("[machine]\nname = 'a'\nmass_kg = 0", "mass_kg"),
         ("[machine]\nname = 'a'\n[[sensor]]\nname = 'g'\nkind = 'gps'\ndrift_share = 2", "drift_share"),
@@ -120,3 +133,38 @@ def test_page_of_ground_estimation_names_every_reason_and_none_else() -> None:
     judged = (CONFIG.parent / "agents" / "estimation" / "plausibility.py").read_text(encoding="utf-8")
     given = set(re.findall(r'return "(\w+)"', judged)) | set(re.findall(r'_hold = "(\w+)"', judged))
     assert given | FAULTS | {NOTHING_KNOWN.reason, "settling"} == reasons
+
+
+# --- base stations ---------------------------------------------------------------------------------------------------
+
+
+def base_file(folder: Path, *lines: str, sensor: str = 'kind = "gps"') -> Path:
+    path = folder / "base.toml"
+    text = "\n".join([*lines, "[machine]", 'name = "base-1"', "[[sensor]]", 'name = "gps-1"', sensor])
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_example_of_a_base_is_one() -> None:
+    base, options = load_agent(CONFIG / "base.toml")
+    assert base
+    assert (base.name, options.role, options.place) == ("base-1", "base", (49.01, 8.4))
+
+
+@pytest.mark.parametrize(
+    ("lines", "sensor", "problem"),
+    [
+        (('role = "base"',), 'kind = "gps"', "needs its surveyed latitude and longitude"),
+        (('role = "base"', "place = [49.0]"), 'kind = "gps"', "needs its surveyed latitude and longitude"),
+        (('role = "base"', "place = [149.0, 8.0]"), 'kind = "gps"', "no latitude and longitude"),
+        (('role = "base"', "place = [nan, 8.0]"), 'kind = "gps"', "a finite number is expected"),
+        (("place = [49.0, 8.0]",), 'kind = "gps"', "a machine moves"),
+        (('role = "rover"',), 'kind = "gps"', "'rover' is neither machine nor base"),
+        (('role = "base"', "place = [49.0, 8.0]"), 'kind = "imu"', "a base needs a GPS receiver"),
+        (('role = "base"', "place = [49.0, 8.0]"), 'kind = "gps"\nuse = false', "a base needs a GPS receiver"),
+        (('role = "base"', "place = [49.0, 8.0]"), 'kind = "gps"\nmode = "relative"', "fixes of a base are places"),
+    ],
+)
+def test_base_that_cannot_be_one_is_refused(tmp_path: Path, lines: tuple[str, ...], sensor: str, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        load_agent(base_file(tmp_path, *lines, sensor=sensor))

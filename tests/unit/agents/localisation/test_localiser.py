@@ -432,6 +432,52 @@ def test_slip_is_taken_off_where_the_machine_pulls(direction: int) -> None:
     assert state(located)[SPEED] == pytest.approx(direction * 2.0 * 0.98, abs=0.01)
 
 
+# --- smoothing -------------------------------------------------------------------------------------------------------
+
+
+def with_wrong_fixes(made: Drive, seed: int) -> list[Reading]:
+    """Fixes that are off by some metres, slowly changing."""
+    rng, off_m, readings = np.random.default_rng(seed), np.zeros(2), []
+    for reading in made.readings:
+        if isinstance(reading, Gps):
+            off_m = 0.97 * off_m + 0.3 * rng.normal(size=2)
+            x, y, _ = PROJECTION.to_map(reading.lat_deg, reading.lon_deg, 0.0)
+            lat, lon, _ = PROJECTION.to_geodetic(x + off_m[0], y + off_m[1], 0.0)
+            reading = replace(reading, lat_deg=lat, lon_deg=lon)
+        readings.append(reading)
+    return readings
+
+
+@pytest.mark.slow
+@FILTERS
+def test_smoothed_places_are_nearer_to_the_truth_from_the_first_step_on(engine: str) -> None:
+    """Those from before the alignment too: they are smoothed as the collected readings are filtered."""
+    made = drive((*S_BEND, Leg(30)), VEHICLE)
+    located = localiser(VEHICLE, filter=engine, lag_s=25.0)
+    located.run(with_wrong_fixes(made, 4))
+    final = located.take_smoothed()
+    poses = final + located.remaining()
+    assert not located.take_smoothed()
+    assert [p.stamp_ns for p in poses] == sorted({p.stamp_ns for p in poses})
+    assert (poses[0].stamp_ns - START_NS) * 1e-9 < 1.0
+    assert poses[-1].stamp_ns == located.belief.stamp_ns
+    assert len(final) == pytest.approx(60 - 25, abs=2)
+    true = np.array([made.at(p.stamp_ns) for p in final])
+    off_m = np.array([(p.x_m, p.y_m) for p in final]) - true[:, :2]
+    filtered_m = off_m - np.array([p.correction[:2] for p in final])
+    assert np.hypot(*off_m.T).mean() < 0.8 * np.hypot(*filtered_m.T).mean()
+    turned = [math.remainder(p.heading_rad - t, math.tau) for p, t in zip(final, true[:, 2].tolist(), strict=True)]
+    assert np.abs(turned).max() < 0.05
+
+
+@pytest.mark.parametrize("options", [{"profile": "paper"}, {"lag_s": 0.0}])
+def test_without_a_smoother_there_are_no_smoothed_poses(options: dict[str, Any]) -> None:
+    located = localiser(VEHICLE, start=START, **options)
+    located.run(drive((Leg(3, 0.5),), VEHICLE).readings)
+    assert located.is_aligned
+    assert located.take_smoothed() == located.remaining() == []
+
+
 # --- configuration ---------------------------------------------------------------------------------------------------
 
 
@@ -444,6 +490,9 @@ def test_slip_is_taken_off_where_the_machine_pulls(direction: int) -> None:
         ("slip", 1.0),
         ("start", (1.0, 2.0)),
         ("start", (math.nan,) * 3),
+        ("lag_s", -1.0),
+        ("lag_s", math.nan),
+        ("lag_s", 1e6),
     ],
 )
 def test_bad_choice_is_refused_by_name(name: str, value: Any) -> None:

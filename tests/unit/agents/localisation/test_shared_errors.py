@@ -58,14 +58,14 @@ def share_of(share: float, seed: int = SEED, receivers: int = 2, seconds: float 
 
 def test_before_any_fix_the_share_is_what_is_likely_of_receivers() -> None:
     assert PRIOR.sum() == 1.0
-    assert ShareEstimator(2).share == pytest.approx(0.75 * 0.5)
+    assert ShareEstimator(2).share == pytest.approx(0.25)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("receivers", [2, 3])
 def test_over_all_shares_the_mean_is_right_and_better_with_time(receivers: int) -> None:
     """Of shares drawn as the estimator expects them, the mean of what is left is zero: a law of every posterior."""
-    true = np.concatenate([np.zeros(10), (np.arange(30) + 0.5) / 30])
+    true = np.concatenate([np.zeros(20), (np.arange(20) + 0.5) / 20])
     early, late = [], []
     for seed, share in enumerate(true):
         estimator = ShareEstimator(receivers)

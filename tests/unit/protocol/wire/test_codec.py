@@ -12,7 +12,7 @@ from protocol.machine.readings import KINDS, Encoder, Imu, columns
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries.answers import PointAnswer, Region
-from protocol.wire import codec
+from protocol.wire import codec, correction_codec
 from protocol.wire.codec import decode_batch, encode_batch
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -309,6 +309,40 @@ def test_bundle_counter_starts_at_one():
 def test_group_that_is_no_map_is_refused(group):
     data = codec.pack({"machine": "m-1", "counter": 1, "sensors": [group]})
     assert refusal(data, codec.decode_bundle).field == "sensors"
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason", "field"),
+    [
+        ({"frame": "fedcba98"}, Refusal.WRONG_FRAME, "frame"),
+        ({"base": "base/*"}, Refusal.OUT_OF_RANGE, "base"),
+        ({"stamp_ns": 0}, Refusal.OUT_OF_RANGE, "stamp_ns"),
+        ({"stamp_ns": 2**62}, Refusal.OUT_OF_RANGE, "stamp_ns"),
+        ({"stamp_ns": 1.5}, Refusal.WRONG_TYPE, "stamp_ns"),
+        ({"east_m": float("nan")}, Refusal.NOT_FINITE, "east_m"),
+        ({"north_m": float("inf")}, Refusal.NOT_FINITE, "north_m"),
+        ({"east_m": 1e4}, Refusal.OUT_OF_RANGE, "base-1.east_m"),
+        ({"white_m2": 0.0}, Refusal.OUT_OF_RANGE, "base-1.white_m2"),
+        ({"slow_m2": -1.0}, Refusal.OUT_OF_RANGE, "base-1.slow_m2"),
+        ({"time_s": 0.0}, Refusal.OUT_OF_RANGE, "base-1.time_s"),
+        ({"offset_m2": None}, Refusal.MISSING_FIELD, "offset_m2"),
+        ({"offset_e_m": [1.0, 2.0]}, Refusal.WRONG_TYPE, "offset_e_m"),
+        ({"east_m": b"12345678"}, Refusal.WRONG_TYPE, "east_m"),
+        ({"v": 2}, Refusal.VERSION, "v"),
+    ],
+)
+def test_bad_correction_is_refused_and_its_field_named(golden, fields, reason, field):
+    table = msgpack.unpackb(correction_codec.encode_correction(golden.CORRECTION))
+    with pytest.raises(MessageError) as caught:
+        correction_codec.decode_correction(msgpack.packb(table | fields), golden.CORRECTION.frame)
+    assert (caught.value.reason, caught.value.field) == (reason, field)
+
+
+def test_correction_of_any_length_but_its_own_is_refused(golden):
+    data = correction_codec.encode_correction(golden.CORRECTION)
+    for cut in (data[:-1], data + b"\0", b""):
+        with pytest.raises(MessageError):
+            correction_codec.decode_correction(cut, golden.CORRECTION.frame)
 
 
 @pytest.mark.parametrize("stamp", [0, -1, 2**63])

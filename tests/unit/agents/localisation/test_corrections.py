@@ -1,0 +1,242 @@
+"""Corrections of a base: what they bring, which are refused and why, and that they never do what nobody asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.localisation.corrections import MAX_AGE_S, MAX_AHEAD_S, REPEATS
+from agents.localisation.localiser import LocalisationConfig
+from agents.localisation.site_share import SiteShareEstimator
+from agents.pipeline import Pipeline, PipelineConfig, Positioning
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import Correction, Gps, Reading
+from tests.unit.agents.drives import PROJECTION, SITE, START_NS, Drive, Leg, drive, machine
+
+BASE = SensorConfig("base-1", "correction")
+TOUR = (Leg(4, 0.5), Leg(6), *[Leg(6, 0, 0.3), Leg(10)] * 3)  # 58 s
+SLOW_M2, TIME_S = 2.25, 45.0
+Off = Callable[[float], tuple[float, float]]
+
+
+def ramp(t_s: float) -> tuple[float, float]:
+    """A slow error (2,) [m] that grows to some metres."""
+    return 2.5 * math.sin(t_s / 12), 2.0 * math.sin(t_s / 17 + 0.4)
+
+
+def with_base(vehicle: MachineConfig) -> MachineConfig:
+    return replace(vehicle, sensors=(*vehicle.sensors, BASE))
+
+
+def off(reading: Reading, error: Off) -> Reading:
+    """A fix that is off by an error."""
+    if not isinstance(reading, Gps):
+        return reading
+    x, y, z = PROJECTION.to_map(reading.lat_deg, reading.lon_deg, reading.height_m)
+    east, north = error((reading.stamp_ns - START_NS) * 1e-9)
+    lat, lon, height = PROJECTION.to_geodetic(x + east, y + north, z)
+    return replace(reading, lat_deg=lat, lon_deg=lon, height_m=height)
+
+
+def correction(t_s: float, east: float, north: float, **options: Any) -> Correction:
+    values = (east, north, 0.01, SLOW_M2, TIME_S, 0.0, 0.0, 0.01)
+    return replace(Correction("base-1", START_NS + round(t_s * 1e9), *values), **options)
+
+
+def corrections(error: Off, seconds: float, from_s: float = 0.2) -> list[Correction]:
+    return [correction(t, *error(t)) for t in np.arange(from_s, seconds, 0.2)]
+
+
+def mixed(readings: Sequence[Reading], made: Sequence[Correction], link_s: float = 0.1) -> list[Reading]:
+    arrivals = [(r.stamp_ns, r) for r in readings] + [(c.stamp_ns + round(link_s * 1e9), c) for c in made]
+    return [reading for _, reading in sorted(arrivals, key=lambda a: a[0])]
+
+
+def locate(vehicle: MachineConfig, readings: Sequence[Reading], engine: str = "ekf", **options: Any) -> Positioning:
+    config = LocalisationConfig(filter=engine, slip=0.0, slip_soft=0.0, lag_s=0.0, **options)
+    positioning = Positioning(SITE, vehicle, PipelineConfig(localisation=config))
+    positioning.step(readings)
+    return positioning
+
+
+def error_m(located: Positioning, made: Drive, from_s: float = 30.0) -> float:
+    """Root mean square error of the poses."""
+    stamps = [int(ns) for ns in made.stamps_ns[::20] if START_NS + from_s * 1e9 < ns]
+    poses = [(pose, made.at(ns)) for ns in stamps if (pose := located.pose_at(ns))]
+    assert poses
+    return float(np.sqrt(np.mean([(p.x_m - x) ** 2 + (p.y_m - y) ** 2 for p, (x, y, *_) in poses])))
+
+
+@pytest.fixture(scope="module")
+def made() -> Drive:
+    return drive(TOUR, machine())
+
+
+@pytest.fixture(scope="module")
+def readings(made: Drive) -> list[Reading]:
+    return [off(reading, ramp) for reading in made.readings]
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The share is known to be large from the start on."""
+    monkeypatch.setattr(SiteShareEstimator, "share", 0.95)
+
+
+@pytest.mark.slow
+def test_base_that_is_not_heard_changes_nothing(readings: list[Reading]) -> None:
+    alone, beside = locate(machine(), readings), locate(with_base(machine()), readings)
+    assert alone.pose
+    assert beside.pose
+    assert beside.pose.x_m == pytest.approx(alone.pose.x_m, abs=1e-6)
+    assert np.allclose(beside.pose.covariance_m2, alone.pose.covariance_m2, rtol=1e-6)
+    assert beside.localiser.base_report() == {
+        "name": "base-1",
+        "used": False,
+        "why_not": "no correction has come in",
+        "age_s": None,
+        "share": pytest.approx(0.32, abs=0.05),
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("receivers", "engine"), [(1, "ekf"), (1, "ukf"), (2, "ekf")])
+def test_base_that_errs_as_the_machine_does_takes_most_of_the_error(
+    made: Drive, known: None, receivers: int, engine: str
+) -> None:
+    vehicle = machine(receivers=receivers)
+    driven = drive(TOUR, vehicle)
+    readings = [off(reading, ramp) for reading in driven.readings]
+    without = locate(vehicle, readings, engine)
+    located = locate(with_base(vehicle), mixed(readings, corrections(ramp, 60)), engine)
+    assert error_m(located, driven) < 0.65 * error_m(without, driven)
+    state = located.localiser.base_report()
+    assert state
+    assert state["used"]
+    assert state["age_s"] < 0.5
+    assert located.counters["base-1_used"] > 150
+
+
+@pytest.mark.slow
+def test_corrections_come_late_and_still_help(made: Drive, readings: list[Reading], known: None) -> None:
+    at_once = error_m(locate(with_base(machine()), mixed(readings, corrections(ramp, 60))), made)
+    late = error_m(locate(with_base(machine()), mixed(readings, corrections(ramp, 60), link_s=4.0)), made)
+    without = error_m(locate(machine(), readings), made)
+    assert at_once < late < 0.8 * without
+
+
+@pytest.mark.slow
+def test_base_with_another_error_does_no_harm_where_nothing_is_shared(
+    made: Drive, readings: list[Reading], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SiteShareEstimator, "share", 0.0)
+    wild = corrections(lambda t: (5 * math.cos(t / 5), -4.0), 60)
+    located = locate(with_base(machine()), mixed(readings, wild))
+    assert error_m(located, made) == pytest.approx(error_m(locate(machine(), readings), made), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_survey_that_is_wrong_is_no_error_of_the_machine(made: Drive, readings: list[Reading], known: None) -> None:
+    def surveyed(t_s: float) -> tuple[float, float]:
+        east, north = ramp(t_s)
+        return east + 5.0, north
+
+    right = error_m(locate(with_base(machine()), mixed(readings, corrections(ramp, 60))), made)
+    known_off = [replace(c, offset_e_m=5.0) for c in corrections(surveyed, 60)]
+    assert error_m(locate(with_base(machine()), mixed(readings, known_off)), made) == pytest.approx(right, rel=1e-3)
+    unsure = [replace(c, offset_m2=9.0) for c in corrections(surveyed, 60)]
+    assert error_m(locate(with_base(machine()), mixed(readings, unsure)), made) < error_m(
+        locate(machine(), readings), made
+    )
+
+
+@pytest.mark.slow
+def test_jump_of_the_base_moves_the_machine_little(made: Drive, readings: list[Reading], known: None) -> None:
+    def jumping(t_s: float) -> tuple[float, float]:
+        east, north = ramp(t_s)
+        return east + 20.0 * (t_s > 40), north
+
+    located = locate(with_base(machine()), mixed(readings, corrections(jumping, 60)))
+    assert located.counters["base-1_gated"] >= 10
+    assert located.counters["base-1_relocked"] == 1
+    assert error_m(located, made, 40.0) < error_m(locate(machine(), readings), made, 40.0)
+
+
+@pytest.mark.slow
+def test_what_does_not_count_is_refused_counted_and_named(readings: list[Reading], made: Drive) -> None:
+    half = [r for r in readings if r.stamp_ns < START_NS + 30e9]
+    located = locate(with_base(machine()), mixed(half, corrections(ramp, 29)))
+    used, pose = located.counters["base-1_used"], located.pose
+    assert used > 50
+    for t_s, reason in ((29.7, ""), (29.7, "not_newer"), (20.0, "not_newer"), (30 + MAX_AHEAD_S + 1, "in_future")):
+        located.step([correction(t_s, t_s, 0.0)])
+        assert sum(
+            located.counters[f"correction_{r}"] for r in ("not_newer", "too_old", "in_future")
+        ) == located.counters["correction_not_newer"] + (reason == "in_future")
+        if reason:
+            assert located.counters[f"correction_{reason}"] >= 1
+            state = located.localiser.base_report()
+            assert state
+            assert state["why_not"] == f"the last one was {reason.replace('_', ' ')}"
+    assert located.pose is pose  # a correction alone moves nothing, and its stamp is nobody's clock
+    located.step([r for r in readings if r.stamp_ns >= START_NS + 30e9])
+    assert located.pose
+    assert located.pose.stamp_ns > START_NS + 50e9
+    assert "gap_restarts" not in located.counters
+
+
+@pytest.mark.slow
+def test_old_and_repeated_ones_are_not_used(readings: list[Reading]) -> None:
+    old = mixed(readings, corrections(ramp, 60), link_s=MAX_AGE_S + 1)
+    located = locate(with_base(machine()), old)
+    assert located.counters["correction_too_old"] > 50
+    assert "base-1_used" not in located.counters
+    stuck = locate(
+        with_base(machine()),
+        mixed(readings, [correction(c.stamp_ns * 1e-9 - START_NS * 1e-9, 1.0, 1.0) for c in corrections(ramp, 60)]),
+    )
+    assert stuck.counters["base-1_used"] <= REPEATS
+    assert stuck.counters["correction_repeated"] > 200
+    state = stuck.localiser.base_report()
+    assert state
+    assert (state["used"], state["why_not"]) == (False, "the last one was repeated")
+
+
+@pytest.mark.slow
+def test_base_that_falls_silent_is_reported_and_fades(made: Drive, readings: list[Reading], known: None) -> None:
+    located = locate(with_base(machine()), mixed(readings, corrections(ramp, 20)))
+    state = located.localiser.base_report()
+    assert state
+    assert not state["used"]
+    assert "s old" in state["why_not"]
+    sure = locate(with_base(machine()), mixed(readings, corrections(ramp, 60)))
+    assert located.pose
+    assert sure.pose
+    assert located.pose.covariance_m2[0, 0] > 1.2 * sure.pose.covariance_m2[0, 0]
+
+
+def test_corrections_of_another_base_are_readings_of_an_unknown_sensor() -> None:
+    pipeline = Pipeline(SITE, with_base(machine()), PipelineConfig())
+    pipeline.step([replace(correction(1.0, 0.0, 0.0), sensor="base-2")])
+    health = pipeline.health()
+    assert health["counters"]["reading_unknown_sensor"] == 1
+    assert health["base"]["used"] is False
+
+
+def test_profile_paper_says_that_it_uses_none() -> None:
+    options = PipelineConfig(localisation=LocalisationConfig(profile="paper"))
+    pipeline = Pipeline(SITE, with_base(machine()), options)
+    pipeline.step([correction(1.0, 0.0, 0.0)])
+    assert pipeline.health()["base"]["why_not"] == "the profile `paper` uses none"
+    assert Pipeline(SITE, machine(), PipelineConfig()).health()["base"] is None
+
+
+def test_machine_uses_one_base() -> None:
+    with pytest.raises(ValueError, match="one base station, not base-1 and base-2"):
+        replace(machine(), sensors=(BASE, replace(BASE, name="base-2")))
+    replace(machine(), sensors=(BASE, replace(BASE, name="base-2", use=False)))

@@ -1,0 +1,97 @@
+"""The share that machine and base have in common is found from both alone, and lost where a base goes wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from agents.localisation.filters.motion import GpsError
+from agents.localisation.site_share import SiteShareEstimator
+from protocol.machine.readings import Correction
+
+T0 = 1_750_000_000_000_000_000
+ERROR = GpsError(2.7, 45.0)
+WHITE_M2 = 0.06  # mean of a second
+
+
+def slow(rng: np.random.Generator, seconds: int) -> np.ndarray:
+    """A Gauss-Markov error (n, 2) of variance 1, once a second."""
+    keep = np.exp(-1 / ERROR.time_s)
+    white = rng.standard_normal((seconds, 2))
+    out = np.empty_like(white)
+    out[0] = white[0]
+    for i in range(1, seconds):
+        out[i] = keep * out[i - 1] + np.sqrt(1 - keep**2) * white[i]
+    return out
+
+
+def errors(share: float, seconds: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Slow errors of machine and base (n, 2) [m]."""
+    rng = np.random.default_rng(seed)
+    site, machine, base = (slow(rng, seconds) for _ in range(3))
+    common, std = np.sqrt(share) * site, np.sqrt(ERROR.variance_m2)
+    return std * (common + np.sqrt(1 - share) * machine), std * (common + np.sqrt(1 - share) * base)
+
+
+def follow(estimator: SiteShareEstimator, machine: np.ndarray, base: np.ndarray, seed: int, start: int = 0) -> None:
+    """Let a machine drive at 4 m/s beside a base; once a second."""
+    rng = np.random.default_rng([seed, start, 1])
+    lost = np.cumsum(rng.standard_normal(machine.shape) * 0.15, axis=0)
+    for i, (e, b) in enumerate(zip(machine + lost, base, strict=True), start):
+        white = rng.standard_normal((2, 2)) * np.sqrt(WHITE_M2)
+        estimator.drive(4.0)
+        estimator.add_fix("gps-1", T0 + i * 10**9, e + white[0], WHITE_M2, ERROR)
+        of_base = Correction("base-1", T0 + i * 10**9, *(b + white[1]), WHITE_M2, ERROR.variance_m2, 45.0, 0, 0, 1.0)
+        estimator.add_correction(of_base.stamp_ns, np.array([of_base.east_m, of_base.north_m]), of_base)
+
+
+@pytest.mark.parametrize(
+    ("share", "low", "high"), [(0.0, 0.0, 0.1), (0.5, 0.3, 0.7), (0.8, 0.65, 0.9), (0.95, 0.87, 0.95)]
+)
+@pytest.mark.slow
+def test_share_is_found_in_ten_minutes(share: float, low: float, high: float) -> None:
+    shares = []
+    for seed in range(3):
+        estimator = SiteShareEstimator()
+        follow(estimator, *errors(share, 600, seed), seed)
+        shares.append(estimator.share)
+    assert low <= np.mean(shares) <= high, shares
+
+
+@pytest.mark.slow
+def test_base_that_repeats_what_is_long_past_loses_its_share() -> None:
+    machine, base = errors(0.95, 1200, 5)
+    estimator = SiteShareEstimator()
+    follow(estimator, machine[:600], base[:600], 5)
+    before = estimator.share
+    follow(estimator, machine[600:], base[:600], 5, start=600)
+    assert before > 0.85
+    assert estimator.share < 0.3
+
+
+def test_offset_of_a_base_changes_nothing_and_a_jump_little() -> None:
+    machine, base = errors(0.9, 300, 3)
+    moved, off, jumps = base + 20.0, SiteShareEstimator(), SiteShareEstimator()
+    follow(off, machine, moved, 3)
+    true = SiteShareEstimator()
+    follow(true, machine, base, 3)
+    assert off.share == pytest.approx(true.share, abs=0.05)
+    moved[:150] -= 20.0
+    follow(jumps, machine, moved, 3)
+    assert jumps.share > 0.6
+
+
+def test_nothing_is_taken_for_half_a_chance_of_nothing() -> None:
+    assert 0.2 < SiteShareEstimator().share < 0.5
+
+
+def test_another_receiver_speaks_only_when_the_first_is_silent() -> None:
+    estimator = SiteShareEstimator()
+    for i in range(60):
+        estimator.add_fix("gps-1", T0 + i * 10**9, np.zeros(2), WHITE_M2, ERROR)
+        estimator.add_fix("gps-2", T0 + i * 10**9, np.full(2, 1e6), WHITE_M2, ERROR)
+    assert np.isfinite(estimator.share)
+    assert np.abs(estimator._x).max() < 10
+    for i in range(80, 90):
+        estimator.add_fix("gps-2", T0 + i * 10**9, np.full(2, 30.0), WHITE_M2, ERROR)
+    assert estimator._x[0, 0, 0] == pytest.approx(30.0, abs=8.0)
