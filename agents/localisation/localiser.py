@@ -21,9 +21,9 @@ from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, anchored_headings
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
-from agents.localisation.motion_sensors import MotionSensors
+from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig
+from protocol.machine.machine_config import ABSOLUTE, MachineConfig
 from protocol.machine.readings import Correction, Gps, GpsVelocity
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
@@ -92,7 +92,7 @@ class Localiser:
         self._base = machine.base
         self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
         self._references = References(machine.sensors, layout)
-        source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
+        source, on_plane = turn_source(machine), not shows_tilt(machine, config.profile)
         tyres = config.slip, config.slip_soft
         self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
@@ -275,23 +275,6 @@ def _layout_of(machine: MachineConfig) -> Layout:
     receivers, references = drifting(machine.sensors), anchored_headings(machine.sensors)
     base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
     return Layout(turns, True, len(receivers) + base, len(references), base)
-
-
-def _shows_tilt(machine: MachineConfig, profile: str) -> bool:
-    """Whether the sensors show roll and pitch; a machine without is taken to be on a plane.
-
-    By a reference of attitude that the profile uses, else by the direction of gravity between rates of turn. Rates
-    alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the acceleration's.
-    """
-    used = [s for s in machine.sensors if s.use]
-    bends = any(s.kind == "articulation" for s in used)
-    imus = [s for s in used if s.kind == "imu" and (s.frame == BASE or bends)]
-    references = [s for s in used if s.kind == "attitude" and s.frame == BASE and s.provides("tilt")]
-    modes = (ABSOLUTE, RELATIVE) if profile == "paper" else (RELATIVE,)
-    if any(s.mode in modes for s in references):
-        return True
-    turns = any(s.provides("rate") for s in imus) or any(s.mode == DIFFERENTIAL for s in references)
-    return turns and any(s.provides("force") for s in imus)
 
 
 def _pose(belief: Belief, speed_mps: float) -> PoseBelief:
