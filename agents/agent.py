@@ -90,7 +90,7 @@ class Agent:
                 break
             if self._step(list(readings)):
                 moved_s = clock()
-            elif clock() - moved_s > SILENT_S:
+            elif self._pipeline.pose and clock() - moved_s > SILENT_S:
                 self._take(self._pipeline.settle())
                 moved_s = math.inf  # once is enough: without a pose there is no sample
             if clock() >= second_s:

@@ -32,6 +32,8 @@ class WriteBuffer:
 
     def add(self, pending: Table, finals: Table) -> None:
         """Add new samples, and final values of those that have been pending longest; order is all that joins them."""
+        if not len(pending) and not len(finals):  # as in most calls: joining copies all that waits
+            return
         in_spool = min(len(finals), self._pending)
         self._finals = np.concatenate([self._finals, finals[:in_spool]])
         self._pending -= in_spool

@@ -30,6 +30,7 @@ from protocol.site.site_config import Projection
 MIN_FIX_STD_M = 0.3  # receivers state less than their error; one whose std is configured may be better
 GATE_SIGMA = 4.0  # fixes further off are refused: outliers of GPS are common
 AGREED_NS = 3_000_000_000  # so old a fix may be to say whether its receiver agrees with the filter
+FADED = 15  # correlation times after which a jump is forgotten
 MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
 
 
@@ -151,6 +152,8 @@ class Receivers(ModalSensors[Fix]):
         super().confirm(fix, result)
         name = fix.sensor.name
         self._monitors[name].note(result, self._believed_error(name, result.belief))
+        if not math.isfinite(result.nis):
+            return
         self._judged[name] = (fix.stamp_ns, result.accepted)
         if not result.accepted:
             self._refused[name] += 1
@@ -158,6 +161,8 @@ class Receivers(ModalSensors[Fix]):
                 self._jumps[name] = (fix.stamp_ns, float((result.innovation**2).mean()))
             return
         self._refused[name] = 0
+        if name in self._jumps and fix.stamp_ns - self._jumps[name][0] > FADED * fix.sensor.drift_time_s * 1e9:
+            del self._jumps[name]
         if len(self._compared) > 1 and name in self._compared:
             white_m2, slow_m2, time_s = float(self._white(fix).mean()), self._drift_m2[name], fix.sensor.drift_time_s
             i, antenna = self._compared[name], fix.reckoned_antenna_m

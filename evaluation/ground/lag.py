@@ -1,7 +1,8 @@
 """What the smoother's lag gives the map: four loaders at work, the same readings with and without it.
 
 Every machine's whole pipeline runs in this process; its final samples go through the map server's own trust, fold and
-read. So a map of minutes of real processes takes seconds, and both rows have the very same readings.
+read. So a map of minutes of real processes takes seconds, and all rows have the very same readings. In the last row the
+samples lie where they truly were made: no lag can give more.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from evaluation.ground.truth import LoadTrack, read_load_track
 from evaluation.maps.methods import soft_votes
 from evaluation.maps.samples import Delivery
 from evaluation.maps.score import score_driven
-from protocol.arrays import Floats, Floats32, Table
+from protocol.arrays import Bools, Floats, Floats32, Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.readings import Reading
 from protocol.queries.answers import MapVersion, Region
@@ -38,6 +39,7 @@ SOURCES = (
     *("agents", "mapserver", "protocol"),
     *(f"evaluation/{part}.py" for part in ("ground/lag", "ground/truth", "maps/methods", "maps/score")),
 )
+TRUE_STD_M = 0.05  # stated of true places
 GOALS = (Goal({"lag_s": LAGS_S[1]}, "fall_pct", ">=", 15.0),)
 FIGURES = ("samples", "cells", "known_pct", "wrong_resistance_pct", "wrong_grade_pct", "place_off_m")
 DIGITS = 3
@@ -56,19 +58,19 @@ class FleetDrive(PlannedDrive):
 
 @dataclass(frozen=True)
 class LagConfiguration:
-    """What one row compares."""
+    """What one row compares. lag_s: None for true places."""
 
-    lag_s: float
+    lag_s: float | None
 
     @property
     def name(self) -> str:
         """Short and unique."""
-        return f"lag{self.lag_s:g}"
+        return "true-places" if self.lag_s is None else f"lag{self.lag_s:g}"
 
     @property
     def options(self) -> PipelineConfig:
         """The agent's."""
-        return PipelineConfig(LocalisationConfig(lag_s=self.lag_s))
+        return PipelineConfig(LocalisationConfig(lag_s=self.lag_s or 0.0))
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def run(
     runner: Runner, seeds: Sequence[int], seconds: float, setup: Setup = LOADERS, lags_s: Sequence[float] = LAGS_S
 ) -> tuple[Report, list[LagResult]]:
     """Record, smooth and merge with all seeds; a row per lag, the first one being what the others are compared with."""
-    rows = [LagConfiguration(lag_s) for lag_s in lags_s]
+    rows = [LagConfiguration(lag_s) for lag_s in (*lags_s, None)]
     pairs = [(FleetDrive(seed, seconds, setup.preset, setup), row) for seed in seeds for row in rows]
     results = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
     by_row = {row: [r for (_, other), r in zip(pairs, results, strict=True) if other == row] for row in rows}
@@ -148,8 +150,9 @@ def _solve(task: Task[LagConfiguration], cache: Path) -> LagResult:
         log = open_log(logs)
         rows = final_samples(Pipeline(log.site, log.machine, task.variant.options), tuple(log.readings()))
         track = read_load_track(folder / "truth" / TRACKS_FOLDER / f"{logs.name}.csv", log.machine.load_centre_m)
-        place_m = track.at(rows["stamp_ns"]).place_m
-        off_m.append(np.hypot(*(place_m - np.stack([rows["x_m"], rows["y_m"]], axis=-1)).T))
+        if task.variant.lag_s is None:
+            rows = at_places(rows, track.at(rows["stamp_ns"]).place_m)
+        off_m.append(distance_m(rows, track))
         tracks.append(track)
         deliveries += batches(logs.name, rows)
     region, truth = merged(deliveries, TruthMap.load(folder / "truth" / MAP_FILE))
@@ -162,6 +165,22 @@ def final_samples(pipeline: Pipeline, readings: Sequence[Reading]) -> Table:
     """All samples that a pipeline makes of readings, at their final places."""
     made = [pipeline.step(readings[i : i + CHUNK]).final for i in range(0, len(readings), CHUNK)]
     return np.concatenate([*made, pipeline.finish().final])
+
+
+def distance_m(rows: Table, track: LoadTrack) -> Floats:
+    """How far samples (n,) are from where the load centre was, NaN where that is not known."""
+    off_m: Floats = np.hypot(*(track.at(rows["stamp_ns"]).place_m - np.stack([rows["x_m"], rows["y_m"]], axis=-1)).T)
+    return off_m
+
+
+def at_places(rows: Table, place_m: Floats) -> Table:
+    """The samples at other places (n, 2), of which they are sure; those whose place is not known are left away."""
+    known: Bools = np.isfinite(place_m[:, 0])
+    rows = rows.copy()
+    rows["x_m"], rows["y_m"] = np.where(known[:, None], place_m, 0.0).T
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = TRUE_STD_M**2
+    rows["cov_xy_m2"] = 0.0
+    return rows[known]
 
 
 def batches(machine: str, rows: Table) -> Iterator[Delivery]:

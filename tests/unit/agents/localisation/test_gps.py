@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from agents.localisation import measurements
-from agents.localisation.filters.belief import Belief
+from agents.localisation.filters.belief import Belief, Conditioned
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
@@ -204,6 +204,19 @@ def test_receivers_that_go_off_together_are_followed(share: float) -> None:
     pose = located.run(moved(made.readings, 60.0, ("gps-1", "gps-2"), 20, 1e9))[-1]
     x, y, _ = made.at(pose.stamp_ns)
     assert math.dist((pose.x_m, pose.y_m), (x, y + 60)) < 4.0
+
+
+def test_results_that_could_not_be_computed_say_nothing_of_a_receiver() -> None:
+    """However many there are, errors and places stay finite, and nobody is outvoted by them."""
+    vehicle = sharing(2, 0.5)
+    receivers = Receivers(vehicle.sensors, PROJECTION, _layout_of(vehicle), slow=True, machine_share=0.5)
+    belief = Belief(START_NS, np.zeros(_layout_of(vehicle).n), np.eye(_layout_of(vehicle).n))
+    one = receivers.fix(fix(vehicle.sensor("gps-1"), START_NS, 0.0, 0.0, 0.0), localiser(vehicle).dead_reckoning.pose)
+    before = receivers.measurement(one) and receivers.errors
+    nothing = Conditioned(belief, np.full(2, np.nan), np.full((2, 2), np.nan), math.nan, accepted=False)
+    for _ in range(40):
+        receivers.confirm(one, nothing)
+    assert receivers.errors == before
 
 
 # --- the share -------------------------------------------------------------------------------------------------------

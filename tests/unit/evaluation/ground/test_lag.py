@@ -32,8 +32,11 @@ def result(runner: Runner) -> tuple[Report, list[LagResult]]:
 @pytest.mark.slow
 def test_both_rows_have_the_same_readings_and_the_same_cells(result, runner: Runner) -> None:
     report, results = result
-    without, smoothed = report["rows"]
-    assert (without["lag_s"], smoothed["lag_s"]) == (0.0, 8.0)
+    without, smoothed, true = report["rows"]
+    assert (without["lag_s"], smoothed["lag_s"], true["lag_s"]) == (0.0, 8.0, None)
+    assert true["place_off_m"] < 1e-6
+    assert true["cells"] == without["cells"]
+    assert true["known_pct"] > without["known_pct"]
     assert (without["fall_pct"], without["samples"], without["cells"]) == (0.0, smoothed["samples"], smoothed["cells"])
     assert without["cells"] > 100
     assert sum(row["cells"] for row in without["by_border"]) == without["cells"]
