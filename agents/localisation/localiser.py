@@ -10,12 +10,12 @@ from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
 from agents.localisation.corrections import Corrections, not_used
-from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
+from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief, pose_of
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import SmoothedPose, nothing_past
-from agents.localisation.filters.state import YAW, Layout
+from agents.localisation.filters.state import Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
@@ -25,7 +25,6 @@ from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig
 from protocol.machine.readings import Correction, Gps, GpsVelocity
-from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
@@ -173,7 +172,7 @@ class Localiser:
         for event in events:
             known = self._fusion
             beliefs += self._filter(known, event) if known else self._collect(event, dead_reckoning.distance_m)
-        return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
+        return [pose_of(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
     def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
         """Beliefs that an event changed, and then a correction that is due."""
@@ -275,8 +274,3 @@ def _layout_of(machine: MachineConfig) -> Layout:
     receivers, references = drifting(machine.sensors), anchored_headings(machine.sensors)
     base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
     return Layout(turns, True, len(receivers) + base, len(references), base)
-
-
-def _pose(belief: Belief, speed_mps: float) -> PoseBelief:
-    x, y, heading = float(belief.x[0]), float(belief.x[1]), wrap_angle(float(belief.x[YAW]))
-    return PoseBelief(belief.stamp_ns, x, y, heading, speed_mps, belief.P[:2, :2].copy())
