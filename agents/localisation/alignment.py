@@ -49,8 +49,7 @@ def align(reckoned_m: Floats, fixes_m: Floats, fix_std_m: float) -> Alignment | 
     if spread_m < 1e-6:
         return None
     rotation = math.atan2(float((d[:, 0] * f[:, 1] - d[:, 1] * f[:, 0]).sum()), float((d * f).sum()))
-    c, s = math.cos(rotation), math.sin(rotation)
-    shift = target - np.array([c * origin[0] - s * origin[1], s * origin[0] + c * origin[1]])
+    shift = target - _turned(rotation, *origin.tolist())
     return Alignment(rotation, fix_std_m / (2 * spread_m), (float(shift[0]), float(shift[1])), fix_std_m)
 
 
@@ -70,7 +69,14 @@ def align_start(start: Sequence[float], reckoned: DeadReckonedPose) -> Alignment
     """The alignment where a machine stands at a known x, y [m] and heading [rad]."""
     x, y, heading = start
     rotation = heading - reckoned.angle_rad
-    return Alignment(rotation, GIVEN_STD_RAD, (x - reckoned.x_m, y - reckoned.y_m), GIVEN_STD_M)
+    east_m, north_m = _turned(rotation, reckoned.x_m, reckoned.y_m)
+    return Alignment(rotation, GIVEN_STD_RAD, (x - east_m, y - north_m), GIVEN_STD_M)
+
+
+def _turned(angle_rad: float, x: float, y: float) -> tuple[float, float]:
+    """A vector, turned to the left."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return c * x - s * y, s * x + c * y
 
 
 def start_belief(
@@ -82,9 +88,8 @@ def start_belief(
     deviation of the lasting error of a turn that no IMU measures, 0 where there is none.
     """
     reckoned = step.reckoned
-    c, s = math.cos(alignment.rotation_rad), math.sin(alignment.rotation_rad)
     x, variance = np.zeros(layout.n), np.full(layout.n, 1e-6)
-    x[:2] = alignment.origin_m + np.array([c * reckoned.x_m - s * reckoned.y_m, s * reckoned.x_m + c * reckoned.y_m])
+    x[:2] = np.array(alignment.origin_m) + _turned(alignment.rotation_rad, reckoned.x_m, reckoned.y_m)
     x[state.YAW] = wrap_angle(alignment.rotation_rad + reckoned.angle_rad)
     x[state.SPEED] = step.wheels.speed_mps
     if forces_mps2:

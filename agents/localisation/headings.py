@@ -1,6 +1,12 @@
 """Attitude references: from orientations to measurements, each in its mode.
 
-Absolute: orientations are measurements of the filter step that they came in. Differential: successive orientations make
+Absolute: orientations are measurements of the filter step that they came in. The error of a magnetic heading is slow:
+it comes from the machine's own steel, from iron and currents near by and from the calibration, and lasts for tens of
+metres to for ever. So each absolute heading has a state for it, a Gauss-Markov process: while GPS shows the heading the
+error is learnt, and without GPS the heading is held to within what the error may have changed since. The profile
+`paper` takes orientations as they are, with white errors, and their tilt too.
+
+Differential: successive orientations make
 an angular rate. Relative: the heading is turned so that the first one agrees with the believed heading; roll and pitch
 stay, since gravity gives them. Differential and relative ones are measurements of their own stamps.
 """
@@ -13,15 +19,21 @@ from functools import partial
 import numpy as np
 
 from agents.localisation import measurements
-from agents.localisation.filters.belief import Belief, Change, Measurement, anchor_states
+from agents.localisation.filters.belief import Belief, Change, Measurement, anchor_states, reset_states
+from agents.localisation.filters.motion import HeadingError
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.imu_steps import FilterStep
 from agents.localisation.measurements import GATE_SIGMA
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from protocol.arrays import Floats
-from protocol.machine.machine_config import ABSOLUTE, RELATIVE, SensorConfig
+from protocol.machine.machine_config import ABSOLUTE, BASE, RELATIVE, SensorConfig
 
 UNKNOWN_STD = 1e4  # of a quantity that a sensor does not measure
+# Of absolute headings. Data sheets state 1 to 2 degrees, of a clean magnetic field; machines are of steel.
+MIN_HEADING_STD_RAD = math.radians(3)  # unless it is configured
+WHITE_SHARE = 0.1  # of the variance
+HEADING_TIME_S = 300.0  # between a disturbance beside the road (seconds) and the steel of the machine (for ever)
+DUE_S = 0.5  # between two that are used: more of a slow error tell nothing new
 
 
 @dataclass(frozen=True)
@@ -37,25 +49,42 @@ class Orientation:
         return self.value.stamp_ns
 
 
-def anchored_headings(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
-    """References whose heading counts from a believed one."""
-    return [s for s in sensors if s.kind == "attitude" and s.use and s.mode == RELATIVE and s.provides("heading")]
+def heading_references(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
+    """References with a state for their heading's error: absolute ones, then those that count from a believed one."""
+    able = [s for s in sensors if s.kind == "attitude" and s.use and s.frame == BASE and s.provides("heading")]
+    return [s for mode in (ABSOLUTE, RELATIVE) for s in able if s.mode == mode]
 
 
 class References(ModalSensors[Orientation]):
-    """The attitude references of one machine."""
+    """The attitude references of one machine; `errors` are those of the absolute headings, as they are now.
 
-    def __init__(self, sensors: Sequence[SensorConfig], layout: Layout) -> None:
+    slow: whether errors of absolute ones are slow, else white.
+    """
+
+    def __init__(self, sensors: Sequence[SensorConfig], layout: Layout, *, slow: bool) -> None:
         super().__init__()
         self._sensors = {s.name: s for s in sensors if s.kind == "attitude" and s.use}
-        states = range(layout.heading_errors.start, layout.heading_errors.stop)
-        self._states = dict(zip((s.name for s in anchored_headings(sensors)), states, strict=False))
+        references, states = heading_references(sensors), range(layout.heading_errors.start, layout.heading_errors.stop)
+        self._states = dict(zip((s.name for s in references), states, strict=False))
         self._turns: dict[str, float] = {}  # of relative ones
+        self._slow = slow
+        absolute = [s.name for s in references if s.mode == ABSOLUTE] if slow else []
+        self._errors = dict.fromkeys(absolute, HeadingError(MIN_HEADING_STD_RAD, HEADING_TIME_S))
+        self._used_ns: dict[str, int] = {}
 
-    def measurements(self, step: FilterStep) -> list[Measurement]:
-        """Measurements of absolute references, at the stamp of the step."""
+    @property
+    def errors(self) -> tuple[HeadingError, ...]:
+        """The error of each absolute heading that has a state for it."""
+        return tuple(self._errors.values())
+
+    def measurements(self, step: FilterStep, belief: Belief) -> list[Measurement]:
+        """Measurements of absolute references, at the stamp of the step; belief: the newest."""
         absolute = [o for o in self._orientations(step) if o.sensor.mode == ABSOLUTE]
-        return [self._attitude(o, step.stamp_ns, o.value.values) for o in absolute]
+        if not self._slow:
+            return [self._attitude(o, step.stamp_ns, o.value.values) for o in absolute]
+        due = [o for o in absolute if step.stamp_ns - self._used_ns.get(o.sensor.name, 0) >= DUE_S * 1e9]
+        self._used_ns.update((o.sensor.name, step.stamp_ns) for o in due)
+        return [m for o in due for m in self._heading(o, step.stamp_ns, belief)]
 
     def own_stamped(self, step: FilterStep) -> list[Orientation]:
         """Orientations of the other references, which become measurements of their own stamps."""
@@ -82,6 +111,27 @@ class References(ModalSensors[Orientation]):
             variances = np.where([sensor.provides(n) for n in names], stated, UNKNOWN_STD**2)
             orientations.append(Orientation(sensor, StampedValue(value.stamp_ns, value.values, variances)))
         return orientations
+
+    def _heading(self, orientation: Orientation, stamp_ns: int, belief: Belief) -> list[Measurement]:
+        """The heading of a reference, with the state of its error.
+
+        An error that turns out larger than stated is taken for that large, and to change as fast as one of the stated
+        size (2 std^2 / time stays): else it would be expected to fade, and the believed heading would follow it.
+        References of one machine stand in one magnetic field: several count as one.
+        """
+        sensor = orientation.sensor
+        if sensor.name not in self._errors:
+            return []
+        state, variance = self._states[sensor.name], float(orientation.value.variances[2])
+        stated = math.sqrt(variance) if "heading" in sensor.std else max(math.sqrt(variance), MIN_HEADING_STD_RAD)
+        times = max(1.0, abs(float(belief.x[state])) / stated)
+        std = math.sqrt(len(self._errors)) * times * stated
+        self._errors[sensor.name] = HeadingError(std, HEADING_TIME_S * times**2)
+        first = partial(reset_states, states=slice(state, state + 1), variance=std**2)
+        change = None if sensor.name in self._confirmed else first
+        self._confirmed.add(sensor.name)
+        yaw, white, gate = float(orientation.value.values[2]), WHITE_SHARE * stated**2, sensor.gate(GATE_SIGMA)
+        return [measurements.heading(stamp_ns, sensor.name, yaw, white, state, gate, change)]
 
     def _attitude(
         self, orientation: Orientation, stamp_ns: int, rpy_rad: Floats, change: Change | None = None

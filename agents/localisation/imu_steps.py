@@ -18,7 +18,7 @@ from agents.dead_reckoning import (
 )
 from agents.localisation.sensor_modes import StampedValue
 from protocol.arrays import Floats
-from protocol.machine.machine_config import ABSOLUTE, FRONT, MachineConfig, SensorConfig
+from protocol.machine.machine_config import FRONT, MachineConfig, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
 from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
 
@@ -68,18 +68,14 @@ class FilterStep:
 
 
 class StepGatherer:
-    """Gathers readings into steps of step_s.
+    """Gathers readings into steps of step_s."""
 
-    orients: whether absolute orientations are used; those of another mode always are.
-    """
-
-    def __init__(self, machine: MachineConfig, step_s: float, *, orients: bool = True) -> None:
+    def __init__(self, machine: MachineConfig, step_s: float) -> None:
         self.counters: Counter[str] = Counter()
         self._step_ns = round(step_s * 1e9)
         self._rotations = {s.name: s.mount.frame_from_sensor() for s in machine.sensors}  # into base_link or front_link
         self._front = {s.name for s in machine.sensors if s.frame == FRONT}
         self._sums: dict[str, tuple[float, ...]] = {}
-        self._orients = orients
         self._attitudes: dict[str, Attitude] = {}  # the last of each: only that is made into angles
         source = turn_source(machine)
         self._turn_sensor = source.name if source else ""
@@ -104,7 +100,7 @@ class StepGatherer:
             self._joint.update(reading.stamp_ns, reading.angle_rad)
         elif isinstance(reading, Imu):
             self._add_imu(reading, sensor)
-        elif isinstance(reading, Attitude) and (self._orients or sensor.mode != ABSOLUTE):
+        elif isinstance(reading, Attitude):
             self._add_attitude(reading, sensor)
         elif isinstance(reading, Steering) and sensor.name == self._turn_sensor:
             self._turn_values.append(math.tan(reading.angle_rad) / self._wheelbase_m)

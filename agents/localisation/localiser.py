@@ -1,4 +1,7 @@
-"""The localiser: readings in, poses out. Until it knows its heading it only collects."""
+"""The localiser: readings in, poses out. Until it knows its heading it only collects.
+
+It is one module because every kind of event meets here the one filter that all of them change.
+"""
 
 import math
 from collections import Counter, deque
@@ -15,11 +18,11 @@ from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import SmoothedPose, nothing_past
-from agents.localisation.filters.state import Layout
+from agents.localisation.filters.state import Layout, X, Y, Z
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
-from agents.localisation.headings import References, anchored_headings
+from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
@@ -28,6 +31,10 @@ from protocol.machine.readings import Correction, Gps, GpsVelocity
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
+# Without GPS for so long, wheels and IMUs teach neither the wheels' scale s nor the place: h = (1 + s) v is linearised
+# at a speed that jitters from step to step, which looks like information about s. While fixes show the distance, they
+# outweigh it; without them it bent the scale by 6 % in ten minutes.
+UNPLACED_S = 5.0
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
 Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
@@ -84,19 +91,20 @@ class Localiser:
         self.engine = _engine(config)
         augmented = config.profile == "default"
         layout = _layout_of(machine) if augmented else Layout()
-        self._gatherer = StepGatherer(machine, step_s, orients=not augmented)
+        self._gatherer = StepGatherer(machine, step_s)
         self._receivers = Receivers(
             machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
         )
         self._base = machine.base
         self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
-        self._references = References(machine.sensors, layout)
+        self._references = References(machine.sensors, layout, slow=augmented)
         source, on_plane = turn_source(machine), not shows_tilt(machine, config.profile)
         tyres = config.slip, config.slip_soft
         self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
         self._model = MotionModel(layout, on_plane, self._gps_errors(), turn_error_radps=turn_error)
         self._fusion: Fusion | None = None
+        self._placed_ns = 0  # stamp of the newest fix or velocity by GPS
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
         self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
@@ -181,20 +189,24 @@ class Localiser:
 
     def _filter_own(self, fusion: Fusion, event: Event) -> list[Belief]:
         """Beliefs that an event of the machine's own sensors changed."""
+        if not isinstance(event, FilterStep):
+            self._placed_ns = event.stamp_ns
         if isinstance(event, Measurement):
             return fusion.add([event])
         if isinstance(event, Fix):
             return self._filter_modal(fusion, self._receivers, event)
-        fusion.model = replace(fusion.model, traction=event.traction)
+        absolute = self._references.measurements(event, fusion.belief)
+        errors = self._references.errors
+        fusion.model = replace(fusion.model, traction=event.traction, heading_errors=errors)
         beliefs: list[Belief] = []
         for orientation in self._references.own_stamped(event):
             beliefs += self._filter_modal(fusion, self._references, orientation)
-        measurements = [
-            *self._body.inertial(event),
-            *self._references.measurements(event),
-            *self._body.turn(event),
-            *self._body.wheels(event),
-        ]
+        inertial, turn, wheels = self._body.inertial(event), self._body.turn(event), self._body.wheels(event)
+        layout = fusion.model.layout
+        if layout.wheel_scale and event.stamp_ns - self._placed_ns > UNPLACED_S * 1e9:
+            considers = (X, Y, Z, layout.wheel_scales.start)
+            inertial, wheels = ([replace(m, considers=considers) for m in several] for several in (inertial, wheels))
+        measurements = [*inertial, *absolute, *turn, *wheels]
         return beliefs + (fusion.add(measurements) if measurements else [])
 
     def _correct(self, fusion: Fusion, corrections: Corrections, event: Event) -> list[Belief]:
@@ -271,6 +283,6 @@ def _layout_of(machine: MachineConfig) -> Layout:
     source = turn_source(machine)
     imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
     turns = imus + (source is not None and source.kind != "imu")
-    receivers, references = drifting(machine.sensors), anchored_headings(machine.sensors)
+    receivers, references = drifting(machine.sensors), heading_references(machine.sensors)
     base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
     return Layout(turns, True, len(receivers) + base, len(references), base)

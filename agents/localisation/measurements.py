@@ -197,6 +197,26 @@ def turn(
     return Measurement(sensor, stamp_ns, np.array([rate_radps]), R, h, jacobian, gate_sigma=gate)
 
 
+def heading(
+    stamp_ns: int, sensor: str, yaw_rad: float, variance: float, error: int, gate: float, change: Change | None = None
+) -> Measurement:
+    """Absolute heading (1,) of `base_link` in `map`: z = yaw + e.
+
+    error: state of the reference's error e. A reference that is off for long has changed, not the machine's heading.
+    """
+
+    def h(x: Floats) -> Floats:
+        return (x[:, YAW] + x[:, error])[:, None]
+
+    def jacobian(x: Floats) -> Floats:
+        H = np.zeros((1, len(x)))
+        H[0, YAW] = H[0, error] = 1.0
+        return H
+
+    z, R, opens = np.array([yaw_rad]), np.array([[variance]]), slice(error, error + 1)
+    return Measurement(sensor, stamp_ns, z, R, h, jacobian, (0,), gate_sigma=gate, opens=opens, change=change)
+
+
 def orientation(
     stamp_ns: int,
     sensor: str,

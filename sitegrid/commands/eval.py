@@ -35,29 +35,40 @@ def add_options(parser: ArgumentParser) -> None:
         "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
     )
     table = add_action(what, "localisation", "repeat the paper's table on simulated recordings")
+    blackout = add_action(what, "blackout", "measure positions without GPS: blackouts, jumps afterwards, starts alone")
     budget = add_action(what, "budget", "show what each kind of error costs, by the truth in its place")
     ground = add_action(what, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work")
     base = add_action(what, "base", "measure what a base station brings, also one that fails")
     merge = add_action(what, "merge", "compare this map merge with other methods")
     lag = add_action(what, "lag", "compare the maps of four loaders at work with and without the smoother's lag")
-    for action, seeds in ((physics, 3), (table, 12), (budget, 12), (ground, 12), (base, 12), (merge, 12), (lag, 12)):
-        action.add_argument("--seeds", type=count, default=seeds, help="number of seeds (default %(default)s)")
+    for action in (table, blackout, budget, ground, base, merge, lag):
+        action.add_argument("--seeds", type=count, default=12, help="number of seeds (default %(default)s)")
+    physics.add_argument("--seeds", type=count, default=3, help="number of seeds (default %(default)s)")
+    for action in (physics, table, blackout, budget, ground, base, merge, lag):
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
-    for action in (table, budget, ground, base, merge, lag):
+    for action in (table, blackout, budget, ground, base, merge, lag):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
         (table, "errors over time, tracks and the table"),
+        (blackout, "errors over the time without GPS"),
         (ground, "estimates along the track, errors by place"),
         (merge, "the maps of the first seed and the table"),
     ):
         action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
-    for action, seconds in ((table, 1200.0), (budget, 1200.0), (ground, 600.0), (base, 1200.0), (lag, 900.0)):
+    for action, seconds in (
+        (table, 1200.0),
+        (blackout, 1200.0),
+        (budget, 1200.0),
+        (ground, 600.0),
+        (base, 1200.0),
+        (lag, 900.0),
+    ):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
     scenario = "what is driven; in the last two the driver wanders and stops (default %(default)s)"
-    for action in (table, budget):
+    for action in (table, blackout, budget):
         action.add_argument("--scenario", choices=SCENARIOS, default=SCENARIOS[0], help=scenario)
     table.add_argument("--rows", choices=("all", "headline"), default="all", help="headline: 1 IMU with 1, 2, 3 GPS")
     shared = "shares of slow GPS errors that the receivers have in common, comma-separated (default: as recorded)"
@@ -92,6 +103,7 @@ def run(arguments: Namespace) -> int:
     evaluations = {
         "physics": _physics,
         "localisation": _localisation,
+        "blackout": _blackout,
         "budget": _budget,
         "ground": _ground,
         "base": _base,
@@ -138,6 +150,15 @@ def _with_oracle(table: Callable[[Runner], tuple[Report, Any]]) -> Callable[[Run
         return {**report, "oracle": oracle.run(runner, outcomes)}, outcomes
 
     return work
+
+
+def _blackout(arguments: Namespace) -> Report:
+    from evaluation.campaign.recordings import SETUPS
+    from evaluation.positions import blackouts
+
+    setup = SETUPS[arguments.scenario]
+    work = partial(blackouts.run, seeds=_seeds(arguments), seconds=arguments.seconds, setup=setup)
+    return _experiment(arguments, "machines drive, and lose GPS", work, "evaluation.positions.blackout_plots")
 
 
 def _budget(arguments: Namespace) -> Report:

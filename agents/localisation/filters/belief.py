@@ -58,7 +58,8 @@ class Measurement:
     z that are angles [rad]. gate_sigma: refused if the innovation is this many standard deviations off, 0 never.
     relocks: accepted again after too many refusals in a row; false for assumptions, which no sensor measures. opens:
     states (k,) that become as unsure as the measurement is off then; the others follow by themselves. change: made to
-    the belief at its stamp before any measurement, as when a state that was unknown gets its first value.
+    the belief at its stamp before any measurement, as when a state that was unknown gets its first value. considers:
+    states that it depends on, and does not change (Schmidt-Kalman: Schmidt 1966).
     """
 
     sensor: str
@@ -72,6 +73,7 @@ class Measurement:
     relocks: bool = True
     opens: slice | None = None
     change: Change | None = None
+    considers: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ Over a step dt, with R = map_from_base and E the matrix from body rates to the r
 
     position += R (velocity dt + acceleration dt^2 / 2)        attitude += E rate dt
     velocity += acceleration dt                                rate, acceleration, biases, scale stay
+    error of an absolute heading *= exp(-dt / tau)
     GPS error *= exp(-dt / tau), of its own tau; what several receivers see, such as one sky, moves all their errors
 
 `velocity` is that of base_link's origin in its own axes and `acceleration` its rate of change; what an accelerometer
@@ -75,23 +76,35 @@ class GpsError:
 
 
 @dataclass(frozen=True)
+class HeadingError:
+    """The error of a reference's absolute heading: a stationary Gauss-Markov process."""
+
+    std_rad: float
+    time_s: float
+
+
+@dataclass(frozen=True)
 class MotionModel:
     """What the motion depends on besides the belief.
 
-    on_plane: whether the machine moves on a plane. gps_errors: one per receiver of the layout. traction: drive force
-    over weight [-], 0 where it is not known. turn_error_radps: standard deviation of the lasting error of an odometry's
-    turn rate, 0 where the turn comes from another sensor.
+    on_plane: whether the machine moves on a plane. gps_errors: one per receiver of the layout. heading_errors:
+    of the first references of the layout; headings of the others count from an anchor, and their errors walk. traction:
+    drive force over weight [-], 0 where it is not known. turn_error_radps: standard deviation of the lasting error of
+    an odometry's turn rate, 0 where the turn comes from another sensor.
     """
 
     layout: Layout
     on_plane: bool = False
     gps_errors: tuple[GpsError, ...] = ()
+    heading_errors: tuple[HeadingError, ...] = ()
     traction: float = 0.0
     turn_error_radps: float = 0.0
 
     def __post_init__(self) -> None:
         if len(self.gps_errors) != self.layout.receivers:
             raise ValueError(f"{len(self.gps_errors)} GPS errors for {self.layout.receivers} receivers")
+        if len(self.heading_errors) > self.layout.references:
+            raise ValueError(f"{len(self.heading_errors)} heading errors for {self.layout.references} references")
 
 
 def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
@@ -104,11 +117,14 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     if model.gps_errors:
         gps = layout.gps_errors
         scale[gps], Q[gps, gps] = _gps_motion(model.gps_errors, dt_s)
+    for state, error in enumerate(model.heading_errors, layout.heading_errors.start):
+        scale[state] = math.exp(-dt_s / error.time_s)
+        Q[state, state] = error.std_rad**2 * -math.expm1(-2 * dt_s / error.time_s)
     of_position = Q[POSITION, POSITION]
     of_position += _slip(belief.x * scale, dt_s, _slip_variance_m2(model.traction * float(belief.x[SPEED]), dt_s))
     if model.turn_error_radps:
-        error = layout.gyro_biases.stop - 1
-        Q[error, error] += 2 * model.turn_error_radps**2 * dt_s / BEND_S
+        turn = layout.gyro_biases.stop - 1
+        Q[turn, turn] += 2 * model.turn_error_radps**2 * dt_s / BEND_S
 
     def f(states: Floats) -> Floats:
         return _moved(states, scale, dt_s)

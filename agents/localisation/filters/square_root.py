@@ -107,7 +107,8 @@ def conclude(
     predicted: (k,). together: Z over X (k + n, m). H (k, n): how the measurement shows the state's error, None of a
     belief without a past. The covariance is the square of what the measurement leaves of the
     deviations, X - K Z: where the measurement is linear that is (I - K H) P (I - K H)^T + K R K^T (Joseph 1964). A sum
-    of squares stays symmetric, and definite but for rounding.
+    of squares stays symmetric, and definite but for rounding; it holds for any gain K, so also for one that is zero for
+    states that are only considered.
     """
     y = wrapped(measurement.z - predicted, measurement.angles)
     if not math.isfinite(y.dot(y)):
@@ -120,11 +121,14 @@ def conclude(
     K, nis = quotients[:-1], float(quotients[-1].dot(y))
     if 0 < measurement.gate_sigma**2 < nis:
         return Conditioned(belief, y, S, nis, accepted=False)
-    left = X - K.dot(Z)
     past = belief.past
     if past is not None and H is not None:
         shown = H.dot(past.transition)
         past = past.informed(shown, _divided(shown.T, S), y, K)
+    if measurement.considers:  # the past learns all the same
+        K = K.copy()
+        K[list(measurement.considers)] = 0.0
+    left = X - K.dot(Z)
     posterior = definite(belief.stamp_ns, belief.x + K.dot(y), left.dot(left.T), past)
     return Conditioned(posterior, y, S, nis, accepted=True)
 

@@ -25,8 +25,8 @@ class Layout:
 
     imus: with a yaw gyro bias each [rad/s], and one more where another sensor shows the turn. wheel_scale: whether
     there is one [-]: wheels turn by 1 + scale times the distance. receivers: GPS receivers with an error east and north
-    each [m]. references: headings [rad] that count from an anchor, which may be off. base: whether the last of the
-    receivers is a base station's, whose lasting error has states too. Without any, the 15 states of the paper.
+    each [m]. references: of attitude, with an error of the heading each [rad]. base: whether the last of the receivers
+    is a base station's, whose lasting error has states too. Without any, the 15 states of the paper.
     """
 
     imus: int = 0

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,18 @@ def test_start_lies_where_it_is_given_and_as_the_forces_show() -> None:
     assert np.linalg.eigvalsh(belief.P).min() > 0
     unforced = start_belief(alignment, *step(), Layout(), 0.0)
     assert unforced.x[ATTITUDE][:2].tolist() == [0.0, 0.0]
+
+
+def test_start_is_where_the_machine_is_now_not_where_dead_reckoning_began() -> None:
+    """Reckoned 3 m ahead and 4 m to the left, turned by 0.3 rad, before the start is applied."""
+    alignment = align_start((50.0, 60.0, 3.0), DeadReckonedPose(9, 5.0, 0.3, 3.0, 4.0))
+    moved = replace(step()[0], reckoned=DeadReckonedPose(9, 5.0, 0.3, 3.0, 4.0))
+    belief = start_belief(alignment, moved, [], Layout(), 0.0)
+    assert belief.x[:2] == pytest.approx((50.0, 60.0))
+    assert belief.x[YAW] == pytest.approx(3.0)
+    back = start_belief(alignment, step()[0], [], Layout(), 0.0)  # the first step, where it had only turned by 0.3 rad
+    c, s = math.cos(2.7), math.sin(2.7)
+    assert back.x[:2] == pytest.approx((50.0 - 3 * c + 4 * s, 60.0 - 3 * s - 4 * c))
 
 
 def test_a_spread_twice_as_large_makes_the_heading_surer() -> None:

@@ -353,7 +353,7 @@ def test_a_given_start_may_lie_anywhere() -> None:
 
 
 @pytest.mark.slow
-def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores() -> None:
+def test_paper_has_15_states_and_follows_orientations_whose_error_the_default_learns() -> None:
     vehicle = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("ahrs", "attitude")))
     made = drive(S_BEND, vehicle)
     off, states, used = {}, {}, {}
@@ -363,9 +363,9 @@ def test_paper_has_15_states_and_follows_orientations_which_the_default_ignores(
         states[profile] = len(state(located))
         used[profile] = located.counters["ahrs_used"]
         off[profile] = math.remainder(state(located)[YAW] - made.heading_rad[-1], math.tau)
-    assert states == {"paper": BASE_STATES, "default": BASE_STATES + 1 + 1 + 2}
+    assert states == {"paper": BASE_STATES, "default": BASE_STATES + 1 + 1 + 2 + 1}
     assert used["paper"] > 500
-    assert used["default"] == 0
+    assert 20 < used["default"] < 100  # one in half a second
     assert off["paper"] > 0.05
     assert abs(off["default"]) < 0.03
 
