@@ -33,7 +33,7 @@ REPEATS = 5  # the same error so often in a row is no measurement any more
 GATE_SIGMA = 4.0  # as of fixes
 TRUST = 0.95  # of the share found: the heading that it is judged by has followed the corrections a little
 LEAST_SHARE = 0.05  # a smaller one is none
-UNKNOWN = GpsError(1.0, 45.0)
+UNKNOWN = GpsError(1.0, 45.0)  # the slow error of a base that was not heard yet: any will do
 
 
 class Corrections:
@@ -168,6 +168,12 @@ class Corrections:
         """Where the machine is by dead reckoning (2,), around the last step."""
         reckoned: Floats = self._track_m + self._velocity_mps * ((stamp_ns - self._followed_ns) * 1e-9)
         return reckoned
+
+
+def not_used(base: SensorConfig, profile: str) -> dict[str, Any]:
+    """The report of a machine that names a base and has no use for it."""
+    why = "the profile `paper` uses none" if profile == "paper" else "no GPS receiver shows places"
+    return {"name": base.name, "used": False, "why_not": why}
 
 
 def _begun(belief: Belief, layout: Layout, slow_m2: float, offset_m2: float) -> Belief:

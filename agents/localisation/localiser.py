@@ -12,23 +12,22 @@ from typing import Any
 from agents.dead_reckoning import DeadReckoning, turn_source
 from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
 from agents.localisation.consistency import Consistency
-from agents.localisation.corrections import Corrections
-from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief
+from agents.localisation.corrections import Corrections, not_used
+from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief, pose_of
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import SmoothedPose, nothing_past
-from agents.localisation.filters.state import YAW, Layout, X, Y, Z
+from agents.localisation.filters.state import Layout, X, Y, Z
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
-from agents.localisation.motion_sensors import MotionSensors
+from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig
+from protocol.machine.machine_config import ABSOLUTE, MachineConfig
 from protocol.machine.readings import Correction, Gps, GpsVelocity
-from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
@@ -99,7 +98,7 @@ class Localiser:
         self._base = machine.base
         self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
         self._references = References(machine.sensors, layout, slow=augmented)
-        source, on_plane = turn_source(machine), not _shows_tilt(machine, config.profile)
+        source, on_plane = turn_source(machine), not shows_tilt(machine, config.profile)
         tyres = config.slip, config.slip_soft
         self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
@@ -130,8 +129,7 @@ class Localiser:
         """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
         if self._corrections:
             return self._corrections.report(self._fusion.belief.stamp_ns if self._fusion else 0)
-        why = "the profile `paper` uses none" if self._config.profile == "paper" else "no GPS receiver shows places"
-        return {"name": self._base.name, "used": False, "why_not": why} if self._base else None
+        return not_used(self._base, self._config.profile) if self._base else None
 
     @property
     def machine_share(self) -> float | None:
@@ -182,7 +180,7 @@ class Localiser:
         for event in events:
             known = self._fusion
             beliefs += self._filter(known, event) if known else self._collect(event, dead_reckoning.distance_m)
-        return [_pose(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
+        return [pose_of(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
 
     def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
         """Beliefs that an event changed, and then a correction that is due."""
@@ -218,20 +216,17 @@ class Localiser:
         if not isinstance(event, FilterStep):
             return []
         corrections.follow(fusion.belief)
-        measurement = corrections.measurement(fusion.belief)
-        if measurement is None:
+        if (measurement := corrections.measurement(fusion.belief)) is None:
             return []
         fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
         beliefs = fusion.add([measurement])
-        if beliefs:
-            corrections.confirm(fusion.last[measurement.sensor])
+        corrections.confirm(fusion.last[measurement.sensor])
         return beliefs
 
     def _gps_errors(self) -> tuple[GpsError, ...]:
         """Slow errors of the machine's receivers and, where it uses one, of the base station's."""
-        if self._corrections is None:
-            return self._receivers.errors
-        return self._receivers.errors_beside(self._corrections.base_error, self._corrections.site_share)
+        base = self._corrections
+        return self._receivers.errors_beside(base.base_error, base.site_share) if base else self._receivers.errors
 
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
         """Filter a value whose sensor may count from what is believed at its stamp."""
@@ -291,26 +286,3 @@ def _layout_of(machine: MachineConfig) -> Layout:
     receivers, references = drifting(machine.sensors), heading_references(machine.sensors)
     base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
     return Layout(turns, True, len(receivers) + base, len(references), base)
-
-
-def _shows_tilt(machine: MachineConfig, profile: str) -> bool:
-    """Whether the sensors show roll and pitch; a machine without is taken to be on a plane.
-
-    By a reference of attitude that the profile uses for it, else by the direction of gravity between rates of turn.
-    Rates alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the
-    acceleration's.
-    """
-    used = [s for s in machine.sensors if s.use]
-    bends = any(s.kind == "articulation" for s in used)
-    imus = [s for s in used if s.kind == "imu" and (s.frame == BASE or bends)]
-    references = [s for s in used if s.kind == "attitude" and s.frame == BASE and s.provides("tilt")]
-    modes = (ABSOLUTE, RELATIVE) if profile == "paper" else (RELATIVE,)
-    if any(s.mode in modes for s in references):
-        return True
-    turns = any(s.provides("rate") for s in imus) or any(s.mode == DIFFERENTIAL for s in references)
-    return turns and any(s.provides("force") for s in imus)
-
-
-def _pose(belief: Belief, speed_mps: float) -> PoseBelief:
-    x, y, heading = float(belief.x[0]), float(belief.x[1]), wrap_angle(float(belief.x[YAW]))
-    return PoseBelief(belief.stamp_ns, x, y, heading, speed_mps, belief.P[:2, :2].copy())

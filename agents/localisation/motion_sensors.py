@@ -21,7 +21,7 @@ from agents.localisation.headings import UNKNOWN_STD
 from agents.localisation.imu_steps import FilterStep, Turn
 from agents.localisation.measurements import GATE_SIGMA
 from protocol.arrays import Floats
-from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig, SensorConfig
 from protocol.units import GRAVITY_MPS2
 
 STANDSTILL_S = 1.0  # after so long without travel the machine stands; coarse ticks of one that crawls come sooner
@@ -122,6 +122,23 @@ class MotionSensors:
     def _bias(self, index: int) -> int | None:
         """State of a yaw gyro's bias."""
         return self._layout.gyro_bias(index) if self._layout.imus else None
+
+
+def shows_tilt(machine: MachineConfig, profile: str) -> bool:
+    """Whether the sensors show roll and pitch; a machine without is taken to be on a plane.
+
+    By a reference of attitude that the profile uses, else by the direction of gravity between rates of turn. Rates
+    alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the acceleration's.
+    """
+    used = [s for s in machine.sensors if s.use]
+    bends = any(s.kind == "articulation" for s in used)
+    imus = [s for s in used if s.kind == "imu" and (s.frame == BASE or bends)]
+    references = [s for s in used if s.kind == "attitude" and s.frame == BASE and s.provides("tilt")]
+    modes = (ABSOLUTE, RELATIVE) if profile == "paper" else (RELATIVE,)
+    if any(s.mode in modes for s in references):
+        return True
+    turns = any(s.provides("rate") for s in imus) or any(s.mode == DIFFERENTIAL for s in references)
+    return turns and any(s.provides("force") for s in imus)
 
 
 def rolling_resistance(before: float, traction: float, force_ahead_mps2: float, dt_s: float) -> float:

@@ -22,7 +22,7 @@ from agents.localisation.filters.motion import GpsError
 from protocol.arrays import Floats
 from protocol.machine.readings import Correction
 
-CANDIDATES = np.array([0.0, 0.25, 0.5, 0.7, 0.85, 0.95])
+CANDIDATES = np.array([0.0, 0.25, 0.5, 0.7, 0.85, 0.93, 0.98])
 NONE_AT_FIRST = 0.5  # probability of no common part before anything is known: a base has to earn its weight
 MEMORY_S = 300.0  # how long what was seen counts: a base that goes wrong must lose its weight
 SPAN_NS = 1_000_000_000  # fixes and corrections of a second are averaged

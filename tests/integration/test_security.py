@@ -373,13 +373,14 @@ def test_only_a_base_publishes_corrections_and_only_its_own(guarded: Guarded):
     own, others = keys.corrections(SITE, "base-1"), keys.corrections(SITE, "base-2")
     with (
         guarded.session("loader-1") as loader,
+        guarded.session("loader-2") as listener,
         guarded.session("base-1") as base,
         guarded.session("sim") as sim,
         guarded.session("guest") as guest,
-        listening(loader, own) as heard,
+        listening(listener, own) as heard,
         listening(guest, keys.corrections_all(SITE)) as guest_heard,
     ):
-        for forger in (loader, sim, guest):
+        for forger in (loader, sim):
             forger.put(own, b"forged")
         base.put(others, b"forged")
         base.put(keys.pose(SITE, "loader-1"), b"forged")

@@ -12,7 +12,9 @@ from typing import Protocol
 import numpy as np
 
 from agents.localisation.filters.smoother import Past
+from agents.localisation.filters.state import YAW, X, Y
 from protocol.arrays import Floats
+from protocol.rotations import wrap_angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +115,12 @@ class Filter(Protocol):
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
         """Condition the belief on a measurement of its stamp."""
+
+
+def pose_of(belief: Belief, speed_mps: float) -> PoseBelief:
+    """The pose that a belief holds, with the wheels' speed."""
+    x, y, heading = float(belief.x[X]), float(belief.x[Y]), wrap_angle(float(belief.x[YAW]))
+    return PoseBelief(belief.stamp_ns, x, y, heading, speed_mps, belief.P[:2, :2].copy())
 
 
 # --- changes ---------------------------------------------------------------------------------------------------------
