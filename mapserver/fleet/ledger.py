@@ -1,0 +1,59 @@
+"""What calibration remembers of one machine: its stays of the newest spans in which it drove.
+
+Sums of integers, so that any order and any batching of the samples give the same ledger, bit for bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mapserver.fleet.stays import SLOT_NS, SLOT_SHIFT, STAY, merged, stays
+from protocol.arrays import Table
+
+CELL_M = 2.0  # about one standard deviation of a position
+EPOCH_SLOTS = 30  # 300 s, the length of the map's time buckets
+EPOCH_NS = EPOCH_SLOTS * SLOT_NS
+EPOCHS = 96  # that are remembered: 8 h of driving
+_PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
+
+
+class Ledger:
+    """Stays of one machine. cell_m: edge of the cells."""
+
+    def __init__(self, cell_m: float = CELL_M) -> None:
+        self._cell_m = cell_m
+        self._stays: Table = np.zeros(0, STAY)
+        self._pending: list[Table] = []
+        self._waiting = 0
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is remembered."""
+        return self._stays.nbytes + sum(each.nbytes for each in self._pending)
+
+    def add(self, rows: Table) -> None:
+        """Add samples whose position is sure enough to vote."""
+        new = stays(rows, self._cell_m)
+        self._pending.append(new)
+        self._waiting += len(new)
+        if self._waiting > max(_PENDING_ROWS, len(self._stays) // 4):
+            self._merge()
+
+    def stays(self) -> Table:
+        """All stays, by their keys."""
+        self._merge()
+        return self._stays
+
+    def _merge(self) -> None:
+        """Sum what waits, and forget the oldest epochs.
+
+        An epoch that is forgotten can never come back among the newest ones, so that when this runs has no influence.
+        """
+        whole = self._stays
+        if self._pending:
+            whole = merged(whole, np.concatenate(self._pending))
+        self._pending, self._waiting = [], 0
+        epochs = (whole["key"] >> SLOT_SHIFT) // EPOCH_SLOTS
+        newest = np.unique(epochs)[-EPOCHS:]
+        start = int(np.searchsorted(epochs, newest[0])) if len(newest) else 0
+        self._stays = whole[start:].copy()

@@ -1,0 +1,154 @@
+"""Stays of a machine in the order of time, and what lies between them: rises from cell to cell, and bends of the slope.
+
+Everything here is measured, nothing estimated: columns of numbers that the sources of evidence weigh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from mapserver.fleet import stays as st
+from mapserver.fleet.ledger import CELL_M, EPOCH_SLOTS
+from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
+
+MOST_SAMPLES = 4000  # of a stay: no machine drives so many in 10 s, and the sums of more have overflowed
+MAX_PAUSE_S = 15.0  # a longer one tears the sequence
+GAP_M = 1.5  # driven without samples between two stays: the slope in between is not known
+SECTORS = 8  # of headings
+
+
+@dataclass(frozen=True)
+class Passages:
+    """Stays (n,) of all machines, one machine behind the other, in the order of their times.
+
+    epoch: index of the machine's epoch, over all machines. machine, cell: indices. direction: +1, -1. c_rr: NaN where
+    none was known. along, across: slopes in the machine's frame as measured. ahead: unit vector (n, 2). place_m: (n, 2).
+    time_s. speed_mps. driven_m: that samples stand for. follows: whether it is the one after the stay before.
+    """
+
+    machine: Ints
+    epoch: Ints
+    cell: Ints
+    direction: Floats
+    c_rr: Floats
+    along: Floats
+    across: Floats
+    ahead: Floats
+    place_m: Floats
+    time_s: Floats
+    speed_mps: Floats
+    driven_m: Floats
+    follows: Bools
+
+    def __len__(self) -> int:
+        return len(self.cell)
+
+
+@dataclass(frozen=True)
+class Epochs:
+    """Epochs (e,) of all machines, one machine behind the other. number: in EPOCH_NS since 1970."""
+
+    machine: Ints
+    number: Ints
+
+
+def passages(ledgers: Mapping[str, Table]) -> tuple[Passages, Epochs, Ints]:
+    """Stays of machines by name, the names in order; their epochs; and the numbers of the cells that indices mean."""
+    parts, epochs, numbers = [], [], []
+    count = 0
+    for index, name in enumerate(sorted(ledgers)):
+        table = ledgers[name]
+        table = table[(table["n"] <= MOST_SAMPLES) & (table["n"] > 0)]
+        own, which = np.unique(st.slot(table["key"]) // EPOCH_SLOTS, return_inverse=True)
+        parts.append(_in_order(table, index, which + count))
+        epochs.append(np.full(len(own), index))
+        numbers.append(own)
+        count += len(own)
+    cells, index_of = np.unique(np.concatenate([part.cell for part in parts]), return_inverse=True)
+    joined = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Passages)}
+    joined["cell"] = index_of
+    return Passages(**joined), Epochs(np.concatenate(epochs), np.concatenate(numbers)), cells
+
+
+def _in_order(table: Table, machine: int, epoch: Ints) -> Passages:
+    """Passages of one machine. cell: its number, not yet an index."""
+    slot = st.slot(table["key"])
+    sums = {name: table[name].astype(np.float64) for name in st.SUMS}
+    start_s = (slot - slot.min(initial=0)) * (st.SLOT_NS * 1e-9)
+    time_s = start_s + sums["time"] / sums["n"] / st.PLACE_UNITS
+    order = np.lexsort((table["key"], time_s))
+    cells, direction = st.cell(table["key"])[order], st.direction(table["key"])[order]
+    time_s = time_s[order]
+    begins = np.ones(len(order), np.bool_)  # what the end of a slot cut in two is one stay again
+    begins[1:] = (np.diff(cells) != 0) | (np.diff(direction) != 0) | (np.diff(time_s) > MAX_PAUSE_S)
+    first = np.flatnonzero(begins)
+    counted_s = np.add.reduceat(time_s * sums["n"][order], first) if len(first) else time_s
+    sums = {name: np.add.reduceat(values[order], first) if len(first) else values for name, values in sums.items()}
+    n, cells, direction = sums["n"], cells[first], direction[first].astype(np.float64)
+    time_s = counted_s / n
+    ahead = np.stack([sums["cosine"], sums["sine"]], axis=1)
+    ahead /= np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
+    gradient = np.stack([sums["east"], sums["north"]], axis=1) / (n * st.VALUE_UNITS)[:, None]
+    place = np.stack([sums["x"], sums["y"]], axis=1) / (n * st.PLACE_UNITS)[:, None]
+    with np.errstate(invalid="ignore"):
+        c_rr = sums["c_rr"] / (sums["known"] * st.VALUE_UNITS)
+    return Passages(
+        machine=np.full(len(first), machine),
+        epoch=epoch[order][first],
+        cell=cells,
+        direction=direction,
+        c_rr=c_rr,
+        along=(gradient * ahead).sum(axis=1),
+        across=gradient[:, 1] * ahead[:, 0] - gradient[:, 0] * ahead[:, 1],
+        ahead=ahead,
+        place_m=np.stack(st.column_row(cells), axis=1) * CELL_M + place,
+        time_s=time_s,
+        speed_mps=sums["speed"] / (n * st.PLACE_UNITS),
+        driven_m=sums["distance"] / st.PLACE_UNITS,
+        follows=_follows(time_s, direction),
+    )
+
+
+def _follows(time_s: Floats, direction: Floats) -> Bools:
+    """Whether a stay goes on where the one before it ended: soon after it, and in the same direction."""
+    out = np.zeros(len(time_s), np.bool_)
+    out[1:] = (np.diff(time_s) < MAX_PAUSE_S) & (direction[1:] == direction[:-1])
+    return out
+
+
+@dataclass(frozen=True)
+class Links:
+    """Rises (n,) from one cell to the next: measured; per_zero: by how much a zero raises it; gap: see GAP_M."""
+
+    epoch: Ints
+    start: Ints
+    end: Ints
+    rise_m: Floats
+    per_zero_m: Floats
+    slope: Floats
+    gap: Bools
+
+
+def links(p: Passages) -> Links:
+    """Trapezoids of the slope between the middles of stays that follow each other."""
+    j = np.flatnonzero(p.follows)
+    i = j - 1
+    apart_m = np.hypot(*(p.place_m[j] - p.place_m[i]).T)
+    gap = apart_m - (p.driven_m[i] + p.driven_m[j]) / 2 > GAP_M
+    by_speed_m = (p.speed_mps[i] + p.speed_mps[j]) / 2 * (p.time_s[j] - p.time_s[i])
+    length_m = np.where(gap, apart_m, by_speed_m)
+    slope = (p.along[i] + p.along[j]) / 2
+    signed_m = length_m * p.direction[j]
+    bend = gap & (np.abs(p.along[j] - p.along[i]) > 0.08)
+    moves = p.cell[i] != p.cell[j]
+    out = Links(p.epoch[j], p.cell[i], p.cell[j], signed_m * slope, signed_m, np.abs(slope), bend)
+    return Links(*(getattr(out, f.name)[moves] for f in fields(out)))
+
+
+def grouped(keys: AnyArray) -> tuple[Ints, Ints, Ints]:
+    """Groups of equal rows of keys (n, k): the first of each, the group of every row, and how many each has."""
+    _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    return first, group.ravel(), count
