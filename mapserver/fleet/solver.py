@@ -13,10 +13,11 @@ TAU_S = 2*ZERO_STD**2/(8e-5)**2
 C_STD, C_REL, SLOPE_STD, SLOPE_REL, RISE_STD, RISE_REL, GAP_STD = 0.004, 0.08, 0.006, 0.3, 0.02, 0.3, 0.5
 SAME = 0.25
 HUBER = 1.5
-EDGE_M = 16.0
+EDGE_M, EDGE_REL = 20.0, 1.0
 BEND = 0.1
+SETTLE, SETTLED = 0.35, 0.05
 PLACE_M = 15.0
-PLACE_STD = 0.001
+PLACE_STD = 0.004
 RAMP_STD = 0.07
 LEAST_C = 0.002
 
@@ -55,11 +56,17 @@ def edges(p, se, sn):
     s = se[p.cell]*p.ahead[:,0]+sn[p.cell]*p.ahead[:,1]
     step = np.hypot(*np.diff(p.place_m, axis=0, prepend=p.place_m[:1]).T); step[~p.follows]=0
     dist = np.cumsum(step)
-    out=[]
-    dist_key = dist + run*1e6
-    j = np.searchsorted(dist_key, dist_key+EDGE_M)
+    key = dist + run*1e6
+    settle = SETTLE*EDGE_M
+    lo = np.searchsorted(key, key-settle); hi = np.searchsorted(key, key+settle, side='right')-1
+    # range of the slope around
+    settled = np.ones(len(p), bool)
+    bad = np.zeros(len(p)); bad[1:] = p.follows[1:]*(np.abs(np.diff(s))>SETTLED)
+    cb = np.cumsum(bad)
+    settled = cb[hi]==cb[lo]
+    j = np.searchsorted(key, key+EDGE_M)
     i = np.arange(len(p)); ok = (j < len(p)); i, j = i[ok], j[ok]
-    ok = (run[i]==run[j]) & (p.direction[i]==p.direction[j]) & np.isfinite(p.c_rr[i]) & np.isfinite(p.c_rr[j])
+    ok = (run[i]==run[j]) & np.isfinite(p.c_rr[i]) & np.isfinite(p.c_rr[j]) & settled[i] & settled[j]
     i, j = i[ok], j[ok]
     ds = s[j]-s[i]
     ok = np.abs(ds) > BEND
@@ -112,7 +119,7 @@ def solve(ledgers, use=("cells","crossings","heights","edges"), rounds=15, ramp_
             uniq,place=np.unique(pk,axis=0,return_inverse=True); place=place.ravel()
             first,count,(dc,dds,dst,cc),_=aggregate(np.stack([p.machine[i],place],1), p.c_rr[j]-p.c_rr[i], p.direction[i]*ds, steep, np.minimum(p.c_rr[i],p.c_rr[j]))
             ne=len(first); mm=p.machine[i][first]
-            sd=np.sqrt(2)*np.hypot(C_STD,C_REL*cc)*2.8*np.sqrt((1-SAME)/count+SAME)
+            sd=np.sqrt(2)*np.hypot(C_STD,C_REL*cc)*EDGE_REL*np.sqrt((1-SAME)/count+SAME)
             npl=len(uniq)
             A=sp.vstack([sparse(ne,P,(lay.scale(mm),dds),(np.full(ne,lay.ramp),dst)), sparse(npl,P)]).tocsr()
             B=sp.vstack([sparse(ne,npl,(place[first],np.ones(ne))), sparse(npl,npl,(np.arange(npl),np.ones(npl)))]).tocsr()
