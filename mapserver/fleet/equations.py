@@ -1,84 +1,105 @@
 """Equations of one source of evidence, and what they say of the machines once the ground in them is eliminated.
 
-An equation is `A x + B y = b` with a standard deviation: x the parameters of the machines, y what the source alone does
-not know of the ground. Sources share no y, so that what they say of x adds up:
+An equation is `A x + B y = b` with a standard deviation: x the parameters of the machines, y what this source alone
+does not know of the ground. Sources share no y, so that what they say of x adds up:
 
     information = A' W A - A' W B (B' W B)^-1 B' W A        (the Schur complement), and likewise its vector.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from protocol.arrays import Floats, Ints
+from protocol.arrays import Bools, Floats, Ints
 
-FAINT = 1e-9  # weight per unit of the diagonal: ground that nothing ties down stays at 0, and pulls on nothing
+HUBER = 1.5  # standard deviations beyond which an equation counts by its size, not by its square
+FAINT = 1e-9  # share of its own weight by which ground that nothing ties down is kept at 0: it pulls on nothing
+NO_GROUND: Floats = np.zeros(0)
+Column = tuple[Ints | int, Floats | float]  # of each row the column, and the value there
 
 
-@dataclass
+@dataclass(frozen=True)
 class Equations:
-    """n equations. A: (n, parameters), B: (n, unknowns of the ground), b and std: (n,). tuning: of robust weights.
+    """n equations. A: (n, parameters), B: (n, unknowns of the ground), b and std: (n,).
 
-    weights (n,): of the last round. y: the ground that fits best.
+    heavy (n,): those with the heavy tails of Cauchy, which a few far ones do not bend at all; the others have Huber's.
     """
 
     A: sp.csr_matrix
     B: sp.csr_matrix
     b: Floats
     std: Floats
-    y: Floats = field(default_factory=lambda: np.zeros(0))
+    heavy: Bools
+
+    def residuals(self, x: Floats, y: Floats) -> Floats:
+        """Residuals (n,) in standard deviations."""
+        out: Floats = (self.b - self.A @ x - self.B @ y) / self.std
+        return out
+
+    def weights(self, x: Floats, y: Floats) -> Floats:
+        """Weights (n,) of the next round of iteratively reweighted least squares."""
+        size = np.abs(self.residuals(x, y))
+        robust = np.where(self.heavy, 1 / (1 + size**2), np.minimum(1.0, HUBER / np.maximum(size, HUBER)))
+        out: Floats = robust / self.std**2
+        return out
 
 
 @dataclass(frozen=True)
 class Information:
-    """What a source says of the parameters: matrix (p, p), vector (p,) = matrix @ parameters."""
+    """What a source says of the parameters x: matrix (p, p), vector (p,) = matrix @ best x.
+
+    ground: the unknowns of its ground that fit best with any x.
+    """
 
     matrix: Floats
     vector: Floats
+    ground: Callable[[Floats], Floats]
 
 
-def sparse(rows: int, columns: int, *terms: tuple[Ints, Floats]) -> sp.csr_matrix:
-    """Matrix with one entry per row and term: (column of each row, value of each row)."""
+def equations(A: sp.csr_matrix, B: sp.csr_matrix | None, b: Floats, std: Floats) -> Equations:
+    """Equations with Huber's tails; B: None for no ground."""
+    return Equations(A, sp.csr_matrix((len(b), 0)) if B is None else B, b, std, np.zeros(len(b), np.bool_))
+
+
+def sparse(rows: int, columns: int, *terms: Column) -> sp.csr_matrix:
+    """Matrix with one entry per row and term."""
     row = np.tile(np.arange(rows), len(terms))
-    column = np.concatenate([np.zeros(0, np.int64), *(np.broadcast_to(c, rows) for c, _ in terms)])
-    value = np.concatenate([np.zeros(0), *(np.broadcast_to(v, rows) for _, v in terms)])
+    column = np.concatenate([np.zeros(0, np.int64), *(np.broadcast_to(term[0], rows) for term in terms)])
+    value = np.concatenate([np.zeros(0), *(np.broadcast_to(term[1], rows) for term in terms)])
     return sp.csr_matrix((value, (row, column)), shape=(rows, columns))
 
 
-def eliminate(equations: Equations, weights: Floats) -> tuple[Information, object]:
-    """Information of equations with weights (n,) in place of 1 / std^2; and what `ground` needs."""
-    A, B = equations.A, equations.B
-    WA = A.multiply(weights[:, None]).tocsr()
-    AA = (A.T @ WA).toarray()
-    Ab = A.T @ (weights * equations.b)
-    if not B.shape[1]:
-        return Information(AA, Ab), None
-    WB = B.multiply(weights[:, None]).tocsr()
-    BB = (B.T @ WB).tocsc()
-    BB = BB + sp.diags(FAINT * np.maximum(BB.diagonal(), 1.0))
-    solver = splu(BB.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
-    BA = (B.T @ WA).tocsr()
-    Bb = B.T @ (weights * equations.b)
-    X = solver.solve(BA.toarray())
-    y0 = solver.solve(Bb)
-    return Information(AA - BA.T @ X, Ab - BA.T @ y0), (y0, X)
+def stacked(*parts: Equations) -> Equations:
+    """Several with the same unknowns as one."""
+    A, B = (sp.vstack([getattr(part, name) for part in parts]).tocsr() for name in ("A", "B"))
+    b, std, heavy = (np.concatenate([getattr(part, name) for part in parts]) for name in ("b", "std", "heavy"))
+    return Equations(A, B, b, std, heavy)
 
 
-def ground(eliminated: object, x: Floats) -> Floats:
-    """The ground that fits best with these parameters."""
-    if eliminated is None:
-        return np.zeros(0)
-    y0, X = eliminated  # type: ignore[misc]
-    return y0 - X @ x
+def eliminate(eq: Equations, weights: Floats) -> Information:
+    """What equations with these weights (n,) say of the parameters."""
+    WA = sp.diags(weights) @ eq.A
+    AA, Ab = (eq.A.T @ WA).toarray(), WA.T @ eq.b
+    if not eq.B.shape[1]:
+        return Information(AA, Ab, lambda _: NO_GROUND)
+    BA, Bb = (eq.B.T @ WA).toarray(), eq.B.T @ (weights * eq.b)
+    BB = (eq.B.T @ (sp.diags(weights) @ eq.B)).tocsc()
+    solve = _solver(BB + sp.diags(FAINT * np.maximum(BB.diagonal(), 1.0)))
+    X, y = solve(BA), solve(Bb)
+    return Information(AA - BA.T @ X, Ab - BA.T @ y, lambda x: np.asarray(y - X @ x, np.float64))
 
 
-def residuals(equations: Equations, x: Floats) -> Floats:
-    """Residuals (n,) in standard deviations."""
-    out = equations.b - equations.A @ x
-    if equations.B.shape[1]:
-        out = out - equations.B @ equations.y
-    return out / equations.std
+def _solver(matrix: sp.csc_matrix) -> Callable[[Floats], Floats]:
+    """Solve with a sparse symmetric matrix, the right sides (n,) or (n, m)."""
+    if matrix.nnz == matrix.shape[0]:
+        diagonal = matrix.diagonal()
+        return lambda right: (right.T / diagonal).T
+    factors = splu(
+        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+    )
+    return lambda right: factors.solve(right)

@@ -13,7 +13,7 @@ from protocol.arrays import Table
 CELL_M = 2.0  # about one standard deviation of a position
 EPOCH_SLOTS = 30  # 300 s, the length of the map's time buckets
 EPOCH_NS = EPOCH_SLOTS * SLOT_NS
-EPOCHS = 96  # that are remembered: 8 h of driving
+EPOCHS = 48  # that are remembered: 4 h of driving; older corrections stay as they were decided
 _PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
 
 

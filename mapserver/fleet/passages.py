@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 MOST_SAMPLES = 4000  # of a stay: no machine drives so many in 10 s, and the sums of more have overflowed
 MAX_PAUSE_S = 15.0  # a longer one tears the sequence
 GAP_M = 1.5  # driven without samples between two stays: the slope in between is not known
-SECTORS = 8  # of headings
+GAP_BEND = 0.08  # change of the slope over a gap that makes the rise in it unsure
 
 
 @dataclass(frozen=True)
@@ -119,9 +120,11 @@ def _follows(time_s: Floats, direction: Floats) -> Bools:
     return out
 
 
-@dataclass(frozen=True)
-class Links:
-    """Rises (n,) from one cell to the next: measured; per_zero: by how much a zero raises it; gap: see GAP_M."""
+class Links(NamedTuple):
+    """Rises (n,) from one cell to the next: measured; per_zero_m: by how much a zero of 1 lowers it.
+
+    gap: whether a bend lies between, on which no samples were made.
+    """
 
     epoch: Ints
     start: Ints
@@ -133,22 +136,27 @@ class Links:
 
 
 def links(p: Passages) -> Links:
-    """Trapezoids of the slope between the middles of stays that follow each other."""
+    """Trapezoids of the slope between the middles of stays that follow each other.
+
+    The distance is that of the wheels; where samples are missing, that of the positions.
+    """
     j = np.flatnonzero(p.follows)
+    j = j[p.cell[j] != p.cell[j - 1]]
     i = j - 1
     apart_m = np.hypot(*(p.place_m[j] - p.place_m[i]).T)
     gap = apart_m - (p.driven_m[i] + p.driven_m[j]) / 2 > GAP_M
     by_speed_m = (p.speed_mps[i] + p.speed_mps[j]) / 2 * (p.time_s[j] - p.time_s[i])
-    length_m = np.where(gap, apart_m, by_speed_m)
+    signed_m = np.where(gap, apart_m, by_speed_m) * p.direction[j]
     slope = (p.along[i] + p.along[j]) / 2
-    signed_m = length_m * p.direction[j]
-    bend = gap & (np.abs(p.along[j] - p.along[i]) > 0.08)
-    moves = p.cell[i] != p.cell[j]
-    out = Links(p.epoch[j], p.cell[i], p.cell[j], signed_m * slope, signed_m, np.abs(slope), bend)
-    return Links(*(getattr(out, f.name)[moves] for f in fields(out)))
+    bend = gap & (np.abs(p.along[j] - p.along[i]) > GAP_BEND)
+    return Links(p.epoch[j], p.cell[i], p.cell[j], signed_m * slope, signed_m, np.abs(slope), bend)
 
 
-def grouped(keys: AnyArray) -> tuple[Ints, Ints, Ints]:
-    """Groups of equal rows of keys (n, k): the first of each, the group of every row, and how many each has."""
-    _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
-    return first, group.ravel(), count
+def grouped(*keys: AnyArray) -> tuple[Ints, Ints, Ints]:
+    """Groups of rows with equal keys, each (n,): the first of each group, the group of every row, and their counts."""
+    order = np.lexsort(keys[::-1])
+    begins = np.ones(len(order), np.bool_)
+    begins[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    group = np.empty(len(order), np.int64)
+    group[order] = np.cumsum(begins) - 1
+    return order[begins], group, np.bincount(group)

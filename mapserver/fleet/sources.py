@@ -1,0 +1,249 @@
+"""The sources of evidence: what stays of machines say of zero, scale and lateral zero, as equations.
+
+With the signs of `mapserver.fleet.correction`, parameters z of each epoch, k and a of each machine:
+
+- `same_ground`: c_rr of a cell is the same for all machines and in both directions.
+- `crossings`: so is its gradient, which machines measure in their own frames, each with its zeros.
+- `heights`: a closed tour rises by nothing; cells have heights, and links between them what was measured plus z.
+- `edges`: the ground does not know of the slope. Where the slope changes, c_rr must not, so that what it seems to
+  change by is k ds. All slopes of a site may differ from what is around them: ascents and descents tell that apart.
+- `known_ground`: the site states c_rr.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from mapserver.fleet.equations import Equations, equations, sparse, stacked
+from mapserver.fleet.passages import Links, Passages, grouped, links
+from protocol.arrays import AnyArray, Floats, Ints
+
+SAME_GROUND, CROSSINGS, HEIGHTS, EDGES, KNOWN_GROUND = "same_ground", "crossings", "heights", "edges", "known_ground"
+
+# Standard deviations of one stay: of c_rr, which grows with it; of the slope and of the rise of a link [m], which grow
+# with the slope. What a machine repeats where it passes again, by its place in the lane, is SAME of the variance.
+C_STD, C_SHARE = 0.004, 0.08
+SLOPE_STD, SLOPE_SHARE = 0.006, 0.3
+RISE_STD_M, RISE_SHARE_M = 0.02, 0.3
+GAP_STD_M = 0.5  # of a link across a bend on which samples are withheld
+SAME = 0.25
+LEAST_C_RR = 0.002  # of ground, for the share of drive force on it
+KNOWN_STD = 0.001  # of c_rr that the site states
+# An edge compares stays so far apart, with the bend of the slope in the middle: the estimate of c_rr follows a change
+# late, and is settled after SETTLE_M on either side.
+EDGE_M, SETTLE_M = 20.0, 7.0
+BEND = 0.1  # least change of the slope that is an edge
+STEP = 0.05  # from stay to stay, of a slope that is not settled
+# What one place steps by on its own, however often it is passed: a border of two soils lies near many ramps.
+PLACE_M, PLACE_STD = 15.0, 0.004
+SECTORS = 8  # of headings that are summed
+EDGE_SECTORS = 4
+
+
+class Layout(NamedTuple):
+    """Where parameters lie: z of all epochs, k and a of all machines, and last what slopes have in common."""
+
+    epochs: int
+    machines: int
+
+    @property
+    def size(self) -> int:
+        """Of all parameters."""
+        return self.epochs + 2 * self.machines + 1
+
+    @property
+    def zeros(self) -> slice:
+        """All z."""
+        return slice(0, self.epochs)
+
+    @property
+    def scales(self) -> slice:
+        """All k."""
+        return slice(self.epochs, self.epochs + self.machines)
+
+    @property
+    def lateral(self) -> slice:
+        """All a."""
+        return slice(self.epochs + self.machines, self.epochs + 2 * self.machines)
+
+    @property
+    def ramps(self) -> int:
+        """By how much c_rr grows with the slope, everywhere."""
+        return self.epochs + 2 * self.machines
+
+
+@dataclass(frozen=True)
+class GroundState:
+    """The ground as it is known so far, by cells: c_rr (n,), gradient (n, 2); NaN where nothing is."""
+
+    c_rr: Floats
+    gradient: Floats
+
+
+class Means(NamedTuple):
+    """Means over the stays of one epoch in one cell in one direction and sector (n,); std: of c_rr and of slopes."""
+
+    epoch: Ints
+    machine: Ints
+    cell: Ints
+    direction: Floats
+    ahead: Floats
+    c_rr: Floats
+    along: Floats
+    across: Floats
+    c_std: Floats
+    slope_std: Floats
+
+
+def first_ground(p: Passages, cells: int) -> GroundState:
+    """The ground by the mean of what was measured, before anything is solved."""
+    known = np.isfinite(p.c_rr)
+    with np.errstate(invalid="ignore"):
+        count = np.bincount(p.cell[known], minlength=cells)
+        c_rr = np.bincount(p.cell[known], p.c_rr[known], cells) / count
+        stays = np.bincount(p.cell, minlength=cells)
+        east, north = (np.bincount(p.cell, part, cells) / stays for part in gradients(p).T)
+    return GroundState(c_rr, np.stack([east, north], axis=1))
+
+
+def gradients(p: Passages) -> Floats:
+    """Gradients (n, 2) as measured, east and north."""
+    left = np.stack([-p.ahead[:, 1], p.ahead[:, 0]], axis=1)
+    out: Floats = p.along[:, None] * p.ahead + p.across[:, None] * left
+    return out
+
+
+def means(p: Passages) -> Means:
+    """Sum up stays: what a day holds is bounded by the ground, not by the number of passages."""
+    sector = np.floor(np.arctan2(p.ahead[:, 1], p.ahead[:, 0]) * (SECTORS / (2 * np.pi)) + 0.5).astype(np.int64) % SECTORS
+    first, group, count = grouped(p.epoch, p.cell, sector * 2 + (p.direction > 0))
+    known = np.isfinite(p.c_rr)
+    known_count = np.bincount(group[known], minlength=len(first))
+    with np.errstate(invalid="ignore"):
+        c_rr = np.bincount(group[known], p.c_rr[known], len(first)) / known_count
+    along, across, east, north = (mean(values, group, count) for values in (p.along, p.across, *p.ahead.T))
+    c_std = np.hypot(C_STD, C_SHARE * np.abs(c_rr)) * repeated(np.maximum(known_count, 1))
+    slope_std = np.hypot(SLOPE_STD, SLOPE_SHARE * np.hypot(along, across)) * repeated(count)
+    ahead = np.stack([east, north], axis=1)
+    where = p.epoch[first], p.machine[first], p.cell[first], p.direction[first]
+    return Means(*where, ahead, c_rr, along, across, c_std, slope_std)
+
+
+def mean(values: Floats, group: Ints, count: Ints) -> Floats:
+    """Mean of the values of each group."""
+    return np.asarray(np.bincount(group, values, len(count)) / count, np.float64)
+
+
+def repeated(count: AnyArray) -> Floats:
+    """Factor of a standard deviation after so many passages."""
+    return np.sqrt((1 - SAME) / count + SAME)
+
+
+def same_ground(m: Means, layout: Layout, ground: GroundState, known: Floats) -> Equations:
+    """c_i = c + d z + d k (d c + s), the share d c + s by the ground as it is known so far.
+
+    Taken from the same stay, its noise would explain itself by the scale. known (cells,): NaN where the site states no
+    c_rr; cells where it does are another source.
+    """
+    at = np.flatnonzero(np.isfinite(m.c_rr) & ~np.isfinite(known[m.cell]))
+    cells = len(known)
+    return equations(
+        _balance(m, at, layout, ground.c_rr[m.cell[at]], ground),
+        sparse(len(at), cells, (m.cell[at], 1.0)),
+        m.c_rr[at],
+        m.c_std[at],
+    )
+
+
+def known_ground(m: Means, layout: Layout, ground: GroundState, known: Floats) -> Equations:
+    """The same where c is known, but for an error that all cells of the same value share."""
+    at = np.flatnonzero(np.isfinite(m.c_rr) & np.isfinite(known[m.cell]))
+    c_rr = known[m.cell[at]]
+    values, which = np.unique(c_rr, return_inverse=True)
+    n = len(values)
+    measured = equations(_balance(m, at, layout, c_rr, ground), sparse(len(at), n, (which, 1.0)), m.c_rr[at] - c_rr, m.c_std[at])
+    stated = equations(sparse(n, layout.size), sparse(n, n, (np.arange(n), 1.0)), np.zeros(n), np.full(n, KNOWN_STD))
+    return stacked(measured, stated)
+
+
+def _balance(m: Means, at: Ints, layout: Layout, c_rr: Floats, ground: GroundState) -> sp.csr_matrix:
+    """Columns of z and k of balances on ground c_rr."""
+    d, slope = m.direction[at], (ground.gradient[m.cell[at]] * m.ahead[at]).sum(axis=1)
+    share = d * np.maximum(c_rr, LEAST_C_RR) + slope
+    return sparse(len(at), layout.size, (m.epoch[at], d), (layout.scales.start + m.machine[at], d * share))
+
+
+def crossings(m: Means, layout: Layout, cells: int) -> Equations:
+    """g h = along + z and g n = across - a, with the gradient g of the cell, h ahead and n to the left."""
+    n, (east, north) = len(m.cell), m.ahead.T
+    ahead = equations(
+        sparse(n, layout.size, (m.epoch, -1.0)),
+        sparse(n, 2 * cells, (m.cell, east), (cells + m.cell, north)),
+        m.along,
+        m.slope_std,
+    )
+    left = equations(
+        sparse(n, layout.size, (layout.lateral.start + m.machine, 1.0)),
+        sparse(n, 2 * cells, (m.cell, -north), (cells + m.cell, east)),
+        m.across,
+        m.slope_std,
+    )
+    return stacked(ahead, left)
+
+
+def heights(p: Passages, layout: Layout, cells: int) -> Equations:
+    """h_j - h_i = rise + z way, the way signed by the direction."""
+    all_links = links(p)
+    first, group, count = grouped(all_links.epoch, all_links.start * cells + all_links.end, all_links.gap)
+    rise, per_zero, slope = (mean(getattr(all_links, name), group, count) for name in ("rise_m", "per_zero_m", "slope"))
+    link = Links(*(values[first] for values in all_links))
+    n = len(first)
+    std = np.hypot(np.hypot(RISE_STD_M, RISE_SHARE_M * slope), GAP_STD_M * link.gap) * repeated(count)
+    ground = sparse(n, cells, (link.end, 1.0), (link.start, -1.0))
+    return equations(sparse(n, layout.size, (link.epoch, -per_zero)), ground, rise, std)
+
+
+def edges(p: Passages, layout: Layout, ground: GroundState) -> Equations:
+    """dc = d k ds + b d|s| + the place's own step, over bends of the slope; the places' steps are its ground."""
+    slope = (ground.gradient[p.cell] * p.ahead).sum(axis=1)
+    i, j = _across_bends(p, slope)
+    change, steeper = p.direction[i] * (slope[j] - slope[i]), np.abs(slope[j]) - np.abs(slope[i])
+    sector = np.floor(np.arctan2(p.ahead[i, 1], p.ahead[i, 0]) * (EDGE_SECTORS / (2 * np.pi)) + 0.5) % EDGE_SECTORS
+    square = np.floor((p.place_m[i] + p.place_m[j]) / 2 / PLACE_M)
+    _, place, passed = grouped(*square.T, sector, np.sign(change), p.direction[i])
+    first, group, count = grouped(p.machine[i], place)
+    c_rr = np.minimum(np.abs(p.c_rr[i]), np.abs(p.c_rr[j]))
+    std = np.sqrt(2) * np.hypot(C_STD, C_SHARE * mean(c_rr, group, count)) * repeated(count)
+    n, places = len(first), len(passed)
+    scale = layout.scales.start + p.machine[i][first]
+    measured = equations(
+        sparse(n, layout.size, (scale, mean(change, group, count)), (layout.ramps, mean(steeper, group, count))),
+        sparse(n, places, (place[first], 1.0)),
+        mean(p.c_rr[j] - p.c_rr[i], group, count),
+        std,
+    )
+    own = sparse(places, places, (np.arange(places), 1.0))
+    steps = equations(sparse(places, layout.size), own, np.zeros(places), np.full(places, PLACE_STD))
+    both = stacked(measured, steps)
+    both.heavy[n:] = True
+    return both
+
+
+def _across_bends(p: Passages, slope: Floats) -> tuple[Ints, Ints]:
+    """Stays i and j, EDGE_M apart, both on settled slopes, which differ."""
+    apart_m = np.hypot(*np.diff(p.place_m, axis=0, prepend=p.place_m[:1]).T)
+    run = np.cumsum(~p.follows)
+    driven_m = np.cumsum(np.where(p.follows, apart_m, 0.0)) + run * 1e6  # runs lie far apart
+    bends = np.cumsum(p.follows & (np.abs(np.diff(slope, prepend=slope[:1])) > STEP))
+    before = np.searchsorted(driven_m, driven_m - SETTLE_M)
+    after = np.searchsorted(driven_m, driven_m + SETTLE_M, side="right") - 1
+    usable = (bends[after] == bends[before]) & np.isfinite(p.c_rr)
+    j = np.searchsorted(driven_m, driven_m + EDGE_M)
+    i = np.flatnonzero(j < len(p))
+    j = j[i]
+    good = (run[i] == run[j]) & usable[i] & usable[j] & (np.abs(slope[j] - slope[i]) > BEND)
+    return i[good], j[good]
