@@ -28,6 +28,10 @@ _TURNS = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
 HEADING_TABLE: Ints = np.rint(_UNIT * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1)).astype(np.int64)
 UNIT_VECTORS: Floats = HEADING_TABLE / _UNIT  # exact: a power of two
 _PER_RAD = HEADINGS / (2 * np.pi)
+# Where a machine's scale is not known, its share of drive force times that error is the larger part of a sample's error
+# from this share on (data sheets: 0.0045 of zero, 0.045 of scale). To take the zero alone off there would exchange one
+# wrong value for another, so that samples on slopes stay as they are.
+LEVEL_SHARE, ANY_SHARE = 0.1, 10.0
 DIGITS = 5  # a correction is rounded to 1e-5 before it is used: it is a fact, not a solver's floats
 _C_LOW, _C_HIGH = LIMITS["c_rr"]
 _GRADE_LOW, _GRADE_HIGH = LIMITS["grade_e"]
@@ -39,7 +43,8 @@ class Correction:
 
     zero of the balance [-], which is also how much too low the slope ahead is; scale: k / (1 + k) of the drive force;
     across: how much too high the slope to the left is. All rounded to DIGITS. covariance (3, 3): of what is left, in
-    this order.
+    this order. most_share: c_rr of a sample with a larger share of drive force over weight stays as it was; see
+    LEVEL_SHARE.
     """
 
     machine: str
@@ -49,6 +54,7 @@ class Correction:
     scale: float
     across: float
     covariance: tuple[tuple[float, ...], ...]
+    most_share: float = ANY_SHARE
 
 
 def corrected(rows: Table, corrections: Sequence[Correction]) -> Table:
@@ -62,7 +68,7 @@ def corrected(rows: Table, corrections: Sequence[Correction]) -> Table:
     out = rows.copy()
     ordered = sorted(corrections, key=lambda correction: correction.from_ns)
     spans = np.array([(each.from_ns, each.to_ns) for each in ordered], np.int64)
-    values = np.array([(each.zero, each.scale, each.across) for each in ordered], np.float64)
+    values = np.array([(each.zero, each.scale, each.across, each.most_share) for each in ordered], np.float64)
     _correct(out, spans, values, UNIT_VECTORS)
     return out
 
@@ -75,7 +81,7 @@ def heading_index(heading_rad: float) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _correct(rows: Any, spans: Any, values: Any, units: Any) -> None:
-    """Correct rows in place. spans (k, 2) in order, values (k, 3): zero, scale, across; units: UNIT_VECTORS."""
+    """Correct rows in place. spans (k, 2) in order, values (k, 4): zero, scale, across, most_share; units: UNIT_VECTORS."""
     for i in range(len(rows)):
         row = rows[i]
         at = np.searchsorted(spans[:, 0], row.stamp_ns, side="right") - 1
@@ -90,7 +96,8 @@ def _correct(rows: Any, spans: Any, values: Any, units: Any) -> None:
             if not np.isnan(c_rr):
                 direction = 1.0 if row.speed_mps >= 0.0 else -1.0
                 share = direction * c_rr + (east * ahead_e + north * ahead_n)
-                c_rr = c_rr - direction * (zero + scale * share)
-                row.c_rr = np.float32(min(max(c_rr, _C_LOW), _C_HIGH))
+                if abs(share) <= values[at, 3]:
+                    c_rr = c_rr - direction * (zero + scale * share)
+                    row.c_rr = np.float32(min(max(c_rr, _C_LOW), _C_HIGH))
             row.grade_e = np.float32(min(max(east + (zero * ahead_e + across * ahead_n), _GRADE_LOW), _GRADE_HIGH))
             row.grade_n = np.float32(min(max(north + (zero * ahead_n - across * ahead_e), _GRADE_LOW), _GRADE_HIGH))

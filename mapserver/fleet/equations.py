@@ -41,12 +41,20 @@ class Equations:
         out: Floats = (self.b - self.A @ x - self.B @ y) / self.std
         return out
 
-    def weights(self, x: Floats, y: Floats) -> Floats:
-        """Weights (n,) of the next round of iteratively reweighted least squares."""
+    def weights(self, x: Floats, y: Floats | None) -> Floats:
+        """Weights (n,) of the next round of iteratively reweighted least squares; y: None before the first."""
+        if y is None:
+            return 1 / self.std**2
         size = np.abs(self.residuals(x, y))
         robust = np.where(self.heavy, 1 / (1 + size**2), np.minimum(1.0, HUBER / np.maximum(size, HUBER)))
         out: Floats = robust / self.std**2
         return out
+
+    def on(self, y: Floats) -> Equations:
+        """The same on ground that is known, without what lies elsewhere (NaN)."""
+        b = self.b - self.B @ y
+        known = np.flatnonzero(np.isfinite(b))
+        return Equations(self.A[known], self.B[known][:, :0], b[known], self.std[known], self.heavy[known])
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ a foot of a ramp the scale of one machine alone, so that a majority that is off 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 
 from mapserver.fleet import sources as src
-from mapserver.fleet.equations import Equations, Information, eliminate, equations, sparse
+from mapserver.fleet.equations import NO_GROUND, Equations, Information, eliminate, equations
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.passages import Epochs, Passages, passages
 from mapserver.fleet.sources import GroundState, Layout
@@ -78,7 +78,6 @@ class Estimate:
     steps: Floats
     edges: str = ""
     rounds: int = 0
-    unknowns: Mapping[str, Floats] = field(default_factory=dict)
 
     def covariance(self, *names: str) -> Floats:
         """Covariance (p, p) by the prior and these sources, by all without any."""
@@ -101,13 +100,23 @@ def estimate(pb: Problem) -> Estimate:
     return _rounds(pb, with_edges=False, reason=reason) if reason else result
 
 
+def against(pb: Problem, others: Problem, result: Estimate) -> Estimate:
+    """Solve a machine that has no say: against the ground of the others, which stays as it is."""
+    cells = len(pb.cells)
+    c_rr, gradient = np.full(cells, np.nan), np.full((cells, 2), np.nan)
+    _, own, theirs = np.intersect1d(pb.cells, others.cells, return_indices=True)
+    c_rr[own], gradient[own] = result.ground.c_rr[theirs], result.ground.gradient[theirs]
+    return _rounds(pb, with_edges=False, frozen=GroundState(c_rr, gradient))
+
+
 def inverse(information: Floats) -> Floats:
     """Covariance of an information matrix."""
     out: Floats = np.linalg.inv(information)
     return (out + out.T) / 2
 
 
-def _rounds(pb: Problem, *, with_edges: bool, reason: str = "") -> Estimate:
+def _rounds(pb: Problem, *, with_edges: bool, reason: str = "", frozen: GroundState | None = None) -> Estimate:
+    """Iterate until nothing moves any more. frozen: ground that is known from elsewhere."""
     layout, cells = pb.layout, len(pb.cells)
     means, ground = src.means(pb.passages), src.first_ground(pb.passages, cells)
     prior = prior_equations(pb)
@@ -117,30 +126,28 @@ def _rounds(pb: Problem, *, with_edges: bool, reason: str = "") -> Estimate:
     }
     if with_edges:
         fixed[src.EDGES] = src.edges(pb.passages, layout, ground)
-    x = np.zeros(layout.size)
-    unknowns: dict[str, Floats] = {}
-    weights: dict[str, Floats] = {}
-    prior_weights = 1 / prior.std**2
+    if frozen:
+        fixed[src.CROSSINGS] = fixed[src.CROSSINGS].on(frozen.gradient.T.ravel())
+        ground = _filled(frozen, ground)
+    x, unknowns = np.zeros(layout.size), dict[str, Floats]()
     for rounds in range(1, MOST_ROUNDS + 1):
+        same = src.same_ground(means, layout, ground, pb.known)
         system = fixed | {
-            src.SAME_GROUND: src.same_ground(means, layout, ground, pb.known),
+            src.SAME_GROUND: same.on(frozen.c_rr) if frozen else same,
             src.KNOWN_GROUND: src.known_ground(means, layout, ground, pb.known),
         }
-        if rounds > 1:
-            weights = {name: eq.weights(x, unknowns[name]) for name, eq in system.items()}
-            prior_weights = prior.weights(x, np.zeros(0))
-        information = {name: eliminate(eq, weights.get(name, 1 / eq.std**2)) for name, eq in system.items()}
-        own = eliminate(prior, prior_weights)
+        information = {name: eliminate(eq, eq.weights(x, unknowns.get(name))) for name, eq in system.items()}
+        own = eliminate(prior, prior.weights(x, NO_GROUND if rounds > 1 else None))
         matrix = own.matrix + sum(each.matrix for each in information.values())
         new = np.linalg.solve(matrix, own.vector + sum(each.vector for each in information.values()))
         moved, x = float(np.abs(new - x).max()), new
         unknowns = {name: each.ground(x) for name, each in information.items()}
-        ground = _ground(pb, unknowns, ground)
+        if not frozen:
+            ground = _ground(pb, unknowns, ground)
         if moved < SETTLED:
             break
-    steps = unknowns.get(src.EDGES, np.zeros(0))
-    sheet = eliminate(prior, 1 / prior.std**2)
-    return Estimate(x, information, sheet, ground, steps, reason, rounds, unknowns)
+    sheet = eliminate(prior, prior.weights(x, None))
+    return Estimate(x, information, sheet, ground, unknowns.get(src.EDGES, NO_GROUND), reason, rounds)
 
 
 def _ground(pb: Problem, unknowns: Mapping[str, Floats], before: GroundState) -> GroundState:
@@ -148,6 +155,13 @@ def _ground(pb: Problem, unknowns: Mapping[str, Floats], before: GroundState) ->
     c_rr = np.where(np.isfinite(pb.known), pb.known, unknowns[src.SAME_GROUND])
     gradient = unknowns[src.CROSSINGS].reshape(2, -1).T
     return GroundState(np.where(np.isfinite(before.c_rr), c_rr, np.nan), gradient)
+
+
+def _filled(first: GroundState, second: GroundState) -> GroundState:
+    """The first, and where it knows nothing the second."""
+    pairs = ((first.c_rr, second.c_rr), (first.gradient, second.gradient))
+    c_rr, gradient = (np.where(np.isfinite(one), one, other) for one, other in pairs)
+    return GroundState(c_rr, gradient)
 
 
 def prior_equations(pb: Problem) -> Equations:
