@@ -96,7 +96,7 @@ def _corrections(pb: Problem, result: Estimate, observed: Observed) -> list[Corr
                 from_ns=number * EPOCH_NS,
                 to_ns=LAST_NS if newest else (number + 1) * EPOCH_NS,
                 zero=round(zero, DIGITS),
-                scale=round(k / (1 + k), DIGITS),
+                scale=round(k / (1 + k), DIGITS) if observed.absolute[machine] or far else 0.0,
                 across=round(across, DIGITS),
                 covariance=_covariance(observed.covariance[np.ix_(at, at)]),
                 most_share=ANY_SHARE if observed.absolute[machine] or far else LEVEL_SHARE,
