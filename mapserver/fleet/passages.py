@@ -18,6 +18,7 @@ from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 MOST_SAMPLES = 4000  # of a stay: no machine drives so many in 10 s, and the sums of more have overflowed
 MAX_PAUSE_S = 15.0  # a longer one tears the sequence
 GAP_M = 1.5  # driven without samples between two stays: the slope in between is not known
+JUMP_M = 2.0  # of positions against the wheels' distance, beside half of it
 GAP_BEND = 0.08  # change of the slope over a gap that makes the rise in it unsure
 
 
@@ -121,7 +122,7 @@ def _follows(time_s: Floats, direction: Floats) -> Bools:
 
 
 class Links(NamedTuple):
-    """Rises (n,) from one cell to the next: measured; per_zero_m: by how much a zero of 1 lowers it.
+    """Rises (n,) from one cell to the next: measured; per_zero_m: by how much a zero of 1 makes that too low.
 
     gap: whether a bend lies between, on which no samples were made.
     """
@@ -146,10 +147,12 @@ def links(p: Passages) -> Links:
     apart_m = np.hypot(*(p.place_m[j] - p.place_m[i]).T)
     gap = apart_m - (p.driven_m[i] + p.driven_m[j]) / 2 > GAP_M
     by_speed_m = (p.speed_mps[i] + p.speed_mps[j]) / 2 * (p.time_s[j] - p.time_s[i])
+    drove = np.abs(apart_m - by_speed_m) < JUMP_M + by_speed_m / 2  # else the position jumped: nobody drove there
     signed_m = np.where(gap, apart_m, by_speed_m) * p.direction[j]
     slope = (p.along[i] + p.along[j]) / 2
     bend = gap & (np.abs(p.along[j] - p.along[i]) > GAP_BEND)
-    return Links(p.epoch[j], p.cell[i], p.cell[j], signed_m * slope, signed_m, np.abs(slope), bend)
+    columns = (p.epoch[j], p.cell[i], p.cell[j], signed_m * slope, signed_m, np.abs(slope), bend)
+    return Links(*(column[drove] for column in columns))
 
 
 def grouped(*keys: AnyArray) -> tuple[Ints, Ints, Ints]:

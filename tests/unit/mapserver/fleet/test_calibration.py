@@ -1,0 +1,309 @@
+"""What drives of known errors show of these errors, and what they must not show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from mapserver.fleet import stays as st
+from mapserver.fleet.calibration import Calibration, MachineState, calibrate
+from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, corrected
+from mapserver.fleet.ledger import EPOCH_NS
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior
+from protocol.arrays import Floats, Table
+from tests.unit.mapserver.fleet.drives import (
+    FOOT_M,
+    LOW,
+    OPEN,
+    RAMP,
+    RAMP_AGAIN,
+    START_NS,
+    TOP_M,
+    Errors,
+    Site,
+    drive,
+    height_slope,
+    ledgers,
+    shifted,
+    soils,
+)
+
+FLEET = {
+    "low": (LOW, Errors(0.004, -0.05, 0.002)),
+    "ramp": (RAMP, Errors(-0.006, 0.04, -0.003)),
+    "again": (RAMP_AGAIN, Errors(0.008, 0.03, 0.0)),
+}
+SEEDS = (0, 1, 2)
+
+
+def fleet(site: Site = soils, seed: int = 0, errors: Mapping[str, Errors] | None = None) -> dict[str, Table]:
+    """Samples of three machines that never reverse."""
+    known = errors or {}
+    return {
+        name: drive(route, known.get(name, own), site=site, seed=10 * seed + i)
+        for i, (name, (route, own)) in enumerate(FLEET.items())
+    }
+
+
+def solve(rows: Mapping[str, Table], excluded: tuple[str, ...] = (), **more: object) -> Calibration:
+    return calibrate(ledgers(rows), excluded, **more)  # type: ignore[arg-type]
+
+
+def check(state: MachineState, errors: Errors, zero: float = 0.0016, scale: float = 0.02) -> None:
+    assert state.zero == pytest.approx(errors.zero, abs=zero)
+    assert state.scale == pytest.approx(errors.scale, abs=scale)
+
+
+def on_ramp(x_m: Floats) -> Floats:
+    return (height_slope(x_m) > 0).astype(np.float64)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_fleet_that_never_reverses_knows_zeros_and_scales(seed: int) -> None:
+    result = solve(fleet(seed=seed))
+    for name in ("ramp", "again"):
+        check(result.machines[name], FLEET[name][1])
+        assert result.machines[name].scale_by == ("edges",)
+        assert "heights" in result.machines[name].zero_by
+        assert result.machines[name].across == pytest.approx(FLEET[name][1].across, abs=0.0025)
+    check(result.machines["low"], FLEET["low"][1], scale=0.04)
+    assert result.common.observed
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_is_stated_is_what_is_off(seed: int) -> None:
+    result = solve(fleet(seed=seed))
+    off = [(s.zero - FLEET[n][1].zero) / s.zero_std for n, s in result.machines.items()]
+    off += [(s.scale - FLEET[n][1].scale) / s.scale_std for n, s in result.machines.items()]
+    assert np.mean(np.square(off)) < 2.5
+
+
+def test_a_closed_tour_shows_the_zero_of_one_machine_alone() -> None:
+    state = solve({"low": drive(LOW, Errors(0.004))}).machines["low"]
+    assert state.zero == pytest.approx(0.004, abs=0.0015)
+    assert state.zero_std < ZERO_STD / 3
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize("zero", [0.006, -0.006])
+def test_the_zero_has_its_sign_ahead_and_in_reverse(direction: float, zero: float) -> None:
+    rows = drive(LOW, Errors(zero), direction=direction)
+    result = solve({"low": rows})
+    assert result.machines["low"].zero == pytest.approx(zero, abs=0.0015)
+    right = corrected(rows, result.corrections)
+    true = drive(LOW, Errors(), direction=direction)
+    usual = true["c_rr"] < 0.1  # on sand the scale counts too
+    assert abs(np.mean((right["c_rr"] - true["c_rr"])[usual])) < 0.0015
+    assert abs(np.mean((rows["c_rr"] - true["c_rr"])[usual])) > 0.005
+
+
+def test_a_track_that_nobody_closes_stays_at_the_data_sheet() -> None:
+    result = solve({"a": drive(OPEN, Errors(0.006, 0.05), seconds=200.0, closed=False)})
+    state = result.machines["a"]
+    assert (state.zero, state.scale, state.across) == pytest.approx((0, 0, 0), abs=1e-6)
+    assert (state.zero_by, state.scale_by) == ((), ())
+    assert state.zero_std == pytest.approx(ZERO_STD, rel=0.05)
+    assert state.scale_std == pytest.approx(SCALE_STD, rel=0.05)
+    assert not result.common.observed
+
+
+@pytest.mark.parametrize("names", [("low", "ramp"), tuple(FLEET)])
+def test_a_majority_that_is_off_by_the_same_is_put_right(names: tuple[str, ...]) -> None:
+    errors = {name: shifted(FLEET[name][1], 0.015) for name in names}
+    result = solve(fleet(errors=errors))
+    for name in FLEET:
+        check(result.machines[name], errors.get(name, FLEET[name][1]), zero=0.002, scale=0.05)
+
+
+def test_scales_that_are_all_off_by_the_same_are_seen() -> None:
+    errors = {name: Errors(scale=0.08) for name in FLEET}
+    result = solve(fleet(errors=errors))
+    for name in ("ramp", "again"):
+        check(result.machines[name], errors[name])
+
+
+def test_without_slopes_nothing_pulls_on_the_scale() -> None:
+    """Nor does a preference for small c_rr, or for smooth ground: on sand it would look like knowledge of the scale."""
+    rows = {"a": drive(LOW, Errors(scale=0.08)), "b": drive(LOW, Errors(scale=0.08), seed=1)}
+    result = solve(rows)
+    assert result.common.std == pytest.approx(SCALE_STD)
+    for state in result.machines.values():
+        assert state.scale == pytest.approx(0.0, abs=0.01)
+
+
+def test_noise_of_a_machine_is_not_explained_by_its_scale() -> None:
+    """The share of drive force is the common ground's: with the sample's own, noise would be a scale."""
+    rows = fleet()
+    draw = np.random.default_rng(5)
+    for table in rows.values():
+        blocks = np.repeat(draw.normal(0.0, 0.02, len(table) // 4 + 1), 4)[: len(table)]
+        table["c_rr"] += blocks
+    result = solve(rows)
+    for name in ("ramp", "again"):
+        assert result.machines[name].scale == pytest.approx(FLEET[name][1].scale, abs=0.035)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_gain_far_beyond_the_data_sheet_is_seen_and_spoils_no_other(seed: int) -> None:
+    errors = {"again": Errors(0.002, 0.6)}
+    rows = fleet(errors=errors, seed=seed)
+    result = solve(rows)
+    assert result.machines["again"].scale == pytest.approx(0.6, abs=0.04)
+    assert result.machines["again"].beyond[1] > 10
+    check(result.machines["ramp"], FLEET["ramp"][1], scale=0.025)
+    own = [each for each in result.corrections if each.machine == "again"]
+    assert own[0].scale == pytest.approx(0.6 / 1.6, abs=0.02)  # k / (1 + k): the measured share has the gain in it
+    right = corrected(rows["again"], own)
+    true = drive(RAMP_AGAIN, Errors(), seed=10 * seed + 2)
+    assert abs(np.median(right["c_rr"] - true["c_rr"])) < 0.003
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_edges_wait_until_the_estimate_has_followed(seed: int) -> None:
+    """Nearer to a bend the estimate of c_rr is still on its way, and the scale would seem smaller than it is."""
+    errors = {"ramp": Errors(scale=0.12), "again": Errors(scale=0.12)}
+    result = solve(fleet(errors=errors, seed=seed))
+    mean = np.mean([result.machines[name].scale for name in errors])
+    assert mean == pytest.approx(0.12, abs=0.012)
+
+
+def test_a_rise_across_withheld_samples_is_not_believed() -> None:
+    """Foot and top of a ramp are round: without samples there, trapezoids see other rises up than down."""
+    rows = drive(RAMP, Errors(), seed=4)
+    x = rows["x_m"]
+    up = rows["y_m"] < 25
+    rows = rows[~(up & ((np.abs(x - FOOT_M - 3) < 6) | (np.abs(x - TOP_M + 3) < 2.5)))]
+    state = solve({"ramp": rows}).machines["ramp"]
+    assert abs(state.zero) < 0.003
+    assert abs(state.zero) < 3 * state.zero_std
+
+
+def test_a_step_of_the_zero_is_followed_from_epoch_to_epoch() -> None:
+    errors = {"ramp": Errors(0.002, 0.04, step=0.015, step_s=300.0)}
+    result = solve(fleet(errors=errors))
+    own = [each for each in result.corrections if each.machine == "ramp"]
+    start = START_NS - START_NS % EPOCH_NS
+    early = [each.zero for each in own if each.to_ns <= start + EPOCH_NS]
+    late = [each.zero for each in own if each.from_ns >= START_NS + 300 * 10**9]
+    assert early[0] == pytest.approx(0.002, abs=0.003)
+    assert late[-1] == pytest.approx(0.017, abs=0.003)
+    check(result.machines["again"], FLEET["again"][1], zero=0.002, scale=0.025)
+
+
+@pytest.mark.parametrize("step", [-0.02, 0.01, 0.02])
+def test_ramps_of_other_ground_change_nothing_on_the_slope(step: float) -> None:
+    rows = fleet(lambda x, y, h: soils(x, y, h) + step * on_ramp(x))
+    result = solve(rows)
+    assert not result.common.observed
+    assert result.common.reason == "ground_changes_with_slope"
+    for name in ("ramp", "again"):
+        own = [each for each in result.corrections if each.machine == name]
+        assert {each.most_share for each in own} == {LEVEL_SHARE}
+        right = corrected(rows[name], own)
+        steep = np.hypot(rows[name]["grade_e"], rows[name]["grade_n"]) > 0.2
+        assert right["c_rr"][steep].tobytes() == rows[name]["c_rr"][steep].tobytes()
+        assert result.machines[name].zero == pytest.approx(FLEET[name][1].zero, abs=0.002)
+
+
+def test_lanes_that_disagree_leave_the_scale_at_the_data_sheet() -> None:
+    rows = fleet(lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x) * (y < 32.0))  # gravel up, none down
+    result = solve(rows)
+    assert not result.common.observed
+    for name in ("ramp", "again"):
+        assert result.machines[name].scale_by == ()
+        assert {each.scale for each in result.corrections if each.machine == name} == {0.0}
+
+
+def test_a_ramp_that_is_only_ever_climbed_shows_no_scale() -> None:
+    rows = drive(RAMP, Errors(scale=0.1))
+    climbed = rows[rows["y_m"] < 25.0]  # the rest is not sampled
+    result = solve({"a": climbed})
+    assert not result.common.observed
+    assert result.common.reason == "no_slope_both_ways"
+
+
+def test_one_ramp_driven_both_ways_in_one_lane_shows_the_scale_by_itself() -> None:
+    site: Site = lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x)  # noqa: E731
+    back = tuple(reversed(RAMP))
+    rows = {"a": drive(RAMP, Errors(0.002, 0.08), site=site), "b": drive(back, Errors(0.0, -0.03), site=site, seed=1)}
+    result = solve(rows)
+    assert result.machines["a"].scale == pytest.approx(0.08, abs=0.02)
+    assert result.machines["b"].scale == pytest.approx(-0.03, abs=0.02)
+    assert result.machines["a"].scale_by == ("same_ground",)
+    assert {each.most_share for each in result.corrections} == {ANY_SHARE}
+
+
+def test_a_machine_without_a_say_moves_nobody() -> None:
+    rows = fleet() | {"bad": drive(RAMP, Errors(0.02, 0.6), seed=99)}
+    rows["bad"]["y_m"] += 3.0
+    with_bad, without = solve(rows, ("bad",)), solve(fleet())
+    others = tuple(each for each in with_bad.corrections if each.machine != "bad")
+    assert others == without.corrections
+    assert with_bad.common == without.common
+    heard = solve(rows)
+    assert tuple(each for each in heard.corrections if each.machine != "bad") != without.corrections
+
+
+def test_a_machine_without_a_say_is_solved_against_the_ground_of_the_others() -> None:
+    rows = fleet() | {"bad": drive(RAMP, Errors(0.003, 0.6), seed=99)}
+    state = solve(rows, ("bad",)).machines["bad"]
+    check(state, Errors(0.003, 0.6), zero=0.003, scale=0.04)
+
+
+def test_rain_between_two_machines_is_not_their_error() -> None:
+    wet: Site = lambda x, y, h: soils(x, y, h) + 0.02  # noqa: E731
+    rows = {
+        "low": drive(LOW, FLEET["low"][1], seconds=900.0),
+        "ramp": drive(RAMP, FLEET["ramp"][1], site=wet, seed=1, start_s=900.0),
+        "again": drive(RAMP_AGAIN, FLEET["again"][1], site=wet, seed=2, start_s=900.0),
+    }
+    result = solve(rows)
+    for name in ("ramp", "again"):
+        check(result.machines[name], FLEET[name][1], zero=0.002, scale=0.03)
+    assert result.machines["low"].zero == pytest.approx(FLEET["low"][1].zero, abs=0.002)
+
+
+def test_known_ground_shows_the_zero_where_nothing_is_closed() -> None:
+    rows = drive(OPEN, Errors(0.006), seconds=200.0, closed=False)
+    cells = np.unique(st.cell(ledgers({"a": rows})["a"]["key"])).tolist()
+    result = solve({"a": rows}, known=dict.fromkeys(cells[: len(cells) // 2], 0.06))
+    assert result.machines["a"].zero == pytest.approx(0.006, abs=0.002)
+    assert result.machines["a"].zero_by == ("known_ground",)
+
+
+def test_a_machine_that_calibrates_itself_pins_the_others() -> None:
+    rows = {"a": drive(OPEN, Errors(0.0), seconds=200.0, closed=False)}
+    rows |= {"b": drive(OPEN, Errors(0.007), seconds=200.0, closed=False, seed=1)}
+    pinned = Prior(0.0, 0.0, ((0.0005**2, 0.0), (0.0, 0.005**2)))
+    result = solve(rows, priors={"a": pinned})
+    assert result.machines["a"].zero_by == ("calibrated",)
+    assert result.machines["b"].zero == pytest.approx(0.007, abs=0.0015)
+    assert "same_ground" in result.machines["b"].zero_by
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_any_order_of_samples_and_machines_gives_the_same_facts(seed: int) -> None:
+    rows = fleet()
+    draw = np.random.default_rng(seed)
+    mixed = {name: draw.permutation(rows[name]) for name in draw.permutation(list(rows)).tolist()}
+    assert solve(rows) == solve(mixed)
+
+
+def test_corrections_are_rounded_follow_each_other_and_the_newest_holds_on() -> None:
+    result = solve(fleet())
+    for name in FLEET:
+        own = [each for each in result.corrections if each.machine == name]
+        assert all(a.to_ns <= b.from_ns for a, b in zip(own, own[1:], strict=False))
+        assert own[-1].to_ns > START_NS + 10**18
+        assert all(value == round(value, 5) for each in own for value in (each.zero, each.scale, each.across))
+        assert all(np.linalg.eigvalsh(np.array(each.covariance)).min() > 0 for each in own)
+
+
+def test_nothing_is_solved_of_nothing() -> None:
+    assert calibrate({}).corrections == ()
+    assert solve({"a": drive(LOW, seconds=10.0)[:0]}).machines == {}
+    assert solve({"a": drive(LOW, seconds=10.0)}, ("a",)).corrections == ()
+    one = solve({"a": drive(LOW, seconds=10.0)[:1]})
+    assert one.machines["a"].zero == 0.0

@@ -1,0 +1,88 @@
+"""Ledgers depend on no order, remember the newest epochs, and keep what samples say."""
+
+import numpy as np
+import pytest
+
+from mapserver.fleet import stays as st
+from mapserver.fleet.ledger import EPOCH_NS, EPOCH_SLOTS, EPOCHS, Ledger
+from mapserver.fleet.passages import links, passages
+from protocol.arrays import Table
+from tests.unit.mapserver.data import random_samples
+from tests.unit.mapserver.fleet.drives import LOW, RAMP, SLOPE, Errors, drive
+
+
+def stays_of(parts: list[Table]) -> Table:
+    ledger = Ledger()
+    for part in parts:
+        ledger.add(part)
+    return ledger.stays()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_any_order_and_any_batching_give_the_same_bits(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = random_samples(20_000, seed)
+    rows["stamp_ns"] += rng.integers(0, 2 * EPOCHS, len(rows)) * EPOCH_NS
+    mixed = np.array_split(rng.permutation(rows), np.sort(rng.integers(0, len(rows), 60)))
+    assert stays_of([rows]).tobytes() == stays_of(mixed).tobytes()
+
+
+def test_only_the_newest_epochs_are_remembered() -> None:
+    rows = np.concatenate([drive(LOW, seconds=20.0, start_s=300.0 * i) for i in range(EPOCHS + 5)])
+    stays = stays_of([rows])
+    assert len(np.unique(st.slot(stays["key"]) // EPOCH_SLOTS)) == EPOCHS
+    newest = rows["stamp_ns"] // EPOCH_NS > rows["stamp_ns"].max() // EPOCH_NS - EPOCHS
+    assert stays.tobytes() == stays_of([rows[newest]]).tobytes()
+
+
+def test_samples_without_slope_or_distance_show_nothing() -> None:
+    rows = drive(LOW, seconds=10.0)
+    for name in ("grade_e", "grade_n", "grade_var"):
+        rows[name][::2] = np.nan
+    rows["distance_m"][1::2] = 0.0
+    assert len(stays_of([rows])) == 0
+
+
+def test_far_places_and_floods_of_samples_do_no_harm() -> None:
+    rows = drive(LOW, seconds=100.0)
+    far = rows.copy()
+    far["x_m"] = 1e9
+    flood = np.repeat(rows[:1], 5000)
+    p, _, _ = passages({"a": stays_of([rows, far, flood])})
+    assert np.isfinite(p.along).all()
+    assert len(p) == len(passages({"a": stays_of([rows])})[0]) - 1  # the stay of the flood
+
+
+def test_passages_measure_what_samples_say() -> None:
+    rows = drive(RAMP, Errors(), seconds=60.0, withheld=False, late=False)
+    p, epochs, _ = passages({"a": stays_of([rows])})
+    assert len(epochs.number) == 1
+    on_ramp = (p.place_m[:, 0] > 54) & (p.place_m[:, 0] < 70) & (p.place_m[:, 1] < 20)
+    assert on_ramp.sum() >= 7
+    assert p.along[on_ramp] == pytest.approx(SLOPE, abs=0.02)
+    assert p.c_rr[on_ramp] == pytest.approx(0.03, abs=0.02)
+    assert p.speed_mps == pytest.approx(4.0, abs=1e-3)
+    assert (np.diff(p.time_s) > 0).all()
+
+
+def test_a_stay_that_the_clock_cuts_in_two_is_one_passage() -> None:
+    rows = drive(LOW, seconds=300.0)
+    p, _, _ = passages({"a": stays_of([rows])})
+    assert (p.cell[1:] != p.cell[:-1]).all()
+
+
+def test_links_rise_by_the_slope_and_sum_up_to_the_height_of_the_ramp() -> None:
+    rows = drive(RAMP, Errors(), seconds=25.0, withheld=False)
+    p, _, _ = passages({"a": stays_of([rows])})
+    rise_m = links(p).rise_m.sum()
+    assert rise_m == pytest.approx(24 * SLOPE, abs=0.4)
+
+
+def test_nobody_drove_where_a_position_jumped() -> None:
+    rows = drive(LOW, seconds=60.0)
+    rows["x_m"][len(rows) // 2 :] += 30.0
+    p, _, _ = passages({"a": stays_of([rows])})
+    link = links(p)
+    apart = np.hypot(*np.diff(p.place_m, axis=0).T)
+    assert len(link.rise_m) == len(p) - 2
+    assert apart.max() > 20
