@@ -44,7 +44,7 @@ class MachineState:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a solve says: corrections of all machines, in the order of machines and stamps, states, and the common scale."""
+    """What a solve says: corrections in the order of stamps, states of all machines, and their common scale."""
 
     corrections: tuple[Correction, ...]
     machines: Mapping[str, MachineState]

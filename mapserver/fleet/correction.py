@@ -4,8 +4,8 @@ A sample of direction d (+1 ahead, -1 in reverse) on ground c with slope s ahead
 
     c_rr = c + d z + d k (d c + s),    slope ahead = s - z,    slope to the left = t + a
 
-and d c_rr + slope ahead is the drive force over weight as it was measured, (1 + k) (d c + s): in it the zero cancels. So
-with scale = k / (1 + k) nothing but the sample itself is needed to undo all three.
+and d c_rr + slope ahead is the drive force over weight as it was measured, (1 + k) (d c + s): in it the zero cancels.
+So with scale = k / (1 + k) nothing but the sample itself is needed to undo all three.
 
 Only + - * / and a table of headings: kernels and machines would differ in the last bit of a sine, and so would maps.
 """
@@ -81,7 +81,7 @@ def heading_index(heading_rad: float) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _correct(rows: Any, spans: Any, values: Any, units: Any) -> None:
-    """Correct rows in place. spans (k, 2) in order, values (k, 4): zero, scale, across, most_share; units: UNIT_VECTORS."""
+    """Correct rows in place. spans (k, 2) in order; values (k, 4): zero, scale, across, most_share."""
     for i in range(len(rows)):
         row = rows[i]
         at = np.searchsorted(spans[:, 0], row.stamp_ns, side="right") - 1

@@ -107,7 +107,5 @@ def _solver(matrix: sp.csc_matrix) -> Callable[[Floats], Floats]:
     if matrix.nnz == matrix.shape[0]:
         diagonal = matrix.diagonal()
         return lambda right: (right.T / diagonal).T
-    factors = splu(
-        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
-    )
+    factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
     return lambda right: factors.solve(right)

@@ -14,7 +14,7 @@ import numpy as np
 
 from mapserver.fleet import sources as src
 from mapserver.fleet.solver import SCALE_STD, Estimate, Problem, inverse
-from protocol.arrays import Bools, Floats
+from protocol.arrays import Bools, Floats, Ints
 
 OBSERVED = 0.25  # of the prior's variance: half its standard deviation
 WEAK = 0.01  # of the weight of data sheets: evidence has to do without
@@ -100,6 +100,7 @@ def _by(pb: Problem, result: Estimate) -> dict[str, dict[str, tuple[str, ...]]]:
     return out
 
 
-def _shown(variances: Mapping[str, Floats], before: Floats, at: Floats) -> Sequence[str]:
-    """Sources by which the variance of these parameters falls enough, on average."""
-    return [name for name, after in variances.items() if np.mean(after[at] / before[at]) < OBSERVED]
+def _shown(variances: Mapping[str, Floats], before: Floats, at: Ints) -> Sequence[str]:
+    """Sources by which the variance of these parameters falls enough, on average; what all share needs no other."""
+    names = [name for name, after in variances.items() if np.mean(after[at] / before[at]) < OBSERVED]
+    return [src.SAME_GROUND] if src.SAME_GROUND in names else names

@@ -27,8 +27,8 @@ class Passages:
     """Stays (n,) of all machines, one machine behind the other, in the order of their times.
 
     epoch: index of the machine's epoch, over all machines. machine, cell: indices. direction: +1, -1. c_rr: NaN where
-    none was known. along, across: slopes in the machine's frame as measured. ahead: unit vector (n, 2). place_m: (n, 2).
-    time_s. speed_mps. driven_m: that samples stand for. follows: whether it is the one after the stay before.
+    none was known. along, across: slopes ahead and to the left as measured. ahead: unit vector (n, 2). place_m: (n, 2)
+    in `map`. driven_m: that samples stand for. follows: whether it is the one after the stay before.
     """
 
     machine: Ints

@@ -29,8 +29,8 @@ ZERO_S = 2 * ZERO_STD**2 / ZERO_WALK**2  # a Gauss-Markov process with this walk
 RAMPS_STD = 0.07  # of c_rr per slope: of what all ramps of a site differ by, 0.02 at 15 degrees
 MOST_ROUNDS = 20
 SETTLED = 2e-6  # of all parameters: below what a correction is rounded to
-# Edges are believed where the ground itself does not change with the slope: not everywhere (so much c_rr per slope, 0.004
-# at 15 degrees; standard errors), and not in many places (so much c_rr in this share of them).
+# Edges are believed where the ground itself does not change with the slope: neither everywhere (by so much c_rr per
+# slope, 0.004 at 15 degrees, and so many standard deviations), nor in many places (by so much c_rr, in this share).
 RAMPS_LIMIT, RAMPS_SIGMAS = 0.015, 2.0
 STEP_LIMIT, STEPPED_SHARE = 0.008, 0.2
 
@@ -49,7 +49,7 @@ DATA_SHEET = Prior()
 
 @dataclass(frozen=True)
 class Problem:
-    """What is solved. names: of the machines, in order. cells: their numbers. known (cells,): stated c_rr, NaN: none."""
+    """What is solved. names: in order. cells: their numbers. known (cells,): c_rr that the site states, NaN: none."""
 
     names: tuple[str, ...]
     passages: Passages

@@ -119,7 +119,7 @@ def gradients(p: Passages) -> Floats:
 
 def means(p: Passages) -> Means:
     """Sum up stays: what a day holds is bounded by the ground, not by the number of passages."""
-    sector = np.floor(np.arctan2(p.ahead[:, 1], p.ahead[:, 0]) * (SECTORS / (2 * np.pi)) + 0.5).astype(np.int64) % SECTORS
+    sector = _sector(p.ahead, SECTORS)
     first, group, count = grouped(p.epoch, p.cell, sector * 2 + (p.direction > 0))
     known = np.isfinite(p.c_rr)
     known_count = np.bincount(group[known], minlength=len(first))
@@ -131,6 +131,12 @@ def means(p: Passages) -> Means:
     ahead = np.stack([east, north], axis=1)
     where = p.epoch[first], p.machine[first], p.cell[first], p.direction[first]
     return Means(*where, ahead, c_rr, along, across, c_std, slope_std)
+
+
+def _sector(ahead: Floats, sectors: int) -> Ints:
+    """Which sector of headings unit vectors (n, 2) lie in."""
+    turns = np.arctan2(ahead[:, 1], ahead[:, 0]) / (2 * np.pi)
+    return np.floor(turns * sectors + 0.5).astype(np.int64) % sectors
 
 
 def mean(values: Floats, group: Ints, count: Ints) -> Floats:
@@ -165,7 +171,9 @@ def known_ground(m: Means, layout: Layout, ground: GroundState, known: Floats) -
     c_rr = known[m.cell[at]]
     values, which = np.unique(c_rr, return_inverse=True)
     n = len(values)
-    measured = equations(_balance(m, at, layout, c_rr, ground), sparse(len(at), n, (which, 1.0)), m.c_rr[at] - c_rr, m.c_std[at])
+    measured = equations(
+        _balance(m, at, layout, c_rr, ground), sparse(len(at), n, (which, 1.0)), m.c_rr[at] - c_rr, m.c_std[at]
+    )
     stated = equations(sparse(n, layout.size), sparse(n, n, (np.arange(n), 1.0)), np.zeros(n), np.full(n, KNOWN_STD))
     return stacked(measured, stated)
 
@@ -178,7 +186,7 @@ def _balance(m: Means, at: Ints, layout: Layout, c_rr: Floats, ground: GroundSta
 
 
 def crossings(m: Means, layout: Layout, cells: int) -> Equations:
-    """g h = along + z and g n = across - a, with the gradient g of the cell, h ahead and n to the left."""
+    """The gradient g of a cell in the frame of a machine, h ahead and n to the left: g h = along + z, g n = across - a."""
     n, (east, north) = len(m.cell), m.ahead.T
     ahead = equations(
         sparse(n, layout.size, (m.epoch, -1.0)),
@@ -196,7 +204,7 @@ def crossings(m: Means, layout: Layout, cells: int) -> Equations:
 
 
 def heights(p: Passages, layout: Layout, cells: int) -> Equations:
-    """h_j - h_i = rise + z way, the way signed by the direction."""
+    """From cell to cell h_j - h_i = rise + z times the distance, which counts down in reverse."""
     all_links = links(p)
     first, group, count = grouped(all_links.epoch, all_links.start * cells + all_links.end, all_links.gap)
     rise, per_zero, slope = (mean(getattr(all_links, name), group, count) for name in ("rise_m", "per_zero_m", "slope"))
@@ -208,11 +216,11 @@ def heights(p: Passages, layout: Layout, cells: int) -> Equations:
 
 
 def edges(p: Passages, layout: Layout, ground: GroundState) -> Equations:
-    """dc = d k ds + b d|s| + the place's own step, over bends of the slope; the places' steps are its ground."""
+    """Over bends of the slope dc = d k ds + b d|s| + the step of the place itself, which is the ground here."""
     slope = (ground.gradient[p.cell] * p.ahead).sum(axis=1)
     i, j = _across_bends(p, slope)
     change, steeper = p.direction[i] * (slope[j] - slope[i]), np.abs(slope[j]) - np.abs(slope[i])
-    sector = np.floor(np.arctan2(p.ahead[i, 1], p.ahead[i, 0]) * (EDGE_SECTORS / (2 * np.pi)) + 0.5) % EDGE_SECTORS
+    sector = _sector(p.ahead[i], EDGE_SECTORS)
     square = np.floor((p.place_m[i] + p.place_m[j]) / 2 / PLACE_M)
     _, place, passed = grouped(*square.T, sector, np.sign(change), p.direction[i])
     first, group, count = grouped(p.machine[i], place)

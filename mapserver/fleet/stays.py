@@ -24,8 +24,8 @@ SLOT_SHIFT = 2 * _AXIS_BITS + 1
 _HEADING_SHIFT = 6  # of the table's integers: a stay of 16 000 samples fits
 HEADING_UNITS = 1 << (20 - _HEADING_SHIFT)
 
-# n samples, of which `known` have c_rr; sums: ms since the slot began, mm from the cell's corner, c_rr, gradient east and
-# north and c_rr in VALUE_UNITS, cosine and sine of the heading in HEADING_UNITS, speed in mm/s, distance driven in mm.
+# n samples, of which `known` have c_rr. Sums: ms since the slot began; mm from the cell's corner; c_rr, gradient east,
+# gradient north in VALUE_UNITS; cosine and sine of the heading in HEADING_UNITS; speed in mm/s; distance driven in mm.
 SUMS = ("n", "known", "time", "x", "y", "c_rr", "east", "north", "cosine", "sine", "speed", "distance")
 STAY = np.dtype([("key", "<i8"), *((name, "<i4") for name in SUMS)])
 

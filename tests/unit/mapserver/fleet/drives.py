@@ -47,7 +47,7 @@ def soils(x_m: Floats, y_m: Floats, _: Floats) -> Floats:
 
 def drive(
     corners: Sequence[tuple[float, float]],
-    errors: Errors = Errors(),  # noqa: B008
+    errors: Errors = Errors(),
     *,
     seconds: float = 600.0,
     site: Site = soils,
@@ -85,7 +85,11 @@ def drive(
     rows["stamp_ns"] = START_NS + np.rint((start_s + seconds_at) * 1e9).astype(np.int64)
     rows["x_m"], rows["y_m"] = (place + _slow(n, 0.4, draw)).T
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.25
-    rows["heading_rad"], rows["speed_mps"], rows["distance_m"] = np.remainder(heading, 2 * np.pi), direction * speed_mps, 0.5
+    rows["heading_rad"], rows["speed_mps"], rows["distance_m"] = (
+        np.remainder(heading, 2 * np.pi),
+        direction * speed_mps,
+        0.5,
+    )
     rows["c_rr"], rows["c_rr_var"] = (_late(balance) if late else balance) + direction * zero + wander, 1e-5
     measured = (slope - zero + _slow(n, 0.003, draw)[:, 0])[:, None] * ahead
     measured += (tilt + errors.across + _slow(n, 0.003, draw)[:, 0])[:, None] * left

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -54,6 +55,11 @@ def solve(rows: Mapping[str, Table], excluded: tuple[str, ...] = (), **more: obj
 def check(state: MachineState, errors: Errors, zero: float = 0.0016, scale: float = 0.02) -> None:
     assert state.zero == pytest.approx(errors.zero, abs=zero)
     assert state.scale == pytest.approx(errors.scale, abs=scale)
+
+
+def concrete(x_m: Floats, _: Floats, __: Floats) -> Floats:
+    """The same everywhere."""
+    return np.full(len(x_m), 0.008)
 
 
 def on_ramp(x_m: Floats) -> Floats:
@@ -266,16 +272,16 @@ def test_rain_between_two_machines_is_not_their_error() -> None:
 
 
 def test_known_ground_shows_the_zero_where_nothing_is_closed() -> None:
-    rows = drive(OPEN, Errors(0.006), seconds=200.0, closed=False)
+    rows = drive(OPEN, Errors(0.006), seconds=200.0, closed=False, site=concrete)
     cells = np.unique(st.cell(ledgers({"a": rows})["a"]["key"])).tolist()
-    result = solve({"a": rows}, known=dict.fromkeys(cells[: len(cells) // 2], 0.06))
+    result = solve({"a": rows}, known=dict.fromkeys(cells[: len(cells) // 2], 0.008))
     assert result.machines["a"].zero == pytest.approx(0.006, abs=0.002)
     assert result.machines["a"].zero_by == ("known_ground",)
 
 
 def test_a_machine_that_calibrates_itself_pins_the_others() -> None:
-    rows = {"a": drive(OPEN, Errors(0.0), seconds=200.0, closed=False)}
-    rows |= {"b": drive(OPEN, Errors(0.007), seconds=200.0, closed=False, seed=1)}
+    rows = {"a": drive(OPEN, Errors(0.0), seconds=200.0, closed=False, site=concrete)}
+    rows |= {"b": drive(OPEN, Errors(0.007), seconds=200.0, closed=False, site=concrete, seed=1)}
     pinned = Prior(0.0, 0.0, ((0.0005**2, 0.0), (0.0, 0.005**2)))
     result = solve(rows, priors={"a": pinned})
     assert result.machines["a"].zero_by == ("calibrated",)
@@ -295,7 +301,7 @@ def test_corrections_are_rounded_follow_each_other_and_the_newest_holds_on() -> 
     result = solve(fleet())
     for name in FLEET:
         own = [each for each in result.corrections if each.machine == name]
-        assert all(a.to_ns <= b.from_ns for a, b in zip(own, own[1:], strict=False))
+        assert all(a.to_ns <= b.from_ns for a, b in pairwise(own))
         assert own[-1].to_ns > START_NS + 10**18
         assert all(value == round(value, 5) for each in own for value in (each.zero, each.scale, each.across))
         assert all(np.linalg.eigvalsh(np.array(each.covariance)).min() > 0 for each in own)
