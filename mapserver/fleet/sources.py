@@ -186,7 +186,7 @@ def _balance(m: Means, at: Ints, layout: Layout, c_rr: Floats, ground: GroundSta
 
 
 def crossings(m: Means, layout: Layout, cells: int) -> Equations:
-    """The gradient g of a cell in the frame of a machine, h ahead and n to the left: g h = along + z, g n = across - a."""
+    """A gradient g in the frame of a machine, h ahead and n to the left: g h = along + z, g n = across - a."""
     n, (east, north) = len(m.cell), m.ahead.T
     ahead = equations(
         sparse(n, layout.size, (m.epoch, -1.0)),

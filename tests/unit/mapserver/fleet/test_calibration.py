@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapserver.fleet import stays as st
-from mapserver.fleet.calibration import Calibration, MachineState, calibrate
+from mapserver.fleet.calibration import SCALE_FLOOR, ZERO_FLOOR, Calibration, MachineState, calibrate
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, corrected
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior
@@ -103,6 +103,27 @@ def test_the_zero_has_its_sign_ahead_and_in_reverse(direction: float, zero: floa
     usual = true["c_rr"] < 0.1  # on sand the scale counts too
     assert abs(np.mean((right["c_rr"] - true["c_rr"])[usual])) < 0.0015
     assert abs(np.mean((rows["c_rr"] - true["c_rr"])[usual])) > 0.005
+
+
+def reversing(errors: Errors, site: Site) -> Table:
+    """Round, and then back in reverse."""
+    there = drive(RAMP, errors, seconds=300.0, site=site)
+    back = drive(tuple(reversed(RAMP)), errors, seconds=300.0, site=site, seed=1, direction=-1, start_s=300.0)
+    return np.concatenate([there, back])
+
+
+@pytest.mark.parametrize("errors", [Errors(0.006), Errors(-0.006)])
+def test_reversing_shows_the_zero_by_the_same_ground(errors: Errors) -> None:
+    state = solve({"a": reversing(errors, concrete)}).machines["a"]
+    assert state.zero_by == ("same_ground",)
+    assert state.zero == pytest.approx(errors.zero, abs=0.001)
+
+
+@pytest.mark.parametrize("scale", [0.1, -0.1])
+def test_reversing_on_a_slope_shows_the_scale_by_the_same_ground(scale: float) -> None:
+    state = solve({"a": reversing(Errors(0.003, scale), soils)}).machines["a"]
+    assert "same_ground" in state.scale_by
+    assert state.scale == pytest.approx(scale, abs=0.015)
 
 
 def test_a_track_that_nobody_closes_stays_at_the_data_sheet() -> None:
@@ -222,6 +243,17 @@ def test_lanes_that_disagree_leave_the_scale_at_the_data_sheet() -> None:
         assert {each.scale for each in result.corrections if each.machine == name} == {0.0}
 
 
+def test_many_places_that_step_on_their_own_leave_the_scale_at_the_data_sheet() -> None:
+    def borders(x_m: Floats, y_m: Floats, _: Floats) -> Floats:
+        """Borders of soils at the foot of two of three lanes, which have nothing to do with the slope."""
+        up, down = (y_m < 17.0) & (x_m > FOOT_M), (y_m > 32.0) & (x_m < FOOT_M)
+        return 0.03 + 0.02 * up + 0.02 * down
+
+    result = solve(fleet(borders))
+    assert result.common.reason == "places_disagree"
+    assert not result.common.observed
+
+
 def test_a_ramp_that_is_only_ever_climbed_shows_no_scale() -> None:
     rows = drive(RAMP, Errors(scale=0.1))
     climbed = rows[rows["y_m"] < 25.0]  # the rest is not sampled
@@ -304,6 +336,8 @@ def test_corrections_are_rounded_follow_each_other_and_the_newest_holds_on() -> 
         assert all(a.to_ns <= b.from_ns for a, b in pairwise(own))
         assert own[-1].to_ns > START_NS + 10**18
         assert all(value == round(value, 5) for each in own for value in (each.zero, each.scale, each.across))
+        assert all(each.covariance[0][0] >= ZERO_FLOOR**2 for each in own)
+        assert all(each.covariance[1][1] >= SCALE_FLOOR**2 for each in own)
         assert all(np.linalg.eigvalsh(np.array(each.covariance)).min() > 0 for each in own)
 
 

@@ -71,8 +71,9 @@ def test_a_stay_that_the_clock_cuts_in_two_is_one_passage() -> None:
     assert (p.cell[1:] != p.cell[:-1]).all()
 
 
-def test_links_rise_by_the_slope_and_sum_up_to_the_height_of_the_ramp() -> None:
-    rows = drive(RAMP, Errors(), seconds=25.0, withheld=False)
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_links_rise_by_the_slope_and_sum_up_to_the_height_of_the_ramp(direction: float) -> None:
+    rows = drive(RAMP, Errors(), seconds=25.0, withheld=False, direction=direction)
     p, _, _ = passages({"a": stays_of([rows])})
     rise_m = links(p).rise_m.sum()
     assert rise_m == pytest.approx(24 * SLOPE, abs=0.4)
@@ -86,3 +87,14 @@ def test_nobody_drove_where_a_position_jumped() -> None:
     apart = np.hypot(*np.diff(p.place_m, axis=0).T)
     assert len(link.rise_m) == len(p) - 2
     assert apart.max() > 20
+
+
+def test_over_withheld_samples_the_distance_is_that_of_the_positions() -> None:
+    rows = drive(RAMP, Errors(), seconds=25.0)  # up the ramp, with gaps at foot and top
+    rows["speed_mps"] *= 0.6  # as where a machine speeds up in between
+    p, _, _ = passages({"a": stays_of([rows])})
+    over = links(p)
+    assert over.gap.sum() == 2
+    apart = np.hypot(*np.diff(p.place_m, axis=0).T)
+    assert sorted(over.per_zero_m[over.gap]) == pytest.approx(sorted(apart)[-2:])
+    assert (over.per_zero_m[over.gap] > 4).all()
