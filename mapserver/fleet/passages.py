@@ -89,7 +89,7 @@ def _in_order(table: Table, machine: int, epoch: Ints) -> Passages:
     first = np.flatnonzero(begins)
     counted_s = np.add.reduceat(time_s * sums["n"][order], first) if len(first) else time_s
     sums = {name: np.add.reduceat(values[order], first) if len(first) else values for name, values in sums.items()}
-    n, cells, direction = sums["n"], cells[first], direction[first].astype(np.float64)
+    n, cells, ahead_or_back = sums["n"], cells[first], direction[first].astype(np.float64)
     time_s = counted_s / n
     ahead = np.stack([sums["cosine"], sums["sine"]], axis=1)
     ahead /= np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
@@ -101,7 +101,7 @@ def _in_order(table: Table, machine: int, epoch: Ints) -> Passages:
         machine=np.full(len(first), machine),
         epoch=epoch[order][first],
         cell=cells,
-        direction=direction,
+        direction=ahead_or_back,
         c_rr=c_rr,
         along=(gradient * ahead).sum(axis=1),
         across=gradient[:, 1] * ahead[:, 0] - gradient[:, 0] * ahead[:, 1],
@@ -110,7 +110,7 @@ def _in_order(table: Table, machine: int, epoch: Ints) -> Passages:
         time_s=time_s,
         speed_mps=sums["speed"] / (n * st.PLACE_UNITS),
         driven_m=sums["distance"] / st.PLACE_UNITS,
-        follows=_follows(time_s, direction),
+        follows=_follows(time_s, ahead_or_back),
     )
 
 

@@ -111,8 +111,8 @@ def against(pb: Problem, others: Problem, result: Estimate) -> Estimate:
 
 def inverse(information: Floats) -> Floats:
     """Covariance of an information matrix."""
-    out: Floats = np.linalg.inv(information)
-    return (out + out.T) / 2
+    out = np.linalg.inv(information)
+    return np.asarray((out + out.T) / 2, np.float64)
 
 
 def _rounds(pb: Problem, *, with_edges: bool, reason: str = "", frozen: GroundState | None = None) -> Estimate:
@@ -140,7 +140,7 @@ def _rounds(pb: Problem, *, with_edges: bool, reason: str = "", frozen: GroundSt
         own = eliminate(prior, prior.weights(x, NO_GROUND if rounds > 1 else None))
         matrix = own.matrix + sum(each.matrix for each in information.values())
         new = np.linalg.solve(matrix, own.vector + sum(each.vector for each in information.values()))
-        moved, x = float(np.abs(new - x).max()), new
+        moved, x = float(np.abs(new - x).max()), np.asarray(new, np.float64)
         unknowns = {name: each.ground(x) for name, each in information.items()}
         if not frozen:
             ground = _ground(pb, unknowns, ground)

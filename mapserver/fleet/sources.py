@@ -208,7 +208,7 @@ def heights(p: Passages, layout: Layout, cells: int) -> Equations:
     all_links = links(p)
     first, group, count = grouped(all_links.epoch, all_links.start * cells + all_links.end, all_links.gap)
     rise, per_zero, slope = (mean(getattr(all_links, name), group, count) for name in ("rise_m", "per_zero_m", "slope"))
-    link = Links(*(values[first] for values in all_links))
+    link = Links._make(values[first] for values in all_links)
     n = len(first)
     std = np.hypot(np.hypot(RISE_STD_M, RISE_SHARE_M * slope), GAP_STD_M * link.gap) * repeated(count)
     ground = sparse(n, cells, (link.end, 1.0), (link.start, -1.0))

@@ -123,7 +123,7 @@ def test_reversing_shows_the_zero_by_the_same_ground(errors: Errors) -> None:
 def test_reversing_on_a_slope_shows_the_scale_by_the_same_ground(scale: float) -> None:
     state = solve({"a": reversing(Errors(0.003, scale), soils)}).machines["a"]
     assert "same_ground" in state.scale_by
-    assert state.scale == pytest.approx(scale, abs=0.015)
+    check(state, Errors(0.003, scale), zero=0.001, scale=0.015)
 
 
 def test_a_track_that_nobody_closes_stays_at_the_data_sheet() -> None:
@@ -317,6 +317,10 @@ def test_a_machine_that_calibrates_itself_pins_the_others() -> None:
     pinned = Prior(0.0, 0.0, ((0.0005**2, 0.0), (0.0, 0.005**2)))
     result = solve(rows, priors={"a": pinned})
     assert result.machines["a"].zero_by == ("calibrated",)
+    sure = Prior(0.0, 0.0, ((1e-12, 0.0), (0.0, 1e-12)))  # no evidence makes a zero surer than the model
+    state = solve(rows, priors={"a": sure}).machines["a"]
+    assert (state.zero_std, state.scale_std) == pytest.approx((ZERO_FLOOR, SCALE_FLOOR), rel=0.05)
+    assert (ZERO_FLOOR, SCALE_FLOOR) == (0.0005, 0.005)
     assert result.machines["b"].zero == pytest.approx(0.007, abs=0.0015)
     assert "same_ground" in result.machines["b"].zero_by
 
