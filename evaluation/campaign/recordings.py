@@ -82,7 +82,7 @@ class PlannedDrive:
         """The scenario file of this drive."""
         setup = self.setup
         top = {"base": setup.scenario, "world": setup.world}
-        return f"{_toml(top)}\n\n[[fleet]]\n{_toml(vars(self.fleet))}\n"
+        return f"{toml_of(top)}\n\n[[fleet]]\n{toml_of(vars(self.fleet))}\n"
 
     @property
     def scenario(self) -> Scenario:
@@ -155,7 +155,7 @@ def digest(*texts: str) -> str:
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:10]
 
 
-def _toml(values: Mapping[str, Any]) -> str:
+def toml_of(values: Mapping[str, Any]) -> str:
     """Plain values as TOML keys; None is none."""
     return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items() if value is not None)
 

@@ -41,13 +41,16 @@ def add_options(parser: ArgumentParser) -> None:
     base = add_action(what, "base", "measure what a base station brings, also one that fails")
     merge = add_action(what, "merge", "compare this map merge with other methods")
     lag = add_action(what, "lag", "compare the maps of four loaders at work with and without the smoother's lag")
-    for action in (table, blackout, budget, ground, base, merge, lag):
+    fleet = add_action(
+        what, "fleet", "measure what calibration of machines by each other and by the ground gives the map"
+    )
+    for action in (table, blackout, budget, ground, base, merge, lag, fleet):
         action.add_argument("--seeds", type=count, default=12, help="number of seeds (default %(default)s)")
     physics.add_argument("--seeds", type=count, default=3, help="number of seeds (default %(default)s)")
-    for action in (physics, table, blackout, budget, ground, base, merge, lag):
+    for action in (physics, table, blackout, budget, ground, base, merge, lag, fleet):
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
-    for action in (table, blackout, budget, ground, base, merge, lag):
+    for action in (table, blackout, budget, ground, base, merge, lag, fleet):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
@@ -64,6 +67,7 @@ def add_options(parser: ArgumentParser) -> None:
         (ground, 600.0),
         (base, 1200.0),
         (lag, 900.0),
+        (fleet, 900.0),
     ):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
@@ -109,6 +113,7 @@ def run(arguments: Namespace) -> int:
         "base": _base,
         "merge": _merge,
         "lag": _lag,
+        "fleet": _fleet,
         "log": _log,
         "parity": _parity,
     }
@@ -198,6 +203,13 @@ def _lag(arguments: Namespace) -> Report:
 
     work = partial(lag.run, seeds=_seeds(arguments), seconds=arguments.seconds)
     return _experiment(arguments, "loaders work, their samples are smoothed and merged", work)
+
+
+def _fleet(arguments: Namespace) -> Report:
+    from evaluation.fleet import experiment
+
+    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    return _experiment(arguments, "machines drive, and are calibrated by the ground", work)
 
 
 def _experiment(

@@ -1,0 +1,116 @@
+"""Recordings of whole fleets, and the samples that each machine's agent makes of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from agents.estimation.ground import EstimationConfig
+from agents.pipeline import Pipeline, PipelineConfig
+from evaluation.campaign.experiment import Experiment, Task
+from evaluation.campaign.recordings import PlannedDrive, Setup, toml_of
+from evaluation.ground.lag import final_samples
+from evaluation.ground.truth import LoadTrack, read_load_track
+from protocol.arrays import Table
+from protocol.machine.log_folder import open_log
+from sim.recorder import TRACKS_FOLDER
+from sim.scenario.file import load_scenario
+from sim.truth import MAP_FILE, TruthMap
+
+SOURCES = ("agents", "protocol", "evaluation/fleet/drives.py", "evaluation/ground/lag.py")
+
+
+@dataclass(frozen=True)
+class FleetDrive(PlannedDrive):
+    """All machines of a scenario on one ground. count: of the machines of its first fleet, 0 as the scenario has it."""
+
+    count: int = 0
+
+    @property
+    def scenario_toml(self) -> str:
+        """The scenario file of this drive."""
+        top = {"base": self.setup.scenario, "world": self.setup.world}
+        if not self.count:
+            return f"{toml_of(top)}\n"
+        first = replace(load_scenario(self.setup.scenario).fleet[0], count=self.count)
+        return f"{toml_of(top)}\n\n[[fleet]]\n{toml_of(vars(first))}\n"
+
+    @property
+    def machines(self) -> int:
+        """How many drive."""
+        return self.count or sum(fleet.size for fleet in load_scenario(self.setup.scenario).fleet)
+
+
+def planned(scenario: str, seed: int, seconds: float, count: int = 0) -> FleetDrive:
+    """A drive of a scenario with the sensors that its file has."""
+    preset = load_scenario(scenario).fleet[0].preset
+    return FleetDrive(seed, seconds, preset, Setup(scenario, (), (), ()), count)
+
+
+@dataclass(frozen=True)
+class Agent:
+    """One machine of a drive, by its place among the names. calibrates: by its own work; first_s: of the recording."""
+
+    index: int
+    calibrates: bool = True
+    first_s: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Short and unique."""
+        return f"machine{self.index}" + "-plain" * (not self.calibrates) + f"-{self.first_s:g}s" * (self.first_s > 0)
+
+
+@dataclass(frozen=True)
+class AgentSamples:
+    """What an agent made of a recording."""
+
+    samples: Table
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is true of a drive: its ground, and the tracks of all machines by name."""
+
+    truth: TruthMap
+    tracks: Mapping[str, LoadTrack]
+
+
+@lru_cache(maxsize=4)  # the cases of a drive come one after the other
+def scene(drive: FleetDrive, cache: Path) -> Scene:
+    """The truth of a recorded drive."""
+    folder = drive.folder(cache)
+    tracks = {
+        logs.name: read_load_track(
+            folder / "truth" / TRACKS_FOLDER / f"{logs.name}.csv", open_log(logs).machine.load_centre_m
+        )
+        for logs in _logs(folder)
+    }
+    return Scene(TruthMap.load(folder / "truth" / MAP_FILE), tracks)
+
+
+def _logs(folder: Path) -> list[Path]:
+    """The log folders of all machines, by name."""
+    return sorted(path for path in (folder / "logs").iterdir() if path.is_dir())
+
+
+# --- in the worker processes -----------------------------------------------------------------------------------------
+
+
+def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
+    """Run one machine's pipeline."""
+    assert task.drive
+    log = open_log(_logs(task.drive.folder(cache))[task.variant.index])
+    readings = tuple(log.readings())
+    if task.variant.first_s:
+        end_ns = readings[0].stamp_ns + round(task.variant.first_s * 1e9)
+        readings = tuple(reading for reading in readings if reading.stamp_ns <= end_ns)
+    options = PipelineConfig(estimation=EstimationConfig(calibrate=task.variant.calibrates))
+    return AgentSamples(np.asarray(final_samples(Pipeline(log.site, log.machine, options), readings)))
+
+
+EXPERIMENT = Experiment("fleet", AgentSamples, SOURCES, _samples)
