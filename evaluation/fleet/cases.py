@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from evaluation.fleet.drives import Scene
-from mapserver.fleet.correction import UNIT_VECTORS
 from protocol.arrays import Bools, Floats, Floats32, Table
 
 Rows = Mapping[str, Table]  # samples by machine
@@ -21,10 +20,15 @@ DIRT = (0.03, 0.05)  # c_rr of the ground that rain makes heavier
 
 @dataclass(frozen=True)
 class Tampered:
-    """Samples as a case has them, and the true c_rr (rows, columns) of the cells at the end."""
+    """Samples as a case has them, and the true c_rr (rows, columns) of the cells at the end.
+
+    earlier: what it was for a machine that drove before it changed. passed_by: whose cells are judged, all by default.
+    """
 
     rows: Rows
     c_rr: Floats32
+    earlier: Mapping[str, Floats32] = field(default_factory=dict)
+    passed_by: tuple[str, ...] = ()
 
 
 Tamper = Callable[[Rows, Scene], Tampered]
@@ -91,7 +95,7 @@ def other_ramps(rows: Rows, scene: Scene, step: float) -> Tampered:
 
 
 def rain(rows: Rows, scene: Scene, step: float) -> Tampered:
-    """It rains on dirt at half time; two machines drive only before it, and one only after it."""
+    """It rains on dirt at half time; two machines drive only before it, and one only after it, whose cells count."""
     truth = scene.truth
     names = sorted(rows)
     stamps = rows[names[0]]["stamp_ns"]
@@ -102,7 +106,8 @@ def rain(rows: Rows, scene: Scene, step: float) -> Tampered:
     late = late[late["stamp_ns"] >= half_ns]
     row, column = cells(truth_places(late, scene, names[-1]), scene)
     out[names[-1]] = _with_ground(late, np.where(dirt[row, column], step, 0.0))
-    return Tampered(out, truth.c_rr)
+    wet = (truth.c_rr + np.where(dirt, step, 0.0)).astype(np.float32)
+    return Tampered(out, wet, dict.fromkeys(names[:-1], truth.c_rr), (names[-1],))
 
 
 TAMPERS: dict[str, Callable[[Rows, Scene, float], Tampered]] = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -156,9 +157,9 @@ def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
     by_truth = {name: [_as_correction(name, error) for error in errors[name]] for name in shown}
     own = {name: [each for each in result.corrections if each.machine == name] for name in shown}
     maps = {
-        "before": judged({name: data.rows[name] for name in shown}, data.c_rr, true),
-        "after": judged({name: corrected(data.rows[name], own[name]) for name in shown}, data.c_rr, true),
-        "oracle": judged({name: corrected(data.rows[name], by_truth[name]) for name in shown}, data.c_rr, true),
+        "before": judged({name: data.rows[name] for name in shown}, data, true),
+        "after": judged({name: corrected(data.rows[name], own[name]) for name in shown}, data, true),
+        "oracle": judged({name: corrected(data.rows[name], by_truth[name]) for name in shown}, data, true),
     }
     off = [_off(data.rows[name], own[name], error) for name in shown for error in errors[name]]
     zeros, scales, zero_std, scale_std = np.array(off).T
@@ -176,9 +177,9 @@ def calibrated(rows: Rows, excluded: set[str]) -> Calibration:
     return calibrate(stays, excluded)
 
 
-def judged(rows: Rows, c_rr: Floats32, true: Scene) -> Row:
-    """FIGURES of the server's map of these samples, over the cells that these machines truly passed."""
-    truth, config = true.truth, ServerConfig()
+def judged(rows: Rows, data: Tampered, true: Scene) -> Row:
+    """FIGURES of the server's map of these samples, over the cells that the machines truly passed."""
+    truth, config, c_rr = true.truth, ServerConfig(), data.c_rr
     lines, columns = c_rr.shape
     window = CellWindow(round(truth.west_m / truth.cell_m), round(truth.south_m / truth.cell_m), columns, lines)
     grid = Grid(truth.cell_m, config.fold)
@@ -186,7 +187,9 @@ def judged(rows: Rows, c_rr: Floats32, true: Scene) -> Row:
         grid.fold(table, name)
     layers = read_cells(view_of(grid, window, config), window, ("resistance",), truth.cell_m, config)
     estimated, classes = resistance_class(layers["resistance"]), resistance_class(c_rr)
-    passed = driven_cells(_region(true), [true.tracks[name].place_m for name in rows]) & (classes != UNKNOWN)
+    passed = driven_cells(_region(true), [true.tracks[name].place_m for name in data.passed_by or rows]) & (
+        classes != UNKNOWN
+    )
     inner = passed & (border_distance(classes, truth.cell_m) > INTERIOR_M)
     steep = passed & (slope_class(truth.grade_east, truth.grade_north) == SLOPE)
 
@@ -219,9 +222,9 @@ def true_errors(data: Tampered, name: str, true: Scene, spans: int) -> list[True
     oldest, newest = int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max())
     ends = [0, *((oldest * (spans - i) + newest * i) // spans for i in range(1, spans)), EVER_NS]
     out = []
-    for from_ns, to_ns in zip(ends[:-1], ends[1:], strict=True):
+    for from_ns, to_ns in pairwise(ends):
         part = rows[(rows["stamp_ns"] >= from_ns) & (rows["stamp_ns"] < to_ns)]
-        out.append(TrueError(from_ns, to_ns, *_fit(part, data.c_rr, name, true)))
+        out.append(TrueError(from_ns, to_ns, *_fit(part, data.earlier.get(name, data.c_rr), name, true)))
     return out
 
 
