@@ -1,0 +1,144 @@
+"""Cases of fleet calibration: what is tampered with, what the truth shows of it, and how rows are made."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.fleet import experiment
+from evaluation.fleet.cases import CASES, RAMP_STEPS, FleetCase, tampered
+from evaluation.fleet.drives import Scene, planned
+from evaluation.fleet.experiment import CaseResult, calibrated, judged, solved, summarise, true_errors
+from evaluation.ground.truth import LoadTrack
+from protocol.arrays import Table
+from sim.truth import TruthMap
+from sitegrid import cli
+from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive, height_slope, soils
+
+ROUTES = {"a": (LOW, Errors(0.004, -0.05)), "b": (RAMP, Errors(-0.006, 0.04)), "c": (RAMP_AGAIN, Errors(0.008, 0.03))}
+
+
+def truth() -> TruthMap:
+    x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(60) + 0.5)
+    layers = soils(x, y, x), height_slope(x), np.zeros_like(x)
+    return TruthMap(0.0, 0.0, *(layer.astype(np.float32) for layer in layers))
+
+
+def track(rows: Table) -> LoadTrack:
+    """As if the samples were where the machine was; headings of the drive, slopes of the ground."""
+    place = np.stack([rows["x_m"], rows["y_m"]], axis=1)
+    gradient = np.stack([height_slope(rows["x_m"]), np.zeros(len(rows))], axis=1)
+    driven = np.cumsum(rows["distance_m"].astype(np.float64))
+    return LoadTrack(rows["stamp_ns"], place, np.unwrap(rows["heading_rad"].astype(np.float64)), gradient, driven)
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[dict[str, Table], Scene]:
+    rows = {name: drive(route, errors, seed=i, late=False) for i, (name, (route, errors)) in enumerate(ROUTES.items())}
+    return rows, Scene(truth(), {name: track(table) for name, table in rows.items()})
+
+
+def case(name: str) -> FleetCase:
+    return next(each for each in CASES if each.name == name)
+
+
+def test_truth_shows_the_errors_of_a_machine(scene) -> None:
+    rows, true = scene
+    data = tampered(case("machines_3"), rows, true)
+    for name, (_, errors) in ROUTES.items():
+        (fitted,) = true_errors(data, name, true, 1)
+        assert fitted.zero == pytest.approx(errors.zero, abs=0.001), name
+        assert fitted.scale == pytest.approx(errors.scale, abs=0.02), name
+        assert fitted.across == pytest.approx(errors.across, abs=0.003), name
+
+
+def test_after_is_better_than_before_and_near_the_oracle(scene) -> None:
+    result = solved(case("machines_3"), *scene)
+    wrong = {name: row["wrong_pct"] for name, row in result.maps.items()}
+    assert wrong["oracle"] <= wrong["after"] + 1.0
+    assert wrong["after"] < wrong["before"] / 2
+    assert result.common == (True, "")
+    assert np.abs(result.zeros).max() < 0.002
+    assert np.abs(result.scales).max() < 0.04
+
+
+@pytest.mark.parametrize("name", ["gain_1.6", "majority_off", "step_at_half"])
+def test_faults_that_a_case_adds_are_those_that_the_truth_shows(scene, name: str) -> None:
+    rows, true = scene
+    chosen, plain = case(name), case("machines_3")
+    wrong, right = tampered(chosen, rows, true), tampered(plain, rows, true)
+    before = true_errors(right, "b", true, chosen.spans)
+    after = true_errors(wrong, "b", true, chosen.spans)
+    if name == "gain_1.6":
+        assert 1 + after[0].scale == pytest.approx(1.6 * (1 + before[0].scale), abs=0.02)
+    else:
+        assert after[-1].zero - before[-1].zero == pytest.approx(0.015, abs=0.0005)
+        assert (after[0].zero - before[0].zero == pytest.approx(0.0, abs=0.0005)) == (name == "step_at_half")
+
+
+@pytest.mark.parametrize("step", RAMP_STEPS)
+def test_ramps_of_other_ground_leave_the_slope_alone(scene, step: float) -> None:
+    rows, true = scene
+    chosen = case(f"ramp_of_other_ground_{step:+g}")
+    data = tampered(chosen, rows, true)
+    assert np.unique(np.round(data.c_rr - true.truth.c_rr, 4)).tolist() == sorted([0.0, step])
+    result = solved(chosen, *scene)
+    if abs(step) > 0.005:
+        assert result.common == (False, "ground_changes_with_slope")
+        assert result.maps["after"]["slope_pct"] <= result.maps["before"]["slope_pct"] + 1.0
+
+
+def test_it_rains_for_the_machine_that_drives_late(scene) -> None:
+    rows, true = scene
+    data = tampered(case("rain"), rows, true)
+    assert data.passed_by == ("c",)
+    assert max(data.rows[name]["stamp_ns"].max() for name in "ab") < data.rows["c"]["stamp_ns"].min() + 10**9
+    wet = data.c_rr > true.truth.c_rr
+    assert 0 < wet.mean() < 1
+    (late,) = true_errors(data, "c", true, 1)
+    assert late.zero == pytest.approx(ROUTES["c"][1].zero, abs=0.003)
+
+
+def test_a_map_of_right_samples_is_right(scene) -> None:
+    rows = {name: drive(route, seed=i, late=False) for i, (name, (route, _)) in enumerate(ROUTES.items())}
+    true = Scene(truth(), {name: track(table) for name, table in rows.items()})
+    figures = judged(rows, tampered(case("machines_3"), rows, true), true)
+    assert figures["interior_pct"] < 2.0
+    assert calibrated(rows, {"a"}).machines["a"].zero == pytest.approx(0.0, abs=0.003)
+
+
+def test_rows_are_means_over_the_seeds() -> None:
+    maps = {name: {"wrong_pct": 2.0, "interior_pct": 1.0, "slope_pct": np.nan} for name in experiment.MAPS}
+    one = CaseResult(maps, np.array([0.001]), np.array([0.02]), np.array([1.0, 2.0]), (True, ""))
+    other = CaseResult(
+        {**maps, "after": {**maps["after"], "wrong_pct": 4.0}},
+        np.array([-0.001]),
+        np.array([0.0]),
+        np.array([0.0, 0.0]),
+        (False, "no_slope_both_ways"),
+    )
+    after, before = (summarise(case("machines_2"), name, [one, other]) for name in ("after", "before"))
+    assert (after["wrong_pct"], after["wrong_by_seed_pct"], after["max_wrong_pct"]) == (3.0, [2.0, 4.0], 4.0)
+    assert (after["rms_zero"], after["rms_scale"], after["normalised"]) == (0.001, 0.0141, 1.25)
+    assert (after["common_scale_observed"], after["reasons"]) == (1, ["no_slope_both_ways"])
+    assert before["wrong_pct"] == 2.0
+    assert np.isnan(before["rms_zero"])
+
+
+def test_cases_share_the_recordings_of_the_papers_site() -> None:
+    drive_of = planned("paper_site", 3, 900.0, 4)
+    assert drive_of.machines == 4
+    assert "count = 4" in drive_of.scenario_toml
+    assert planned("haul_road", 3, 900.0).machines == 5
+
+
+def test_command_prints_rows(monkeypatch, capsys, tmp_path: Path) -> None:
+    asked: list[dict] = []
+    monkeypatch.setattr(experiment, "run", lambda runner, **options: (asked.append(options), ({"rows": []}, {}))[1])
+    words = ["eval", "fleet", "--seeds", "2", "--first-seed", "3", "--seconds", "60", "--out", str(tmp_path), "--json"]
+    assert cli.main(words) == 0
+    assert asked == [{"seeds": range(3, 5), "seconds": 60.0}]
+    assert json.loads(capsys.readouterr().out) == {"rows": []}
