@@ -42,7 +42,7 @@ def height_slope(x_m: Floats) -> Floats:
 
 def soils(x_m: Floats, y_m: Floats, _: Floats) -> Floats:
     """Dirt, with sand in the south-west and gravel in the north-east."""
-    return np.where(y_m > 32.0, 0.06, np.where(x_m < 16.0, 0.25, 0.03))
+    return np.where(y_m > 32.0, 0.06, np.where(x_m < 16.0, 0.25, 0.04))
 
 
 def drive(
