@@ -6,7 +6,7 @@ gain may then be let in again.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.observability import CommonScale, Observed, observe
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, against, estimate, problem
 from protocol.arrays import Floats, Table
+from protocol.site.site_config import KnownGround
 
 # Errors of the model: no evidence makes a zero or a scale surer than this.
 ZERO_FLOOR, SCALE_FLOOR = 0.0005, 0.005
@@ -54,26 +55,26 @@ class Calibration:
 def calibrate(
     ledgers: Mapping[str, Table],
     excluded: Collection[str] = (),
-    known: Mapping[int, float] | None = None,
+    areas: Sequence[KnownGround] = (),
     priors: Mapping[str, Prior] | None = None,
 ) -> Calibration:
     """Solve for all machines.
 
-    ledgers: stays by machine, as `Ledger.stays` has them. excluded: machines without a say. known: c_rr by number of
-    cell, where the site states it. priors: of machines of which more is known than their data sheet.
+    ledgers: stays by machine, as `Ledger.stays` has them. excluded: machines without a say. areas: whose
+    c_rr the site states. priors: of machines of which more is known than their data sheet.
     """
-    known, priors = known or {}, priors or {}
+    priors = priors or {}
     trusted = {name: table for name, table in ledgers.items() if name not in excluded and len(table)}
     if not trusted:
         return Calibration((), {}, CommonScale(False, SCALE_STD, "no_machine"))
-    pb = problem(trusted, known, priors)
+    pb = problem(trusted, areas, priors)
     result = estimate(pb)
     observed = observe(pb, result)
     corrections, states = _corrections(pb, result, observed), _states(pb, observed)
     for name in sorted(set(excluded) & set(ledgers)):
         if not len(ledgers[name]):
             continue
-        own = problem({name: ledgers[name]}, known, priors)
+        own = problem({name: ledgers[name]}, areas, priors)
         alone = against(own, pb, result)
         shown = observe(own, alone)
         corrections, states = corrections + _corrections(own, alone, shown), states | _states(own, shown)

@@ -8,18 +8,20 @@ a foot of a ramp the scale of one machine alone, so that a majority that is off 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 
 from mapserver.fleet import sources as src
+from mapserver.fleet import stays
 from mapserver.fleet.equations import NO_GROUND, Equations, Information, eliminate, equations
-from mapserver.fleet.ledger import EPOCH_NS
+from mapserver.fleet.ledger import CELL_M, EPOCH_NS
 from mapserver.fleet.passages import Epochs, Passages, passages
 from mapserver.fleet.sources import GroundState, Layout
 from protocol.arrays import Floats, Ints, Table
+from protocol.site.site_config import KnownGround
 
 # Standard deviations by data sheets: of the zero, as a share of gravity, ahead and to the left, and of the scale of the
 # drive force over weight. ZERO_WALK: of the zero [1/sqrt(s)]. The agents' own calibration begins with the same.
@@ -27,6 +29,7 @@ ZERO_STD, SCALE_STD = 0.0045, 0.045
 ZERO_WALK = 8e-5
 ZERO_S = 2 * ZERO_STD**2 / ZERO_WALK**2  # a Gauss-Markov process with this walk stays within the data sheet
 RAMPS_STD = 0.07  # of c_rr per slope: of what all ramps of a site differ by, 0.02 at 15 degrees
+INSIDE_M = 6.0  # of a cell's centre in an area of known ground: two standard deviations of a position, and 3 m
 MOST_ROUNDS = 20
 SETTLED = 2e-6  # of all parameters: below what a correction is rounded to
 # Edges are believed where the ground itself does not change with the slope: neither everywhere (by so much c_rr per
@@ -85,12 +88,25 @@ class Estimate:
         return inverse(self.prior.matrix + sum(self.information[name].matrix for name in chosen))
 
 
-def problem(ledgers: Mapping[str, Table], known: Mapping[int, float], priors: Mapping[str, Prior]) -> Problem:
-    """Stays by machine as `Ledger.stays` has them; known: c_rr by number of cell; priors: where not the data sheet."""
+def problem(ledgers: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]) -> Problem:
+    """Stays by machine as `Ledger.stays` has them; areas: whose c_rr the site states; priors: where not the data sheet."""
     names = tuple(sorted(name for name, table in ledgers.items() if len(table)))
     p, epochs, cells = passages({name: ledgers[name] for name in names})
-    stated = np.array([known.get(number, np.nan) for number in cells.tolist()], np.float64)
-    return Problem(names, p, epochs, cells, stated, tuple(priors.get(name, DATA_SHEET) for name in names))
+    return Problem(
+        names, p, epochs, cells, known_cells(cells, areas), tuple(priors.get(name, DATA_SHEET) for name in names)
+    )
+
+
+def known_cells(cells: Ints, areas: Sequence[KnownGround]) -> Floats:
+    """The c_rr (n,) that the site states of cells (n,) well inside of its areas; NaN elsewhere."""
+    out = np.full(len(cells), np.nan)
+    centres = (np.stack(stays.column_row(cells), axis=1) + 0.5) * CELL_M
+    for area in areas:
+        low, high = np.min(area.outline, axis=0), np.max(area.outline, axis=0)
+        for i in np.flatnonzero(((centres > low) & (centres < high)).all(axis=1)).tolist():
+            if area.inside_m(*centres[i].tolist()) > INSIDE_M:
+                out[i] = area.c_rr
+    return out
 
 
 def estimate(pb: Problem) -> Estimate:

@@ -8,12 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.fleet import stays as st
 from mapserver.fleet.calibration import SCALE_FLOOR, ZERO_FLOOR, Calibration, MachineState, calibrate
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, corrected
 from mapserver.fleet.ledger import EPOCH_NS
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior
+from mapserver.fleet.passages import passages
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
 from protocol.arrays import Floats, Table
+from protocol.site.site_config import KnownGround
 from tests.unit.mapserver.fleet.drives import (
     FOOT_M,
     LOW,
@@ -305,10 +306,22 @@ def test_rain_between_two_machines_is_not_their_error() -> None:
 
 def test_known_ground_shows_the_zero_where_nothing_is_closed() -> None:
     rows = drive(OPEN, Errors(0.006), seconds=200.0, closed=False, site=concrete)
-    cells = np.unique(st.cell(ledgers({"a": rows})["a"]["key"])).tolist()
-    result = solve({"a": rows}, known=dict.fromkeys(cells[: len(cells) // 2], 0.008))
+    area = KnownGround("apron", 0.008, ((300.0, 50.0), (700.0, 50.0), (700.0, 90.0), (300.0, 90.0)))
+    result = solve({"a": rows}, areas=[area])
     assert result.machines["a"].zero == pytest.approx(0.006, abs=0.002)
     assert result.machines["a"].zero_by == ("known_ground",)
+
+
+def test_cells_at_the_edge_of_known_ground_are_not_known() -> None:
+    area = KnownGround("apron", 0.008, ((0.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0)))
+    p, _, cells = passages(ledgers({"a": drive(LOW, seconds=60.0)}))
+    known = np.isfinite(known_cells(cells, [area]))[p.cell]
+    inside = ((p.place_m > 7.5) & (p.place_m < 32.5)).all(axis=1)
+    outside = ((p.place_m < 4.5) | (p.place_m > 35.5)).any(axis=1)
+    assert known[inside].all()
+    assert inside.any()
+    assert not known[outside].any()
+    assert outside.any()
 
 
 def test_a_machine_that_calibrates_itself_pins_the_others() -> None:
