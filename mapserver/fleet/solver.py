@@ -89,7 +89,7 @@ class Estimate:
 
 
 def problem(ledgers: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]) -> Problem:
-    """Stays by machine as `Ledger.stays` has them; areas: whose c_rr the site states; priors: where not the data sheet."""
+    """Stays by machine as `Ledger.stays` has them; areas: whose c_rr is stated; priors: where not the data sheet."""
     names = tuple(sorted(name for name, table in ledgers.items() if len(table)))
     p, epochs, cells = passages({name: ledgers[name] for name in names})
     return Problem(
