@@ -35,7 +35,7 @@ SETTLED = 2e-6  # of all parameters: below what a correction is rounded to
 # Edges are believed where the ground itself does not change with the slope: neither everywhere (by so much c_rr per
 # slope, 0.004 at 15 degrees, and so many standard deviations), nor in many places (by so much c_rr, in this share).
 RAMPS_LIMIT, RAMPS_SIGMAS = 0.015, 2.0
-STEP_LIMIT, STEPPED_SHARE = 0.008, 0.2
+STEP_LIMIT, STEPPED_SHARE = 0.008, 0.3
 
 
 @dataclass(frozen=True)
