@@ -19,7 +19,7 @@ from protocol.arrays import Floats, Table
 from protocol.site.site_config import KnownGround
 
 # Errors of the model: no evidence makes a zero or a scale surer than this.
-ZERO_FLOOR, SCALE_FLOOR = 0.0005, 0.005
+ZERO_FLOOR, SCALE_FLOOR = 0.0004, 0.004
 FAULTY_SIGMAS = 3.0  # of the data sheet: a scale so far off is worse than anything that a slope may hide
 LAST_NS = 2**62  # a machine's newest correction holds until there is a newer one
 

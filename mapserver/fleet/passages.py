@@ -139,7 +139,8 @@ class Links(NamedTuple):
 def links(p: Passages) -> Links:
     """Trapezoids of the slope between the middles of stays that follow each other.
 
-    The distance is that of the wheels; where samples are missing, that of the positions.
+    The distance is that of the positions, which is level as the slope's denominator is: wheels count the length of the
+    slope, and slip uphill.
     """
     j = np.flatnonzero(p.follows)
     j = j[p.cell[j] != p.cell[j - 1]]
@@ -148,7 +149,7 @@ def links(p: Passages) -> Links:
     gap = apart_m - (p.driven_m[i] + p.driven_m[j]) / 2 > GAP_M
     by_speed_m = (p.speed_mps[i] + p.speed_mps[j]) / 2 * (p.time_s[j] - p.time_s[i])
     drove = np.abs(apart_m - by_speed_m) < JUMP_M + by_speed_m / 2  # else the position jumped: nobody drove there
-    signed_m = np.where(gap, apart_m, by_speed_m) * p.direction[j]
+    signed_m = apart_m * p.direction[j]
     slope = (p.along[i] + p.along[j]) / 2
     bend = gap & (np.abs(p.along[j] - p.along[i]) > GAP_BEND)
     columns = (p.epoch[j], p.cell[i], p.cell[j], signed_m * slope, signed_m, np.abs(slope), bend)

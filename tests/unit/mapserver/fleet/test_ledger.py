@@ -89,12 +89,11 @@ def test_nobody_drove_where_a_position_jumped() -> None:
     assert apart.max() > 20
 
 
-def test_over_withheld_samples_the_distance_is_that_of_the_positions() -> None:
+def test_distances_are_those_of_the_positions() -> None:
     rows = drive(RAMP, Errors(), seconds=25.0)  # up the ramp, with gaps at foot and top
-    rows["speed_mps"] *= 0.6  # as where a machine speeds up in between
+    rows["speed_mps"] *= 1.2  # wheels that slip
     p, _, _ = passages({"a": stays_of([rows])})
     over = links(p)
     assert over.gap.sum() == 2
-    apart = np.hypot(*np.diff(p.place_m, axis=0).T)
-    assert sorted(over.per_zero_m[over.gap]) == pytest.approx(sorted(apart)[-2:])
     assert (over.per_zero_m[over.gap] > 4).all()
+    assert over.per_zero_m == pytest.approx(np.hypot(*np.diff(p.place_m, axis=0).T))
