@@ -19,7 +19,6 @@ MOST_SAMPLES = 4000  # of a stay: no machine drives so many in 10 s, and the sum
 MAX_PAUSE_S = 15.0  # a longer one tears the sequence
 GAP_M = 1.5  # driven without samples between two stays: the slope in between is not known
 JUMP_M = 2.0  # of positions against the wheels' distance, beside half of it
-GAP_BEND = 0.08  # change of the slope over a gap that makes the rise in it unsure
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ def _follows(time_s: Floats, direction: Floats) -> Bools:
 class Links(NamedTuple):
     """Rises (n,) from one cell to the next: measured; per_zero_m: by how much a zero of 1 makes that too low.
 
-    gap: whether a bend lies between, on which no samples were made.
+    bend_m: length times change of the slope where samples are missing in between, else 0.
     """
 
     epoch: Ints
@@ -133,7 +132,7 @@ class Links(NamedTuple):
     rise_m: Floats
     per_zero_m: Floats
     slope: Floats
-    gap: Bools
+    bend_m: Floats
 
 
 def links(p: Passages) -> Links:
@@ -151,8 +150,8 @@ def links(p: Passages) -> Links:
     drove = np.abs(apart_m - by_speed_m) < JUMP_M + by_speed_m / 2  # else the position jumped: nobody drove there
     signed_m = apart_m * p.direction[j]
     slope = (p.along[i] + p.along[j]) / 2
-    bend = gap & (np.abs(p.along[j] - p.along[i]) > GAP_BEND)
-    columns = (p.epoch[j], p.cell[i], p.cell[j], signed_m * slope, signed_m, np.abs(slope), bend)
+    bend_m = np.where(gap, apart_m * np.abs(p.along[j] - p.along[i]), 0.0)
+    columns = (p.epoch[j], p.cell[i], p.cell[j], signed_m * slope, signed_m, np.abs(slope), bend_m)
     return Links(*(column[drove] for column in columns))
 
 

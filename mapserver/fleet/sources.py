@@ -29,7 +29,9 @@ SAME_GROUND, CROSSINGS, HEIGHTS, EDGES, KNOWN_GROUND = "same_ground", "crossings
 C_STD, C_SHARE = 0.004, 0.08
 SLOPE_STD, SLOPE_SHARE = 0.006, 0.3
 RISE_STD_M, RISE_SHARE_M = 0.02, 0.3
-GAP_STD_M = 0.25  # of a link across a bend on which samples are withheld
+# Standard deviation of the rise across a bend on which samples are withheld, of its length times the change of the slope.
+# A bend anywhere in it would be 0.29; they are withheld around its middle.
+BEND_SHARE = 0.16
 SAME = 0.25
 LEAST_C_RR = 0.002  # of ground, for the share of drive force on it
 KNOWN_STD = 0.001  # of c_rr that the site states
@@ -206,11 +208,12 @@ def crossings(m: Means, layout: Layout, cells: int) -> Equations:
 def heights(p: Passages, layout: Layout, cells: int) -> Equations:
     """From cell to cell h_j - h_i = rise + z times the distance, which counts down in reverse."""
     all_links = links(p)
-    first, group, count = grouped(all_links.epoch, all_links.start * cells + all_links.end, all_links.gap)
-    rise, per_zero, slope = (mean(getattr(all_links, name), group, count) for name in ("rise_m", "per_zero_m", "slope"))
+    first, group, count = grouped(all_links.epoch, all_links.start * cells + all_links.end, all_links.bend_m > 0)
+    measured = all_links.rise_m, all_links.per_zero_m, all_links.slope, all_links.bend_m
+    rise, per_zero, slope, bend = (mean(values, group, count) for values in measured)
     link = Links._make(values[first] for values in all_links)
     n = len(first)
-    std = np.hypot(np.hypot(RISE_STD_M, RISE_SHARE_M * slope), GAP_STD_M * link.gap) * repeated(count)
+    std = np.hypot(np.hypot(RISE_STD_M, RISE_SHARE_M * slope), BEND_SHARE * bend) * repeated(count)
     ground = sparse(n, cells, (link.end, 1.0), (link.start, -1.0))
     return equations(sparse(n, layout.size, (link.epoch, -per_zero)), ground, rise, std)
 

@@ -94,6 +94,6 @@ def test_distances_are_those_of_the_positions() -> None:
     rows["speed_mps"] *= 1.2  # wheels that slip
     p, _, _ = passages({"a": stays_of([rows])})
     over = links(p)
-    assert over.gap.sum() == 2
-    assert (over.per_zero_m[over.gap] > 4).all()
+    assert (over.bend_m > 0.5).sum() == 2
+    assert (over.per_zero_m[over.bend_m > 0.5] > 4).all()
     assert over.per_zero_m == pytest.approx(np.hypot(*np.diff(p.place_m, axis=0).T))
