@@ -29,8 +29,8 @@ SAME_GROUND, CROSSINGS, HEIGHTS, EDGES, KNOWN_GROUND = "same_ground", "crossings
 C_STD, C_SHARE = 0.004, 0.08
 SLOPE_STD, SLOPE_SHARE = 0.006, 0.3
 RISE_STD_M, RISE_SHARE_M = 0.02, 0.3
-# Standard deviation of the rise across a bend on which samples are withheld, of its length times the change of the slope.
-# A bend anywhere in it would be 0.29; they are withheld around its middle.
+# Standard deviation of a rise across a bend on which samples are withheld, of its length times the change of the slope:
+# a bend anywhere in it would be 0.29, but they are withheld around its middle.
 BEND_SHARE = 0.16
 SAME = 0.25
 LEAST_C_RR = 0.002  # of ground, for the share of drive force on it
@@ -195,12 +195,14 @@ def crossings(m: Means, layout: Layout, cells: int) -> Equations:
         sparse(n, 2 * cells, (m.cell, east), (cells + m.cell, north)),
         m.along,
         m.slope_std,
+        blocks=2,
     )
     left = equations(
         sparse(n, layout.size, (layout.lateral.start + m.machine, 1.0)),
         sparse(n, 2 * cells, (m.cell, -north), (cells + m.cell, east)),
         m.across,
         m.slope_std,
+        blocks=2,
     )
     return stacked(ahead, left)
 
@@ -215,7 +217,7 @@ def heights(p: Passages, layout: Layout, cells: int) -> Equations:
     n = len(first)
     std = np.hypot(np.hypot(RISE_STD_M, RISE_SHARE_M * slope), BEND_SHARE * bend) * repeated(count)
     ground = sparse(n, cells, (link.end, 1.0), (link.start, -1.0))
-    return equations(sparse(n, layout.size, (link.epoch, -per_zero)), ground, rise, std)
+    return equations(sparse(n, layout.size, (link.epoch, -per_zero)), ground, rise, std, blocks=0)
 
 
 def edges(p: Passages, layout: Layout, ground: GroundState) -> Equations:
