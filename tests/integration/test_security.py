@@ -92,9 +92,8 @@ class Guarded:
 
     def still_works(self) -> str:
         """Raises unless a visitor still reads the map; returns whom a failed assertion is about."""
-        wait_until(
-            self._reads, READY_S, "a visitor reads the map"
-        )  # a loaded machine may take longer than a client waits
+        # A loaded machine may take longer than a client waits.
+        wait_until(self._reads, READY_S, "a visitor reads the map")
         return f"router pid {self.router.pid}, server pid {self.server.pid}"
 
     def _reads(self) -> bool:
