@@ -16,9 +16,11 @@ from hypothesis import settings
 from sitegrid.process.lifetime import SIGNALS
 from tests.paths import ROOT, SHARED_DATA
 
-# A shell starts what it runs in the background with SIGINT ignored, and so would be all processes of the tests.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell starts what it runs in the background with SIGINT ignored, nohup with SIGHUP, and so would be all processes of
+# the tests.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 # Repeatable on every machine, and no complaint about a slow one.
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, print_blob=True)

@@ -252,10 +252,10 @@ READINGS = [
 def _logs() -> Iterator[Decoder]:
     (workshop() / "paper.toml").write_bytes((CONFIG / "site.toml").read_bytes())
     site = load_site(workshop() / "paper.toml")
-    folders = [workshop() / name for name in ("log", "csv", "gzip")]
+    folders = [workshop() / name for name in ("log", "csv", "gzip", "judged")]
     for folder in folders:
         write_log(folder, "drive", site, MACHINE, READINGS)
-    log, plain, packed = folders
+    log, plain, packed, judged = folders
     manifest, csv = (log / "log.toml").read_bytes(), (log / "imu-1.csv").read_bytes()
     (packed / "log.toml").write_bytes(manifest.replace(b"imu-1.csv", b"imu-1.csv.gz"))
     converted = manifest.replace(b'gyro_x_radps = "', b'gyro_x_radps = { value = 0.5, unit = "deg/s" }\n#"')
@@ -265,9 +265,9 @@ def _logs() -> Iterator[Decoder]:
     assert b"\nx_m = {" in metres
     errors, seeds = (ConfigError, LogFolderError), (gzip.compress(csv, mtime=0),)
     yield Decoder("manifest", (manifest, converted, metres), partial(_log, log, "log.toml"), errors, texts, str(log))
-    (log / "truth.csv").write_bytes(PLACES)
+    (judged / "truth.csv").write_bytes(PLACES)
     (plain / "evaluation.toml").write_bytes(TRUTH)
-    yield Decoder("truth", (TRUTH,), partial(_truth, log, "evaluation.toml"), errors, texts, str(log))
+    yield Decoder("truth", (TRUTH,), partial(_truth, judged, "evaluation.toml"), errors, texts, str(judged))
     yield Decoder("truth_csv", (PLACES,), partial(_truth, plain, "truth.csv"), errors[1:], texts, "truth.csv")
     yield Decoder("csv", (csv,), partial(_log, plain, "imu-1.csv"), errors[1:], texts, "imu-1.csv")
     yield Decoder("csv_gzip", seeds, partial(_log, packed, "imu-1.csv.gz"), errors[1:], files, "imu-1.csv.gz")

@@ -92,9 +92,15 @@ class Guarded:
 
     def still_works(self) -> str:
         """Raises unless a visitor still reads the map; returns whom a failed assertion is about."""
-        with connect(self.endpoint, SITE, keys=self.keys / "guest") as client:
-            client.info()
+        # A loaded machine may take longer than a client waits.
+        wait_until(self._reads, READY_S, "a visitor reads the map")
         return f"router pid {self.router.pid}, server pid {self.server.pid}"
+
+    def _reads(self) -> bool:
+        with contextlib.suppress(LinkError), connect(self.endpoint, SITE, keys=self.keys / "guest") as client:
+            client.info()
+            return True
+        return False
 
     def batch(self, machine: str) -> bytes:
         """One sample of a machine, as its agent sends it, in a spool of its own."""

@@ -4,25 +4,46 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.store_folder import store_id
+from protocol.wire.session import free_endpoint
+from sim.config import SimConfig
 from sitegrid.cli import main
-from sitegrid.process.children import wait_until
+from sitegrid.client import Client
+from sitegrid.process.children import Children, wait_until
 from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
 
 SOME = 20  # samples
+
+
+@pytest.fixture
+def site_run(tmp_path: Path, children: Children) -> SiteRun:
+    """Machines that drive on for long after all of them have samples in the map."""
+    return SiteRun(
+        tmp_path, children, free_endpoint(), SimConfig(machines=3, seconds=160, speed=8, seed=3, world="fast")
+    )
 
 
 def cut_short(site_run: SiteRun) -> str:
     """A site at work, whose server dies once it has taken samples; returns the id of its store."""
     _, server, _ = site_run.start()
     with site_run.connect() as client:
-        site_run.wait_merged(client, SOME)
+        wait_until(lambda: len(_samples(client)) == site_run.sim.machines, READY_S, "every machine has samples there")
+        # An agent sends a batch only after the one before was acknowledged: by then its run is bound to the store.
+        first = {name: max(samples, SOME) for name, samples in _samples(client).items()}
+        more = "every machine has more of them"
+        wait_until(lambda: all(n > first[name] for name, n in _samples(client).items()), READY_S, more)
     kill(server)
     return store_id(site_run.folder / "store" / JOURNAL_FILE)
+
+
+def _samples(client: Client) -> dict[str, int]:
+    """Of each machine, how many are in the map."""
+    return {name: counts.samples for name, counts in client.info().machines.items()}
 
 
 @pytest.mark.processes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.pipeline import PipelineConfig, Positioning
-from evaluation.campaign.experiment import Runner
+from evaluation.campaign.experiment import Runner, Task
 from evaluation.positions import blackouts
 from evaluation.positions.blackouts import (
     BACK_S,
@@ -108,3 +108,19 @@ def test_a_copy_goes_on_as_the_original_would_and_leaves_it_as_it_was() -> None:
     early.step([r for r in rest if r.stamp_ns < made.readings[0].stamp_ns + 40_000_000_000])
     assert late.pose
     assert (early.pose.x_m, early.pose.y_m) == (late.pose.x_m, late.pose.y_m)
+
+
+def test_a_report_judges_the_goals_on_rows_and_on_ratios(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The profile `paper` twice as far off, with a covariance that is right for `default`."""
+    sizes = {BLACKOUT: (4, LENGTHS_S[-1]), START: (1, 599), **dict.fromkeys(blackouts.JUMPS, (4, GAP_S + BACK_S[-1]))}
+
+    def solved(_: Runner, __: object, tasks: list[Task[Variant]]) -> list[Courses]:
+        sizes_of = [(sizes[task.variant.case], task.variant.profile) for task in tasks]
+        return [courses(0.03 if p == "default" else 0.06, 10.0, *size) for size, p in sizes_of]
+
+    monkeypatch.setattr(Runner, "run", solved)
+    report, outcomes = blackouts.run(Runner(tmp_path), (0, 1), 600.0)
+    assert len(report["goals"]) == 2 * len(LENGTHS_S) + 3
+    assert all(goal["met"] for goal in report["goals"])
+    assert {row["ratio"] for row in report["ratios"] if row["seconds"] == 300} == {0.5}
+    assert len(outcomes) == 2 * 4 * 4

@@ -250,7 +250,7 @@ def test_impossible_route_is_refused_with_its_place(tmp_path: Path, text: str) -
 
 
 def test_missing_scenario_is_named() -> None:
-    for name, words in (("nowhere", "'nowhere'; known: bad_machine, busy_site"), ("gone.toml", r"gone\.toml")):
+    for name, words in (("nowhere", "'nowhere'; known: bad_machine, base_station"), ("gone.toml", r"gone\.toml")):
         with pytest.raises(ConfigError, match=words):
             load_scenario(name)
 

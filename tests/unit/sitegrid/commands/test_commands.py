@@ -202,7 +202,7 @@ def test_replay_takes_its_speed(husky_data: Path):
     manifest = MANIFEST
     words = ["agent", "--spool", "x", "--driver", "replay", "--log", str(manifest), "--speed", "7"]
     log = open_log(manifest, husky_data)
-    driver = agent._driver(build_parser().parse_args(words), log, None, log.site.name, log.machine.name)
+    driver = agent._driver(build_parser().parse_args(words), log, None)
     assert driver._speed == 7
 
 

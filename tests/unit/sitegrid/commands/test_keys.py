@@ -322,7 +322,7 @@ def test_common_names_never_meet():
 
 # --- rules -----------------------------------------------------------------------------------------------------------
 
-NAMES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim"}
+NAMES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim", "b1": "base"}
 REGISTER = Register(SITE, (), {n: RegisterEntry(r, "1", NOW) for n, r in {**NAMES, "server": "server"}.items()})
 
 
@@ -359,7 +359,9 @@ def may(name: str, message: str, key: str, flow: str = "ingress", register: Regi
         ("declare_subscriber", keys.poses_all(SITE), {"guest", "boss", "server"}),
         ("declare_subscriber", keys.health_all(SITE), {"guest", "boss", "server"}),
         ("declare_subscriber", keys.changed(SITE), {"loader-1", "loader-2", "guest", "boss"}),
-        ("declare_subscriber", f"sitegrid/{SITE}/base/b1/correction", {"loader-1", "loader-2"}),
+        ("declare_subscriber", keys.corrections(SITE, "b1"), {"loader-1", "loader-2", "guest", "boss"}),
+        ("put", keys.corrections(SITE, "b1"), {"b1"}),
+        ("put", keys.corrections(SITE, "b2"), set()),
         ("declare_subscriber", "**", set()),
         ("declare_queryable", keys.ingest_all(SITE), {"server"}),
         ("declare_queryable", keys.map_queries_all(SITE), {"server"}),
@@ -392,7 +394,7 @@ def test_every_key_that_exists_is_granted_to_somebody():
         parameters = list(inspect.signature(build).parameters)
         if build.__module__ != keys.__name__ or name.startswith("_") or parameters[:1] != ["site"]:
             continue
-        values = {"site": SITE, "machine": "loader-1", "query": "info", "command": "trust"}
+        values = {"site": SITE, "machine": "loader-1", "base": "b1", "query": "info", "command": "trust"}
         key = build(**{parameter: values[parameter] for parameter in parameters})
         messages = ("put", "query", "declare_subscriber", "liveliness_token", "liveliness_query", "declare_queryable")
         assert any(may(who, message, key) for who in REGISTER.names for message in messages), f"{name}: {key}"
@@ -413,7 +415,7 @@ def test_limits_never_touch_what_is_acknowledged():
     for item in settings["downsampling"]:
         assert item["messages"] == ["put"]
         for rule in item["rules"]:
-            assert rule["key_expr"] in (keys.poses_all(SITE), keys.health_all(SITE))
+            assert rule["key_expr"] in (keys.poses_all(SITE), keys.health_all(SITE), keys.corrections_all(SITE))
     sizes = {key: item["size_limit"] for item in settings["low_pass_filter"] for key in item["key_exprs"]}
     assert sizes[keys.ingest_all(SITE)] > MAX_BATCH_BYTES
     assert all("reply" not in item["messages"] for item in settings["low_pass_filter"])
