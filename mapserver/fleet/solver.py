@@ -162,8 +162,8 @@ def _rounds(pb: Problem, *, with_edges: bool, reason: str = "", frozen: GroundSt
             ground = _ground(pb, unknowns, ground)
         if moved < SETTLED:
             break
-    sheet = eliminate(prior, prior.weights(x, None))
-    return Estimate(x, information, sheet, ground, unknowns.get(src.EDGES, NO_GROUND), reason, rounds)
+    data_sheet = eliminate(prior, prior.weights(x, None))
+    return Estimate(x, information, data_sheet, ground, unknowns.get(src.EDGES, NO_GROUND), reason, rounds)
 
 
 def _ground(pb: Problem, unknowns: Mapping[str, Floats], before: GroundState) -> GroundState:
