@@ -374,7 +374,7 @@ def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
     """Without what it states, it is that of a machine that does not calibrate itself."""
     readings = off(cycles(VEHICLE, 3, ahead_rad=0.1), -0.06, torque=1.04)
     runs = [EstimatorRun(VEHICLE, EstimationConfig(calibrate=each)).feed(readings) for each in (True, False)]
-    zeros = set()
+    assert len({own.zero for _, own in runs[0].estimates}) > 2  # it changes on the drive
     for direction, *span in ((1, 79.5, 83.5), (-1, 97.5, 101.5)):
         pairs = list(zip(*(run.between(*span) for run in runs), strict=True))
         assert len(pairs) > 30
@@ -384,8 +384,6 @@ def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
             assert abs(own.c_rr - plain.c_rr) > 5e-3
             assert own.slope_x == pytest.approx(math.tan(math.atan(plain.slope_x) + own.zero), abs=1e-12)
             assert (plain.zero, plain.scale) == (0.0, 0.0)
-            zeros.add(own.zero)
-    assert len(zeros) > 1
 
 
 def test_an_estimate_keeps_the_calibration_of_its_time() -> None:
