@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque
+from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque, WheelReading
 from protocol.units import GRAVITY_MPS2
 
 TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
@@ -105,7 +105,7 @@ class WheelSpeed:
 class _Wheel:
     """One wheel sensor: its last reading, how far it has rolled by then, and the machine's angle then."""
 
-    reading: Encoder | Odometry
+    reading: WheelReading
     offset_m: float
     angle_rad: float
     rolled_m: float = 0.0
@@ -145,7 +145,7 @@ class DeadReckoning:
         """Take in a reading of the wheels, or of a sensor that shows the turn; others change nothing."""
         if isinstance(reading, Imu) and sensor.frame == BASE and sensor.provides("rate"):
             self._turn(reading, sensor)
-        elif isinstance(reading, Encoder | Odometry):
+        elif isinstance(reading, WheelReading):
             if isinstance(reading, Odometry) and sensor.name == self._turn_sensor:
                 self._turn_by_odometry(reading)
             if sensor.provides("speed"):
@@ -182,7 +182,7 @@ class DeadReckoning:
             self.angle_rad += odometry.rate_z_radps * min(dt_s, PAUSE_S)
         self._turned_ns = odometry.stamp_ns
 
-    def _roll(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
+    def _roll(self, reading: WheelReading, sensor: SensorConfig) -> None:
         """Advance by what a wheel sensor rolled since its last reading, by its share in the mean."""
         stamp_ns, offset_m = reading.stamp_ns, sensor.mount.xyz_m[1]
         wheel = self._wheels.setdefault(reading.sensor, _Wheel(reading, offset_m, self.angle_rad))
@@ -196,7 +196,7 @@ class DeadReckoning:
         self.wheels = _mean_speed([wheel, *others])
         self._advance(wheel, rolled_m, 1 + len(others))
 
-    def _rolled_between(self, last: Encoder | Odometry, now: Encoder | Odometry, sensor: SensorConfig) -> float:
+    def _rolled_between(self, last: WheelReading, now: WheelReading, sensor: SensorConfig) -> float:
         dt_s = (now.stamp_ns - last.stamp_ns) * 1e-9
         if isinstance(now, Odometry):
             return now.speed_x_mps * min(dt_s, PAUSE_S)

@@ -18,7 +18,7 @@ from agents.dead_reckoning import (
 )
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, SensorConfig
-from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
+from protocol.machine.readings import Articulation, Attitude, Imu, Odometry, Reading, Steering, WheelReading
 
 Sensed = tuple[Reading, SensorConfig]
 NOTHING = (0.0,) * 7  # count and sums
@@ -102,10 +102,10 @@ class StepGatherer:
             self._add_attitude(reading, sensor)
         elif isinstance(reading, Steering) and sensor.name == self._turn_sensor:
             self._turn_values.append(math.tan(reading.angle_rad) / self._wheelbase_m)
-        elif isinstance(reading, Encoder | Odometry):
+        elif isinstance(reading, WheelReading):
             self._add_wheels(reading, sensor)
 
-    def _add_wheels(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
+    def _add_wheels(self, reading: WheelReading, sensor: SensorConfig) -> None:
         if sensor.provides("speed"):
             self._rolled, self._rolled_ns = True, reading.stamp_ns
         if isinstance(reading, Odometry) and sensor.name == self._turn_sensor:

@@ -72,7 +72,9 @@ class Ukf:
         points = self._points(len(belief.x), k)
         of_x, d, mean = points.deviations(belief, measurement.h, measurement.angles)
         H = points.slope(d, belief)
-        together = points.root_W * np.concatenate([d, of_x])
+        together = np.empty((k + len(of_x), d.shape[1]))
+        np.multiply(points.root_W, d, out=together[:k])
+        np.multiply(points.root_W, of_x, out=together[k:])
         together[:k, -k:] = noise
         return conclude(belief, measurement, mean, together, H)
 
