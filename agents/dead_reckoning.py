@@ -14,7 +14,7 @@ from protocol.units import GRAVITY_MPS2
 
 TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
 STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
-PAUSE_S = 1.0  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
+PAUSE_S, PAUSE_NS = 1.0, 1_000_000_000  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
 MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine
 MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
 MIN_NARROWING = 0.2  # of a bend for its inner wheel: one near the middle of the bend rolls too little to scale it up
@@ -170,7 +170,7 @@ class DeadReckoning:
         up = self._up[imu.sensor]
         dt = (imu.stamp_ns - self._gyro_ns.get(imu.sensor, imu.stamp_ns)) * 1e-9
         self._gyro_ns[imu.sensor] = imu.stamp_ns
-        speaking = sum(_speaks(last_ns, imu.stamp_ns) for last_ns in self._gyro_ns.values())
+        speaking = sum([_speaks(last_ns, imu.stamp_ns) for last_ns in self._gyro_ns.values()])
         rate = up[0] * imu.gyro_x_radps + up[1] * imu.gyro_y_radps + up[2] * imu.gyro_z_radps
         self.angle_rad += rate * min(dt, PAUSE_S) / speaking
         self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
@@ -234,7 +234,7 @@ def narrowing(curvature: float, offset_m: float) -> float:
 
 def _speaks(last_ns: int, now_ns: int) -> bool:
     """Whether a sensor that was last heard then still counts."""
-    return now_ns - last_ns <= PAUSE_S * 1e9
+    return now_ns - last_ns <= PAUSE_NS
 
 
 def _mean_speed(wheels: Sequence[_Wheel]) -> WheelSpeed:
