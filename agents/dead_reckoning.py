@@ -14,7 +14,8 @@ from protocol.units import GRAVITY_MPS2
 
 TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
 STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
-PAUSE_S, PAUSE_NS = 1.0, 1_000_000_000  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
+PAUSE_S = 1.0  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
+PAUSE_NS = round(PAUSE_S * 1e9)
 MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine
 MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
 MIN_NARROWING = 0.2  # of a bend for its inner wheel: one near the middle of the bend rolls too little to scale it up
