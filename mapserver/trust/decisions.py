@@ -67,13 +67,3 @@ class TrustDecisions:
             return None
         reason = ", ".join(verdict.reasons) if trusted else "agrees with the others again"
         return TrustDecision(machine, not trusted, AUDIT, reason, stamp_ns, dict(verdict.evidence))
-
-
-def last_counted(events: Iterable[Event], excluded: frozenset[str]) -> int:
-    """Number of the last decision up to which decisions exclude these machines; 0 for none."""
-    decisions, number = TrustDecisions(()), 0
-    for event in events:
-        decisions.add(TrustDecision(**event.body))
-        if decisions.distrusted == excluded:
-            number = event.id
-    return number
