@@ -23,7 +23,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration, calibrate
-from mapserver.fleet.correction import Correction, corrected
+from mapserver.fleet.correction import LAST_NS, Correction, corrected, measured
 from mapserver.fleet.ledger import Ledger
 from mapserver.query.views import read_cells, view_of
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Table
@@ -36,7 +36,6 @@ SECONDS = {"loading": 900.0, "bad_machine": 900.0}
 INTERIOR_M = 2.0
 MAPS = ("before", "after", "oracle")
 FIGURES = ("wrong_pct", "interior_pct", "slope_pct")
-EVER_NS = 2**62
 OUTLIER = 3.0  # typical errors beyond which a sample does not count for the true zero and scale
 DIGITS = 4
 # For seeds that nothing was tuned on.
@@ -214,13 +213,13 @@ def _region(true: Scene) -> Region:
 
 
 def true_errors(data: Tampered, name: str, true: Scene, spans: int) -> list[TrueError]:
-    """Zero and scale of a machine in equal spans of its samples, by least squares against the true ground.
+    """Zero and scale of what a machine measured, in equal spans of its samples, by least squares to the true ground.
 
     Samples near borders of soils do not count, nor those further off than OUTLIER typical errors.
     """
-    rows = data.rows[name]
+    rows = measured(data.rows[name])
     oldest, newest = int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max())
-    ends = [0, *((oldest * (spans - i) + newest * i) // spans for i in range(1, spans)), EVER_NS]
+    ends = [0, *((oldest * (spans - i) + newest * i) // spans for i in range(1, spans)), LAST_NS]
     out = []
     for from_ns, to_ns in pairwise(ends):
         part = rows[(rows["stamp_ns"] >= from_ns) & (rows["stamp_ns"] < to_ns)]
@@ -236,8 +235,8 @@ def _fit(rows: Table, c_rr: Floats32, name: str, true: Scene) -> tuple[float, fl
     ahead = np.stack([np.cos(track.yaw_rad), np.sin(track.yaw_rad)], axis=1)
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
     d, slope = np.sign(rows["speed_mps"].astype(np.float64)), (track.gradient * ahead).sum(axis=1)
-    measured = np.stack([rows["grade_e"], rows["grade_n"]], axis=1)
-    across = np.nanmedian(((measured - track.gradient) * left).sum(axis=1))
+    gradient = np.stack([rows["grade_e"], rows["grade_n"]], axis=1)
+    across = np.nanmedian(((gradient - track.gradient) * left).sum(axis=1))
     usable = np.isfinite(rows["c_rr"]) & np.isfinite(slope) & (border_m > INTERIOR_M)
     columns, off = np.stack([d, d * (d * ground + slope)], axis=1)[usable], (rows["c_rr"] - ground)[usable]
     first = _least_squares(columns, off)

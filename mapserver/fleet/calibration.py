@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.fleet.correction import ANY_SHARE, DIGITS, LEVEL_SHARE, Correction
+from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.observability import CommonScale, Observed, observe
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, against, estimate, problem
@@ -21,7 +21,6 @@ from protocol.site.site_config import KnownGround
 # Errors of the model: no evidence makes a zero or a scale surer than this.
 ZERO_FLOOR, SCALE_FLOOR = 0.0004, 0.004
 FAULTY_SIGMAS = 3.0  # of the data sheet: a scale so far off is worse than anything that a slope may hide
-LAST_NS = 2**62  # a machine's newest correction holds until there is a newer one
 
 
 @dataclass(frozen=True)

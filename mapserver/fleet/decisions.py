@@ -13,8 +13,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mapserver.fleet.calibration import LAST_NS, Calibration
-from mapserver.fleet.correction import ANY_SHARE, Correction, Corrections
+from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.correction import ANY_SHARE, LAST_NS, Correction, Corrections
 
 KIND = "calibration"
 VERSION = 1  # of the event; what a newer one means is not known here

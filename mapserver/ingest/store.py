@@ -20,7 +20,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
+from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_store, judge, signature_problem
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.decisions import Decision, Decisions, plain
 from mapserver.ingest.losses import by_machine, name_shortfalls
@@ -37,13 +37,11 @@ from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
-from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
 JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
-Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
 
 @dataclass(frozen=True)
@@ -86,9 +84,8 @@ class Store:
             self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             checkpoints.remove_beyond(folder, last_row)
-            self.merged, self.grid = snapshot.load_newest(
-                folder, last_row, site.cell_m, config.fold, facts.of_evidence()
-            )
+            loaded = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, facts.of_evidence())
+            self.merged, self.grid = loaded
             self.snapshot_row = self.merged
             in_snapshot = self.grid.counts()
             fold_history(self.grid, self._history(), self.merged, selection=Selection.by(facts))
@@ -119,11 +116,6 @@ class Store:
     def version(self) -> MapVersion:
         """The version of the map as it is."""
         return MapVersion(self.identity.id, self.merged, self.fact)
-
-    @property
-    def excluded(self) -> frozenset[str]:
-        """Machines whose rows are not in the grid."""
-        return self.facts.excluded
 
     @property
     def fact(self) -> int:
@@ -227,7 +219,7 @@ class Store:
             "version": package_version(),
             "server": {"host": socket.gethostname(), "pid": os.getpid()},
             "machines": self.machines(),
-            "distrusted": sorted(self.excluded),
+            "distrusted": sorted(self.facts.excluded),
             "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
             "counters": dict(self.counters),
         }
@@ -238,22 +230,11 @@ class Store:
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
         """What each batch holds, or why it is refused; one that is not signed is not looked at."""
-        refused = [self._signature_problem(incoming) for incoming in group]
+        sent = ((incoming.machine, incoming.payload, incoming.signature) for incoming in group)
+        refused = [signature_problem(self._verify, self.site.name, *each) if self._verify else None for each in sent]
         signed = (incoming.payload for incoming, error in zip(group, refused, strict=True) if error is None)
         decoded = iter(decode_batches(list(signed), self.site.extent_m))
         return [error or next(decoded) for error in refused]
-
-    def _signature_problem(self, incoming: Incoming) -> MessageError | None:
-        if not self._verify:
-            return None
-        if not incoming.machine:
-            return MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
-        key = keys.ingest(self.site.name, incoming.machine)
-        try:
-            self._verify(incoming.machine, key, incoming.payload, incoming.signature)
-        except MessageError as error:
-            return error
-        return None
 
     def _admit(self, incoming: Incoming, batch: SampleBatch | MessageError) -> tuple[Ack | Refused, Admission | None]:
         try:
@@ -275,7 +256,7 @@ class Store:
 
     def _newest_but(self, machine: str) -> int:
         """The newest stamp of the machines in the map but one."""
-        hidden = self.excluded | {machine}
+        hidden = self.facts.excluded | {machine}
         return max((newest_ns for name, newest_ns in self._newest.items() if name not in hidden), default=0)
 
     def _seen(self, machine: str) -> SeenTime:
@@ -299,12 +280,11 @@ class Store:
 
     def _fold(self, batches: list[SampleBatch]) -> None:
         """Fold what was committed: all of it that there is, up to the last journal row."""
-        folded = [batch for batch in batches if batch.machine not in self.excluded]
+        folded = [batch for batch in batches if batch.machine not in self.facts.excluded]
         names = np.array([name_hash(batch.machine) for batch in folded], np.uint64)
         machine = np.repeat(np.arange(len(folded)), [len(batch.rows) for batch in folded])
         rows = joined([batch.rows for batch in folded])
-        rows = self.facts.corrections.applied(rows, [batch.machine for batch in folded], machine)
-        self.grid.fold_all(rows, names[machine])
+        self.grid.fold_all(self.facts.corrections.applied(rows, [b.machine for b in folded], machine), names[machine])
         for batch in batches:
             newest_ns = int(batch.rows["stamp_ns"].max())
             self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import LAST_NS, Calibration
-from mapserver.fleet.correction import LEVEL_SHARE, Correction, Corrections
+from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.correction import LAST_NS, LEVEL_SHARE, Correction, Corrections
 from mapserver.fleet.decisions import (
     EVERY_NS,
     FROZEN_NS,
@@ -53,7 +53,7 @@ class Solver:
         self.decisions = CalibrationDecisions(decisions)
         self.now_ns = NOW_NS
 
-    def says(self, *corrections: Correction, asked: bool = False, after_ns: int = 60 * 10**9) -> int:
+    def hears(self, *corrections: Correction, asked: bool = False, after_ns: int = 60 * 10**9) -> int:
         """How many corrections are decided."""
         made = self.decisions.judge(solved(*corrections), self.now_ns, asked=asked)
         for decision in made:
@@ -69,7 +69,7 @@ class Solver:
 
 def test_a_correction_counts_once_it_is_found_twice_in_a_row():
     solver = Solver()
-    assert [solver.says(one(0.003)) for _ in range(3)] == [0, 1, 0]
+    assert [solver.hears(one(0.003)) for _ in range(3)] == [0, 1, 0]
     assert solver.zero() == 0.003
     assert solver.zero(5000) == 0.003, "it holds until there is a newer one"
     assert solver.zero(999.9) is None
@@ -92,73 +92,73 @@ def test_a_correction_counts_once_it_is_found_twice_in_a_row():
 )
 def test_what_differs_by_less_than_it_is_unsure_changes_nothing(off, counts):
     solver = Solver()
-    solver.says(one(0.002))
-    solver.says(one(0.002), after_ns=EVERY_NS)
-    assert [solver.says(one(**off)) for _ in range(2)] == [0, int(counts)]
+    solver.hears(one(0.002))
+    solver.hears(one(0.002), after_ns=EVERY_NS)
+    assert [solver.hears(one(**off)) for _ in range(2)] == [0, int(counts)]
 
 
 def test_a_doubtful_machine_does_not_go_to_and_fro():
     solver = Solver()
-    assert [solver.says(one(zero)) for zero in (0.003, 0.0, 0.003, 0.0, 0.003)] == [0] * 5
+    assert [solver.hears(one(zero)) for zero in (0.003, 0.0, 0.003, 0.0, 0.003)] == [0] * 5
 
 
 def test_the_solver_decides_at_most_once_in_ten_minutes_of_site_time_unless_it_is_asked():
     solver = Solver()
-    counts = [solver.says(one(0.002 + 0.002 * (minute // 2))) for minute in range(14)]
+    counts = [solver.hears(one(0.002 + 0.002 * (minute // 2))) for minute in range(14)]
     assert np.flatnonzero(counts).tolist() == [1, 11]
-    assert solver.says(one(0.1), asked=True) == 1
+    assert solver.hears(one(0.1), asked=True) == 1
     started_anew = Solver(*[CalibrationDecision("a", SOLVER, "", solver.now_ns, (one(0.1),))])
     started_anew.now_ns = solver.now_ns
-    assert [started_anew.says(one(0.2)) for _ in range(11)] == [0] * 10 + [1], "its last decision is on disk"
+    assert [started_anew.hears(one(0.2)) for _ in range(11)] == [0] * 10 + [1], "its last decision is on disk"
 
 
 def test_machines_are_decided_each_by_itself():
     solver = Solver()
-    solver.says(one(0.003), one(0.004, machine="b"))
-    assert solver.says(one(0.003), one(0.0, machine="b")) == 1
+    solver.hears(one(0.003), one(0.004, machine="b"))
+    assert solver.hears(one(0.003), one(0.0, machine="b")) == 1
     assert (solver.zero(), solver.zero(machine="b")) == (0.003, None)
 
 
 def test_epochs_are_decided_each_by_itself_and_what_follows_keeps_the_newest():
     solver = Solver()
     for _ in range(2):
-        solver.says(one(0.003, 998, to_ns=999 * EPOCH_NS), one(-0.003, 1000))
+        solver.hears(one(0.003, 998, to_ns=999 * EPOCH_NS), one(-0.003, 1000))
     assert [solver.zero(epoch) for epoch in (998, 999, 1000, 1001)] == [0.003, 0.003, -0.003, -0.003]
     solver.now_ns += EVERY_NS
     for _ in range(2):
-        solver.says(one(0.005, 998, to_ns=999 * EPOCH_NS), one(-0.003, 1000))
+        solver.hears(one(0.005, 998, to_ns=999 * EPOCH_NS), one(-0.003, 1000))
     assert [solver.zero(epoch) for epoch in (998, 999.5, 1000)] == [0.005, 0.005, -0.003]
 
 
 def test_an_old_epoch_keeps_its_correction_unless_a_person_asks():
     solver = Solver()
     for _ in range(2):
-        solver.says(one(0.003))
+        solver.hears(one(0.003))
     solver.now_ns += FROZEN_NS
     later = one(0.001, 1000 + FROZEN_NS // EPOCH_NS)
     for _ in range(3):
-        assert solver.says(one(0.03), later) <= 1
+        assert solver.hears(one(0.03), later) <= 1
     assert (solver.zero(), solver.zero(1000 + FROZEN_NS / EPOCH_NS)) == (0.003, 0.001)
-    assert solver.says(one(0.03), later, asked=True) == 1
+    assert solver.hears(one(0.03), later, asked=True) == 1
     assert solver.zero() == 0.03
 
 
 def test_samples_that_come_hours_late_are_corrected():
     solver = Solver()
-    solver.says(one(0.003))
+    solver.hears(one(0.003))
     solver.now_ns += 10 * FROZEN_NS
     late = one(0.004, machine="late")
-    assert [solver.says(one(0.003), late, after_ns=EVERY_NS) for _ in range(2)] == [1, 1]
+    assert [solver.hears(one(0.003), late, after_ns=EVERY_NS) for _ in range(2)] == [1, 1]
     assert solver.zero(machine="late") == 0.004
     solver.now_ns += FROZEN_NS
-    assert [solver.says(one(0.003), one(0.04, machine="late")) for _ in range(3)] == [0] * 3
+    assert [solver.hears(one(0.003), one(0.04, machine="late")) for _ in range(3)] == [0] * 3
 
 
 def test_asked_for_it_takes_all_that_is_known_and_then_nothing_is_left_to_decide():
     solver = Solver()
-    assert solver.says(one(0.0001), asked=True) == 1
-    assert solver.says(one(0.0001), asked=True) == 0
-    assert solver.says(one(0.00011), asked=True) == 1
+    assert solver.hears(one(0.0001), asked=True) == 1
+    assert solver.hears(one(0.0001), asked=True) == 0
+    assert solver.hears(one(0.00011), asked=True) == 1
 
 
 def person(zero: float | None, *, machine: str = "a") -> CalibrationDecision:
@@ -169,16 +169,16 @@ def person(zero: float | None, *, machine: str = "a") -> CalibrationDecision:
 def test_a_person_s_correction_stands_until_it_is_taken_back():
     solver = Solver()
     for _ in range(2):
-        solver.says(one(0.003))
+        solver.hears(one(0.003))
     solver.decisions.add(person(0.02))
     assert (solver.zero(), solver.zero(3)) == (0.02, 0.02)
     assert solver.decisions.newest("a").by == PERSON
     solver.now_ns += EVERY_NS
-    assert [solver.says(one(0.05), asked=asked) for asked in (False, False, True)] == [0, 0, 0]
+    assert [solver.hears(one(0.05), asked=asked) for asked in (False, False, True)] == [0, 0, 0]
     solver.decisions.add(person(None))
     assert (solver.zero(), solver.zero(3)) == (0.003, None)
     assert solver.decisions.newest("a").by == SOLVER
-    assert [solver.says(one(0.05)) for _ in range(2)] == [0, 1]
+    assert [solver.hears(one(0.05)) for _ in range(2)] == [0, 1]
 
 
 def test_a_machine_without_a_correction_has_no_decision():

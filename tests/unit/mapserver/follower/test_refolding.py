@@ -190,7 +190,7 @@ def test_the_end_during_a_fold_gives_it_up_and_the_next_start_has_the_map(writer
     assert "the decision is kept, but the server is stopping" in problems[0]
     writer.close()
     with closing(open_store(tmp_path)) as store:
-        assert store.excluded == {"b"}
+        assert store.facts.excluded == {"b"}
         assert same(store.grid, map_without("b", 5))
 
 
