@@ -136,7 +136,7 @@ class Corrections:
         elif not why and not self._accepted:
             why = "the machine does not know its heading yet"
         elif not why and share < LEAST_SHARE:
-            why = "its errors are not those of this machine"
+            why = "its errors are not those of this machine, or its clock is off"
         return {
             "name": self._base.name,
             "used": not why,
