@@ -15,20 +15,24 @@ from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, 
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.observability import CommonScale, Observed, observe
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, against, estimate, problem
-from protocol.arrays import Floats, Table
+from protocol.arrays import Bools, Floats, Table
 from protocol.site.site_config import KnownGround
 
 # Errors of the model: no evidence makes a zero or a scale surer than this.
 ZERO_FLOOR, SCALE_FLOOR = 0.0004, 0.004
 FAULTY_SIGMAS = 3.0  # of the data sheet: a scale so far off is worse than anything that a slope may hide
+FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a zero, and a scale of 30 %, that no sensor of its kind has
+SURE = 2.0  # standard deviations by which an estimate must be beyond a limit
+# A sensor that measures less than half or more than twice of the drive force has no gain: it is stuck, or on its head.
+LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 
 
 @dataclass(frozen=True)
 class MachineState:
     """What is known of one machine: zero of its newest epoch, scale error k, lateral zero, and standard deviations.
 
-    zero_by, scale_by: the sources that show them, none where the data sheet has to do. beyond: how many standard
-    deviations of the data sheet zero and scale are off.
+    zero_by, scale_by: the sources that show them, none where the data sheet has to do; the scale is 0 then. beyond:
+    how many standard deviations of the data sheet the largest zero and the scale are off, for sure.
     """
 
     zero: float
@@ -63,43 +67,122 @@ def calibrate(
     c_rr the site states. priors: of machines of which more is known than their data sheet.
     """
     priors = priors or {}
-    trusted = {name: table for name, table in ledgers.items() if name not in excluded and len(table)}
+    known = {name: table for name, table in ledgers.items() if len(table)}
+    trusted = {name: table for name, table in known.items() if name not in excluded}
     if not trusted:
         return Calibration((), {}, CommonScale(False, SCALE_STD, "no_machine"))
-    pb = problem(trusted, areas, priors)
-    result = estimate(pb)
+    pb, result = _common_ground(trusted, areas, priors)
     observed = observe(pb, result)
-    corrections, states = _corrections(pb, result, observed), _states(pb, observed)
-    for name in sorted(set(excluded) & set(ledgers)):
-        if not len(ledgers[name]):
-            continue
-        own = problem({name: ledgers[name]}, areas, priors)
+    corrections, states = _said(pb, result, observed, observed.absolute)
+    for name in sorted(set(known) - set(pb.names)):
+        own = problem({name: known[name]}, areas, priors)
         alone = against(own, pb, result)
         shown = observe(own, alone)
-        corrections, states = corrections + _corrections(own, alone, shown), states | _states(own, shown)
+        more, state = _said(own, alone, shown, shown.absolute & observed.common.observed)
+        corrections, states = corrections + more, states | state
     return Calibration(tuple(corrections), dict(sorted(states.items())), observed.common)
 
 
-def _corrections(pb: Problem, result: Estimate, observed: Observed) -> list[Correction]:
-    """One correction for each epoch; the newest of a machine holds on."""
+def _common_ground(
+    trusted: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]
+) -> tuple[Problem, Estimate]:
+    """The ground of all machines but those that are at fault: one alone can put the slopes of a whole site in doubt.
+
+    Without the oddest machine, and the next, as long as there is one and most remain; as if there were none where that
+    does not end the doubt.
+    """
+    left = dict(trusted)
+    first = pb, result = _estimated(left, areas, priors)
+    while odd := _oddest(pb, result):
+        del left[odd]
+        if 2 * len(left) <= len(trusted):
+            return first
+        pb, result = _estimated(left, areas, priors)
+    return first if result.edges else (pb, result)
+
+
+def _estimated(
+    ledgers: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]
+) -> tuple[Problem, Estimate]:
+    pb = problem(ledgers, areas, priors)
+    return pb, estimate(pb)
+
+
+def _oddest(pb: Problem, result: Estimate) -> str:
+    """The machine that is furthest beyond what its data sheet may mean, "" for none."""
+    far = _beyond(pb, result) / ((FAULT_SIGMAS[0], FAULTY_SIGMAS) if result.edges else FAULT_SIGMAS)
+    worst = int(np.argmax(far.max(axis=1)))
+    return pb.names[worst] if far[worst].max() > 1 else ""
+
+
+def _beyond(pb: Problem, result: Estimate) -> Floats:
+    """By how many standard deviations of the data sheet the largest zero and the scale (m, 2) are off, for sure."""
+    surely = np.maximum(np.abs(result.x) - SURE * np.sqrt(np.diag(result.covariance())), 0.0)
+    zeros = [surely[pb.layout.zeros][pb.epochs.machine == index].max() for index in range(len(pb.names))]
+    out: Floats = np.stack([np.array(zeros) / ZERO_STD, surely[pb.layout.scales] / SCALE_STD], axis=1)
+    return out
+
+
+@dataclass(frozen=True)
+class _Applied:
+    """The part of an estimate that is applied: x (p,), and the covariance (p, p) of what is left.
+
+    scaled (m,): whether a machine has a scale of its own. beyond (m, 2): see MachineState.
+    """
+
+    x: Floats
+    covariance: Floats
+    scaled: Bools
+    beyond: Floats
+
+
+def _said(
+    pb: Problem, result: Estimate, observed: Observed, absolute: Bools
+) -> tuple[list[Correction], dict[str, MachineState]]:
+    """Corrections and states of the machines of a problem. absolute (m,): whose scale the evidence shows."""
+    applied = _applied(pb, result, observed, absolute)
+    return _corrections(pb, applied), _states(pb, applied, observed.by)
+
+
+def _applied(pb: Problem, result: Estimate, observed: Observed, absolute: Bools) -> _Applied:
+    """Scales count where the evidence shows them, and where they are so far off that any value is better than none.
+
+    There the estimate itself is taken: what is not observed of it is no more than what the data sheet leaves open. But
+    not where slopes contradict each other: nobody knows then who is far off.
+    """
+    scales = np.arange(pb.layout.scales.start, pb.layout.scales.stop)
+    covariance, beyond = result.covariance(), _beyond(pb, result)
+    far = (beyond[:, 1] > FAULTY_SIGMAS) & (not result.edges)
+    x, left = observed.x.copy(), observed.covariance.copy()
+    x[scales] = np.where(absolute, x[scales], np.where(far, result.x[scales], 0.0))
+    for index, at in enumerate(scales.tolist()):
+        if not absolute[index]:
+            left[at, :] = left[:, at] = 0.0
+            left[at, at] = covariance[at, at] if far[index] else SCALE_STD**2
+    beyond[:, 1] *= absolute  # of machines that differ nobody knows which is at fault
+    return _Applied(x, left, absolute | far, beyond)
+
+
+def _corrections(pb: Problem, applied: _Applied) -> list[Correction]:
+    """One correction for each epoch; the newest of a machine holds on. None of a machine that measures no force."""
     layout, epochs = pb.layout, pb.epochs
-    x = observed.x
     out = []
     for epoch, (machine, number) in enumerate(zip(epochs.machine.tolist(), epochs.number.tolist(), strict=True)):
         at = np.array([epoch, layout.scales.start + machine, layout.lateral.start + machine])
         newest = epoch + 1 == len(epochs.number) or epochs.machine[epoch + 1] != machine
-        zero, k, across = x[at].tolist()
-        far = abs(result.x[at[1]]) > FAULTY_SIGMAS * SCALE_STD
+        zero, k, across = applied.x[at].tolist()
+        if not LEAST_GAIN < 1 + k < MOST_GAIN:
+            continue
         out.append(
             Correction(
                 machine=pb.names[machine],
                 from_ns=number * EPOCH_NS,
                 to_ns=LAST_NS if newest else (number + 1) * EPOCH_NS,
                 zero=round(zero, DIGITS),
-                scale=round(k / (1 + k), DIGITS) if observed.absolute[machine] or far else 0.0,
+                scale=round(k / (1 + k), DIGITS),
                 across=round(across, DIGITS),
-                covariance=_covariance(observed.covariance[np.ix_(at, at)]),
-                most_share=ANY_SHARE if observed.absolute[machine] or far else LEVEL_SHARE,
+                covariance=_covariance(applied.covariance[np.ix_(at, at)]),
+                most_share=ANY_SHARE if applied.scaled[machine] else LEVEL_SHARE,
             )
         )
     return out
@@ -111,25 +194,25 @@ def _covariance(covariance: Floats) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(f"{value:.4g}") for value in row) for row in floored.tolist())
 
 
-def _states(pb: Problem, observed: Observed) -> dict[str, MachineState]:
-    """States of the machines of a problem."""
+def _states(
+    pb: Problem, applied: _Applied, shown: Mapping[str, Mapping[str, tuple[str, ...]]]
+) -> dict[str, MachineState]:
+    """States of the machines of a problem. shown: by which sources."""
     layout = pb.layout
-    std = np.sqrt(np.diag(observed.covariance))
+    x, std = applied.x, np.sqrt(np.diag(applied.covariance))
     out = {}
     for index, name in enumerate(pb.names):
         epoch = int(np.flatnonzero(pb.epochs.machine == index)[-1])
         scale, across = layout.scales.start + index, layout.lateral.start + index
-        zeros = np.abs(observed.x[layout.zeros][pb.epochs.machine == index])
-        by = observed.by[name]
         out[name] = MachineState(
-            zero=float(observed.x[epoch]),
+            zero=float(x[epoch]),
             zero_std=float(np.hypot(std[epoch], ZERO_FLOOR)),
-            scale=float(observed.x[scale]),
+            scale=float(x[scale]),
             scale_std=float(np.hypot(std[scale], SCALE_FLOOR)),
-            across=float(observed.x[across]),
+            across=float(x[across]),
             across_std=float(np.hypot(std[across], ZERO_FLOOR)),
-            zero_by=by["zero"],
-            scale_by=by["scale"],
-            beyond=(float(zeros.max() / ZERO_STD), float(abs(observed.x[scale]) / SCALE_STD)),
+            zero_by=shown[name]["zero"],
+            scale_by=shown[name]["scale"],
+            beyond=(float(applied.beyond[index, 0]), float(applied.beyond[index, 1])),
         )
     return out

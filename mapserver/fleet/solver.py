@@ -117,12 +117,15 @@ def estimate(pb: Problem) -> Estimate:
 
 
 def against(pb: Problem, others: Problem, result: Estimate) -> Estimate:
-    """Solve a machine that has no say: against the ground of the others, which stays as it is."""
+    """Solve a machine that has no say: against the ground of the others, which stays as it is.
+
+    Its edges count where theirs do: with a gain or an antenna that is wrong it may share little of their ground.
+    """
     cells = len(pb.cells)
     c_rr, gradient = np.full(cells, np.nan), np.full((cells, 2), np.nan)
     _, own, theirs = np.intersect1d(pb.cells, others.cells, return_indices=True)
     c_rr[own], gradient[own] = result.ground.c_rr[theirs], result.ground.gradient[theirs]
-    return _rounds(pb, with_edges=False, frozen=GroundState(c_rr, gradient))
+    return _rounds(pb, with_edges=not result.edges, frozen=GroundState(c_rr, gradient))
 
 
 def inverse(information: Floats) -> Floats:

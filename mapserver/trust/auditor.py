@@ -2,8 +2,9 @@
 
 Each machine has a coarse map of its own (coarse_map.py). All pairs of maps are compared (comparison.py), and so are the
 stamps at reception. A machine contradicts all others where it is outvoted by machines that agree among themselves, and
-where its difference from the map of all that are in good standing is beyond doubt (judgement.py). Whether and when to
-exclude a machine is the caller's decision.
+where its difference from the map of all that are in good standing is beyond doubt (judgement.py). Compared are samples
+without what calibration takes off; what it takes off is a fault of its own where no data sheet allows it, as a torque
+that reads half as much again. Whether and when to exclude a machine is the caller's decision.
 """
 
 from __future__ import annotations
@@ -17,9 +18,22 @@ from typing import Any
 import numpy as np
 
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
+from mapserver.fleet.calibration import MachineState
 from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
 from mapserver.trust.comparison import ComparedMap, Difference, compare, reverse
-from mapserver.trust.judgement import AGREE, DISAGREE, GROUND, UNKNOWN, ClockLeads, Judgement, Reason, judge, outvoted
+from mapserver.trust.judgement import (
+    AGREE,
+    DISAGREE,
+    UNKNOWN,
+    VOTED,
+    ClockLeads,
+    Judgement,
+    Reason,
+    beyond_data_sheet,
+    faulty,
+    judge,
+    outvoted,
+)
 from protocol.arrays import Ints, Table
 
 # Standard errors that are added to each limit: a vote may be doubtful where several are needed, a verdict may not.
@@ -35,7 +49,8 @@ class Verdict:
 
     reasons: empty unless it contradicts all others. evidence: plain values; what could not be compared is missing.
     cells, gain, offset_east_m, offset_north_m, offset_std_m, agreement [-], spread and spread_of_others (of the levels)
-    against the map of all others in good standing; clock_s: ahead of the others; excess: by reason, 1 at its limit;
+    against the map of all others in good standing; clock_s: ahead of the others; zero, scale: by which its samples are
+    corrected; excess: by reason, 1 at its limit;
     agrees_with, disagrees_with, undecided_with: machines.
     """
 
@@ -55,7 +70,7 @@ class Auditor:
         self._clocks = ClockLeads()
 
     def add(self, machine: str, rows: Table) -> None:
-        """Add samples of one machine, as they lie in a journal row; rows in the order of the journal.
+        """Add samples of one machine, corrected; rows in the order of the journal.
 
         The maps depend on no order. The clocks do: compared is what the machines sent at about the same time, and the
         order of the journal shows that better than the time of receipt, which steps where the server's clock is set.
@@ -68,22 +83,25 @@ class Auditor:
         self._maps[machine].add(rows if sure.all() else rows[sure])
         self._clocks.add(machine, int(rows["stamp_ns"].max()))
 
-    def verdicts(self) -> dict[str, Verdict]:
-        """Judge every machine."""
+    def verdicts(self, states: Mapping[str, MachineState] | None = None) -> dict[str, Verdict]:
+        """Judge every machine. states: what calibration knows of them, by name."""
         names = sorted(self._maps)
         surfaces = [self._maps[name].surface() for name in names]
         maps = [ComparedMap(surface, surface.places()) for surface in surfaces]
         pairs = self._pairs(names, maps)
-        states = {reason: _states(names, pairs, reason) for reason in Reason}
-        groups = {reason: outvoted(states[reason]) for reason in Reason}
-        suspected = [any(groups[reason][i] for reason in GROUND) for i in range(len(names))]
+        votes = {reason: _votes(names, pairs, reason) for reason in VOTED}
+        groups = {reason: outvoted(votes[reason]) for reason in VOTED}
+        known = [(states or {}).get(name) for name in names]
+        groups[Reason.BEYOND_DATA_SHEET] = faulty([beyond_data_sheet(state) for state in known])
+        suspected = [any(groups[reason][i] for reason in Reason if reason != Reason.CLOCK) for i in range(len(names))]
         verdicts = {}
         for i, difference in enumerate(self._from_pool(maps, suspected)):
             judgements = judge(difference, VERDICT_SIGMAS)
             judgements[Reason.CLOCK], lead = self._clock(names, i, groups[Reason.CLOCK][i])
+            judgements[Reason.BEYOND_DATA_SHEET] = beyond_data_sheet(known[i])
             reasons = tuple(r for r in Reason if groups[r][i] and judgements[r].state == DISAGREE)
             excess = {str(r): round(j.excess, 3) for r, j in judgements.items() if j.excess}
-            evidence = _measured(difference) | lead | {"excess": excess} | _sides(names, states, i)
+            evidence = _measured(difference) | lead | _off(known[i]) | {"excess": excess} | _sides(names, votes, i)
             verdicts[names[i]] = Verdict(names[i], reasons, evidence, bool(reasons))
         return verdicts
 
@@ -117,7 +135,7 @@ class Auditor:
         return judgement, {"clock_s": round(lead, 1)}
 
 
-def _states(names: Sequence[str], pairs: Pairs, reason: Reason) -> Ints:
+def _votes(names: Sequence[str], pairs: Pairs, reason: Reason) -> Ints:
     """Matrix of AGREE, UNKNOWN, DISAGREE for one reason."""
     states = np.full((len(names), len(names)), UNKNOWN, np.int64)
     for (one, other), judgements in pairs.items():
@@ -138,9 +156,14 @@ def _measured(difference: Difference | None) -> dict[str, Any]:
     return {name: round(value, 3) for name, value in values.items()}
 
 
-def _sides(names: Sequence[str], states: Mapping[Reason, Ints], i: int) -> dict[str, Any]:
+def _off(state: MachineState | None) -> dict[str, Any]:
+    """What calibration knows of a machine, in plain values."""
+    return {} if state is None else {"zero": round(state.zero, 5), "scale": round(state.scale, 4)}
+
+
+def _sides(names: Sequence[str], votes: Mapping[Reason, Ints], i: int) -> dict[str, Any]:
     """Whom it disagrees with in anything, agrees with in all that is known, and cannot be compared with."""
-    rows = np.stack([states[reason][i] for reason in Reason])
+    rows = np.stack([of_reason[i] for of_reason in votes.values()])
     worst = np.where((rows == DISAGREE).any(axis=0), DISAGREE, rows.max(axis=0))
     others = [j for j in range(len(names)) if j != i]
     return {text: tuple(names[j] for j in others if worst[j] == state) for state, text in _PRINTED.items()}

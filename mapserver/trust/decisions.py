@@ -1,7 +1,8 @@
 """Which machines the map trusts: decisions by the audit and by people, kept with their reasons as journal events.
 
 A machine's newest decision counts. One made by a person stands until a person hands it back to the audit; the audit
-waits for the same verdict several times, so that a doubtful machine does not go in and out.
+waits for the same verdict several times, so that a doubtful machine does not go in and out. A machine beyond its data
+sheet comes back by a person alone: its corrected samples agree, but something in it is broken.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 
 from mapserver.journal.rows import Event
 from mapserver.trust.auditor import Verdict
+from mapserver.trust.judgement import Reason
 
 KIND = "trust"
 AUDIT, PERSON = "audit", "person"
@@ -59,7 +61,7 @@ class TrustDecisions:
     def _judge(self, verdict: Verdict, stamp_ns: int) -> TrustDecision | None:
         machine, now = verdict.machine, self._newest.get(verdict.machine)
         trusted = now is None or now.trusted
-        if (now and now.by == PERSON) or verdict.contradicts != trusted:
+        if (now and _stands(now)) or verdict.contradicts != trusted:
             self._in_a_row.pop(machine, None)
             return None
         self._in_a_row[machine] = self._in_a_row.get(machine, 0) + 1
@@ -69,11 +71,6 @@ class TrustDecisions:
         return TrustDecision(machine, not trusted, AUDIT, reason, stamp_ns, dict(verdict.evidence))
 
 
-def last_counted(events: Iterable[Event], excluded: frozenset[str]) -> int:
-    """Number of the last decision up to which decisions exclude these machines; 0 for none."""
-    decisions, number = TrustDecisions(()), 0
-    for event in events:
-        decisions.add(TrustDecision(**event.body))
-        if decisions.distrusted == excluded:
-            number = event.id
-    return number
+def _stands(decision: TrustDecision) -> bool:
+    """Whether the audit leaves a decision alone."""
+    return decision.by == PERSON or (not decision.trusted and Reason.BEYOND_DATA_SHEET in decision.reason.split(", "))

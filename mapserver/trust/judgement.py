@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from math import hypot, log, sqrt
 
 import numpy as np
 
+from mapserver.fleet.calibration import FAULT_SIGMAS, MachineState
 from mapserver.trust.comparison import CELLS_PER_DRAW, ZERO_ERROR, Difference, Gain
 from mapserver.trust.shift import Shift
 from protocol.arrays import Ints
@@ -37,6 +39,7 @@ class Reason(StrEnum):
     CLOCK = "clock"
     STUCK = "stuck"
     DISAGREES = "disagrees"  # in no way that has a name
+    BEYOND_DATA_SHEET = "beyond_data_sheet"  # zero or scale is a fault, though the map may be right without it
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class Judgement:
 
 
 GROUND = (Reason.GAIN, Reason.OFFSET, Reason.STUCK, Reason.DISAGREES)
+VOTED = (*GROUND, Reason.CLOCK)
 _NO_JUDGEMENT = Judgement()
 
 
@@ -106,6 +110,17 @@ def _offset(shift: Shift | None, sigmas: float) -> Judgement:
     return Judgement(excess, AGREE if agrees else UNKNOWN)
 
 
+# --- sensors ---------------------------------------------------------------------------------------------------------
+
+
+def beyond_data_sheet(state: MachineState | None) -> Judgement:
+    """Judge what calibration says of a machine: None where it says nothing."""
+    if state is None:
+        return _NO_JUDGEMENT
+    excess = max(sigmas / limit for sigmas, limit in zip(state.beyond, FAULT_SIGMAS, strict=True))
+    return Judgement(excess, DISAGREE if excess > 1 else AGREE)
+
+
 # --- clocks ----------------------------------------------------------------------------------------------------------
 
 
@@ -155,6 +170,17 @@ def outvoted(states: Ints) -> list[tuple[int, ...]]:
     nobody knows which is right, nor when most of a fleet is wrong.
     """
     return [_outvoters(states, machine) for machine in range(len(states))]
+
+
+def faulty(judgements: Sequence[Judgement]) -> list[tuple[int, ...]]:
+    """For each machine beyond its data sheet the others that are not, if these are as many or more; else empty.
+
+    A gain is measured, not voted on, but where most machines seem wrong it is more likely the site's doing: and a map
+    of nobody is no map.
+    """
+    right = tuple(i for i, judgement in enumerate(judgements) if judgement.state != DISAGREE)
+    rest = right if 2 * len(right) >= len(judgements) else ()
+    return [() if i in right else rest for i in range(len(judgements))]
 
 
 def _outvoters(states: Ints, machine: int) -> tuple[int, ...]:

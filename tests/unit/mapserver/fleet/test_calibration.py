@@ -8,8 +8,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import SCALE_FLOOR, ZERO_FLOOR, Calibration, MachineState, calibrate
-from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, corrected
+from mapserver.fleet.calibration import (
+    FAULT_SIGMAS,
+    SCALE_FLOOR,
+    ZERO_FLOOR,
+    Calibration,
+    MachineState,
+    calibrate,
+)
+from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, corrected
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.passages import passages
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
@@ -274,15 +281,63 @@ def test_one_ramp_driven_both_ways_in_one_lane_shows_the_scale_by_itself() -> No
     assert {each.most_share for each in result.corrections} == {ANY_SHARE}
 
 
-def test_a_machine_without_a_say_moves_nobody() -> None:
-    rows = fleet() | {"bad": drive(RAMP, Errors(0.02, 0.6), seed=99)}
+def with_bad(scale: float, zero: float = 0.01) -> dict[str, Table]:
+    """The fleet, and a machine whose torque reads too much and whose antenna lies 3 m off."""
+    rows = fleet() | {"bad": drive(RAMP, Errors(zero, scale), seed=99)}
     rows["bad"]["y_m"] += 3.0
-    with_bad, without = solve(rows, ("bad",)), solve(fleet())
-    others = tuple(each for each in with_bad.corrections if each.machine != "bad")
-    assert others == without.corrections
-    assert with_bad.common == without.common
-    heard = solve(rows)
-    assert tuple(each for each in heard.corrections if each.machine != "bad") != without.corrections
+    return rows
+
+
+def of_others(result: Calibration) -> tuple[Correction, ...]:
+    return tuple(each for each in result.corrections if each.machine != "bad")
+
+
+def test_a_machine_without_a_say_moves_nobody() -> None:
+    rows, without = with_bad(0.1), solve(fleet())
+    excluded = solve(rows, ("bad",))
+    assert of_others(excluded) == without.corrections
+    assert excluded.common == without.common
+    assert of_others(solve(rows)) != without.corrections
+
+
+@pytest.mark.parametrize(("scale", "zero"), [(0.6, 0.01), (-0.45, 0.0), (0.1, 0.04)])
+def test_a_machine_at_fault_has_no_say_though_nobody_said_so(scale: float, zero: float) -> None:
+    result = solve(with_bad(scale, zero))
+    assert of_others(result) == solve(fleet()).corrections
+    assert max(np.divide(result.machines["bad"].beyond, FAULT_SIGMAS)) > 1
+    assert all(max(np.divide(result.machines[name].beyond, FAULT_SIGMAS)) < 1 for name in FLEET)
+
+
+def test_where_most_seem_at_fault_all_have_a_say() -> None:
+    errors = {"ramp": Errors(0.002, 0.5), "again": Errors(0.0, 0.5)}
+    rows = fleet(errors=errors)
+    result = solve(rows)
+    for name in errors:
+        check(result.machines[name], errors[name], zero=0.003, scale=0.05)
+        assert result.machines[name].beyond[1] > FAULT_SIGMAS[1]
+
+
+def test_of_slopes_that_contradict_each_other_nobody_is_at_fault() -> None:
+    """One machine measures half of its force where few others pass: the doubt must not fall on one of them."""
+    rows = fleet()
+    rows["ramp"]["c_rr"] -= 0.5 * (rows["ramp"]["c_rr"] + rows["ramp"]["grade_e"])
+    result = solve(rows)
+    assert not result.common.observed
+    for name, state in result.machines.items():
+        assert state.scale == 0.0, name
+        assert state.beyond[1] == 0.0, name
+        assert state.scale_std == pytest.approx(SCALE_STD, rel=0.05), name
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, 3.0])
+def test_a_sensor_that_measures_no_force_is_corrected_by_nothing(factor: float) -> None:
+    rows = fleet()
+    share = rows["low"]["c_rr"].copy()
+    rows["low"]["c_rr"] += (factor - 1) * share
+    result = solve(rows)
+    assert {each.machine for each in result.corrections} == {"ramp", "again"}
+    assert result.machines["low"].beyond[1] > FAULT_SIGMAS[1]
+    check(result.machines["ramp"], FLEET["ramp"][1])
 
 
 def test_a_machine_without_a_say_is_solved_against_the_ground_of_the_others() -> None:

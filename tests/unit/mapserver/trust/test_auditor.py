@@ -8,6 +8,8 @@ import pytest
 from scipy.signal import lfilter
 
 from mapserver.evidence.fold_config import FoldConfig
+from mapserver.fleet.calibration import MachineState
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.trust import coarse_map
 from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.judgement import Reason
@@ -122,6 +124,43 @@ def test_gain_and_displacement_together_are_both_found_and_measured(seed: int) -
     assert abs(evidence["offset_east_m"]) < 1.0
     assert evidence["agreement"] > 0.8
     assert evidence["disagrees_with"] == ("a", "b", "c")
+
+
+def state(zero: float, scale: float) -> MachineState:
+    beyond = (abs(zero) / ZERO_STD, abs(scale) / SCALE_STD)
+    return MachineState(zero, 0.001, scale, 0.01, 0.0, 0.001, ("heights",), ("edges",), beyond)
+
+
+@pytest.mark.parametrize("off", [(0.0, 0.6), (0.0, -0.35), (0.03, 0.0)])
+def test_a_machine_whose_corrected_samples_agree_is_accused_of_what_was_corrected(off: tuple[float, float]) -> None:
+    auditor = Auditor(1.0)
+    send(auditor, "abcd", fleet(0, GOOD, GOOD, GOOD, GOOD))
+    known = {name: state(0.004, 0.05) for name in "abc"}
+    verdicts = auditor.verdicts(known | {"d": state(*off)})
+    assert accused(verdicts) == {"d": (Reason.BEYOND_DATA_SHEET,)}
+    evidence = verdicts["d"].evidence
+    assert (evidence["zero"], evidence["scale"]) == off
+    assert evidence["excess"]["beyond_data_sheet"] > 1
+    assert evidence["agrees_with"] == ("a", "b", "c")
+    assert accused(auditor.verdicts(known | {"d": state(0.02, 0.29)})) == {}
+    assert accused(auditor.verdicts(dict.fromkeys("abcd", state(*off)))) == {}
+
+
+def test_a_machine_at_fault_is_no_measure_for_the_others() -> None:
+    auditor = Auditor(1.0)
+    send(auditor, "abc", fleet(0, GOOD, GOOD, {"gain": 1.1}))
+    by_all = auditor.verdicts()["a"].evidence["gain"]
+    by_right = auditor.verdicts({"c": state(0.0, 0.6)})["a"].evidence["gain"]
+    assert by_all < 0.99
+    assert by_right == pytest.approx(1.0, abs=0.01)
+
+
+def test_gain_and_displacement_of_corrected_samples_are_told_apart() -> None:
+    """The gain is corrected, and the offset stays: it is no business of calibration."""
+    auditor = Auditor(1.0)
+    send(auditor, "abcd", fleet(1, GOOD, GOOD, GOOD, {"off_m": (0.0, 3.5)}, km=10.8))
+    verdicts = auditor.verdicts({"d": state(0.002, 0.55)})
+    assert accused(verdicts) == {"d": (Reason.OFFSET, Reason.BEYOND_DATA_SHEET)}
 
 
 HONEST = {

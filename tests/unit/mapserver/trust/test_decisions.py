@@ -68,6 +68,17 @@ def test_a_decision_handed_back_lets_the_audit_decide():
     assert judged(decisions, BAD, DISTRUST_AFTER)
 
 
+@pytest.mark.parametrize("reasons", [(Reason.BEYOND_DATA_SHEET,), (Reason.OFFSET, Reason.BEYOND_DATA_SHEET)])
+def test_a_machine_beyond_its_data_sheet_is_let_in_by_a_person_alone(reasons):
+    decisions = TrustDecisions([])
+    judged(decisions, Verdict("c", reasons, {}, True), DISTRUST_AFTER)
+    assert judged(decisions, GOOD, 20) == []
+    assert decisions.distrusted == {"c"}
+    decisions.add(TrustDecision("c", True, PERSON, "its samples are corrected", 30))
+    assert decisions.distrusted == frozenset()
+    assert judged(decisions, Verdict("c", reasons, {}, True), 20) == []
+
+
 def test_decisions_come_back_from_events_the_newest_of_each_machine():
     made = [
         TrustDecision("c", False, AUDIT, "gain", 1, {"gain": 1.6}),

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapserver.fleet.calibration import FAULT_SIGMAS, MachineState
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.trust.comparison import ZERO_ERROR, Difference, Gain
 from mapserver.trust.judgement import (
     AGREE,
@@ -20,7 +22,10 @@ from mapserver.trust.judgement import (
     STUCK_SPREAD,
     UNKNOWN,
     ClockLeads,
+    Judgement,
     Reason,
+    beyond_data_sheet,
+    faulty,
     judge,
     outvoted,
 )
@@ -72,6 +77,44 @@ def test_between_maps_that_have_nothing_in_common_gain_and_offset_mean_nothing(c
     judgements = judge(replace(ALIKE, **(gain(2.0) | shift(9.0) | changed)), sigmas=0.0)
     assert (judgements[Reason.GAIN].state, judgements[Reason.OFFSET].state) == (UNKNOWN, UNKNOWN)
     assert {judgement.state for judgement in judge(None, sigmas=0.0).values()} == {UNKNOWN}
+
+
+# --- sensors ---------------------------------------------------------------------------------------------------------
+
+STATE = MachineState(0.0, 0.001, 0.0, 0.01, 0.0, 0.001, ("heights",), ("edges",), (0.0, 0.0))
+ZERO_LIMIT, SCALE_LIMIT = FAULT_SIGMAS
+
+
+@pytest.mark.parametrize(
+    ("beyond", "state"),
+    [
+        ((ZERO_LIMIT * 1.01, 0.0), DISAGREE),
+        ((0.0, SCALE_LIMIT * 1.01), DISAGREE),
+        ((ZERO_LIMIT * 0.99, SCALE_LIMIT * 0.99), AGREE),
+    ],
+)
+def test_a_zero_or_a_scale_that_no_data_sheet_allows_is_a_fault(beyond: tuple[float, float], state: int) -> None:
+    assert beyond_data_sheet(replace(STATE, beyond=beyond)).state == state
+    assert beyond_data_sheet(None).state == UNKNOWN
+    assert pytest.approx((0.0225, 0.3)) == (ZERO_LIMIT * ZERO_STD, SCALE_LIMIT * SCALE_STD)
+
+
+@pytest.mark.parametrize(
+    ("at_fault", "expected"),
+    [
+        ("..x", [(), (), (0, 1)]),
+        (".x", [(), (0,)]),
+        ("x", [()]),
+        (".xx", [(), (), ()]),
+        (".?xx", [(), (), (0, 1), (0, 1)]),
+        ("...", [(), (), ()]),
+    ],
+)
+def test_faults_are_named_as_long_as_half_of_the_machines_are_right(
+    at_fault: str, expected: list[tuple[int, ...]]
+) -> None:
+    known = {"x": Judgement(2.0, DISAGREE), ".": Judgement(0.5, AGREE), "?": Judgement()}
+    assert faulty([known[each] for each in at_fault]) == expected
 
 
 # --- votes -----------------------------------------------------------------------------------------------------------
