@@ -7,7 +7,7 @@ the server's own ledger, solver, correction, fold and read.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,6 +18,7 @@ from evaluation.campaign.figures import Goal, Report, Row, judge, root_mean_squa
 from evaluation.fleet import drives
 from evaluation.fleet.cases import CASES, PAPER, FleetCase, Rows, Tampered, cells, tampered, truth_places
 from evaluation.fleet.drives import Agent, FleetDrive, Scene, planned, scene
+from evaluation.maps.cases import CELL_M
 from evaluation.maps.score import border_distance, driven_cells
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
@@ -25,32 +26,55 @@ from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import Correction, corrected
 from mapserver.fleet.ledger import Ledger
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.query.views import read_cells, view_of
+from mapserver.trust.auditor import Auditor
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Table
 from protocol.queries.answers import MapVersion, Region
 from protocol.site.geometry import CellWindow
 from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
 
-LOADERS = 4  # of a drive of the paper's site
-SECONDS = {"loading": 900.0, "bad_machine": 900.0}
+LOADERS = 4  # of a drive of the paper's site with the usual sensors
 INTERIOR_M = 2.0
 MAPS = ("before", "after", "oracle")
 FIGURES = ("wrong_pct", "interior_pct", "slope_pct")
 EVER_NS = 2**62
 OUTLIER = 3.0  # typical errors beyond which a sample does not count for the true zero and scale
+BATCH = 100  # samples of one machine at a time, as trust sees them
 DIGITS = 4
+
+
+def _goals(case: str, **limits: float) -> list[Goal]:
+    """At most so much, of the map after."""
+    return [Goal({"case": case, "map": "after"}, figure, "<=", limit) for figure, limit in limits.items()]
+
+
+# Figures that only the map after has.
+AFTER_ALONE = (
+    *("change_pct", "above_before_pct", "max_above_before_pct", "above_oracle_pct", "max_above_oracle_pct"),
+    *("slope_change_pct", "common_scale_observed", "reasons", "distrusted"),
+)
 # For seeds that nothing was tuned on.
 GOALS = (
-    Goal({"case": "machines_3", "map": "after"}, "wrong_pct", "<=", 2.2),
-    Goal({"case": "machines_3", "map": "after"}, "interior_pct", "<=", 0.8),
-    Goal({"case": "machines_3", "map": "after"}, "slope_pct", "<=", 1.0),
-    Goal({"case": "machines_3", "map": "after"}, "rms_zero", "<=", 0.0006),
-    Goal({"case": "machines_3", "map": "after"}, "rms_scale", "<=", 0.01),
+    *_goals("machines_3", wrong_pct=2.2, interior_pct=0.8, slope_pct=1.0, above_oracle_pct=0.3),
+    *_goals("machines_3", max_above_oracle_pct=0.6, max_above_before_pct=0.3, rms_zero=0.0006, rms_scale=0.01),
     Goal({"case": "machines_3", "map": "after"}, "normalised", ">=", 0.3),
-    Goal({"case": "machines_3", "map": "after"}, "normalised", "<=", 1.5),
-    Goal({"case": "machines_1", "map": "after"}, "wrong_pct", "<=", 1.6),
-    Goal({"case": "first_180_s", "map": "after"}, "median_wrong_pct", "<=", 3.5),
-    Goal({"case": "bad_machine", "map": "after"}, "wrong_pct", "<=", 2.8),
+    *_goals("machines_3", normalised=1.5),
+    *_goals("machines_1", wrong_pct=1.6),
+    *_goals("first_180_s", median_wrong_pct=3.5),
+    *_goals("bad_machine", wrong_pct=2.8, above_oracle_pct=0.3),
+    *(
+        goal
+        for case in ("gain_1.6", "majority_off", "step_at_half", "haul_road", "rain")
+        for goal in _goals(case, above_oracle_pct=0.4)
+    ),
+    *_goals("loading", change_pct=0.2),
+    *(
+        goal
+        for case in CASES
+        if case.tamper == "other_ramps"
+        for goal in _goals(case.name, slope_change_pct=1.0, above_before_pct=0.2, common_scale_observed=0)
+    ),
 )
 
 
@@ -69,7 +93,7 @@ class TrueError:
 class CaseResult:
     """One case with one seed. maps: FIGURES by map. zeros, scales: errors of the corrections, over their std too.
 
-    common: whether the common scale is observed, and why not.
+    common: whether the common scale is observed, and why not. distrusted: by trust, with reasons.
     """
 
     maps: Mapping[str, Row]
@@ -77,6 +101,7 @@ class CaseResult:
     scales: Floats
     normalised: Floats
     common: tuple[bool, str]
+    distrusted: Mapping[str, str]
 
 
 def run(
@@ -105,12 +130,15 @@ def run(
 
 
 def _drive(case: FleetCase, seed: int, seconds: float) -> FleetDrive:
-    """The recording of a case: cases of the paper's site share one of four loaders."""
-    return planned(case.scenario, seed, seconds, LOADERS if case.scenario == PAPER else 0)
+    """The recording of a case: cases of the paper's site with the usual sensors share one of four loaders."""
+    if case.scenario != PAPER:
+        return planned(case.scenario, seed, seconds)
+    return planned(PAPER, seed, seconds, case.machines if case.preset else LOADERS, case.preset)
 
 
 def _agents(case: FleetCase, drive: FleetDrive) -> list[Agent]:
-    return [Agent(index, case.calibrates, case.first_s) for index in range(case.machines or drive.machines)]
+    places = range(case.machines or drive.machines)
+    return [Agent(index, case.calibrates, case.first_s, index in case.bad) for index in places]
 
 
 def summarise(case: FleetCase, name: str, results: Sequence[CaseResult]) -> Row:
@@ -131,10 +159,37 @@ def summarise(case: FleetCase, name: str, results: Sequence[CaseResult]) -> Row:
         "median_wrong_pct": float(np.median(wrong)),
         "max_wrong_pct": max(wrong),
         "wrong_by_seed_pct": wrong,
-        "common_scale_observed": sum(result.common[0] for result in results) if after else None,
-        "reasons": sorted({result.common[1] for result in results} - {""}) if after else [],
     }
+    if after:
+        row |= _against_others(results)
+        row |= {
+            "common_scale_observed": sum(result.common[0] for result in results),
+            "reasons": sorted({result.common[1] for result in results} - {""}),
+            "distrusted": [dict(result.distrusted) for result in results],
+        }
+    else:
+        row |= dict.fromkeys(AFTER_ALONE)
     return rounded(row, DIGITS, rms_zero=6)
+
+
+def _against_others(results: Sequence[CaseResult]) -> Row:
+    """How much more of the map is wrong afterwards than with other maps [points], seed by seed; not below 0 if `above`.
+
+    Of the slope the mean.
+    """
+
+    def more(figure: str, other: str) -> list[float]:
+        return [result.maps["after"][figure] - result.maps[other][figure] for result in results]
+
+    change, from_oracle, slope = more("wrong_pct", "before"), more("wrong_pct", "oracle"), more("slope_pct", "before")
+    return {
+        "change_pct": _mean(change),
+        "above_before_pct": max(0.0, _mean(change)),
+        "max_above_before_pct": max(0.0, *change),
+        "above_oracle_pct": max(0.0, _mean(from_oracle)),
+        "max_above_oracle_pct": max(0.0, *from_oracle),
+        "slope_change_pct": _mean(slope),
+    }
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -150,12 +205,13 @@ def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
     """Calibrate a case's samples, and judge its maps."""
     data = tampered(case, recorded, true)
     names = sorted(data.rows)
-    excluded = {names[index] for index in case.excluded}
-    shown = [name for name in names if case.judged or name not in excluded]
-    result = calibrated(data.rows, excluded)
+    distrusted = accused(data.rows, calibrated(data.rows))
+    result = calibrated(data.rows, set(distrusted))
+    let_in = {names[index] for index in case.let_in}
+    shown = [name for name in names if name in let_in or name not in distrusted]
     errors = {name: true_errors(data, name, true, case.spans) for name in shown}
     by_truth = {name: [_as_correction(name, error) for error in errors[name]] for name in shown}
-    own = {name: [each for each in result.corrections if each.machine == name] for name in shown}
+    own = {name: of_machine(result, name) for name in shown}
     maps = {
         "before": judged({name: data.rows[name] for name in shown}, data, true),
         "after": judged({name: corrected(data.rows[name], own[name]) for name in shown}, data, true),
@@ -164,10 +220,27 @@ def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
     off = [_off(data.rows[name], own[name], error) for name in shown for error in errors[name]]
     zeros, scales, zero_std, scale_std = np.array(off).T
     normalised = np.concatenate([zeros / zero_std, scales / scale_std])
-    return CaseResult(maps, zeros, scales, normalised, (result.common.observed, result.common.reason))
+    common = result.common.observed, result.common.reason
+    return CaseResult(maps, zeros, scales, normalised, common, distrusted)
 
 
-def calibrated(rows: Rows, excluded: set[str]) -> Calibration:
+def of_machine(result: Calibration, name: str) -> list[Correction]:
+    """The corrections of one machine."""
+    return [each for each in result.corrections if each.machine == name]
+
+
+def accused(rows: Rows, result: Calibration) -> dict[str, str]:
+    """Machines that the server's trust excludes, and why: it judges corrected samples, which come in turn."""
+    auditor = Auditor(CELL_M)
+    right = {name: corrected(table, of_machine(result, name)) for name, table in rows.items()}
+    for first in range(0, max(map(len, right.values())), BATCH):
+        for name, table in sorted(right.items()):
+            auditor.add(name, table[first : first + BATCH])
+    verdicts = auditor.verdicts(result.machines)
+    return {name: ", ".join(verdict.reasons) for name, verdict in verdicts.items() if verdict.contradicts}
+
+
+def calibrated(rows: Rows, excluded: Collection[str] = ()) -> Calibration:
     """What the server's ledger and solver make of samples."""
     config, stays = ServerConfig(), {}
     for name, table in rows.items():
@@ -259,6 +332,8 @@ def _as_correction(name: str, error: TrueError) -> Correction:
 
 def _off(rows: Table, own: Sequence[Correction], error: TrueError) -> tuple[float, float, float, float]:
     """Errors of a machine's corrections, of the zero and of the scale k, and what they state as standard deviation."""
+    if not own:
+        return -error.zero, -error.scale, ZERO_STD, SCALE_STD
     stamps = rows["stamp_ns"][(rows["stamp_ns"] >= error.from_ns) & (rows["stamp_ns"] < error.to_ns)]
     count = np.array([((stamps >= each.from_ns) & (stamps < each.to_ns)).sum() for each in own], np.float64)
     weight = count / count.sum()
