@@ -189,7 +189,7 @@ class Sampler:
         x, y = pose.x_m + c * self._load_centre_m, pose.y_m + s * self._load_centre_m
         grade = (c * e.slope_x - s * e.slope_y, s * e.slope_x + c * e.slope_y, e.slope_var)
         at = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)
-        return (*at, e.c_rr, e.c_rr_var, *grade)
+        return (*at, e.c_rr, e.c_rr_var, *grade, e.zero, e.scale)
 
 
 def joined(made: Sequence[Samples]) -> Samples:

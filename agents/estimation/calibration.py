@@ -19,6 +19,7 @@ import numpy as np
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.balance import Balance
 from protocol.arrays import Floats
+from protocol.machine.samples import APPLIED, LIMITS
 
 # Standard deviations before anything is measured: of the zero, as a share of gravity (0.044 m/s2), and of the scale of
 # drive force over weight.
@@ -31,6 +32,7 @@ MAX_GAP_NS = 300_000_000  # a stretch without a balance for so long is interrupt
 # by which they are matched, drifts.
 PAIR_M, PAIR_RAD, PAIR_S = 0.7, 0.15, 120.0
 KEPT = 400  # stretches: 200 m of distance
+MOST_ZERO, MOST_SCALE = (LIMITS[name][1] for name in APPLIED)  # that a sample may state as applied
 FLOOR = 0.0007  # error of the model: no number of pairs makes the zero surer than this, or the scale than ten times it
 GATE_SIGMA = 3.0  # pairs further off are excluded
 RELOCK = 12  # so many excluded in a row are right, and the calibration is wrong: a sensor worse than its class
@@ -96,7 +98,7 @@ class Calibrator:
         """The present one."""
         (zz, zs), (_, ss) = self._P.tolist()
         zz, ss = max(zz, FLOOR**2), max(ss, (10 * FLOOR) ** 2)  # raised variances keep a covariance definite
-        zero, scale = self._x.tolist()
+        zero, scale = np.clip(self._x, (-MOST_ZERO, -MOST_SCALE), (MOST_ZERO, MOST_SCALE)).tolist()
         return Calibration(zero, scale, ((zz, zs), (zs, ss)), self._stamp_ns, self._passages)
 
     def update(self, balance: Balance, dead_reckoning: DeadReckoning, known_c_rr: float | None) -> None:

@@ -7,14 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from agents.estimation.calibration import Calibration
+from agents.estimation.calibration import MOST_SCALE, MOST_ZERO, Calibration
 from protocol.errors import StoreError
 from protocol.files import PRIVATE, write_whole
 
 VERSION = 2
-# No accelerometer or drive train that a machine is driven with is further off: more than ten times what is expected
-# before anything is measured (`calibration.py`).
-MOST_ZERO, MOST_SCALE = 0.05, 0.5
 
 
 class CalibrationFile:
@@ -87,6 +84,6 @@ def _parse(path: Path, table: dict[str, Any]) -> Calibration:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StoreError(path, f"is no calibration: {error}") from None
     sound = math.isfinite(zero + scale + zz + zs + ss) and zz > 0 and ss > 0 and zs * zs <= zz * ss and zs == sz
-    if not (sound and abs(zero) < MOST_ZERO and abs(scale) < MOST_SCALE and stamp_ns >= 0 and passages >= 0):
+    if not (sound and abs(zero) <= MOST_ZERO and abs(scale) <= MOST_SCALE and stamp_ns >= 0 and passages >= 0):
         raise StoreError(path, "is no calibration: its numbers make no sense")
     return Calibration(zero, scale, ((zz, zs), (sz, ss)), stamp_ns, passages)

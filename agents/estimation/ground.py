@@ -53,7 +53,7 @@ class GroundEstimate:
     """The ground at a stamp.
 
     c_rr, c_rr_var: NaN where `reason` states why c_rr is not known, "" else. slope_x, slope_y: rise over run ahead and
-    to the left, slope_var of either; NaN without accelerometer.
+    to the left, slope_var of either; NaN without accelerometer. zero, scale: of the calibration that was applied.
     """
 
     c_rr: float
@@ -62,6 +62,8 @@ class GroundEstimate:
     slope_y: float
     slope_var: float
     reason: str
+    zero: float = 0.0
+    scale: float = 0.0
 
     @property
     def is_blurred(self) -> bool:
@@ -74,12 +76,13 @@ NOTHING_KNOWN = GroundEstimate(math.nan, math.nan, math.nan, math.nan, math.nan,
 
 @dataclass(frozen=True, slots=True)
 class _JudgedBalance:
-    """A balance as it was judged, and the slope ahead by the estimator in use [rad]."""
+    """A balance as it was judged, the slope ahead by the estimator in use [rad], and the calibration of that time."""
 
     stamp_ns: int
     balance: Balance
     reason: str
     slope_x: float
+    applied: Calibration
 
 
 class GroundEstimator:
@@ -155,7 +158,7 @@ class GroundEstimator:
         judged = self._nearest(stamp_ns)
         if judged is None:
             return NOTHING_KNOWN
-        balance, applied = judged.balance, self._applied
+        balance, applied = judged.balance, judged.applied
         resistance = None if judged.reason else self._resistance.at(stamp_ns)
         c_rr, variance = math.nan, math.nan
         if resistance:
@@ -166,7 +169,8 @@ class GroundEstimator:
         slope_x = math.tan(judged.slope_x + applied.zero)  # the accelerometer's zero is an error of the slope too
         # The mean of both directions: work shows the zero ahead, and nothing shows the one across.
         slope_var = balance.slope_var + (applied.covariance[0][0] + ZERO_STD**2) / 2
-        return GroundEstimate(c_rr, variance, slope_x, math.tan(balance.slope_y), slope_var, reason)
+        slope_y, calibration = math.tan(balance.slope_y), (applied.zero, applied.scale)
+        return GroundEstimate(c_rr, variance, slope_x, slope_y, slope_var, reason, *calibration)
 
     def _nearest(self, stamp_ns: int) -> _JudgedBalance | None:
         index = bisect_left(self._judged, stamp_ns, key=lambda judged: judged.stamp_ns)
@@ -181,7 +185,7 @@ class GroundEstimator:
         raw = self._applied.corrected(balance)
         reason = self._plausibility.judge(balance, balance.direction * raw / cosine)
         slope_x = self._grade.update(balance.dt_s, balance.sine_x) if self._grade else balance.slope_x
-        self._judged.append(_JudgedBalance(balance.stamp_ns, balance, reason, slope_x))
+        self._judged.append(_JudgedBalance(balance.stamp_ns, balance, reason, slope_x, self._applied))
         if reason == "standstill":
             self._stand(balance)
         if reason:

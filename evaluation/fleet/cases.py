@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from evaluation.fleet.drives import Scene
+from mapserver.fleet.correction import measured
 from protocol.arrays import Bools, Floats, Floats32, Table
 
 Rows = Mapping[str, Table]  # samples by machine
@@ -65,9 +66,9 @@ def nothing(rows: Rows, scene: Scene, _: float) -> Tampered:
 def gain(rows: Rows, scene: Scene, factor: float) -> Tampered:
     """The torque of the second machine reads too much."""
     name = sorted(rows)[1]
-    table = rows[name].copy()
+    table, raw = rows[name].copy(), measured(rows[name])
     d = np.where(table["speed_mps"] >= 0, 1.0, -1.0)
-    share = d * table["c_rr"] + (_gradient(table) * _ahead(table)).sum(axis=1)
+    share = d * raw["c_rr"] + (_gradient(raw) * _ahead(raw)).sum(axis=1)
     table["c_rr"] += d * (factor - 1) * share
     return Tampered({**rows, name: table}, scene.truth.c_rr)
 

@@ -24,7 +24,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration, calibrate
-from mapserver.fleet.correction import Correction, corrected
+from mapserver.fleet.correction import LAST_NS, Correction, corrected, measured
 from mapserver.fleet.ledger import Ledger
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.query.views import read_cells, view_of
@@ -38,7 +38,6 @@ LOADERS = 4  # of a drive of the paper's site with the usual sensors
 INTERIOR_M = 2.0
 MAPS = ("before", "after", "oracle")
 FIGURES = ("wrong_pct", "interior_pct", "slope_pct")
-EVER_NS = 2**62
 OUTLIER = 3.0  # typical errors beyond which a sample does not count for the true zero and scale
 BATCH = 100  # samples of one machine at a time, as trust sees them
 DIGITS = 4
@@ -287,13 +286,13 @@ def _region(true: Scene) -> Region:
 
 
 def true_errors(data: Tampered, name: str, true: Scene, spans: int) -> list[TrueError]:
-    """Zero and scale of a machine in equal spans of its samples, by least squares against the true ground.
+    """Zero and scale of what a machine measured, in equal spans of its samples, by least squares to the true ground.
 
     Samples near borders of soils do not count, nor those further off than OUTLIER typical errors.
     """
-    rows = data.rows[name]
+    rows = measured(data.rows[name])
     oldest, newest = int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max())
-    ends = [0, *((oldest * (spans - i) + newest * i) // spans for i in range(1, spans)), EVER_NS]
+    ends = [0, *((oldest * (spans - i) + newest * i) // spans for i in range(1, spans)), LAST_NS]
     out = []
     for from_ns, to_ns in pairwise(ends):
         part = rows[(rows["stamp_ns"] >= from_ns) & (rows["stamp_ns"] < to_ns)]
@@ -309,8 +308,8 @@ def _fit(rows: Table, c_rr: Floats32, name: str, true: Scene) -> tuple[float, fl
     ahead = np.stack([np.cos(track.yaw_rad), np.sin(track.yaw_rad)], axis=1)
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
     d, slope = np.sign(rows["speed_mps"].astype(np.float64)), (track.gradient * ahead).sum(axis=1)
-    measured = np.stack([rows["grade_e"], rows["grade_n"]], axis=1)
-    across = np.nanmedian(((measured - track.gradient) * left).sum(axis=1))
+    gradient = np.stack([rows["grade_e"], rows["grade_n"]], axis=1)
+    across = np.nanmedian(((gradient - track.gradient) * left).sum(axis=1))
     usable = np.isfinite(rows["c_rr"]) & np.isfinite(slope) & (border_m > INTERIOR_M)
     columns, off = np.stack([d, d * (d * ground + slope)], axis=1)[usable], (rows["c_rr"] - ground)[usable]
     first = _least_squares(columns, off)

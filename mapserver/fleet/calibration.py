@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.fleet.correction import ANY_SHARE, DIGITS, LEVEL_SHARE, Correction
+from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.observability import CommonScale, Observed, observe
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, against, estimate, problem
@@ -25,7 +25,6 @@ FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a zero, and a scale of
 SURE = 2.0  # standard deviations by which an estimate must be beyond a limit
 # A sensor that measures less than half or more than twice of the drive force has no gain: it is stuck, or on its head.
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
-LAST_NS = 2**62  # a machine's newest correction holds until there is a newer one
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,10 @@ A sample of direction d (+1 ahead, -1 in reverse) on ground c with slope s ahead
 and d c_rr + slope ahead is the drive force over weight as it was measured, (1 + k) (d c + s): in it the zero cancels.
 So with scale = k / (1 + k) nothing but the sample itself is needed to undo all three.
 
+A machine that calibrates itself has taken a zero and a scale off already, and states them in each sample. Then the sum
+above is (1 - applied scale) of the drive force over weight, so that what was measured follows (`measured`), and a
+correction takes off the difference alone: it does not matter who calibrated when.
+
 Only + - * / and a table of headings: kernels and machines would differ in the last bit of a sine, and so would maps.
 """
 
@@ -31,7 +35,8 @@ _PER_RAD = HEADINGS / (2 * np.pi)
 # Where a machine's scale is not known, its share of drive force times that error is the larger part of a sample's error
 # from this share on (data sheets: 0.0045 of zero, 0.045 of scale). To take the zero alone off there would exchange one
 # wrong value for another, so that samples on slopes stay as they are.
-LEVEL_SHARE, ANY_SHARE = 0.1, 10.0
+LEVEL_SHARE, ANY_SHARE = 0.1, 100.0
+LAST_NS = 2**62  # a correction without an end ends then
 DIGITS = 5  # a correction is rounded to 1e-5 before it is used: it is a fact, not a solver's floats
 _C_LOW, _C_HIGH = LIMITS["c_rr"]
 _GRADE_LOW, _GRADE_HIGH = LIMITS["grade_e"]
@@ -60,8 +65,8 @@ class Correction:
 def corrected(rows: Table, corrections: Sequence[Correction]) -> Table:
     """Samples (n,) of one machine without its errors; those that no correction covers stay bytes as they were.
 
-    corrections: of this machine; their spans do not overlap. Values leave the limits of a sample by nothing: they end
-    there.
+    corrections: of this machine; their spans do not overlap. They count from what was measured, so of them only what
+    a sample does not state as applied is taken off. Values leave the limits of a sample by nothing: they end there.
     """
     if not corrections or not len(rows):
         return rows
@@ -70,6 +75,20 @@ def corrected(rows: Table, corrections: Sequence[Correction]) -> Table:
     spans = np.array([(each.from_ns, each.to_ns) for each in ordered], np.int64)
     values = np.array([(each.zero, each.scale, each.across, each.most_share) for each in ordered], np.float64)
     _correct(out, spans, values, UNIT_VECTORS)
+    return out
+
+
+def measured(rows: Table) -> Table:
+    """Samples (n,) as their machines measured them, without the calibrations that these applied; the same where none.
+
+    Ledgers are made of these: the zero of a machine that calibrates itself would seem to step at every standstill.
+    """
+    applied = (rows["applied_zero"] != 0.0) | (rows["applied_scale"] != 0.0)
+    if not applied.any():
+        return rows
+    out = rows.copy()
+    _correct(out, np.array([(0, LAST_NS)], np.int64), np.array([(0.0, 0.0, 0.0, ANY_SHARE)]), UNIT_VECTORS)
+    out["applied_zero"] = out["applied_scale"] = 0.0
     return out
 
 
@@ -87,7 +106,9 @@ def _correct(rows: Any, spans: Any, values: Any, units: Any) -> None:
         at = np.searchsorted(spans[:, 0], row.stamp_ns, side="right") - 1
         if at < 0 or row.stamp_ns >= spans[at, 1]:
             continue
-        zero, scale, across = values[at, 0], values[at, 1], values[at, 2]
+        applied = np.float64(row.applied_scale)
+        zero, scale = values[at, 0] - np.float64(row.applied_zero), values[at, 1] - applied
+        across = values[at, 2]
         unit = heading_index(np.float64(row.heading_rad))
         ahead_e, ahead_n = units[unit, 0], units[unit, 1]
         east, north = np.float64(row.grade_e), np.float64(row.grade_n)
@@ -95,7 +116,7 @@ def _correct(rows: Any, spans: Any, values: Any, units: Any) -> None:
             c_rr = np.float64(row.c_rr)
             if not np.isnan(c_rr):
                 direction = 1.0 if row.speed_mps >= 0.0 else -1.0
-                share = direction * c_rr + (east * ahead_e + north * ahead_n)
+                share = (direction * c_rr + (east * ahead_e + north * ahead_n)) / (1.0 - applied)
                 if abs(share) <= values[at, 3]:
                     c_rr = c_rr - direction * (zero + scale * share)
                     row.c_rr = np.float32(min(max(c_rr, _C_LOW), _C_HIGH))

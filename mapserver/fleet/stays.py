@@ -12,7 +12,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver.fleet.correction import HEADING_TABLE, heading_index
+from mapserver.fleet.correction import HEADING_TABLE, heading_index, measured
 from protocol.arrays import Ints, Table
 
 SLOT_NS = 10_000_000_000
@@ -31,7 +31,8 @@ STAY = np.dtype([("key", "<i8"), *((name, "<i4") for name in SUMS)])
 
 
 def stays(rows: Table, cell_m: float) -> Table:
-    """Stays (k,) of samples (n,) of one machine that have a slope, by their keys."""
+    """Stays (k,) of samples (n,) of one machine that have a slope, by their keys; of what it measured."""
+    rows = measured(rows)
     keys, sums = np.empty(len(rows), np.int64), np.empty((len(rows), len(SUMS)), np.int32)
     used = _measure(rows, cell_m, HEADING_TABLE, keys, sums)
     return summed(keys[:used], sums[:used])

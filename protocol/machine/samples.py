@@ -26,6 +26,8 @@ SAMPLE_DTYPE = np.dtype(
         ("grade_e", "<f4"),
         ("grade_n", "<f4"),
         ("grade_var", "<f4"),
+        ("applied_zero", "<f4"),
+        ("applied_scale", "<f4"),
     ]
 )
 COLUMNS: tuple[str, ...] = SAMPLE_DTYPE.names or ()
@@ -33,6 +35,8 @@ RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records 
 
 RESISTANCE = ("c_rr", "c_rr_var")  # may both be NaN
 GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
+# What the machine's own calibration has taken off its balance already. They may be missing: it took off nothing.
+APPLIED = ("applied_zero", "applied_scale")
 
 
 # Plausible range of each column.
@@ -49,6 +53,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "grade_e": (-5.0, 5.0),
     "grade_n": (-5.0, 5.0),
     "grade_var": (0.0, 100.0),
+    # No accelerometer or drive train that a machine is driven with is further off: ten times what is expected.
+    "applied_zero": (-0.05, 0.05),
+    "applied_scale": (-0.5, 0.5),
 }
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
-from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples, empty
+from protocol.machine.samples import APPLIED, COLUMNS, SAMPLE_DTYPE, check_samples, empty
 from protocol.site.site_config import NAME
 from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
 
@@ -167,7 +167,8 @@ def unpack_batch(data: bytes) -> PackedBatch:
 
 
 def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
-    columns: tuple[Any, ...] = tuple(map(cols.get, COLUMNS))
+    missing = {name: bytes(n * SAMPLE_DTYPE[name].itemsize) for name in APPLIED if cols.get(name) is None}
+    columns: tuple[Any, ...] = tuple(map((cols | missing).get, COLUMNS))
     for name, width, data in zip(COLUMNS, _WIDTHS, columns, strict=True):
         if type(data) is not bytes:
             take(cols, name, bytes)

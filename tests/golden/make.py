@@ -26,7 +26,7 @@ from protocol.machine.readings import (
     Odometry,
     Torque,
 )
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import APPLIED, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
@@ -55,9 +55,26 @@ def rows() -> np.ndarray:
     """Return three samples: complete, without a gradient, without a resistance."""
     return np.array(
         [
-            (T0, 12.25, -40.5, 1.5, 0.25, 2.0, 0.5, 2.75, 0.55, 0.02, 1e-5, 0.125, -0.25, 1e-4),
-            (T0 + 200_000_000, 12.75, -40.25, 1.5, -0.25, 2.0, 0.5, -2.75, 0.5, 0.25, 1e-5, NAN, NAN, NAN),
-            (T0 + 400_000_000, 13.25, -40.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, NAN, NAN, 0.0, 0.0, 1e-4),
+            (T0, 12.25, -40.5, 1.5, 0.25, 2.0, 0.5, 2.75, 0.55, 0.02, 1e-5, 0.125, -0.25, 1e-4, 0.00390625, -0.0625),
+            (
+                T0 + 200_000_000,
+                12.75,
+                -40.25,
+                1.5,
+                -0.25,
+                2.0,
+                0.5,
+                -2.75,
+                0.5,
+                0.25,
+                1e-5,
+                NAN,
+                NAN,
+                NAN,
+                0.00390625,
+                -0.0625,
+            ),
+            (T0 + 400_000_000, 13.25, -40.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, NAN, NAN, 0.0, 0.0, 1e-4, 0.0, 0.0),
         ],
         SAMPLE_DTYPE,
     )
@@ -217,7 +234,15 @@ GOLDEN: dict[str, Golden] = {
     "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),
     "overloaded.bin": Golden(OVERLOADED, answers.encode_error, answers.decode_error),
 }
+OLDER = "batch_older.bin"  # of an agent that does not calibrate itself: it states nothing
 NEWER = "batch_newer.bin"  # of a later version of the software: an unknown field and an unknown column
+
+
+def older_batch() -> bytes:
+    """Return BATCH as an agent without a calibration sends it."""
+    table = msgpack.unpackb(codec.encode_batch(BATCH))
+    cols = {name: column for name, column in table["cols"].items() if name not in APPLIED}
+    return bytes(msgpack.packb({**table, "cols": cols}))
 
 
 def newer_batch() -> bytes:
@@ -230,6 +255,7 @@ def newer_batch() -> bytes:
 def main() -> None:
     for name, golden in GOLDEN.items():
         (FOLDER / name).write_bytes(golden.encode(golden.record))
+    (FOLDER / OLDER).write_bytes(older_batch())
     (FOLDER / NEWER).write_bytes(newer_batch())
 
 

@@ -30,7 +30,7 @@ from agents.delivery.uplink import (
 from agents.delivery.uplink_thread import linger, perform
 from mapserver.ingest.admission import GapError, admit, judge
 from protocol.errors import MessageError, Refusal, StoreError
-from protocol.machine.samples import content_hash
+from protocol.machine.samples import SAMPLE_DTYPE, content_hash
 from protocol.wire.codec import decode_batch, decode_reply, encode_reply
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from tests.unit.agents.drives import SITE, made_up_samples
@@ -296,7 +296,7 @@ def test_batch_fits_the_link(rate_bps: float, delay_s: float, jitter_s: float) -
     assert d.uplink.counters["timeouts"] <= 3
     # Smaller batches would not help where the delay alone takes that long, nor where the first one is small already.
     assert np.median(late) < max(1.2, 1.2 * delay_s + 0.5) if rate_bps > 100e3 else max(late) < TIMEOUT_S
-    share = sent * 68 * 8 / rate_bps / now_s
+    share = sent * SAMPLE_DTYPE.itemsize * 8 / rate_bps / now_s
     assert sent == 60_000 or share > (0.6 if delay_s < 0.2 else 0.15)
 
 

@@ -369,6 +369,36 @@ def test_new_calibration_takes_effect_at_a_standstill_only() -> None:
     assert run.estimator.calibration.passages > 100
 
 
+@pytest.mark.slow
+def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
+    """Without what it states, it is that of a machine that does not calibrate itself."""
+    readings = off(cycles(VEHICLE, 3, ahead_rad=0.1), -0.06, torque=1.04)
+    runs = [EstimatorRun(VEHICLE, EstimationConfig(calibrate=each)).feed(readings) for each in (True, False)]
+    assert len({own.zero for _, own in runs[0].estimates}) > 2  # it changes on the drive
+    for direction, *span in ((1, 79.5, 83.5), (-1, 97.5, 101.5)):
+        pairs = list(zip(*(run.between(*span) for run in runs), strict=True))
+        assert len(pairs) > 30
+        for own, plain in pairs:
+            share = (direction * own.c_rr + own.slope_x) / (1 - own.scale)
+            assert own.c_rr + direction * (own.zero + own.scale * share) == pytest.approx(plain.c_rr, abs=2e-3)
+            assert abs(own.c_rr - plain.c_rr) > 5e-3
+            assert own.slope_x == pytest.approx(math.tan(math.atan(plain.slope_x) + own.zero), abs=1e-12)
+            assert (plain.zero, plain.scale) == (0.0, 0.0)
+
+
+def test_an_estimate_keeps_the_calibration_of_its_time() -> None:
+    """It is made 2 s later, when the machine may stand, and have another."""
+    known = Calibration(0.004, 0.1, ((1e-7, 0.0), (0.0, 1e-4)), START_NS - 10**10, 400)
+    made = drive([STAND, START, Leg(6), STOP, Leg(3)], VEHICLE).readings
+    run = EstimatorRun(VEHICLE, EstimationConfig(), lag_s=4.0, calibration=known)
+    run.feed(made[: len(made) * 3 // 4])
+    asked_ns = made[len(made) // 2].stamp_ns
+    before = run.estimator.at(asked_ns)
+    run.estimator._applied = Calibration(-0.02, 0.3, known.covariance)
+    assert run.estimator.at(asked_ns) == before
+    assert (before.zero, before.scale) == (known.zero, known.scale)
+
+
 def test_calibration_from_before_is_used_at_once() -> None:
     zero = -0.06 / GRAVITY_MPS2
     known = Calibration(zero, 0.0, ((1e-7, 0.0), (0.0, 1e-4)), START_NS - 10**10, 400)

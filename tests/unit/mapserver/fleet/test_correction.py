@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from mapserver.fleet.correction import ANY_SHARE, HEADINGS, LEVEL_SHARE, UNIT_VECTORS, Correction, corrected
+from mapserver.fleet.correction import ANY_SHARE, HEADINGS, LEVEL_SHARE, UNIT_VECTORS, Correction, corrected, measured
+from mapserver.fleet.stays import SUMS, stays
 from protocol.arrays import Floats, Table
-from protocol.machine.samples import LIMITS, SAMPLE_DTYPE
+from protocol.machine.samples import APPLIED, LIMITS, SAMPLE_DTYPE
 from tests.unit.mapserver.data import random_samples
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, START_NS, Errors, drive
 
@@ -27,13 +28,15 @@ def in_numpy(rows: Table, c: Correction) -> Table:
     east, north = rows["grade_e"].astype(np.float64), rows["grade_n"].astype(np.float64)
     d = np.where(rows["speed_mps"] >= 0, 1.0, -1.0)
     c_rr = rows["c_rr"].astype(np.float64)
-    share = d * c_rr + (east * unit[:, 0] + north * unit[:, 1])
+    applied = rows["applied_scale"].astype(np.float64)
+    zero, scale = c.zero - rows["applied_zero"].astype(np.float64), c.scale - applied
+    share = (d * c_rr + (east * unit[:, 0] + north * unit[:, 1])) / (1.0 - applied)
     level = np.abs(share) <= c.most_share
-    new = np.where(level, np.clip(c_rr - d * (c.zero + c.scale * share), *LIMITS["c_rr"]), c_rr)
+    new = np.where(level, np.clip(c_rr - d * (zero + scale * share), *LIMITS["c_rr"]), c_rr)
     low, high = LIMITS["grade_e"]
     out["c_rr"] = np.where(np.isnan(share), rows["c_rr"], new.astype(np.float32))
-    out["grade_e"] = np.clip(east + (c.zero * unit[:, 0] + c.across * unit[:, 1]), low, high)
-    out["grade_n"] = np.clip(north + (c.zero * unit[:, 1] - c.across * unit[:, 0]), low, high)
+    out["grade_e"] = np.clip(east + (zero * unit[:, 0] + c.across * unit[:, 1]), low, high)
+    out["grade_n"] = np.clip(north + (zero * unit[:, 1] - c.across * unit[:, 0]), low, high)
     return out
 
 
@@ -42,7 +45,7 @@ def wild(seed: int) -> Table:
     rows = random_samples(5000, seed)
     rows["heading_rad"] = draw.uniform(-7, 7, len(rows))
     rows["speed_mps"] = draw.normal(0, 3, len(rows))
-    for name in ("c_rr", "grade_e", "grade_n"):
+    for name in ("c_rr", "grade_e", "grade_n", *APPLIED):
         rows[name] = draw.uniform(*LIMITS[name], len(rows))
     rows["c_rr"][:100] = np.nan
     for name in ("c_rr", "grade_e", "grade_n"):
@@ -119,6 +122,82 @@ def test_where_the_scale_is_not_known_samples_on_slopes_keep_their_resistance() 
     assert steep.sum() > 100
     assert out["c_rr"][steep].tobytes() == rows["c_rr"][steep].tobytes()
     assert (out["c_rr"][np.abs(rows["grade_e"]) < 0.02] != rows["c_rr"][np.abs(rows["grade_e"]) < 0.02]).mean() > 0.7
+
+
+# --- machines that calibrate themselves ------------------------------------------------------------------------------
+
+
+def calibrated_by_itself(rows: Table, zero: Floats, scale: Floats) -> Table:
+    """What the machine would have sent with these zeros and scales (n,) applied: agents/estimation/ground.py."""
+    out = rows.copy()
+    d, heading = np.where(rows["speed_mps"] >= 0, 1.0, -1.0), rows["heading_rad"].astype(np.float64)
+    c, s = np.cos(heading), np.sin(heading)
+    share = d * rows["c_rr"] + c * rows["grade_e"] + s * rows["grade_n"]
+    out["c_rr"] -= d * (zero + scale * share)
+    out["grade_e"], out["grade_n"] = rows["grade_e"] + zero * c, rows["grade_n"] + zero * s
+    out["applied_zero"], out["applied_scale"] = zero, scale
+    return out
+
+
+def at_standstills(n: int, seed: int) -> tuple[Floats, Floats]:
+    """Zeros and scales (n,) of a calibration that changes at standstills."""
+    draw = np.random.default_rng(seed)
+    stand = np.arange(n) * 12 // n
+    return draw.normal(0, 0.006, 12)[stand], draw.normal(0, 0.1, 12)[stand]
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_what_a_machine_applied_is_undone_sample_by_sample(direction: float) -> None:
+    raw = drive(RAMP, Errors(0.006, 0.08, -0.004), direction=direction, seed=4)
+    sent = calibrated_by_itself(raw, *at_standstills(len(raw), 1))
+    assert np.abs(sent["c_rr"] - raw["c_rr"]).max() > 0.01
+    back = measured(sent)
+    for name in ("c_rr", "grade_e", "grade_n"):
+        assert np.abs(back[name] - raw[name]).max() < 1e-5 + 0.02 * np.pi / HEADINGS, name
+    assert not back["applied_zero"].any()
+    assert not back["applied_scale"].any()
+    assert measured(back) is back
+
+
+def test_samples_without_a_stated_calibration_are_what_was_measured() -> None:
+    rows = drive(LOW, Errors(0.006), seconds=50.0)
+    assert measured(rows) is rows
+
+
+def test_a_correction_counts_from_what_was_measured_whatever_was_applied() -> None:
+    raw = drive(RAMP, Errors(0.006, 0.08, -0.004), seed=4)
+    sent = calibrated_by_itself(raw, *at_standstills(len(raw), 2))
+    for c in (correction(0.006, 0.08, -0.004), correction(0.0), correction(0.004, most=LEVEL_SHARE)):
+        one, other = corrected(raw, [c]), corrected(sent, [c])
+        level = np.abs(raw["grade_e"]) < 0.02 if c.most_share == LEVEL_SHARE else np.ones(len(raw), np.bool_)
+        assert np.abs(one["c_rr"] - other["c_rr"])[level].max() < 5e-5
+        assert np.abs(one["grade_e"] - other["grade_e"]).max() < 5e-5
+
+
+def test_a_correction_that_a_machine_has_applied_itself_changes_nothing() -> None:
+    zero, scale = 0.00390625, 0.0625  # exact in single precision
+    rows = drive(RAMP, Errors(0.006, 0.08), seed=4)
+    rows["applied_zero"], rows["applied_scale"] = zero, scale
+    own = Correction("a", *EVER, zero, scale, 0.0, ())
+    assert corrected(rows, [own]).tobytes() == rows.tobytes()
+
+
+def test_the_ledger_of_a_machine_that_calibrates_itself_is_that_of_one_that_does_not() -> None:
+    raw = drive(RAMP, Errors(0.006, 0.08, -0.004), seed=5)
+    sent = calibrated_by_itself(raw, *at_standstills(len(raw), 3))
+    one, other, blind = (stays(rows, 2.0) for rows in (raw, sent, without_statement(sent)))
+    assert (one["key"] == other["key"]).all()
+    for name in ("c_rr", "east", "north"):
+        assert np.abs(one[name] - other[name]).max() <= 5 * one["n"].max(), name
+        assert np.abs(one[name] - blind[name]).max() > 100 * one["n"].max(), name
+    for name in set(SUMS) - {"c_rr", "east", "north"}:
+        assert (one[name] == other[name]).all(), name
+
+
+def without_statement(rows: Table) -> Table:
+    out = rows.copy()
+    out["applied_zero"] = out["applied_scale"] = 0.0
+    return out
 
 
 def test_headings_are_those_of_the_table() -> None:

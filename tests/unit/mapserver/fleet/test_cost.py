@@ -9,7 +9,8 @@ from mapserver.fleet.ledger import EPOCHS, Ledger
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
 
 MACHINES, HOURS = 10, 8
-MOST_BYTES, MOST_S = 50e6, 5.0
+MOST_BYTES = 50e6
+MOST_S = 10.0  # twice the goal: processor time itself doubles on a loaded machine
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ T0 = 1_750_000_000_000_000_000
 
 
 def rows(n: int = 5) -> np.ndarray:
-    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4)
+    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4, 1e-3, 0.01)
     return np.array([one] * n, SAMPLE_DTYPE)
 
 
@@ -141,6 +141,10 @@ def test_column_of_another_length_is_named(column, change):
         ("grade_e", np.nan, Refusal.NOT_FINITE),
         ("grade_n", -6.0, Refusal.OUT_OF_RANGE),
         ("grade_var", np.inf, Refusal.NOT_FINITE),
+        ("applied_zero", np.nan, Refusal.NOT_FINITE),
+        ("applied_zero", 0.051, Refusal.OUT_OF_RANGE),
+        ("applied_scale", -np.inf, Refusal.NOT_FINITE),
+        ("applied_scale", -0.51, Refusal.OUT_OF_RANGE),
     ],
 )
 def test_bad_value_is_named_with_its_row(column, value, reason):
@@ -149,6 +153,25 @@ def test_bad_value_is_named_with_its_row(column, value, reason):
     partner = {"cov_xx_m2": "cov_xy_m2", "c_rr_var": "c_rr"}  # named for the pair
     assert error.field in (column, partner.get(column))
     assert f"{error.field}[3]" in str(error)
+
+
+@pytest.mark.parametrize("missing", [("applied_zero",), ("applied_scale",), ("applied_zero", "applied_scale")])
+@pytest.mark.parametrize("nil", [False, True])
+def test_a_calibration_that_is_not_stated_is_none(missing, nil):
+    cols = {name: column for name, column in msgpack.unpackb(changed())["cols"].items() if name not in missing}
+    expected = rows()
+    for name in missing:
+        expected[name] = 0.0
+    got = decode_batch(changed(cols=cols | (dict.fromkeys(missing) if nil else {})), EXTENT_M)
+    assert got.rows.tobytes() == expected.tobytes()
+
+
+def test_a_calibration_that_is_no_column_is_refused():
+    cols = {**msgpack.unpackb(changed())["cols"], "applied_zero": 0.001}
+    assert (refusal(changed(cols=cols)).reason, refusal(changed(cols=cols)).field) == (
+        Refusal.WRONG_TYPE,
+        "applied_zero",
+    )
 
 
 def test_ten_megabytes_are_refused_unread():
@@ -196,6 +219,8 @@ def tables(draw):
         **dict.fromkeys(("heading_rad", "grade_e", "grade_n"), st.floats(-4, 4, width=32)),
         **dict.fromkeys(("speed_mps", "distance_m", "c_rr_var", "grade_var"), st.floats(0, 50, width=32)),
         "c_rr": st.floats(-1, 5, width=32),
+        "applied_zero": st.floats(-0.03125, 0.03125, width=32),
+        "applied_scale": st.floats(-0.5, 0.5, width=32),
     }
     table = np.zeros(draw(st.integers(0, 4)), SAMPLE_DTYPE)
     for row in table:

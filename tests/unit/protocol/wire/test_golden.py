@@ -25,10 +25,10 @@ def same(a, b) -> bool:
 
 
 def test_every_message_has_a_golden_file(golden):
-    assert sorted([*golden.GOLDEN, golden.NEWER]) == NAMES
+    assert sorted([*golden.GOLDEN, golden.OLDER, golden.NEWER]) == NAMES
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "batch_newer.bin"])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("batch_older.bin", "batch_newer.bin")])
 def test_golden_file_decodes_to_the_record_and_back(golden, name):
     entry, data = golden.GOLDEN[name], (FOLDER / name).read_bytes()
     assert same(entry.decode(data), entry.record)
@@ -39,8 +39,15 @@ def test_unknown_field_and_column_of_a_newer_agent_are_ignored(golden):
     assert same(golden.decode_batch((FOLDER / golden.NEWER).read_bytes()), golden.BATCH)
 
 
+def test_an_agent_that_states_no_calibration_has_applied_none(golden):
+    rows = golden.BATCH.rows.copy()
+    rows["applied_zero"] = rows["applied_scale"] = 0.0
+    older = golden.decode_batch((FOLDER / golden.OLDER).read_bytes())
+    assert same(older, dataclasses.replace(golden.BATCH, rows=rows))
+
+
 def test_columns_and_types_are_the_specified_ones():
     from protocol.machine.samples import SAMPLE_DTYPE
 
     assert SAMPLE_DTYPE.names[:3] == ("stamp_ns", "x_m", "y_m")
-    assert [SAMPLE_DTYPE[name].str for name in SAMPLE_DTYPE.names] == ["<i8", "<f8", "<f8", *["<f4"] * 11]
+    assert [SAMPLE_DTYPE[name].str for name in SAMPLE_DTYPE.names] == ["<i8", "<f8", "<f8", *["<f4"] * 13]
