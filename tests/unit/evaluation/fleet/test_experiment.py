@@ -13,7 +13,9 @@ from evaluation.campaign.figures import judge
 from evaluation.fleet import experiment
 from evaluation.fleet.cases import CASES, RAMP_STEPS, FleetCase, tampered
 from evaluation.fleet.drives import Scene, planned, spoiled
-from evaluation.fleet.experiment import CaseResult, calibrated, judged, solved, summarise, true_errors
+from evaluation.fleet.experiment import summarise
+from evaluation.fleet.solving import FIGURES, MAPS, CaseResult, JudgedMap, calibrated, judged, solved
+from evaluation.fleet.true_errors import true_errors
 from evaluation.ground.truth import LoadTrack
 from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
@@ -61,7 +63,7 @@ def test_truth_shows_the_errors_of_a_machine(scene) -> None:
 
 def test_after_is_better_than_before_and_near_the_oracle(scene) -> None:
     result = solved(case("machines_3"), *scene)
-    wrong = {name: row["wrong_pct"] for name, row in result.maps.items()}
+    wrong = {name: each.figures["wrong_pct"] for name, each in result.maps.items()}
     assert wrong["oracle"] <= wrong["after"] + 1.0
     assert wrong["after"] < wrong["before"] / 2
     assert result.common == (True, "")
@@ -93,7 +95,7 @@ def test_ramps_of_other_ground_leave_the_slope_alone(scene, step: float) -> None
     result = solved(chosen, *scene)
     if abs(step) > 0.005:
         assert result.common == (False, "ground_changes_with_slope")
-        assert result.maps["after"]["slope_pct"] <= result.maps["before"]["slope_pct"] + 1.0
+        assert result.maps["after"].figures["slope_pct"] <= result.maps["before"].figures["slope_pct"] + 1.0
 
 
 def test_it_rains_for_the_machine_that_drives_late(scene) -> None:
@@ -110,16 +112,22 @@ def test_it_rains_for_the_machine_that_drives_late(scene) -> None:
 def test_a_map_of_right_samples_is_right(scene) -> None:
     rows = {name: drive(route, seed=i, late=False) for i, (name, (route, _)) in enumerate(ROUTES.items())}
     true = Scene(truth(), {name: track(table) for name, table in rows.items()})
-    figures = judged(rows, tampered(case("machines_3"), rows, true), true)
+    figures = judged(rows, tampered(case("machines_3"), rows, true), true).figures
     assert figures["interior_pct"] < 2.0
     assert calibrated(rows, {"a"}).machines["a"].zero == pytest.approx(0.0, abs=0.003)
 
 
+def judged_map(*figures: float) -> JudgedMap:
+    return JudgedMap(
+        dict(zip(FIGURES, figures, strict=True)), *[np.zeros((1, 1), np.int64)] * 2, np.ones((1, 1), np.bool_)
+    )
+
+
 def test_rows_are_means_over_the_seeds() -> None:
-    maps = {name: {"wrong_pct": 2.0, "interior_pct": 1.0, "slope_pct": np.nan} for name in experiment.MAPS}
+    maps = dict.fromkeys(MAPS, judged_map(2.0, 1.0, np.nan))
     one = CaseResult(maps, np.array([0.001]), np.array([0.02]), np.array([1.0, 2.0]), (True, ""), {})
     other = CaseResult(
-        {**maps, "after": {**maps["after"], "wrong_pct": 4.0}},
+        {**maps, "after": judged_map(4.0, 1.0, np.nan)},
         np.array([-0.001]),
         np.array([0.0]),
         np.array([0.0, 0.0]),
@@ -139,7 +147,7 @@ def test_rows_are_means_over_the_seeds() -> None:
 
 
 def test_better_than_before_is_not_above_it() -> None:
-    maps = {name: dict.fromkeys(experiment.FIGURES, wrong) for name, wrong in (("before", 9.0), ("after", 2.0))}
+    maps = {name: judged_map(wrong, wrong, wrong) for name, wrong in (("before", 9.0), ("after", 2.0))}
     result = CaseResult({**maps, "oracle": maps["after"]}, *[np.zeros(1)] * 3, (True, ""), {})
     row = summarise(case("machines_3"), "after", [result])
     assert (row["change_pct"], row["slope_change_pct"]) == (-7.0, -7.0)
@@ -147,8 +155,7 @@ def test_better_than_before_is_not_above_it() -> None:
 
 
 def test_goals_are_of_cases_and_figures_that_there_are() -> None:
-    result = CaseResult({name: dict.fromkeys(experiment.FIGURES, 1.0) for name in experiment.MAPS}, *[np.zeros(1)] * 3,
-                        (True, ""), {})  # fmt: skip
+    result = CaseResult(dict.fromkeys(MAPS, judged_map(1.0, 1.0, 1.0)), *[np.zeros(1)] * 3, (True, ""), {})
     rows = [summarise(each, "after", [result]) for each in CASES]
     judgements = judge(experiment.GOALS, rows)
     assert len(judgements) == len(experiment.GOALS)
@@ -165,10 +172,10 @@ def test_a_bad_machine_is_distrusted_and_the_others_are_as_without_it(scene) -> 
     without = solved(case("machines_3"), rows, true)
     assert list(with_bad.distrusted) == ["bad"]
     assert "beyond_data_sheet" in with_bad.distrusted["bad"]
-    assert with_bad.maps == without.maps
+    assert {n: each.figures for n, each in with_bad.maps.items()} == {n: m.figures for n, m in without.maps.items()}
     let_in = replace(case("machines_4"), machines=0, let_in=(2,))
     result = solved(let_in, {**rows, "bad": d}, Scene(true.truth, places))
-    assert result.maps["after"]["wrong_pct"] < result.maps["before"]["wrong_pct"]
+    assert result.maps["after"].figures["wrong_pct"] < result.maps["before"].figures["wrong_pct"]
     assert len(result.zeros) == len(without.zeros) + 1
 
 
