@@ -12,7 +12,7 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
-from mapserver.follower import exclusion, follower
+from mapserver.follower import follower, refolding
 from mapserver.follower.follower import Follower
 from mapserver.follower.jobs import Archiving, Audit
 from mapserver.ingest.store import JOURNAL_FILE
@@ -66,7 +66,7 @@ class Site:
 @pytest.fixture
 def opened(tmp_path, monkeypatch):
     monkeypatch.setattr(follower, "TURN_S", 0.01)
-    monkeypatch.setattr(exclusion, "RETRY_S", 0.01)
+    monkeypatch.setattr(refolding, "RETRY_S", 0.01)
 
     @contextmanager
     def open_site(**options: Any):
@@ -132,7 +132,7 @@ def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
         row = site.follower.trust("b", False, "its scale is broken", 20.0)
         assert (row["trusted"], row["by"], row["reason"]) == (False, "person", "its scale is broken")
         assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert site.follower.excluded() == {"b"}
+        assert site.follower.facts().excluded == {"b"}
         assert site.follower.trust("b", True, "repaired", 20.0)["trusted"]
         assert same(site.grid, fold_of(sent, site.config))
 
@@ -169,7 +169,7 @@ def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
     with opened(judge_s=JUDGE_S) as site:
         deliver(site, sent)
-        wait_for(lambda: site.follower.excluded() == {"c"})
+        wait_for(lambda: site.follower.facts().excluded == {"c"})
         row = site.machine("c")
         assert (row["trusted"], row["by"]) == (False, "audit")
         assert "gain" in row["reason"]
@@ -185,7 +185,7 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
         never = threading.Event()
         for _ in range(4):  # turns in which it could be excluded
             never.wait(JUDGE_S)
-        assert site.follower.excluded() == frozenset()
+        assert site.follower.facts().excluded == frozenset()
         assert site.machine("c")["trusted"]
         assert site.machine("c")["reasons"]
 
@@ -193,11 +193,11 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
 def test_a_person_overrules_the_audit_and_hands_back(opened):
     with opened(judge_s=JUDGE_S) as site:
         deliver(site, fleet({"c": 1.6}))
-        wait_for(lambda: site.follower.excluded() == {"c"})
+        wait_for(lambda: site.follower.facts().excluded == {"c"})
         assert site.follower.trust("c", True, "I know better", 20.0)["by"] == "person"
-        assert site.follower.excluded() == frozenset()
+        assert site.follower.facts().excluded == frozenset()
         assert not site.follower.trust("c", None, "", 20.0)["trusted"]
-        assert site.follower.excluded() == {"c"}
+        assert site.follower.facts().excluded == {"c"}
 
 
 def test_a_machine_that_sent_nothing_is_refused_by_name(opened):
@@ -276,7 +276,7 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
         with pytest.raises(QueryError, match=f"the decision is kept, but the map is not folded again .*{path.name}"):
             site.follower.trust("a", False, "", 0.5)
         assert path.name in caplog.text
-        wait_for(lambda: caplog.text.count("job=exclusion") > 1)  # it is tried again
+        wait_for(lambda: caplog.text.count("job=refolding") > 1)  # it is tried again
         assert len(reader.events("trust")) == 1
         send(site.writer, [incoming(samples(5), 6)])
         assert site.grid.state().folded == 10
