@@ -175,7 +175,7 @@ def _moved(pb: Problem, zero: Floats, variance: Floats) -> Floats:
     beside = (np.diff(machine) == 0) & (np.diff(number) == 1)
     noise = SURE**2 * (variance[1:] + variance[:-1])
     apart = np.where(beside, np.maximum(np.diff(zero) ** 2 - noise, 0.0) / 4, 0.0)
-    return np.maximum(np.append(apart, 0.0), np.append(0.0, apart))
+    return np.asarray(np.maximum(np.append(apart, 0.0), np.append(0.0, apart)), np.float64)
 
 
 def _corrections(pb: Problem, applied: _Applied) -> list[Correction]:
