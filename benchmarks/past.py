@@ -14,6 +14,7 @@ from benchmarks.measure import START_NS, Report, machine
 from benchmarks.merge_restart import CONFIG, SITE, build
 from benchmarks.merge_work import A_SECOND, samples_of
 from mapserver.ingest.store import JOURNAL_FILE
+from mapserver.journal.facts import NO_FACTS
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Admission
@@ -25,7 +26,6 @@ from protocol.machine.samples import empty
 from protocol.site.geometry import CellWindow
 from protocol.wire.messages import SampleBatch
 
-NOBODY: frozenset[str] = frozenset()
 POINT_M, AROUND_CELLS = 250.0, 80  # a crossing; the cells that a point is read from, as changes need surroundings
 HISTORY_ROWS, HISTORY_SPAN_NS = 100_000, 300 * 10**9
 GOALS_MS = {
@@ -61,7 +61,7 @@ def made(past: Past, reader: JournalReader, now_ns: int) -> Report:
     closed, seconds, steps = list[int](), list[float](), list[float]()
     while (closed_ns := due(now_ns + GRACE_NS, closed, [], lambda at: past.next_stamp(reader, at))) is not None:
         began_s = last_s = time.process_time()
-        for _ in make(past, reader, closed_ns, NOBODY):
+        for _ in make(past, reader, closed_ns, NO_FACTS):
             steps.append(time.process_time() - last_s)
             last_s = time.process_time()
         seconds.append(time.process_time() - began_s)
@@ -84,7 +84,7 @@ def _asked(past: Past, reader: JournalReader, now_ns: int, runs: int) -> Iterato
         "point, last day", [_took_s(lambda: past.grid_as_of(reader, next(times), window)) for _ in range(9 * runs)]
     )
     yield _row("whole map, last day", [_took_s(lambda: past.grid_as_of(reader, next(times))) for _ in range(runs)])
-    for entry in past.checkpoints.entries({}, 0)[1:]:
+    for entry in past.checkpoints.entries(lambda _: {}, 0)[1:]:
         entry.path.unlink()
     later = iter(np.linspace(START_NS + HOUR_NS, now_ns, runs + 1, dtype=np.int64)[1:].tolist())
     yield _row("whole map, last month", [_took_s(lambda: past.grid_as_of(reader, next(later))) for _ in range(runs)])

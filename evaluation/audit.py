@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +21,12 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import REFOLD_ROWS, Grid
 from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import Page
+from mapserver.ingest.decisions import Decisions
 from mapserver.ingest.store import JOURNAL_FILE
+from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRow
-from mapserver.trust.decisions import KIND as TRUST
-from mapserver.trust.decisions import TrustDecisions
 from protocol.arrays import Ints
 from protocol.machine.samples import content_hash
 from protocol.site.site_config import SiteConfig
@@ -64,10 +64,10 @@ def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, conf
     """Compare audit files with the store of a server that has ended."""
     with JournalReader(folder / JOURNAL_FILE) as journal:
         rows = list(history_rows(History.beside(journal)))
-        excluded = TrustDecisions(journal.events(TRUST)).distrusted
+        facts = Decisions.of_journal(journal).facts
     last = rows[-1].row if rows else 0
-    _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, excluded)
-    return compare(read_audits(audits), rows, grid, site, config, excluded)
+    _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, facts.of_evidence())
+    return compare(read_audits(audits), rows, grid, site, config, facts)
 
 
 def compare(
@@ -76,18 +76,19 @@ def compare(
     grid: Grid,
     site: SiteConfig,
     config: ServerConfig,
-    excluded: Collection[str] = (),
+    facts: Facts = NO_FACTS,
 ) -> AuditResult:
-    """Compare recorded samples with journal rows, and those, folded again, with a grid; excluded: of the grid."""
+    """Compare recorded samples with journal rows, and those, folded again, with a grid; facts: of the grid."""
     withheld = 0
     refolded = Grid(site.cell_m, config.fold, REFOLD_ROWS)
     hashes: dict[SampleKey, list[str]] = {}
     contents: Counter[tuple[str, str]] = Counter()
     for row in rows:
-        if row.machine in excluded:
+        if row.machine in facts.excluded:
             withheld += len(row.rows)
         else:
-            refolded.fold(row.rows, row.machine)
+            corrected = facts.corrections.applied(row.rows, [row.machine], np.zeros(len(row.rows), np.int64))
+            refolded.fold(corrected, row.machine)
         for i, sample in enumerate(row.rows):
             content = content_hash(sample)
             hashes.setdefault((row.machine, row.spool_id, row.first_seq + i), []).append(content)

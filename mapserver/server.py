@@ -17,7 +17,8 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import grid
 from mapserver.follower.follower import Follower
 from mapserver.ingest import batches
-from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store, Verify
+from mapserver.ingest.admission import Verify
+from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.ingest.store_folder import store_id
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records

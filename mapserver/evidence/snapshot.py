@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -25,22 +25,23 @@ from protocol.files import PRIVATE, whole_file
 
 _NAME = re.compile(r"snapshot-(\d+)\.npz")
 KEEP = 2
+NO_FACTS: Mapping[str, object] = {}
 _TOTALS = ("folded", "skipped", "newest_ns", "oldest_ns")
 log = logging.getLogger("mapserver.evidence.snapshot")
 
 
 def save(
-    folder: Path, row: int, state: GridState, cell_m: float, config: FoldConfig, excluded: Collection[str] = ()
+    folder: Path, row: int, state: GridState, cell_m: float, config: FoldConfig, facts: Mapping[str, object] = NO_FACTS
 ) -> Path:
     """Write a snapshot that is true for journal row `row`, and remove all but the newest two.
 
-    excluded: machines whose rows were not folded. Raises OSError.
+    facts: plain values of all else that it depends on; see `parameters`. Raises OSError.
     """
     path = folder / f"snapshot-{row}.npz"
     for part in folder.glob(".snapshot-*.part"):  # of a process that was killed: one alone writes to a store
         part.unlink(missing_ok=True)
     totals = {name: getattr(state, name) for name in _TOTALS}
-    header = {**parameters(cell_m, config, excluded), "row": row, **totals}
+    header = {**parameters(cell_m, config, facts), "row": row, **totals}
     with whole_file(path, PRIVATE) as file:
         np.savez(file, header=np.array(json.dumps(header)), **_arrays(state.blocks))  # type: ignore[arg-type]
     for old in rows_on_disk(folder)[KEEP:]:
@@ -65,12 +66,14 @@ def remove_beyond(folder: Path, last_row: int) -> None:
             (folder / f"snapshot-{row}.npz").unlink(missing_ok=True)
 
 
-def load(path: Path, cell_m: float, config: FoldConfig, excluded: Collection[str] = ()) -> tuple[int, Grid] | None:
+def load(
+    path: Path, cell_m: float, config: FoldConfig, facts: Mapping[str, object] = NO_FACTS
+) -> tuple[int, Grid] | None:
     """Return the row and the grid of a snapshot, or None if it is damaged or was made with other parameters."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
-            expected = parameters(cell_m, config, excluded)
+            expected = parameters(cell_m, config, facts)
             if {key: header.get(key) for key in expected} != expected:
                 return None
             state = GridState(_blocks(file), *(header[name] for name in _TOTALS))
@@ -83,23 +86,23 @@ def load(path: Path, cell_m: float, config: FoldConfig, excluded: Collection[str
 
 
 def load_newest(
-    folder: Path, last_row: int, cell_m: float, config: FoldConfig, excluded: Collection[str] = ()
+    folder: Path, last_row: int, cell_m: float, config: FoldConfig, facts: Mapping[str, object] = NO_FACTS
 ) -> tuple[int, Grid]:
     """Return the newest usable snapshot that the journal reaches, or row 0 and an empty grid."""
     for row in rows_on_disk(folder):
-        if row <= last_row and (loaded := load(folder / f"snapshot-{row}.npz", cell_m, config, excluded)):
+        if row <= last_row and (loaded := load(folder / f"snapshot-{row}.npz", cell_m, config, facts)):
             return loaded
     return 0, Grid(cell_m, config)
 
 
-def parameters(cell_m: float, config: FoldConfig, excluded: Collection[str]) -> dict[str, object]:
+def parameters(cell_m: float, config: FoldConfig, facts: Mapping[str, object]) -> dict[str, object]:
     """What the evidence depends on beside the samples: its form, the fold, and the facts about machines.
 
-    A snapshot or a checkpoint made with others is not used. excluded: machines whose rows are not folded.
+    A snapshot or a checkpoint made with others is not used. facts: plain values.
     """
     fold = {**asdict(config), "std_floor_m": STD_FLOOR_M}
     bins = [ev.RESISTANCE_BINS, ev.GRADE_BINS, ev.SECTORS]
-    return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": bins, "excluded": sorted(excluded), **fold}
+    return {"schema": ev.SCHEMA, "cell_m": cell_m, "bins": bins, **facts, **fold}
 
 
 def _arrays(blocks: Sequence[tuple[int, int, CompactPages]]) -> dict[str, AnyArray]:

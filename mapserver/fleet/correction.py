@@ -16,7 +16,8 @@ Only + - * / and a table of headings: kernels and machines would differ in the l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ import numba
 import numpy as np
 
 from protocol.arrays import Floats, Ints, Table
+from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import LIMITS
 
 HEADINGS = 4096  # of the table: 0.8e-3 rad off at most, which on 15 degrees is 0.2e-3 of a slope across
@@ -62,20 +64,64 @@ class Correction:
     most_share: float = ANY_SHARE
 
 
-def corrected(rows: Table, corrections: Sequence[Correction]) -> Table:
-    """Samples (n,) of one machine without its errors; those that no correction covers stay bytes as they were.
+class Corrections:
+    """Corrections of all machines as one value: equal ones change every sample alike.
 
-    corrections: of this machine; their spans do not overlap. They count from what was measured, so of them only what
-    a sample does not state as applied is taken off. Values leave the limits of a sample by nothing: they end there.
+    each: by machine and time; the spans of one machine do not overlap.
     """
-    if not corrections or not len(rows):
-        return rows
-    out = rows.copy()
-    ordered = sorted(corrections, key=lambda correction: correction.from_ns)
-    spans = np.array([(each.from_ns, each.to_ns) for each in ordered], np.int64)
-    values = np.array([(each.zero, each.scale, each.across, each.most_share) for each in ordered], np.float64)
-    _correct(out, spans, values, UNIT_VECTORS)
-    return out
+
+    def __init__(self, each: Iterable[Correction] = ()) -> None:
+        self.each = tuple(sorted(each, key=lambda one: (one.machine, one.from_ns)))
+        self._spans = np.array([(one.from_ns, one.to_ns) for one in self.each], np.int64).reshape(-1, 2)
+        values = [(one.zero, one.scale, one.across, one.most_share) for one in self.each]
+        self._values = np.array(values, np.float64).reshape(-1, 4)
+        self._places: dict[str, tuple[int, int]] = {}  # of each machine's: the first, and the end
+        for at, one in enumerate(self.each):
+            self._places[one.machine] = self._places.get(one.machine, (at, at))[0], at + 1
+        self._key = self.digest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Corrections) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def digest(self, before_ns: int = MAX_STAMP_NS) -> str:
+        """A word for what they do to samples stamped before a time, which no others have; "" for nothing.
+
+        Where a span is cut in two, it is another word, which does no harm: it says when evidence may be used again.
+        """
+        early = self._spans[:, 0] < before_ns
+        if not early.any():
+            return ""
+        hashed = hashlib.blake2b(digest_size=8)
+        hashed.update(np.minimum(self._spans[early], before_ns).tobytes() + self._values[early].tobytes())
+        hashed.update("/".join(one.machine for one, hit in zip(self.each, early, strict=True) if hit).encode())
+        return hashed.hexdigest()
+
+    def applied(self, rows: Table, machines: Sequence[str], machine: Ints) -> Table:
+        """Samples (n,) without their machines' errors; those that no correction covers stay bytes as they were.
+
+        machines: names; machine (n,): index of each sample's in them. Corrections count from what was measured, so of
+        them only what a sample does not state as applied is taken off. Values leave the limits of a sample by nothing:
+        they end there.
+        """
+        places = np.array([self._places.get(name, (0, 0)) for name in machines], np.int64).reshape(-1, 2)
+        if not len(rows) or not places.any():
+            return rows
+        out = rows.copy()
+        _correct(out, machine, places, self._spans, self._values, UNIT_VECTORS)
+        return out
+
+
+UNCORRECTED = Corrections()
+
+
+def corrected(rows: Table, corrections: Iterable[Correction]) -> Table:
+    """Samples (n,) of one machine without its errors. corrections: of this machine; see `Corrections.applied`."""
+    own = Corrections(corrections)
+    names = [one.machine for one in own.each[:1]]
+    return own.applied(rows, names, np.zeros(len(rows), np.int64))
 
 
 def measured(rows: Table) -> Table:
@@ -86,8 +132,7 @@ def measured(rows: Table) -> Table:
     applied = (rows["applied_zero"] != 0.0) | (rows["applied_scale"] != 0.0)
     if not applied.any():
         return rows
-    out = rows.copy()
-    _correct(out, np.array([(0, LAST_NS)], np.int64), np.array([(0.0, 0.0, 0.0, ANY_SHARE)]), UNIT_VECTORS)
+    out = corrected(rows, [Correction("", 0, LAST_NS, 0.0, 0.0, 0.0, ())])
     out["applied_zero"] = out["applied_scale"] = 0.0
     return out
 
@@ -99,12 +144,16 @@ def heading_index(heading_rad: float) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _correct(rows: Any, spans: Any, values: Any, units: Any) -> None:
-    """Correct rows in place. spans (k, 2) in order; values (k, 4): zero, scale, across, most_share."""
+def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, units: Any) -> None:
+    """Correct rows in place. machine (n,): index in places (m, 2), each one's first and end in the corrections.
+
+    spans (k, 2): by machine, in order of time; values (k, 4): zero, scale, across, most_share.
+    """
     for i in range(len(rows)):
         row = rows[i]
-        at = np.searchsorted(spans[:, 0], row.stamp_ns, side="right") - 1
-        if at < 0 or row.stamp_ns >= spans[at, 1]:
+        first, end = places[machine[i], 0], places[machine[i], 1]
+        at = first + np.searchsorted(spans[first:end, 0], row.stamp_ns, side="right") - 1
+        if at < first or row.stamp_ns >= spans[at, 1]:
             continue
         applied = np.float64(row.applied_scale)
         zero, scale = values[at, 0] - np.float64(row.applied_zero), values[at, 1] - applied

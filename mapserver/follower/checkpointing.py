@@ -6,11 +6,13 @@ import logging
 import shutil
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mapserver.ingest.writer import Writer
+from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalReader
 from mapserver.past.checkpoints import Entry
 from mapserver.past.making import make, remove_unfinished
@@ -30,7 +32,8 @@ class _Making:
     """A checkpoint in the making. began_s: on the monotonic clock."""
 
     path: Path
-    without: frozenset[str]
+    closed_ns: int
+    depends_on: Mapping[str, Any]
     steps: Iterator[None]
     began_s: float
 
@@ -68,19 +71,19 @@ class Checkpointing:
             self._making = None
 
     def _turn(self) -> None:
-        now_ns, without = self._writer.run(lambda store: (store.newest_ns, store.excluded))
-        if self._making and self._making.without != without:
+        now_ns, facts = self._writer.run(lambda store: (store.newest_ns, store.facts))
+        before = self._past.depends_on(self._reader, facts)
+        if self._making and self._making.depends_on != before(self._making.closed_ns):
             self.close()
         if not self._making:
-            facts = self._past.facts(self._reader, without)
-            entries = self._past.checkpoints.look(facts, self._reader.last_row)
+            entries = self._past.checkpoints.look(before, self._reader.last_row)
             self._remove(entries, surplus(now_ns, [entry.closed_ns for entry in entries]))
-            closed_ns = self._next(now_ns, without, entries)
+            closed_ns = self._next(now_ns, facts, entries)
             more = 0 if closed_ns is None else max([self._expected_bytes, *(entry.bytes for entry in entries[-1:])])
             if not self._has_room(now_ns, entries, more) or closed_ns is None:
                 return
-            steps = make(self._past, self._reader, closed_ns, without)
-            self._making = _Making(self._past.checkpoints.path(closed_ns), without, steps, time.monotonic())
+            steps, path = make(self._past, self._reader, closed_ns, facts), self._past.checkpoints.path(closed_ns)
+            self._making = _Making(path, closed_ns, before(closed_ns), steps, time.monotonic())
         self._go_on(self._making)
 
     def _go_on(self, making: _Making) -> None:
@@ -93,10 +96,10 @@ class Checkpointing:
         values = (making.path.name, self._expected_bytes, time.monotonic() - making.began_s)
         log.info("checkpoint made name=%s bytes=%d seconds=%.1f", *values)
 
-    def _next(self, now_ns: int, without: frozenset[str], entries: list[Entry]) -> int | None:
+    def _next(self, now_ns: int, facts: Facts, entries: list[Entry]) -> int | None:
         """When the next one is closed; None where there is nothing to do."""
         usable, unusable = ([entry.closed_ns for entry in entries if entry.usable == each] for each in (True, False))
-        there = (now_ns // MINUTE_NS, without, *usable, None, *unusable)
+        there = (now_ns // MINUTE_NS, facts, *usable, None, *unusable)
         if there != self._nothing_due:
             closed_ns = due(now_ns, usable, unusable, lambda from_ns: self._past.next_stamp(self._reader, from_ns))
             if closed_ns is not None:

@@ -1,4 +1,4 @@
-"""The follower: a thread beside the writer that runs four jobs in turn, and one that folds the map again."""
+"""The follower: a thread beside the writer that runs five jobs in turn, and one that folds the map again."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ import threading
 import time
 from typing import Any
 
+from mapserver.follower.calibrating import Calibrating
 from mapserver.follower.checkpointing import Checkpointing
-from mapserver.follower.exclusion import Exclusion
 from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Publish
+from mapserver.follower.refolding import Refolding
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
+from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalReader
 from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
-from protocol.errors import QueryError, Refusal, SitegridError
+from protocol.errors import QueryError, Refusal, SitegridError, StoreError
 from protocol.queries.answers import GroundChange
 
 # Between two turns, which is how late a change of the ground is published: where a large fleet drives everywhere at
@@ -35,17 +37,19 @@ class Follower:
         self._writer = writer
         self._reader = reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ending = threading.Event()
-        self._exclusion = Exclusion(writer)
-        self._audit = Audit(writer, reader, self._exclusion.judge, self._ending)
+        self._refolding = Refolding(writer, past)
+        self._calibrating = Calibrating(writer, past, self._refolding.calibrate, self._doubtful, self._ending)
+        self._audit = Audit(writer, reader, self._refolding.judge, self._calibrating.states, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
-        self._jobs = (self._audit, self._changes, Archiving(writer, reader, self._ending), self._checkpointing)
+        archiving = Archiving(writer, reader, self._ending)
+        self._jobs = (self._audit, self._calibrating, self._changes, archiving, self._checkpointing)
         self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
         self._thread.start()
 
-    def excluded(self) -> frozenset[str]:
-        """Machines whose rows are not in the map."""
-        return self._exclusion.excluded()
+    def facts(self) -> Facts:
+        """What the map is folded with."""
+        return self._refolding.facts()
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with a number beyond `after`."""
@@ -66,20 +70,38 @@ class Follower:
         if machine not in sent:
             names = ", ".join(sorted(sent)) or "none"
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
-        number = self._exclusion.decide(self._decision(machine, trusted, reason))
-        self._exclusion.wait(number, wait_s)
+        number = self._refolding.decide(self._decision(machine, trusted, reason))
+        self._refolding.wait(number, wait_s)
         return next(row for row in self.machines() if row["name"] == machine)
+
+    def calibrate(self, wait_s: float) -> None:
+        """Calibrate all machines with all that is journalled by now; waits until the map is folded so.
+
+        Raises QueryError where nothing can be read or written, or after wait_s; then what was decided is kept.
+        """
+        try:
+            solved, now_ns = self._calibrating.solve()
+        except StoreError as error:
+            raise QueryError(Refusal.STORE, str(error)) from None
+        number = self._refolding.calibrate(solved, now_ns, asked=True)
+        self._refolding.wait(number, wait_s)
 
     def close(self) -> None:
         """End the threads."""
         self._ending.set()
-        self._exclusion.close()
+        self._refolding.close()
         self._thread.join()
         self._checkpointing.close()
+        self._calibrating.close()
         self._reader.close()
 
+    def _doubtful(self) -> frozenset[str]:
+        """Machines without a say on what the ground is like: those left out, and those that contradict all others."""
+        contradict = {name for name, verdict in self._audit.verdicts.items() if verdict.contradicts}
+        return self._refolding.distrusted() | contradict
+
     def _machine(self, name: str, sent: dict[str, int]) -> dict[str, Any]:
-        decision, verdict = self._exclusion.decision(name), self._audit.verdicts.get(name)
+        decision, verdict = self._refolding.decision(name), self._audit.verdicts.get(name)
         return {
             "name": name,
             "trusted": decision.trusted if decision else True,

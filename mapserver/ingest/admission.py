@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from mapserver.journal.rows import Admission, StoreIdentity
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
+from protocol.wire import keys
 from protocol.wire.messages import SampleBatch
 
+Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 DAY_NS = 86_400_000_000_000
 FUTURE_NS = DAY_NS  # clocks that nobody set to the right zone or day are less wrong than that
 FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01: a server's clock before this program was written is wrong
@@ -99,6 +101,17 @@ def check_store(batch: SampleBatch, identity: StoreIdentity, accepted: Collectio
     problem = f"earlier samples of this run are in store {batch.store}, and this is store {identity.id}: start the"
     problem += f" server with that one, or `sitegrid accept {batch.store}` if it is gone"
     raise MessageError(Refusal.OTHER_STORE, problem, field="store")
+
+
+def signature_problem(verify: Verify, site: str, machine: str, payload: bytes, signature: bytes) -> MessageError | None:
+    """What is wrong with the signature of a batch that came in under the key of `machine`, None where nothing is."""
+    if not machine:
+        return MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
+    try:
+        verify(machine, keys.ingest(site, machine), payload, signature)
+    except MessageError as error:
+        return error
+    return None
 
 
 def admit(batch: SampleBatch, watermark: int) -> Admission:

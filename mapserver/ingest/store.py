@@ -20,30 +20,28 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, SeenTime, admit, check_store, judge
+from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_store, judge, signature_problem
 from mapserver.ingest.batches import decode_batches
+from mapserver.ingest.decisions import Decision, Decisions, plain
 from mapserver.ingest.losses import by_machine, name_shortfalls
 from mapserver.ingest.store_folder import hold
 from mapserver.journal.archive import FOLDER, Archive
+from mapserver.journal.facts import Facts
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
 from mapserver.journal.refold import fold_history, release_memory
-from mapserver.journal.rows import Admission, Selection
+from mapserver.journal.rows import Admission, Event, Selection
 from mapserver.past import checkpoints
-from mapserver.trust.decisions import KIND as TRUST
-from mapserver.trust.decisions import TrustDecision, TrustDecisions, last_counted
 from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
-from protocol.wire import keys
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
 JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
-Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
 
 
 @dataclass(frozen=True)
@@ -58,8 +56,8 @@ class Incoming:
 class Store:
     """Journal, grid, watermarks and counters of one site.
 
-    identity: which store this is; accepted: ids of those whose place it takes. excluded: machines whose rows are not in
-    the grid. merged: the last journal row that is; fact: the last decision in it. newest_ns: the site's now.
+    identity: which store this is; accepted: ids of those whose place it takes. facts: that the grid was folded with;
+    merged: the last journal row that is in it. newest_ns: the site's now.
     """
 
     def __init__(
@@ -81,21 +79,22 @@ class Store:
             opened.callback(self.journal.close)
             self.identity = self.journal.identity()
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
-            self.excluded, last_row = TrustDecisions(self.journal.events(TRUST)).distrusted, self.journal.last_row
+            self._decisions, last_row = Decisions.of_journal(self.journal), self.journal.last_row
+            self.facts = facts = self._decisions.facts
             self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
             snapshot.remove_beyond(folder, last_row)
             checkpoints.remove_beyond(folder, last_row)
-            self.merged, self.grid = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, self.excluded)
+            loaded = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, facts.of_evidence())
+            self.merged, self.grid = loaded
             self.snapshot_row = self.merged
             in_snapshot = self.grid.counts()
-            fold_history(self.grid, self._history(), self.merged, selection=Selection(without=self.excluded))
+            fold_history(self.grid, self._history(), self.merged, selection=Selection.by(facts))
             release_memory()
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
             self._snapshot_samples = self.journal.samples - tail
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
-            self.fact = last_counted(self.journal.events(TRUST), self.excluded)
             self._opened = opened.pop_all()
 
     @property
@@ -117,6 +116,11 @@ class Store:
     def version(self) -> MapVersion:
         """The version of the map as it is."""
         return MapVersion(self.identity.id, self.merged, self.fact)
+
+    @property
+    def fact(self) -> int:
+        """Number of the last decision that is in the grid."""
+        return self.facts.number
 
     def commit(self, group: list[Incoming]) -> list[Ack | Refused]:
         """Journal a group of batches in one commit, fold it, and return the answer to each.
@@ -148,32 +152,39 @@ class Store:
         """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
         if self.merged <= self.snapshot_row:
             return None
-        row, grid, excluded, samples = self.merged, self.grid, self.excluded, self.journal.samples
+        row, grid, facts, samples = self.merged, self.grid, self.facts, self.journal.samples
         state = grid.state()
 
         def write() -> None:
-            snapshot.save(self.folder, row, state, self.site.cell_m, self.config.fold, excluded)
+            snapshot.save(self.folder, row, state, self.site.cell_m, self.config.fold, facts.of_evidence())
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
                 self.snapshot_row, self._snapshot_samples = row, samples
 
         return write
 
-    def adopt(self, grid: Grid, row: int, excluded: frozenset[str]) -> None:
-        """Go on with a grid that was folded elsewhere up to a journal row, without the excluded machines.
+    def adopt(self, grid: Grid, row: int, facts: Facts) -> None:
+        """Go on with a grid that was folded elsewhere, with these facts, up to a journal row.
 
         The rows beyond it are folded here, while batches wait: let them be few.
         """
         grid.touch_all()
-        for rows in read_history(self._history(), after=row, selection=Selection(without=excluded)):
-            grid.fold_all(rows.samples, rows.names())
-        self.grid, self.excluded = grid, excluded
-        self.fact = last_counted(self.journal.events(TRUST), self.excluded)
-        self.snapshot_row = self._snapshot_samples = 0  # what is on disk has other machines in it
+        selection = Selection.by(facts)
+        for rows in read_history(self._history(), after=row, selection=selection):
+            grid.fold_all(*rows.selected(selection))
+        self.grid, self.facts = grid, facts
+        self._count_decisions()
+        self.snapshot_row = self._snapshot_samples = 0  # what is on disk was folded with other facts
 
-    def decide(self, decision: TrustDecision) -> None:
-        """Keep a decision with the journal; it counts in the map at once, unless that has to be folded again for it."""
-        self.journal.append_event(TRUST, decision.stamp_ns, asdict(decision))
-        self.fact = last_counted(self.journal.events(TRUST), self.excluded)
+    def decide(self, decision: Decision) -> tuple[Event, Facts]:
+        """Keep a decision with the journal; returns it as an event, and the facts that the map is to follow.
+
+        It counts at once, unless the map has to be folded again for it.
+        """
+        kind, body = plain(decision)
+        event = Event(self.journal.append_event(kind, decision.stamp_ns, body), kind, decision.stamp_ns, body)
+        self._decisions.add(event)
+        self._count_decisions()
+        return event, self._decisions.facts
 
     def accept(self, store: str, reason: str) -> None:
         """Take the place of another store for good, since a person says so: its runs are taken on here."""
@@ -208,7 +219,7 @@ class Store:
             "version": package_version(),
             "server": {"host": socket.gethostname(), "pid": os.getpid()},
             "machines": self.machines(),
-            "distrusted": sorted(self.excluded),
+            "distrusted": sorted(self.facts.excluded),
             "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
             "counters": dict(self.counters),
         }
@@ -219,22 +230,11 @@ class Store:
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
         """What each batch holds, or why it is refused; one that is not signed is not looked at."""
-        refused = [self._signature_problem(incoming) for incoming in group]
+        sent = ((incoming.machine, incoming.payload, incoming.signature) for incoming in group)
+        refused = [signature_problem(self._verify, self.site.name, *each) if self._verify else None for each in sent]
         signed = (incoming.payload for incoming, error in zip(group, refused, strict=True) if error is None)
         decoded = iter(decode_batches(list(signed), self.site.extent_m))
         return [error or next(decoded) for error in refused]
-
-    def _signature_problem(self, incoming: Incoming) -> MessageError | None:
-        if not self._verify:
-            return None
-        if not incoming.machine:
-            return MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
-        key = keys.ingest(self.site.name, incoming.machine)
-        try:
-            self._verify(incoming.machine, key, incoming.payload, incoming.signature)
-        except MessageError as error:
-            return error
-        return None
 
     def _admit(self, incoming: Incoming, batch: SampleBatch | MessageError) -> tuple[Ack | Refused, Admission | None]:
         try:
@@ -256,7 +256,7 @@ class Store:
 
     def _newest_but(self, machine: str) -> int:
         """The newest stamp of the machines in the map but one."""
-        hidden = self.excluded | {machine}
+        hidden = self.facts.excluded | {machine}
         return max((newest_ns for name, newest_ns in self._newest.items() if name not in hidden), default=0)
 
     def _seen(self, machine: str) -> SeenTime:
@@ -280,14 +280,20 @@ class Store:
 
     def _fold(self, batches: list[SampleBatch]) -> None:
         """Fold what was committed: all of it that there is, up to the last journal row."""
-        folded = [batch for batch in batches if batch.machine not in self.excluded]
+        folded = [batch for batch in batches if batch.machine not in self.facts.excluded]
         names = np.array([name_hash(batch.machine) for batch in folded], np.uint64)
+        machine = np.repeat(np.arange(len(folded)), [len(batch.rows) for batch in folded])
         rows = joined([batch.rows for batch in folded])
-        self.grid.fold_all(rows, np.repeat(names, [len(batch.rows) for batch in folded]))
+        self.grid.fold_all(self.facts.corrections.applied(rows, [b.machine for b in folded], machine), names[machine])
         for batch in batches:
             newest_ns = int(batch.rows["stamp_ns"].max())
             self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)
         self.merged = self.journalled
+
+    def _count_decisions(self) -> None:
+        """Count further decisions as followed where they come to the facts that the grid has."""
+        if self._decisions.facts == self.facts:
+            self.facts = self._decisions.facts
 
     def _history(self) -> History:
         return History(self.journal, Archive(self.folder / FOLDER))

@@ -55,7 +55,16 @@ def fold_history(
 
     Whether it came to the end: where `stopped` says so it ends early, and the grid is of no use.
     """
-    pieces = _pieces(history, after, until, selection)
+    return fold_samples(grid, _pieces(history, after, until, selection), stopped, threads)
+
+
+def fold_samples(
+    grid: Grid,
+    pieces: Generator[Samples, None, None],
+    stopped: Callable[[], bool] = lambda: False,
+    threads: int = THREADS,
+) -> bool:
+    """As `fold_history`, of any samples, piece by piece."""
     try:
         with lent(threads) as workers, grid.bulk(workers), closing(ahead(pieces) if threads > 1 else pieces) as coming:
             for samples, names in coming:

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence.fold_config import name_hash
+from mapserver.fleet.correction import UNCORRECTED, Corrections
+from mapserver.journal.facts import Facts
 from protocol.arrays import Bools, Ints, Table
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
@@ -98,30 +100,38 @@ class JournalRows:
         return self.chosen(others[self.machine])
 
     def selected(self, selection: Selection) -> tuple[Table, NDArray[np.uint64]]:
-        """Samples that are selected by stamp and place, (m,), and the hashes of their machines' names, (m,)."""
+        """Samples that are selected by stamp and place, corrected, (m,), and hashes of their machines' names, (m,)."""
         chosen = selection.includes(self.samples)
-        if chosen.all():
-            return self.samples, self.names()
-        return self.samples.view(RAW_SAMPLE)[chosen].view(SAMPLE_DTYPE), self.names()[chosen]
+        samples, names, machine = self.samples, self.names(), np.repeat(self.machine, self.lengths)
+        if not chosen.all():
+            samples = samples.view(RAW_SAMPLE)[chosen].view(SAMPLE_DTYPE)
+            names, machine = names[chosen], machine[chosen]
+        return selection.corrections.applied(samples, self.machines, machine), names
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which journal rows to read. A row that may hold a selected sample is given whole.
+    """Which journal rows to read. A row that may hold a selected sample is given whole, bytes as they were sent.
 
     from_ns, to_ns: rows with samples in from_ns <= stamp <= to_ns. bounds: rows whose samples' bounding box touches it.
-    without: machines to exclude.
+    without: machines to exclude. corrections: of what `JournalRows.selected` gives.
     """
 
     from_ns: int = 0
     to_ns: int = MAX_STAMP_NS
     bounds: Bounds | None = None
     without: frozenset[str] = frozenset()
+    corrections: Corrections = UNCORRECTED
+
+    @classmethod
+    def by(cls, facts: Facts, from_ns: int = 0, to_ns: int = MAX_STAMP_NS, bounds: Bounds | None = None) -> Selection:
+        """What a map with these facts is made of."""
+        return cls(from_ns, to_ns, bounds, facts.excluded, facts.corrections)
 
     @property
     def everywhere(self) -> bool:
         """Whether neither time nor place excludes a row."""
-        return self == Selection(without=self.without)
+        return (self.from_ns, self.to_ns, self.bounds) == (0, MAX_STAMP_NS, None)
 
     def includes(self, samples: Table) -> Bools:
         """Which samples (n,) are selected by stamp and place."""

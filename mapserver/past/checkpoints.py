@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 from mapserver.past.checkpoint_file import Checkpoint, DamagedError, FileState, Header, file_state
 
 FOLDER = "checkpoints"  # in the folder of a store
+FactsBefore = Callable[[int], Mapping[str, Any]]  # what evidence of samples stamped before a time depends on
 _FORMAT = "%Y-%m-%dT%H.checkpoint"
 log = logging.getLogger("mapserver.past.checkpoints")
 
@@ -47,7 +48,7 @@ class Checkpoints:
         """Where the one that is closed at a full hour lies."""
         return self.folder / datetime.fromtimestamp(closed_ns // 10**9, UTC).strftime(_FORMAT)
 
-    def entries(self, facts: Mapping[str, Any], last_row: int) -> list[Entry]:
+    def entries(self, facts: FactsBefore, last_row: int) -> list[Entry]:
         """All that there are, oldest first; usable are those made with these facts, of rows that there are."""
         with self._lock:
             paths = list(self.folder.glob("*.checkpoint"))
@@ -56,10 +57,11 @@ class Checkpoints:
         entries = []
         for entry in sorted(known, key=lambda entry: entry.closed_ns):
             head = entry.header
-            entries.append(replace(entry, usable=bool(head and head.facts == facts and head.row <= last_row)))
+            usable = head is not None and head.row <= last_row and head.facts == facts(entry.closed_ns)
+            entries.append(replace(entry, usable=usable))
         return entries
 
-    def nearest(self, until_ns: int, facts: Mapping[str, Any], last_row: int) -> Checkpoint | None:
+    def nearest(self, until_ns: int, facts: FactsBefore, last_row: int) -> Checkpoint | None:
         """Open the newest usable one that is closed at `until_ns` or before; None where there is none."""
         for entry in reversed(self.entries(facts, last_row)):
             if entry.usable and entry.closed_ns <= until_ns:
@@ -72,7 +74,7 @@ class Checkpoints:
                 checkpoint.close()
         return None
 
-    def look(self, facts: Mapping[str, Any], last_row: int) -> list[Entry]:
+    def look(self, facts: FactsBefore, last_row: int) -> list[Entry]:
         """As `entries`; `state` tells of them from then on."""
         entries = self.entries(facts, last_row)
         usable = [entry.closed_ns for entry in entries if entry.usable]
@@ -119,7 +121,7 @@ def remove_beyond(store: Path, last_row: int) -> None:
 
     They are left where the journal was restored from a backup.
     """
-    for entry in Checkpoints(store).entries({}, last_row):
+    for entry in Checkpoints(store).entries(lambda _: {}, last_row):
         if entry.header and entry.header.row > last_row:
             log.warning("checkpoint removed path=%s row=%d last_row=%d", entry.path, entry.header.row, last_row)
             entry.path.unlink(missing_ok=True)

@@ -16,6 +16,7 @@ from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridState
 from mapserver.evidence.pages import CompactPages
 from mapserver.evidence.timeline import Block
+from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Selection
 from mapserver.past.checkpoint_file import Checkpoint, CheckpointWriter, DamagedError, Header
@@ -29,18 +30,19 @@ SPILL_SAMPLES = 1_000_000  # what was folded of them takes 50 MB; then it goes t
 SPILL_FILE = "spill"
 
 
-def make(past: Past, reader: JournalReader, closed_ns: int, without: frozenset[str]) -> Iterator[None]:
-    """Make the checkpoint that is closed at a full hour, without some machines, step by step.
+def make(past: Past, reader: JournalReader, closed_ns: int, facts: Facts) -> Iterator[None]:
+    """Make the checkpoint that is closed at a full hour, with these facts, step by step.
 
     It is true for all rows that the journal has at the first step. Ended early, it leaves nothing. Raises OSError, and
     StoreError where the journal, the archive or the checkpoint that it begins with is damaged; that one is passed over.
     """
-    header = Header(closed_ns, reader.last_row, past.facts(reader, without))
-    base = past.checkpoints.nearest(closed_ns, header.facts, header.row)
+    before = past.depends_on(reader, facts)
+    header = Header(closed_ns, reader.last_row, before(closed_ns))
+    base = past.checkpoints.nearest(closed_ns, before, header.row)
     spill = past.checkpoints.folder / SPILL_FILE
     try:
         part, waiting = Grid(past.cell_m, past.config, FOLDED_AT_ONCE), 0
-        selection = Selection(to_ns=closed_ns - 1, without=without)
+        selection = Selection.by(facts, to_ns=closed_ns - 1)
         for samples, names in past.lacking(reader, base.header if base else None, selection, header.row):
             part.fold_all(samples, names)
             waiting += len(samples)

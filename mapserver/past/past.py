@@ -8,7 +8,7 @@ samples up to that time, bit for bit, whichever checkpoint it begins with, and a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,14 @@ from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.snapshot import parameters
 from mapserver.journal.archive import FOLDER, Archive
+from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.history import History, read_history
 from mapserver.journal.reader import LAST, JournalReader
 from mapserver.journal.refold import THREADS, lent
-from mapserver.journal.rows import Selection
+from mapserver.journal.rows import JournalRows, Selection
 from mapserver.journal.stamp_index import StampIndex
 from mapserver.past.checkpoint_file import Checkpoint, DamagedError, Header
-from mapserver.past.checkpoints import Checkpoints
+from mapserver.past.checkpoints import Checkpoints, FactsBefore
 from protocol.arrays import Table
 from protocol.site.geometry import Bounds, CellWindow, GridGeometry
 
@@ -48,25 +49,33 @@ class Past:
         """The past of the store in a folder."""
         return cls(Archive(folder / FOLDER), StampIndex(), Checkpoints(folder), cell_m, config)
 
-    def facts(self, reader: JournalReader, without: frozenset[str]) -> dict[str, Any]:
-        """What evidence of this store depends on beside its samples; checkpoints made with other facts are not used.
+    def depends_on(self, reader: JournalReader, facts: Facts) -> FactsBefore:
+        """What evidence of samples stamped before a time depends on; no checkpoint made with anything else is used."""
+        store = reader.identity().id
 
-        without: machines whose samples are excluded.
-        """
-        return {"store": reader.identity().id, **parameters(self.cell_m, self.config, without)}
+        def before(closed_ns: int) -> Mapping[str, Any]:
+            return {"store": store, **parameters(self.cell_m, self.config, facts.of_evidence(closed_ns))}
+
+        return before
 
     def samples(
         self, reader: JournalReader, selection: Selection, after: int = 0, until: int = LAST
     ) -> Iterator[NamedSamples]:
-        """The selected samples of rows after < row <= until, many at a time."""
+        """The selected samples of rows after < row <= until, corrected, many at a time."""
+        for rows in self.rows(reader, selection, after, until):
+            yield rows.selected(selection)
+
+    def rows(
+        self, reader: JournalReader, selection: Selection, after: int = 0, until: int = LAST
+    ) -> Iterator[JournalRows]:
+        """Rows after < row <= until that may hold selected samples, as they were sent, many at a time."""
         history = History(reader, self.archive)
         for stretch in self.stamps.stretches(reader, after, until, selection):
-            for rows in read_history(history, *stretch, selection):
-                yield rows.selected(selection)
+            yield from read_history(history, *stretch, selection)
 
     def lacking(
         self, reader: JournalReader, base: Header | None, selection: Selection, until: int = LAST
-    ) -> Iterator[NamedSamples]:
+    ) -> Generator[NamedSamples, None, None]:
         """The selected samples of rows up to `until` that are not in a checkpoint: all of them without one.
 
         selection: without a beginning, and with an end that is not before that of the checkpoint.
@@ -100,25 +109,25 @@ class Past:
         reader: JournalReader,
         to_ns: int,
         window: CellWindow | None = None,
-        without: frozenset[str] = frozenset(),
+        facts: Facts = NO_FACTS,
     ) -> Grid:
-        """The fold of all samples stamped `to_ns` or earlier, without the machines in `without`.
+        """The fold of all samples stamped `to_ns` or earlier, with these facts.
 
         window: only the evidence of these cells is complete, and nothing far from them is read.
         """
-        grid, base = self._nearest(reader, to_ns, window, without)
+        grid, base = self.nearest(reader, to_ns, window, facts)
         bounds = reach_of(window, self.cell_m, self.config) if window else None
         with lent(1 if window else THREADS) as workers, grid.bulk(workers):
-            for samples, names in self.lacking(reader, base, Selection(to_ns=to_ns, bounds=bounds, without=without)):
+            for samples, names in self.lacking(reader, base, Selection.by(facts, to_ns=to_ns, bounds=bounds)):
                 grid.fold_all(samples, names)
         return grid
 
-    def _nearest(
-        self, reader: JournalReader, to_ns: int, window: CellWindow | None, without: frozenset[str]
+    def nearest(
+        self, reader: JournalReader, to_ns: int, window: CellWindow | None, facts: Facts
     ) -> tuple[Grid, Header | None]:
         """The evidence of the nearest checkpoint without later samples, and its header; empty where there is none."""
-        facts, last_row = self.facts(reader, without), reader.last_row
-        while checkpoint := self.checkpoints.nearest(to_ns + 1, facts, last_row):
+        before, last_row = self.depends_on(reader, facts), reader.last_row
+        while checkpoint := self.checkpoints.nearest(to_ns + 1, before, last_row):
             with checkpoint:
                 try:
                     return self.grid(checkpoint, window), checkpoint.header

@@ -126,14 +126,14 @@ class Answers:
     def history(self, query: HistoryQuery) -> HistoryAnswer:
         """Layers of the cell that a position lies in, span by span."""
         names = _of_cells(query.layers)
-        now_ns, fact = self._writer.run(lambda store: (store.newest_ns, store.fact))
+        now_ns, facts = self._writer.run(lambda store: store.newest_ns), self._follower.facts()
         span_s = query.span_s or self._config.fold.bucket_s
         from_ns, to_ns = _time_of(query, now_ns, span_s)
         cell = self._cell(query.x_m, query.y_m)
-        selection = Selection(from_ns, to_ns, without=self._follower.excluded())
+        selection = Selection.by(facts, from_ns, to_ns)
         past, merged = self._past.history((cell.column, cell.row), selection, round(span_s * 1e9))
         x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
-        version = MapVersion(self._writer.store_id, merged, fact)
+        version = MapVersion(self._writer.store_id, merged, facts.number)
         return HistoryAnswer(x_m, y_m, self._spans(past, names), version, now_ns)
 
     def tiles(self, query: TilesQuery) -> TilesAnswer:
@@ -158,7 +158,7 @@ class Answers:
         """Everything that is known of the cell that a position lies in."""
         window = self._cell(query.x_m, query.y_m)
         view = self._view(window, query.as_of_ns)
-        excluded = self._follower.excluded()
+        excluded = self._follower.facts().excluded
         names = self._writer.run(lambda store: [name for name in store.machines() if name not in excluded])
         version = MapVersion(self._writer.store_id, view.merged, view.fact)
         return reasons(view, version, (window.column, window.row), names, self._site.cell_m, self._config)
@@ -214,8 +214,7 @@ class Answers:
     def _view(self, window: CellWindow, as_of_ns: int | None) -> View:
         if as_of_ns is None:
             return self._writer.run(lambda store: view_now(store, window))
-        fact = self._writer.run(lambda store: store.fact)
-        return replace(self._past.view(window, as_of_ns, self._follower.excluded()), fact=fact)
+        return self._past.view(window, as_of_ns, self._follower.facts())
 
     def _spans(self, past: CellHistory, names: tuple[str, ...]) -> tuple[HistorySpan, ...]:
         values = cell_layers.read(past.evidence, names, self._config.read, past.last_ns[:, None])

@@ -15,6 +15,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block, evidence
 from mapserver.ingest.store import Store
+from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
@@ -56,12 +57,12 @@ class PastMaps:
     past: Past
     config: ServerConfig
 
-    def view(self, window: CellWindow, stamp_ns: int, without: frozenset[str]) -> View:
+    def view(self, window: CellWindow, stamp_ns: int, facts: Facts) -> View:
         """The map from samples stamped so or earlier; journal rows that are committed meanwhile may be in it."""
         reach = reach_blocks(self.past.cell_m, self.config.change)
         with self._reader() as (reader, last_row):
-            grid = self.past.grid_as_of(reader, stamp_ns, _surroundings(window, reach), without)
-        return View(_pages(grid, window, reach), last_row, stamp_ns)
+            grid = self.past.grid_as_of(reader, stamp_ns, _surroundings(window, reach), facts)
+        return View(_pages(grid, window, reach), last_row, stamp_ns, facts.number)
 
     def history(self, cell: tuple[int, int], selection: Selection, span_ns: int) -> tuple[CellHistory, int]:
         """Evidence of a cell (column, row) span by span, and the journal row that it is true for."""

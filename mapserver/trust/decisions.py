@@ -74,13 +74,3 @@ class TrustDecisions:
 def _stands(decision: TrustDecision) -> bool:
     """Whether the audit leaves a decision alone."""
     return decision.by == PERSON or (not decision.trusted and Reason.BEYOND_DATA_SHEET in decision.reason.split(", "))
-
-
-def last_counted(events: Iterable[Event], excluded: frozenset[str]) -> int:
-    """Number of the last decision up to which decisions exclude these machines; 0 for none."""
-    decisions, number = TrustDecisions(()), 0
-    for event in events:
-        decisions.add(TrustDecision(**event.body))
-        if decisions.distrusted == excluded:
-            number = event.id
-    return number

@@ -24,7 +24,7 @@ from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
 
 if TYPE_CHECKING:
-    from mapserver.ingest.store import Verify
+    from mapserver.ingest.admission import Verify
     from mapserver.server import Server
 
 HELP = "run the map server of a site"

@@ -182,7 +182,7 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     newest = next(iter(snapshot.rows_on_disk(folder)), 0)
     age_s = now_s - (folder / f"snapshot-{newest}.npz").stat().st_mtime if newest else math.inf
     text = str(lacks) if lacks else ""
-    past = Checkpoints(folder).entries({}, last_row)
+    past = Checkpoints(folder).entries(lambda _: {}, last_row)
     sizes, damaged = sum(entry.bytes for entry in past), sum(entry.header is None for entry in past)
     rows = (SCHEMA, last_row, archived, len(machines), newest, age_s)
     return StoreState(site, frame, *rows, text, missing, len(past) - damaged, sizes, damaged)

@@ -101,7 +101,7 @@ def test_batches_and_queries_are_answered_during_a_refold_and_the_map_is_that_of
     end(server)
     snapshots = list((site.folder / "store").glob("snapshot-*"))
     with store_of(site) as store:
-        assert store.excluded == {"loader-1", "loader-2"}
+        assert store.facts.excluded == {"loader-1", "loader-2"}
         adopted = store.grid
         folded = adopted.folded
         assert folded == fold_without(site, {"loader-1", "loader-2"}).folded + sender.watermark

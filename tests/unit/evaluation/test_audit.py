@@ -219,7 +219,7 @@ def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, folder):
     store.journal.append_event(KIND, 1, asdict(TrustDecision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1)))
     store.close()
     store = Store(folder, SITE, CONFIG, time.time_ns)
-    assert store.excluded == {"b"}
+    assert store.facts.excluded == {"b"}
     store.save_snapshot()
     store.close()
     result = audit_store(clean[1], folder, SITE, CONFIG)

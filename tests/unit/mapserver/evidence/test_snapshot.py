@@ -113,14 +113,14 @@ def test_a_snapshot_of_other_cells_or_another_floor_is_passed_over(tmp_path, mon
     assert snapshot.load(path, 1.0, FOLD) is None
 
 
-def test_a_snapshot_without_other_machines_is_passed_over(tmp_path):
-    state = folded(samples(3)).state()
-    path = snapshot.save(tmp_path, 1, state, 1.0, FOLD, excluded={"b", "a"})
-    assert snapshot.load(path, 1.0, FOLD, excluded=frozenset({"a", "b"})) is not None
-    for excluded in ((), ("a",), ("a", "b", "c")):
-        assert snapshot.load(path, 1.0, FOLD, excluded) is None
-        assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD, excluded)[0] == 0
-    assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD, {"a", "b"})[0] == 1
+def test_a_snapshot_of_other_facts_is_passed_over(tmp_path):
+    state, facts = folded(samples(3)).state(), {"excluded": ["a", "b"], "corrections": "3c"}
+    path = snapshot.save(tmp_path, 1, state, 1.0, FOLD, facts)
+    assert snapshot.load(path, 1.0, FOLD, facts) is not None
+    for other in ({"excluded": []}, {"excluded": ["a"]}, {"excluded": ["a", "b", "c"]}, {"corrections": ""}):
+        assert snapshot.load(path, 1.0, FOLD, {**facts, **other}) is None
+        assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD, {**facts, **other})[0] == 0
+    assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD, facts)[0] == 1
 
 
 def test_an_empty_grid_is_kept_too(tmp_path):

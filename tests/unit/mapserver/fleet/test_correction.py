@@ -1,12 +1,23 @@
 """Corrected samples: the errors of a sample undone, and nothing else changed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mapserver.fleet.correction import ANY_SHARE, HEADINGS, LEVEL_SHARE, UNIT_VECTORS, Correction, corrected, measured
+from mapserver.fleet.correction import (
+    ANY_SHARE,
+    HEADINGS,
+    LEVEL_SHARE,
+    Correction,
+    Corrections,
+    corrected,
+    measured,
+)
 from mapserver.fleet.stays import SUMS, stays
 from protocol.arrays import Floats, Table
 from protocol.machine.samples import APPLIED, LIMITS, SAMPLE_DTYPE
+from tests.reference.correction import in_numpy
 from tests.unit.mapserver.data import random_samples
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, START_NS, Errors, drive
 
@@ -17,27 +28,6 @@ def correction(
     zero: float, k: float = 0.0, across: float = 0.0, *, span: tuple[int, int] = EVER, most: float = ANY_SHARE
 ) -> Correction:
     return Correction("a", *span, zero, k / (1 + k), across, (), most)
-
-
-def in_numpy(rows: Table, c: Correction) -> Table:
-    """The same in numpy, operation by operation."""
-    out = rows.copy()
-    unit = UNIT_VECTORS[
-        (np.floor(rows["heading_rad"].astype(np.float64) * (HEADINGS / (2 * np.pi)) + 0.5)).astype(int) % HEADINGS
-    ]
-    east, north = rows["grade_e"].astype(np.float64), rows["grade_n"].astype(np.float64)
-    d = np.where(rows["speed_mps"] >= 0, 1.0, -1.0)
-    c_rr = rows["c_rr"].astype(np.float64)
-    applied = rows["applied_scale"].astype(np.float64)
-    zero, scale = c.zero - rows["applied_zero"].astype(np.float64), c.scale - applied
-    share = (d * c_rr + (east * unit[:, 0] + north * unit[:, 1])) / (1.0 - applied)
-    level = np.abs(share) <= c.most_share
-    new = np.where(level, np.clip(c_rr - d * (zero + scale * share), *LIMITS["c_rr"]), c_rr)
-    low, high = LIMITS["grade_e"]
-    out["c_rr"] = np.where(np.isnan(share), rows["c_rr"], new.astype(np.float32))
-    out["grade_e"] = np.clip(east + (zero * unit[:, 0] + c.across * unit[:, 1]), low, high)
-    out["grade_n"] = np.clip(north + (zero * unit[:, 1] - c.across * unit[:, 0]), low, high)
-    return out
 
 
 def wild(seed: int) -> Table:
@@ -207,3 +197,60 @@ def test_headings_are_those_of_the_table() -> None:
     out = corrected(rows, [correction(1.0)])
     assert np.abs(out["grade_e"] - np.cos(angles)).max() < np.pi / HEADINGS + 1e-5
     assert np.abs(out["grade_n"] - np.sin(angles)).max() < np.pi / HEADINGS + 1e-5
+
+
+# --- all machines ----------------------------------------------------------------------------------------------------
+
+MANY = [
+    Correction("a", 0, START_NS + 600 * 10**9, 0.01, 0.03, 0.002, ()),
+    Correction("a", START_NS + 600 * 10**9, 2**62, -0.01, 0.0, 0.0, (), LEVEL_SHARE),
+    Correction("b", START_NS + 300 * 10**9, START_NS + 900 * 10**9, 0.002, -0.1, 0.0, ()),
+]
+
+
+def test_samples_of_all_machines_are_corrected_as_those_of_each():
+    rows, draw = wild(7), np.random.default_rng(7)
+    rows["stamp_ns"] = START_NS + draw.integers(0, 1800, len(rows)) * 10**9
+    machine = draw.integers(0, 3, len(rows))
+    out = Corrections(MANY).applied(rows, ["c", "b", "a"], machine)
+    for index, name in enumerate("cba"):
+        own = [each for each in MANY if each.machine == name]
+        assert out[machine == index].tobytes() == corrected(rows[machine == index], own).tobytes()
+    assert out[machine == 0].tobytes() == rows[machine == 0].tobytes()
+    assert (out[machine == 2] != rows[machine == 2]).any()
+    halves = [Corrections(MANY[::-1]).applied(rows[i::2], ["c", "b", "a"], machine[i::2]) for i in (0, 1)]
+    assert [half.tobytes() for half in halves] == [out[i::2].tobytes() for i in (0, 1)]
+
+
+def test_corrections_of_others_leave_the_samples_alone():
+    rows = wild(1)
+    assert Corrections(MANY).applied(rows, ["c"], np.zeros(len(rows), np.int64)) is rows
+    assert Corrections().applied(rows, ["a"], np.zeros(len(rows), np.int64)) is rows
+
+
+def test_equal_corrections_are_those_that_do_the_same():
+    assert Corrections(MANY) == Corrections(MANY[::-1])
+    assert len({Corrections(MANY), Corrections(MANY[::-1]), Corrections()}) == 2
+    less_sure = [replace(each, covariance=((1.0,),)) for each in MANY]
+    assert Corrections(less_sure) == Corrections(MANY)
+    for changed in (
+        {"machine": "d"},
+        {"zero": 0.02},
+        {"scale": 0.02},
+        {"across": 0.02},
+        {"most_share": 0.2},
+        {"to_ns": 9},
+    ):
+        assert Corrections([replace(MANY[0], **changed), *MANY[1:]]) != Corrections(MANY)
+    assert Corrections() != MANY
+
+
+def test_a_digest_before_a_time_is_of_what_is_done_until_then():
+    some, later = Corrections(MANY), Correction("b", START_NS + 900 * 10**9, 2**62, 0.5, 0.0, 0.0, ())
+    more = Corrections([*MANY, later])
+    assert more.digest() != some.digest()
+    assert more.digest(START_NS + 900 * 10**9) == some.digest(START_NS + 900 * 10**9)
+    assert more.digest(START_NS + 900 * 10**9 + 1) != some.digest(START_NS + 900 * 10**9 + 1)
+    cut = [replace(MANY[0], to_ns=START_NS + 200 * 10**9), *MANY[1:]]
+    assert Corrections(cut).digest(START_NS + 200 * 10**9) == some.digest(START_NS + 200 * 10**9)
+    assert Corrections(MANY[1:]).digest(START_NS) == Corrections().digest() == ""

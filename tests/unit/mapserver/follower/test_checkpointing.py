@@ -14,6 +14,7 @@ from mapserver.follower import checkpointing
 from mapserver.follower.checkpointing import RESERVE_BYTES, Checkpointing
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalReader
 from mapserver.past.plan import HOUR_NS
 from protocol.arrays import Table
@@ -55,7 +56,7 @@ class Site:
     def exclude(self, *machines: str) -> None:
         """Have the map without some machines, as after a decision."""
         grid = self.folded(2**62, frozenset(machines))
-        self.writer.run(lambda store: store.adopt(grid, store.merged, frozenset(machines)))
+        self.writer.run(lambda store: store.adopt(grid, store.merged, Facts(frozenset(machines))))
 
     def run(self) -> None:
         """Turns until nothing is left to do."""
@@ -70,7 +71,7 @@ class Site:
     @property
     def hours(self) -> list[float]:
         """When those that can be used are closed."""
-        facts = self.past.facts(self.reader, self.writer.run(lambda store: store.excluded))
+        facts = self.past.depends_on(self.reader, self.writer.run(lambda store: store.facts))
         entries = self.past.checkpoints.entries(facts, self.reader.last_row)
         return [(entry.closed_ns - NOW_NS) / HOUR_NS for entry in entries if entry.usable]
 
@@ -83,7 +84,7 @@ class Site:
 
     def is_true(self, hour: float, without: frozenset[str] = frozenset()) -> bool:
         to_ns = NOW_NS + round(hour * HOUR_NS)
-        return same(self.past.grid_as_of(self.reader, to_ns, without=without), self.folded(to_ns, without))
+        return same(self.past.grid_as_of(self.reader, to_ns, facts=Facts(without)), self.folded(to_ns, without))
 
     def close(self) -> None:
         self.job.close()
@@ -132,15 +133,17 @@ def test_one_that_lacks_many_late_rows_is_made_again(opened, monkeypatch):
     with opened() as site:
         site.drive([8, 9, 10])
         site.run()
-        rows = {entry.closed_ns: entry.header.row for entry in site.past.checkpoints.entries({}, 99)}
+        rows = {entry.closed_ns: entry.header.row for entry in site.past.checkpoints.entries(lambda _: {}, 99)}
         assert list(rows.values()) == [3, 3]
         site.drive([8.1, 8.2], machine="late")
         site.run()
-        assert [entry.header.row for entry in site.past.checkpoints.entries({}, 99)] == [3, 3]
+        assert [entry.header.row for entry in site.past.checkpoints.entries(lambda _: {}, 99)] == [3, 3]
         assert site.is_true(8.9)
         site.drive([9.1], machine="late")
         site.run()
-        assert [entry.header.row for entry in site.past.checkpoints.entries({}, 99)] == [3, 6], "only what lacks three"
+        assert [entry.header.row for entry in site.past.checkpoints.entries(lambda _: {}, 99)] == [3, 6], (
+            "only what lacks three"
+        )
         assert all(site.is_true(hour) for hour in (8.9, 9, 9.9, 10))
 
 
@@ -169,10 +172,10 @@ def test_a_decision_ends_what_was_in_the_making(opened, monkeypatch):
         site.drive([8, 9])
         site.drive([8.1, 9.1], machine="bad")
         site.job.run()
-        assert site.job._making.without == frozenset()
+        assert site.job._making.depends_on["excluded"] == []
         site.exclude("bad")
         site.job.run()
-        assert site.job._making.without == {"bad"}
+        assert site.job._making.depends_on["excluded"] == ["bad"]
         site.run()
         assert site.is_true(9, frozenset(["bad"]))
 

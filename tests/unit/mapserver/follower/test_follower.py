@@ -12,13 +12,17 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
-from mapserver.follower import exclusion, follower
+from mapserver.fleet.calibration import MachineState
+from mapserver.fleet.correction import Correction
+from mapserver.fleet.decisions import SOLVER, CalibrationDecision
+from mapserver.follower import follower, refolding
 from mapserver.follower.follower import Follower
 from mapserver.follower.jobs import Archiving, Audit
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.reader import JournalReader
+from mapserver.trust.judgement import Reason
 from protocol.errors import QueryError, StoreError
 from protocol.queries.answers import GroundChange
 from protocol.site.ground_classes import ZONES
@@ -66,7 +70,7 @@ class Site:
 @pytest.fixture
 def opened(tmp_path, monkeypatch):
     monkeypatch.setattr(follower, "TURN_S", 0.01)
-    monkeypatch.setattr(exclusion, "RETRY_S", 0.01)
+    monkeypatch.setattr(refolding, "RETRY_S", 0.01)
 
     @contextmanager
     def open_site(**options: Any):
@@ -132,7 +136,7 @@ def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
         row = site.follower.trust("b", False, "its scale is broken", 20.0)
         assert (row["trusted"], row["by"], row["reason"]) == (False, "person", "its scale is broken")
         assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert site.follower.excluded() == {"b"}
+        assert site.follower.facts().excluded == {"b"}
         assert site.follower.trust("b", True, "repaired", 20.0)["trusted"]
         assert same(site.grid, fold_of(sent, site.config))
 
@@ -169,7 +173,7 @@ def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
     with opened(judge_s=JUDGE_S) as site:
         deliver(site, sent)
-        wait_for(lambda: site.follower.excluded() == {"c"})
+        wait_for(lambda: site.follower.facts().excluded == {"c"})
         row = site.machine("c")
         assert (row["trusted"], row["by"]) == (False, "audit")
         assert "gain" in row["reason"]
@@ -185,7 +189,7 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
         never = threading.Event()
         for _ in range(4):  # turns in which it could be excluded
             never.wait(JUDGE_S)
-        assert site.follower.excluded() == frozenset()
+        assert site.follower.facts().excluded == frozenset()
         assert site.machine("c")["trusted"]
         assert site.machine("c")["reasons"]
 
@@ -193,11 +197,11 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
 def test_a_person_overrules_the_audit_and_hands_back(opened):
     with opened(judge_s=JUDGE_S) as site:
         deliver(site, fleet({"c": 1.6}))
-        wait_for(lambda: site.follower.excluded() == {"c"})
+        wait_for(lambda: site.follower.facts().excluded == {"c"})
         assert site.follower.trust("c", True, "I know better", 20.0)["by"] == "person"
-        assert site.follower.excluded() == frozenset()
+        assert site.follower.facts().excluded == frozenset()
         assert not site.follower.trust("c", None, "", 20.0)["trusted"]
-        assert site.follower.excluded() == {"c"}
+        assert site.follower.facts().excluded == {"c"}
 
 
 def test_a_machine_that_sent_nothing_is_refused_by_name(opened):
@@ -276,7 +280,7 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
         with pytest.raises(QueryError, match=f"the decision is kept, but the map is not folded again .*{path.name}"):
             site.follower.trust("a", False, "", 0.5)
         assert path.name in caplog.text
-        wait_for(lambda: caplog.text.count("job=exclusion") > 1)  # it is tried again
+        wait_for(lambda: caplog.text.count("job=refolding") > 1)  # it is tried again
         assert len(reader.events("trust")) == 1
         send(site.writer, [incoming(samples(5), 6)])
         assert site.grid.state().folded == 10
@@ -285,9 +289,9 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
 # --- the audit -------------------------------------------------------------------------------------------------------
 
 
-def audit_of(writer: Writer, reader: JournalReader, report: Any, judge_s: float = 1e-9) -> Audit:
+def audit_of(writer: Writer, reader: JournalReader, report: Any, judge_s: float = 1e-9, states: Any = dict) -> Audit:
     writer.config = ServerConfig(trust=TrustConfig(judge_s))
-    return Audit(writer, reader, report, threading.Event())
+    return Audit(writer, reader, report, states, threading.Event())
 
 
 def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(store, monkeypatch):
@@ -300,10 +304,34 @@ def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(
 
     audit = audit_of(writer, reader, lambda *report: reports.append(report))
     audit.run()
-    monkeypatch.setattr(reader, "read", damaged)
+    monkeypatch.setattr(reader, "read_many", damaged)
     with pytest.raises(StoreError):
         audit.run()
     assert [(list(verdicts), stamp_ns) for verdicts, stamp_ns in reports] == [(["a"], NOW_NS + 4 * 10**9)] * 2
+
+
+def test_corrected_samples_are_judged_also_those_that_came_before_the_correction(store):
+    writer, reader = store
+    sent = fleet({})
+    for rows in sent["c"]:  # its torque reads too much, and most of it is spent on a slope
+        rows["c_rr"] += 0.6 * (rows["c_rr"] + rows["grade_e"])
+    for name, (first, second) in sent.items():
+        send(writer, [incoming(np.concatenate([first, second]), 1, name)])
+    states: dict[str, MachineState] = {}
+    audit = audit_of(writer, reader, lambda *_: None, states=lambda: states)
+    audit.run()
+    assert audit.verdicts["c"].reasons
+    states["c"] = MachineState(0.0, 0.001, 0.6, 0.01, 0.0, 0.001, (), (), (0.0, 13.0))
+    with closing(refolding.Refolding(writer, past_of(writer))) as refolds:
+        whole = Correction("c", 0, 2**62, 0.0, 0.375, 0.0, ())
+        refolds.wait(refolds.decide(CalibrationDecision("c", SOLVER, "", NOW_NS, (whole,))), 20.0)
+    audit.run()
+    assert audit.verdicts["c"].reasons == (Reason.BEYOND_DATA_SHEET,)
+    assert audit.verdicts["c"].evidence["gain"] == pytest.approx(1.0, abs=0.02)
+    states.clear()
+    audit.run()
+    assert not audit.verdicts["c"].contradicts
+    assert not any(audit.verdicts[name].contradicts for name in "abd")
 
 
 @pytest.mark.parametrize(("judge_s", "times"), [(1e-9, 3), (60.0, 1)])

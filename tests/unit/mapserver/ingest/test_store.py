@@ -13,6 +13,7 @@ import pytest
 
 from mapserver.evidence import snapshot
 from mapserver.ingest.store import Store
+from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import Refusal, StoreError
 from protocol.wire.messages import Ack, Refused
@@ -202,10 +203,10 @@ def test_a_grid_adopted_while_a_snapshot_is_written_gets_one_of_its_own(tmp_path
     store = open_store(tmp_path)
     store.commit([incoming(samples(3)), incoming(samples(3), machine="b")])
     write = store.snapshot()
-    store.adopt(folded(samples(3)), store.merged, frozenset({"b"}))
+    store.adopt(folded(samples(3)), store.merged, Facts(frozenset({"b"})))
     write()
     store.save_snapshot()
-    row, _ = snapshot.load_newest(tmp_path, store.merged, SITE.cell_m, store.config.fold, {"b"})
+    row, _ = snapshot.load_newest(tmp_path, store.merged, SITE.cell_m, store.config.fold, store.facts.of_evidence())
     store.close()
     assert row == 2
 
@@ -213,7 +214,7 @@ def test_a_grid_adopted_while_a_snapshot_is_written_gets_one_of_its_own(tmp_path
 @pytest.mark.parametrize("row", [0, 1])
 def test_an_adopted_grid_gets_what_came_since_without_those_excluded(store, row):
     store.commit([incoming(samples(3)), incoming(samples(3), machine="b"), incoming(samples(5), 4)])
-    store.adopt(folded(samples(3 * row)), row, frozenset({"b"}))
+    store.adopt(folded(samples(3 * row)), row, Facts(frozenset({"b"})))
     expected = folded(samples(3))
     expected.fold(samples(5), "a")
     assert same(store.grid, expected)
@@ -378,7 +379,7 @@ def test_the_version_of_the_map_names_the_last_decision_that_counts_in_it(tmp_pa
         assert store.fact == 1  # it changes nothing in the map, so it counts at once
         store.decide(TrustDecision("b", trusted=False, by="person", reason="moved", stamp_ns=1))
         assert store.fact == 1
-        store.adopt(folded(samples(2)), 2, frozenset({"b"}))
+        store.adopt(folded(samples(2)), 2, Facts(frozenset({"b"})))
         assert store.fact == 2
     with closing(open_store(tmp_path)) as store:
         assert (store.version.row, store.version.fact) == (2, 2)
@@ -394,7 +395,7 @@ def test_the_site_s_now_is_that_of_trusted_machines_and_is_taken_back(tmp_path):
         store.commit([incoming(samples(1)), incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
         assert store.newest_ns == NOW_NS + DAY
         store.decide(TrustDecision("b", trusted=False, by="person", reason="its clock", stamp_ns=1))
-        store.adopt(folded(samples(1)), 2, frozenset({"b"}))
+        store.adopt(folded(samples(1)), 2, Facts(frozenset({"b"})))
         assert store.newest_ns == store.info()["stamp_ns"] == NOW_NS
         store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), 2, machine="b")])
         assert (store.newest_ns, store.machines()["b"]["newest_ns"]) == (NOW_NS, NOW_NS + DAY)
@@ -406,9 +407,9 @@ def test_a_machine_from_the_future_bears_out_no_other_once_it_is_distrusted(tmp_
     with closing(open_store(tmp_path)) as store:
         store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
         later = incoming(samples(1, stamp_ns=NOW_NS + 2 * DAY), machine="c")
-        store.adopt(folded(samples(0)), 1, frozenset({"b"}))
+        store.adopt(folded(samples(0)), 1, Facts(frozenset({"b"})))
         assert store.commit([later])[0].reason == Refusal.FAR_FUTURE
-        store.adopt(folded(samples(1, stamp_ns=NOW_NS + DAY)), 1, frozenset())
+        store.adopt(folded(samples(1, stamp_ns=NOW_NS + DAY)), 1, NO_FACTS)
         assert isinstance(store.commit([later])[0], Ack)
 
 

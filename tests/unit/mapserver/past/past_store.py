@@ -8,6 +8,7 @@ import numpy as np
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.journal.archive import FOLDER, archive
+from mapserver.journal.facts import Facts
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Admission
@@ -19,7 +20,6 @@ from tests.unit.mapserver.data import NOW_NS, SITE, batch
 
 FOLD = FoldConfig()
 S = 10**9
-NOBODY: frozenset[str] = frozenset()
 
 
 class PastStore:
@@ -46,10 +46,10 @@ class PastStore:
 
     def make(self, closed_ns: int, without: Iterable[str] = ()) -> int:
         """Make a checkpoint; returns how many steps it took."""
-        return sum(1 for _ in make(self.past, self.reader, closed_ns, frozenset(without)))
+        return sum(1 for _ in make(self.past, self.reader, closed_ns, Facts(frozenset(without))))
 
     def as_of(self, to_ns: int, without: Iterable[str] = (), **more: object) -> Grid:
-        return self.past.grid_as_of(self.reader, to_ns, without=frozenset(without), **more)
+        return self.past.grid_as_of(self.reader, to_ns, facts=Facts(frozenset(without)), **more)
 
     def folded(self, to_ns: int, without: Iterable[str] = (), from_ns: int = 0) -> Grid:
         """What the map is by its definition: a fold of the samples in memory, from the start."""

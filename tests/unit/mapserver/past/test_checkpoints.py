@@ -5,10 +5,11 @@ from contextlib import closing
 
 import pytest
 
+from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.past.checkpoints import Checkpoints, remove_beyond
 from mapserver.past.plan import HOUR_NS
 from tests.unit.mapserver.data import NOW_NS, random_samples
-from tests.unit.mapserver.past.past_store import NOBODY, PastStore
+from tests.unit.mapserver.past.past_store import PastStore
 
 
 @pytest.fixture
@@ -21,9 +22,9 @@ def store(tmp_path):
         yield opened
 
 
-def nearest(store: PastStore, hour: float, without=NOBODY, last_row: int = 3) -> int | None:
+def nearest(store: PastStore, hour: float, without=(), last_row: int = 3) -> int | None:
     """Hour at which the nearest one is closed."""
-    facts = store.past.facts(store.reader, without)
+    facts = store.past.depends_on(store.reader, Facts(frozenset(without)))
     checkpoint = store.past.checkpoints.nearest(NOW_NS + round(hour * HOUR_NS), facts, last_row)
     if checkpoint is None:
         return None
@@ -49,9 +50,10 @@ def test_one_of_other_facts_is_not_used(store):
 
 
 def test_one_of_another_fold_or_store_is_not_used(store, tmp_path):
-    facts = store.past.facts(store.reader, NOBODY)
+    facts = store.past.depends_on(store.reader, NO_FACTS)
     for name, other in (("keep_hours", 5), ("cell_m", 2.0), ("schema", 0), ("store", "another"), ("correction", 1)):
-        assert store.past.checkpoints.nearest(NOW_NS + 3 * HOUR_NS, {**facts, name: other}, 3) is None
+        others = {**facts(0), name: other}
+        assert store.past.checkpoints.nearest(NOW_NS + 3 * HOUR_NS, lambda _, others=others: others, 3) is None
     (tmp_path / "other").mkdir()
     with closing(PastStore(tmp_path / "other")) as other:
         other.add(random_samples(20, 1))
@@ -73,20 +75,20 @@ def test_a_file_under_another_name_is_not_what_its_name_says(store):
     for name in ("2026-13-45T99.checkpoint", "notes.txt", ".2026-01-01T05.checkpoint.12.part"):
         shutil.copy(path, path.with_name(name))
     assert nearest(store, 90) == 3
-    assert len(store.past.checkpoints.entries({}, 3)) == 4
+    assert len(store.past.checkpoints.entries(lambda _: {}, 3)) == 4
     assert store.past.checkpoints.passed_over == 1
 
 
 def test_a_replaced_file_is_another_one(store):
-    entries = store.past.checkpoints.entries(store.past.facts(store.reader, NOBODY), 3)
+    entries = store.past.checkpoints.entries(store.past.depends_on(store.reader, NO_FACTS), 3)
     assert [entry.header.row for entry in entries] == [1, 2, 3]
     store.make(NOW_NS + HOUR_NS)
-    entries = store.past.checkpoints.entries(store.past.facts(store.reader, NOBODY), 3)
+    entries = store.past.checkpoints.entries(store.past.depends_on(store.reader, NO_FACTS), 3)
     assert [entry.header.row for entry in entries] == [3, 2, 3]
 
 
 def test_damage_seen_in_a_file_that_was_replaced_meanwhile_does_not_count(store):
-    facts = store.past.facts(store.reader, NOBODY)
+    facts = store.past.depends_on(store.reader, NO_FACTS)
     with store.past.checkpoints.nearest(NOW_NS + HOUR_NS, facts, 3) as checkpoint:
         store.make(NOW_NS + HOUR_NS)
         store.past.checkpoints.entries(facts, 3)
@@ -99,10 +101,10 @@ def test_a_look_says_what_there_is(store):
     checkpoints = store.past.checkpoints
     assert checkpoints.state == {"count": 0, "bytes": 0, "newest_ns": 0, "passed_over": 0}
     size = sum(path.stat().st_size for path in checkpoints.folder.iterdir())
-    checkpoints.look(store.past.facts(store.reader, NOBODY), 2)
+    checkpoints.look(store.past.depends_on(store.reader, NO_FACTS), 2)
     assert checkpoints.state == {"count": 2, "bytes": size, "newest_ns": NOW_NS + 2 * HOUR_NS, "passed_over": 0}
 
 
 def test_a_store_without_any_has_none(tmp_path):
-    assert Checkpoints(tmp_path).entries({}, 9) == []
+    assert Checkpoints(tmp_path).entries(lambda _: {}, 9) == []
     remove_beyond(tmp_path, 0)

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapserver.journal.facts import NO_FACTS
 from mapserver.past import making
 from mapserver.past.checkpoint_file import Checkpoint, DamagedError
 from mapserver.past.making import make, remove_unfinished
 from mapserver.past.plan import HOUR_NS
 from tests.unit.mapserver.data import NOW_NS, random_samples, same
-from tests.unit.mapserver.past.past_store import NOBODY, PastStore, S
+from tests.unit.mapserver.past.past_store import PastStore, S
 
 pytest.importorskip("pyarrow.parquet")
 HOURS = 4
@@ -125,7 +126,7 @@ def test_one_that_is_given_up_leaves_what_was_there(store, steps, monkeypatch):
     store.make(NOW_NS + HOUR_NS)
     before = {path.name: path.read_bytes() for path in store.past.checkpoints.folder.iterdir()}
     store.add(some_samples(2), "b")
-    running = make(store.past, store.reader, NOW_NS + HOUR_NS, NOBODY)
+    running = make(store.past, store.reader, NOW_NS + HOUR_NS, NO_FACTS)
     for _ in range(steps):
         next(running)
     running.close()

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from mapserver.evidence.fold_config import FoldConfig
+from mapserver.journal.facts import NO_FACTS
 from mapserver.past.plan import HOUR_NS
 from protocol.errors import StoreError
 from protocol.site.geometry import CellWindow
 from tests.unit.mapserver.data import NOW_NS, random_samples, same, samples
-from tests.unit.mapserver.past.past_store import NOBODY, PastStore, S
+from tests.unit.mapserver.past.past_store import PastStore, S
 
 pytest.importorskip("pyarrow.parquet")
 WINDOW = CellWindow(-7, 3, 20, 9)
@@ -140,10 +141,10 @@ def test_a_damaged_checkpoint_is_passed_over_counted_and_never_used(tmp_path, at
         assert store.past.checkpoints.passed_over == 1
         assert caplog.text.count("checkpoint passed over") == 1
         assert "2026-01-01T02.checkpoint" in caplog.text
-        entries = store.past.checkpoints.entries(store.past.facts(store.reader, NOBODY), 9)
+        entries = store.past.checkpoints.entries(store.past.depends_on(store.reader, NO_FACTS), 9)
         assert [entry.usable for entry in entries] == [True, False]
         store.make(NOW_NS + 2 * HOUR_NS)
-        entries = store.past.checkpoints.entries(store.past.facts(store.reader, NOBODY), 9)
+        entries = store.past.checkpoints.entries(store.past.depends_on(store.reader, NO_FACTS), 9)
         assert [entry.usable for entry in entries] == [True, True]
         assert same(store.as_of(NOW_NS + 3 * HOUR_NS), store.folded(NOW_NS + 3 * HOUR_NS))
 

@@ -4,6 +4,7 @@ from concurrent.futures import Future
 from dataclasses import asdict
 from typing import Any
 
+from mapserver.journal.facts import Facts
 from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import GroundChange
@@ -32,8 +33,8 @@ class FakeFollower:
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine}` is not known")
         return asdict(machine_state(machine, trusted=trusted is not False))
 
-    def excluded(self) -> frozenset[str]:
-        return self._excluded
+    def facts(self) -> Facts:
+        return Facts(self._excluded)
 
 
 def answered(answers: Answers, name: str, parameters: dict[str, str]) -> bytes:

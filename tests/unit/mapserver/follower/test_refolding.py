@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from mapserver.evidence.grid import Grid
-from mapserver.follower import exclusion
-from mapserver.follower.exclusion import Exclusion
+from mapserver.follower import refolding
+from mapserver.follower.refolding import Refolding
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.reader import JournalReader
@@ -30,6 +30,7 @@ from tests.unit.mapserver.data import (
     incoming,
     open_store,
     open_writer,
+    past_of,
     random_samples,
     same,
     send,
@@ -48,8 +49,8 @@ class HeldFold:
         self.rows: list[tuple[int, int]] = []
         self.came_to_an_end: list[bool] = []
         self.may_go_on = Event()
-        self._fold = exclusion.fold_history
-        monkeypatch.setattr(exclusion, "fold_history", self)
+        self._fold = refolding.fold_history
+        monkeypatch.setattr(refolding, "fold_history", self)
 
     def __call__(self, grid: Grid, history: Any, after: int, until: int, selection: Any, stopped: Any) -> bool:
         self.without.append(set(selection.without))
@@ -96,13 +97,13 @@ def decision(machine: str, *, trusted: bool = False, reason: str = "why") -> Tru
 
 
 def test_batches_are_acknowledged_during_a_fold_and_are_in_the_map_afterwards(writer, fold):
-    with closing(Exclusion(writer)) as excluding:
-        number = excluding.decide(decision("b"))
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        number = refolds.decide(decision("b"))
         fold.wait(1)
         deliver(writer, range(5, 10))
         assert same(writer.run(grid_copy), map_without("", 10)), "the map answers as it was, with what came in"
         fold.may_go_on.set()
-        excluding.wait(number, WAIT_S)
+        refolds.wait(number, WAIT_S)
         assert same(writer.run(grid_copy), map_without("b", 10))
         assert fold.rows == [(0, 20), (20, 40)], "what came in was folded beside the writer, too"
         deliver(writer, range(10, 12))
@@ -110,73 +111,73 @@ def test_batches_are_acknowledged_during_a_fold_and_are_in_the_map_afterwards(wr
 
 
 def test_a_few_rows_are_left_to_the_writer(writer, fold):
-    with closing(Exclusion(writer)) as excluding:
-        number = excluding.decide(decision("b"))
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        number = refolds.decide(decision("b"))
         fold.wait(1)
         deliver(writer, range(5, 7))
         fold.may_go_on.set()
-        excluding.wait(number, WAIT_S)
+        refolds.wait(number, WAIT_S)
         assert fold.rows == [(0, 20)]
         assert same(writer.run(grid_copy), map_without("b", 7))
 
 
 def test_where_batches_never_end_the_writer_has_them_wait(writer, monkeypatch):
-    monkeypatch.setattr(exclusion, "FEW_ROWS", -1)
-    with closing(Exclusion(writer)) as excluding:
-        excluding.wait(excluding.decide(decision("b")), WAIT_S)
+    monkeypatch.setattr(refolding, "FEW_ROWS", -1)
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        refolds.wait(refolds.decide(decision("b")), WAIT_S)
     assert same(writer.run(grid_copy), map_without("b", 5))
 
 
 def test_decisions_during_a_fold_are_folded_together_and_the_old_fold_is_given_up(writer, fold):
-    with closing(Exclusion(writer)) as excluding:
-        first = excluding.decide(decision("b"))
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        first = refolds.decide(decision("b"))
         fold.wait(1)
-        excluding.decide(decision("c"))
-        last = excluding.decide(decision("d"))
-        assert excluding.decision("d") == decision("d"), "it counts at once"
+        refolds.decide(decision("c"))
+        last = refolds.decide(decision("d"))
+        assert refolds.decision("d") == decision("d"), "it counts at once"
         fold.may_go_on.set()
         for number in (first, last):
-            excluding.wait(number, WAIT_S)
+            refolds.wait(number, WAIT_S)
         assert fold.without == [{"b"}, {"b", "c", "d"}]
         assert fold.came_to_an_end == [False, True]
         assert same(writer.run(grid_copy), map_without("bcd", 5))
 
 
 def test_a_decision_that_leaves_the_same_machines_out_lets_the_fold_go_on(writer, fold):
-    with closing(Exclusion(writer)) as excluding:
-        excluding.decide(decision("b"))
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        refolds.decide(decision("b"))
         fold.wait(1)
-        excluding.decide(decision("c"))
-        excluding.decide(decision("c", trusted=True))
-        number = excluding.decide(decision("b", reason="a better reason"))
+        refolds.decide(decision("c"))
+        refolds.decide(decision("c", trusted=True))
+        number = refolds.decide(decision("b", reason="a better reason"))
         fold.may_go_on.set()
-        excluding.wait(number, WAIT_S)
+        refolds.wait(number, WAIT_S)
         assert (fold.without, fold.came_to_an_end) == ([{"b"}], [True])
 
 
 def test_a_decision_that_is_taken_back_during_its_fold_leaves_the_map(writer, fold):
     before = writer.run(lambda store: store.grid)
-    with closing(Exclusion(writer)) as excluding:
-        excluding.decide(decision("b"))
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        refolds.decide(decision("b"))
         fold.wait(1)
-        number = excluding.decide(decision("b", trusted=True))
+        number = refolds.decide(decision("b", trusted=True))
         fold.may_go_on.set()
-        excluding.wait(number, WAIT_S)
+        refolds.wait(number, WAIT_S)
         assert fold.came_to_an_end == [False]
         assert writer.run(lambda store: store.grid) is before
 
 
 def test_the_end_during_a_fold_gives_it_up_and_the_next_start_has_the_map(writer, fold, tmp_path):
-    excluding = Exclusion(writer)
-    number = excluding.decide(decision("b"))
+    refolds = Refolding(writer, past_of(writer))
+    number = refolds.decide(decision("b"))
     problems: list[str] = []
 
     def wait() -> None:
         with pytest.raises(QueryError) as refused:
-            excluding.wait(number, WAIT_S)
+            refolds.wait(number, WAIT_S)
         problems.append(str(refused.value))
 
-    waits, ends = Thread(target=wait), Thread(target=excluding.close)
+    waits, ends = Thread(target=wait), Thread(target=refolds.close)
     waits.start()
     fold.wait(1)
     ends.start()
@@ -189,7 +190,7 @@ def test_the_end_during_a_fold_gives_it_up_and_the_next_start_has_the_map(writer
     assert "the decision is kept, but the server is stopping" in problems[0]
     writer.close()
     with closing(open_store(tmp_path)) as store:
-        assert store.excluded == {"b"}
+        assert store.facts.excluded == {"b"}
         assert same(store.grid, map_without("b", 5))
 
 
@@ -201,16 +202,16 @@ def room(store: Store, *, full: bool) -> None:
 def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer, tmp_path):
     long = decision("b", reason="a reason that needs new pages" * 1000)
     before = writer.run(lambda store: store.grid)
-    with closing(Exclusion(writer)) as excluding, JournalReader(tmp_path / JOURNAL_FILE) as reader:
+    with closing(Refolding(writer, past_of(writer))) as refolds, JournalReader(tmp_path / JOURNAL_FILE) as reader:
         writer.run(lambda store: room(store, full=True))
         with pytest.raises(QueryError, match=r"cannot be written, so it does not count: .*full; make room") as refused:
-            excluding.decide(long)
+            refolds.decide(long)
         assert refused.value.reason == Refusal.STORE
-        assert (excluding.decision("b"), excluding.excluded(), reader.events(KIND)) == (None, frozenset(), [])
+        assert (refolds.decision("b"), refolds.facts().excluded, reader.events(KIND)) == (None, frozenset(), [])
         assert writer.run(lambda store: store.grid) is before
         writer.run(lambda store: room(store, full=False))
-        excluding.wait(excluding.decide(long), WAIT_S)
-        assert excluding.excluded() == {"b"}
+        refolds.wait(refolds.decide(long), WAIT_S)
+        assert refolds.facts().excluded == {"b"}
         assert [event.body["machine"] for event in reader.events(KIND)] == ["b"]
         deliver(writer, range(5, 6))
     assert same(writer.run(grid_copy), map_without("b", 6))
@@ -218,40 +219,40 @@ def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer,
 
 def test_the_audit_decides_again_what_a_full_disk_did_not_take(writer):
     bad = {"b": Verdict("b", (Reason.GAIN,), {"why": "evidence that needs new pages" * 1000}, True)}
-    with closing(Exclusion(writer)) as excluding:
+    with closing(Refolding(writer, past_of(writer))) as refolds:
         writer.run(lambda store: room(store, full=True))
         for _ in range(DISTRUST_AFTER - 1):
-            excluding.judge(bad, NOW_NS)
+            refolds.judge(bad, NOW_NS)
         with pytest.raises(QueryError, match="cannot be written"):
-            excluding.judge(bad, NOW_NS)
-        assert (excluding.decision("b"), excluding.excluded()) == (None, frozenset())
+            refolds.judge(bad, NOW_NS)
+        assert (refolds.decision("b"), refolds.facts().excluded) == (None, frozenset())
         writer.run(lambda store: room(store, full=False))
-        excluding.judge(bad, NOW_NS)
-        wait_for(lambda: excluding.excluded() == {"b"})
+        refolds.judge(bad, NOW_NS)
+        wait_for(lambda: refolds.facts().excluded == {"b"})
 
 
 def test_a_person_is_not_overruled_by_an_audit_that_judged_at_the_same_time(writer):
     bad = {"b": Verdict("b", (Reason.GAIN,), {}, True)}
-    with closing(Exclusion(writer)) as excluding:
+    with closing(Refolding(writer, past_of(writer))) as refolds:
         for _ in range(DISTRUST_AFTER - 1):
-            excluding.judge(bad, NOW_NS)
-        person = Thread(target=excluding.decide, args=(decision("b", trusted=True),))
-        judge = Thread(target=excluding.judge, args=(bad, NOW_NS))
+            refolds.judge(bad, NOW_NS)
+        person = Thread(target=refolds.decide, args=(decision("b", trusted=True),))
+        judge = Thread(target=refolds.judge, args=(bad, NOW_NS))
         with held(writer):  # both wait for the writer's thread
             person.start()
             judge.start()
         for thread in (person, judge):
             thread.join(WAIT_S)
-        assert excluding.decision("b") == decision("b", trusted=True)
-        wait_for(lambda: excluding.excluded() == frozenset())
+        assert refolds.decision("b") == decision("b", trusted=True)
+        wait_for(lambda: refolds.facts().excluded == frozenset())
 
 
 def test_a_decision_that_the_writer_has_no_time_for_is_not_said_to_be_refused(writer, monkeypatch):
     run = writer.run
-    with closing(Exclusion(writer)) as excluding:
+    with closing(Refolding(writer, past_of(writer))) as refolds:
         with held(writer), monkeypatch.context() as patch:
             patch.setattr(writer, "run", lambda work: run(work, timeout_s=0.01))
             with pytest.raises(QueryError, match="may still do so") as refused:
-                excluding.decide(decision("b"))
+                refolds.decide(decision("b"))
         assert refused.value.reason == Refusal.AFTER_TIMEOUT
-        wait_for(lambda: excluding.decision("b") == decision("b"))
+        wait_for(lambda: refolds.decision("b") == decision("b"))

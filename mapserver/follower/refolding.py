@@ -1,7 +1,9 @@
-"""Exclusion of machines: decisions are kept with the journal, then the map is folded again without those excluded.
+"""Decisions about machines: kept with the journal, then the map is folded again with the facts that they come to.
 
-The grid belongs to the writer's thread. So a map without a machine is folded on a thread of its own, in rounds, each
+The grid belongs to the writer's thread. So a map with other facts is folded on a thread of its own, in rounds, each
 with what came in during the one before; the writer folds what the last round left, a few rows, and goes on with it.
+It begins with the newest checkpoint whose evidence the new facts leave as it is, which is recent where they are about
+recent samples alone, and else with nothing.
 """
 
 from __future__ import annotations
@@ -14,31 +16,36 @@ from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 from mapserver.evidence.grid import Grid
+from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.decisions import CalibrationDecision
+from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal.facts import Facts
 from mapserver.journal.history import History
-from mapserver.journal.reader import JournalReader
-from mapserver.journal.refold import fold_history, release_memory
+from mapserver.journal.reader import LAST, JournalReader
+from mapserver.journal.refold import fold_history, fold_samples, release_memory
 from mapserver.journal.rows import Selection
+from mapserver.past.past import Past
 from mapserver.trust.auditor import Verdict
-from mapserver.trust.decisions import KIND, TrustDecision, TrustDecisions
+from mapserver.trust.decisions import TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
 
 FEW_ROWS = 8  # may be left to the writer's thread: some ms
 MOST_ROUNDS = 20  # where batches come in as fast as they are folded, the writer has to make them wait
 RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after rows that could not be read; doubled, as a fold up to them may take minutes
 T = TypeVar("T")
-log = logging.getLogger("mapserver.follower.exclusion")
+log = logging.getLogger("mapserver.follower.refolding")
 
 
-class Exclusion:
-    """Decisions about machines, and a thread that folds the map without those excluded. All of it is for any thread."""
+class Refolding:
+    """Decisions about machines, and a thread that folds the map as they say. All of it is for any thread."""
 
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
+    def __init__(self, writer: Writer, past: Past) -> None:
+        self._writer, self._past = writer, past
         self._reader = JournalReader(writer.folder / JOURNAL_FILE)
-        self._decisions = TrustDecisions(self._reader.events(KIND))
-        self._wanted = self._decisions.distrusted
+        self._decisions = Decisions.of_journal(self._reader)
+        self._wanted = self._decisions.facts
         self._changed = threading.Condition()  # its holder never waits for the writer, which takes it
         self._decided = self._folded = 0  # decisions kept since the start, and so many of them that the map follows
         self._problem = ""  # of the last fold, until one succeeds
@@ -46,14 +53,24 @@ class Exclusion:
         self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
         self._thread.start()
 
-    def excluded(self) -> frozenset[str]:
-        """Machines whose rows are not in the map."""
-        return self._writer.run(lambda store: store.excluded)
+    def facts(self) -> Facts:
+        """What the map is folded with."""
+        return self._writer.run(lambda store: store.facts)
+
+    def distrusted(self) -> frozenset[str]:
+        """Machines that decisions leave out, though they may be in the map still."""
+        with self._changed:
+            return self._decisions.trust.distrusted
 
     def decision(self, machine: str) -> TrustDecision | None:
-        """The newest decision about a machine that counts."""
+        """The newest decision about the trust in a machine that counts."""
         with self._changed:
-            return self._decisions.newest(machine)
+            return self._decisions.trust.newest(machine)
+
+    def calibration(self, machine: str) -> CalibrationDecision | None:
+        """The newest decision about the calibration of a machine that counts."""
+        with self._changed:
+            return self._decisions.calibration.newest(machine)
 
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
         """Decide what the audit may decide, which may be nothing: `machines` names its verdicts in any case.
@@ -63,7 +80,14 @@ class Exclusion:
         if self._writer.config.trust.exclude:
             self._write(lambda store: self._judge(store, verdicts, stamp_ns))
 
-    def decide(self, decision: TrustDecision) -> int:
+    def calibrate(self, solved: Calibration, stamp_ns: int, *, asked: bool = False) -> int:
+        """Decide what the solver may decide, or all that it would where a person asks; returns a number to wait for.
+
+        Raises QueryError as `decide` does; the solver then decides the same the next time.
+        """
+        return self._write(lambda store: self._calibrate(store, solved, stamp_ns, asked=asked))
+
+    def decide(self, decision: Decision) -> int:
         """Keep a decision on disk, then have the map folded so; returns its number, to wait for.
 
         Raises QueryError where it cannot be written: nothing has changed then.
@@ -101,17 +125,29 @@ class Exclusion:
 
     def _judge(self, store: Store, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
         with self._changed:
-            decisions = self._decisions.judge(verdicts, stamp_ns)
+            decisions = self._decisions.trust.judge(verdicts, stamp_ns)
         for decision in decisions:
             self._keep(store, decision)
 
-    def _keep(self, store: Store, decision: TrustDecision) -> int:
-        store.decide(decision)
-        values = (decision.machine, decision.trusted, decision.by, decision.reason)
-        log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
+    def _calibrate(self, store: Store, solved: Calibration, stamp_ns: int, *, asked: bool) -> int:
         with self._changed:
-            self._decisions.add(decision)
-            self._wanted = self._decisions.distrusted
+            decisions = self._decisions.calibration.judge(solved, stamp_ns, asked=asked)
+        for decision in decisions:
+            self._keep(store, decision)
+        with self._changed:
+            return self._decided
+
+    def _keep(self, store: Store, decision: Decision) -> int:
+        event, facts = store.decide(decision)
+        if isinstance(decision, TrustDecision):
+            values = (decision.machine, decision.trusted, decision.by, decision.reason)
+            log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
+        else:
+            spans = (decision.machine, len(decision.corrections), decision.by, decision.reason)
+            log.info("calibration machine=%s spans=%d by=%s reason=%r", *spans)
+        with self._changed:
+            self._decisions.add(event)
+            self._wanted = facts
             self._decided += 1
             self._changed.notify_all()
             return self._decided
@@ -120,8 +156,8 @@ class Exclusion:
         """Have the map follow the decisions; those that were made in the meantime are followed together."""
         retry_s = RETRY_S
         while decided := self._next():
-            number, excluded = decided
-            follows, problem = self._attempt(excluded)
+            number, facts = decided
+            follows, problem = self._attempt(facts)
             with self._changed:
                 self._problem = problem
                 if follows:
@@ -129,8 +165,8 @@ class Exclusion:
                     self._changed.notify_all()
             retry_s = self._pause(number, retry_s) if problem else RETRY_S
 
-    def _next(self) -> tuple[int, frozenset[str]] | None:
-        """Wait for decisions that the map does not follow yet: how many there are, and whom they leave out."""
+    def _next(self) -> tuple[int, Facts] | None:
+        """Wait for decisions that the map does not follow yet: how many there are, and what they come to."""
         with self._changed:
             self._changed.wait_for(lambda: self._ending or self._folded < self._decided)
             return None if self._ending else (self._decided, self._wanted)
@@ -141,41 +177,53 @@ class Exclusion:
             self._changed.wait_for(lambda: self._ending or self._decided > number, retry_s)
         return min(2 * retry_s, MOST_RETRY_S)
 
-    def _attempt(self, excluded: frozenset[str]) -> tuple[bool, str]:
+    def _attempt(self, facts: Facts) -> tuple[bool, str]:
         """Whether the map follows, and what keeps it from that."""
         try:
-            return self._follow(excluded), ""
+            return self._follow(facts), ""
         except (SitegridError, OSError) as error:
-            log.error("follower failed job=exclusion error=%r", str(error))
+            log.error("follower failed job=refolding error=%r", str(error))
             return False, str(error)
         except Exception:  # a bug here must not end the server, nor pass unseen
-            log.exception("follower failed job=exclusion")
+            log.exception("follower failed job=refolding")
             return False, "the server failed; see its log"
 
-    def _follow(self, excluded: frozenset[str]) -> bool:
-        """Have a map without these machines; whether it is there, else it is to be another one meanwhile."""
-        if excluded == self.excluded():
+    def _follow(self, facts: Facts) -> bool:
+        """Have a map with these facts; whether it is there, else it is to be another one meanwhile."""
+        if facts == self.facts():
             return True
         began_s = time.monotonic()
-        grid, row, rounds = Grid(self._writer.site.cell_m, self._writer.config.fold), 0, 0
-        history, selection = History.beside(self._reader), Selection(without=excluded)
+        history, selection, rounds = History.beside(self._reader), Selection.by(facts), 0
+        begun = self._begun(facts)
+        if begun is None:
+            return False
+        grid, row = begun
         while (last := self._reader.last_row) - row > FEW_ROWS and rounds < MOST_ROUNDS:
-            if not fold_history(grid, history, row, last, selection, lambda: self._superseded(excluded)):
+            if not fold_history(grid, history, row, last, selection, lambda: self._superseded(facts)):
                 return False
             row, rounds = last, rounds + 1
         replaced: list[Grid] = []
 
         def adopt(store: Store) -> None:
             replaced.append(store.grid)
-            store.adopt(grid, row, excluded)
+            store.adopt(grid, row, facts)
 
         self._writer.run(adopt)
         replaced.clear()  # here: to let go of a grid takes time that the writer's thread does not have
         release_memory()
-        values = (",".join(sorted(excluded)), rounds, time.monotonic() - began_s)
-        log.warning("map folded again without=%s rounds=%d seconds=%.1f", *values)
+        values = (facts.number, ",".join(sorted(facts.excluded)), rounds, time.monotonic() - began_s)
+        log.warning("map folded again fact=%d without=%s rounds=%d seconds=%.1f", *values)
         return True
 
-    def _superseded(self, excluded: frozenset[str]) -> bool:
+    def _begun(self, facts: Facts) -> tuple[Grid, int] | None:
+        """The map up to a journal row that a checkpoint makes quick, or an empty one; None where it is not wanted."""
+        last = self._reader.last_row
+        grid, base = self._past.nearest(self._reader, LAST, None, facts)
+        if base is None:
+            return grid, 0
+        samples = self._past.lacking(self._reader, base, Selection.by(facts), last)
+        return (grid, last) if fold_samples(grid, samples, lambda: self._superseded(facts)) else None
+
+    def _superseded(self, facts: Facts) -> bool:
         """Whether what is being folded is not wanted any more."""
-        return self._ending or self._wanted != excluded
+        return self._ending or self._wanted != facts

@@ -1,0 +1,76 @@
+"""All decisions that a store's map follows, of trust and of calibration, and the facts that they come to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mapserver.fleet import decisions as calibration
+from mapserver.fleet.correction import Corrections
+from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions, NewerVersionError
+from mapserver.journal.facts import Facts
+from mapserver.journal.reader import JournalQueries
+from mapserver.journal.rows import Event
+from mapserver.trust import decisions as trust
+from mapserver.trust.decisions import TrustDecision, TrustDecisions
+from protocol.errors import StoreError
+
+Decision = TrustDecision | CalibrationDecision
+KINDS = (trust.KIND, calibration.KIND)
+
+
+class Decisions:
+    """Decisions about machines. trust, calibration: those of either kind; facts: what all of them come to."""
+
+    def __init__(self) -> None:
+        self.trust, self.calibration = TrustDecisions(()), CalibrationDecisions()
+        self.facts = Facts()
+
+    @classmethod
+    def of_journal(cls, journal: JournalQueries) -> Decisions:
+        """Those that a journal has; StoreError where one was written by a newer version."""
+        decisions = cls()
+        decisions._add_all(decided(journal), journal.path)
+        return decisions
+
+    def add(self, event: Event) -> None:
+        """Have one more decision count; NewerVersionError where a newer version wrote it."""
+        self._take(event)
+        self._conclude(event.id)
+
+    def _add_all(self, events: Iterable[Event], path: Path) -> None:
+        number = 0
+        for event in events:
+            try:
+                self._take(event)
+            except NewerVersionError as error:
+                problem = f"event {event.id}: {error}; open it with that version, or choose another --store"
+                raise StoreError(path, problem) from None
+            number = event.id
+        self._conclude(number)
+
+    def _take(self, event: Event) -> None:
+        if event.kind == calibration.KIND:
+            self.calibration.add(CalibrationDecision.from_body(event.body))
+        else:
+            self.trust.add(TrustDecision(**event.body))
+
+    def _conclude(self, number: int) -> None:
+        excluded, corrections = self.trust.distrusted, self.calibration.corrections
+        if excluded:  # what is taken off samples that do not count changes no map
+            corrections = Corrections(one for one in corrections.each if one.machine not in excluded)
+        self.facts = Facts(excluded, corrections, number)
+
+
+def decided(journal: JournalQueries) -> list[Event]:
+    """Events of all decisions about machines, in the order in which they were made."""
+    return [event for event in journal.events() if event.kind in KINDS]
+
+
+def plain(decision: Decision) -> tuple[str, Mapping[str, Any]]:
+    """Kind and body of the event that keeps a decision."""
+    if isinstance(decision, CalibrationDecision):
+        return calibration.KIND, decision.body()
+    return trust.KIND, asdict(decision)

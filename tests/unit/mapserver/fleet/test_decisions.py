@@ -1,0 +1,216 @@
+"""Which corrections count: hysteresis of the solver, people above it, events, and spans painted over each other."""
+
+import json
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.correction import LAST_NS, LEVEL_SHARE, Correction, Corrections
+from mapserver.fleet.decisions import (
+    EVERY_NS,
+    FROZEN_NS,
+    PERSON,
+    SOLVER,
+    CalibrationDecision,
+    CalibrationDecisions,
+    NewerVersionError,
+    at,
+    paint,
+)
+from mapserver.fleet.ledger import EPOCH_NS
+from mapserver.fleet.observability import CommonScale
+
+SURE = ((2.5e-7, 0.0, 0.0), (0.0, 2.5e-5, 0.0), (0.0, 0.0, 2.5e-7))  # 0.5e-3, 0.5 %, 0.5e-3
+NOW_NS = 1000 * EPOCH_NS
+
+
+def one(
+    zero: float,
+    epoch: int = 1000,
+    *,
+    scale: float = 0.0,
+    machine: str = "a",
+    to_ns: int = LAST_NS,
+    covariance: Sequence[Sequence[float]] = SURE,
+    **more: float,
+) -> Correction:
+    across = more.pop("across", 0.0)
+    rows = tuple(map(tuple, covariance))
+    return Correction(machine, epoch * EPOCH_NS, to_ns, zero, scale, across, rows, **more)
+
+
+def solved(*corrections: Correction) -> Calibration:
+    return Calibration(corrections, {}, CommonScale(True, 0.005, ""))
+
+
+class Solver:
+    """Solves one after the other, a minute apart; what is decided counts at once."""
+
+    def __init__(self, *decisions: CalibrationDecision) -> None:
+        self.decisions = CalibrationDecisions(decisions)
+        self.now_ns = NOW_NS
+
+    def hears(self, *corrections: Correction, asked: bool = False, after_ns: int = 60 * 10**9) -> int:
+        """How many corrections are decided."""
+        made = self.decisions.judge(solved(*corrections), self.now_ns, asked=asked)
+        for decision in made:
+            self.decisions.add(CalibrationDecision.from_body(json.loads(json.dumps(decision.body()))))
+        self.now_ns += after_ns
+        return sum(len(decision.corrections) for decision in made)
+
+    def zero(self, epoch: float = 1000, machine: str = "a") -> float | None:
+        own = [each for each in self.decisions.corrections.each if each.machine == machine]
+        counts = at(own, round(epoch * EPOCH_NS))
+        return counts and counts.zero
+
+
+def test_a_correction_counts_once_it_is_found_twice_in_a_row():
+    solver = Solver()
+    assert [solver.hears(one(0.003)) for _ in range(3)] == [0, 1, 0]
+    assert solver.zero() == 0.003
+    assert solver.zero(5000) == 0.003, "it holds until there is a newer one"
+    assert solver.zero(999.9) is None
+
+
+@pytest.mark.parametrize(
+    ("off", "counts"),
+    [
+        ({"zero": 0.00301}, True),
+        ({"zero": 0.00249}, False),
+        ({"zero": 0.002, "scale": 0.006}, True),
+        ({"zero": 0.002, "scale": -0.0049}, False),
+        ({"zero": 0.002, "across": 0.0006}, True),
+        ({"zero": 0.002, "across": 0.0004}, False),
+        ({"zero": 0.002, "most_share": LEVEL_SHARE}, True),
+        ({"zero": 0.004, "covariance": 17 * np.array(SURE)}, False),
+        ({"zero": 0.0048, "covariance": 17 * np.array(SURE)}, True),
+        ({"zero": 0.0024, "covariance": 0.01 * np.array(SURE)}, False),
+    ],
+)
+def test_what_differs_by_less_than_it_is_unsure_changes_nothing(off, counts):
+    solver = Solver()
+    solver.hears(one(0.002))
+    solver.hears(one(0.002), after_ns=EVERY_NS)
+    assert [solver.hears(one(**off)) for _ in range(2)] == [0, int(counts)]
+
+
+def test_a_doubtful_machine_does_not_go_to_and_fro():
+    solver = Solver()
+    assert [solver.hears(one(zero)) for zero in (0.003, 0.0, 0.003, 0.0, 0.003)] == [0] * 5
+
+
+def test_the_solver_decides_at_most_once_in_ten_minutes_of_site_time_unless_it_is_asked():
+    solver = Solver()
+    counts = [solver.hears(one(0.002 + 0.002 * (minute // 2))) for minute in range(14)]
+    assert np.flatnonzero(counts).tolist() == [1, 11]
+    assert solver.hears(one(0.1), asked=True) == 1
+    started_anew = Solver(*[CalibrationDecision("a", SOLVER, "", solver.now_ns, (one(0.1),))])
+    started_anew.now_ns = solver.now_ns
+    assert [started_anew.hears(one(0.2)) for _ in range(11)] == [0] * 10 + [1], "its last decision is on disk"
+
+
+def test_machines_are_decided_each_by_itself():
+    solver = Solver()
+    solver.hears(one(0.003), one(0.004, machine="b"))
+    assert solver.hears(one(0.003), one(0.0, machine="b")) == 1
+    assert (solver.zero(), solver.zero(machine="b")) == (0.003, None)
+
+
+def test_epochs_are_decided_each_by_itself_and_what_follows_keeps_the_newest():
+    solver = Solver()
+    for _ in range(2):
+        solver.hears(one(0.003, 998, to_ns=999 * EPOCH_NS), one(-0.003, 1000))
+    assert [solver.zero(epoch) for epoch in (998, 999, 1000, 1001)] == [0.003, 0.003, -0.003, -0.003]
+    solver.now_ns += EVERY_NS
+    for _ in range(2):
+        solver.hears(one(0.005, 998, to_ns=999 * EPOCH_NS), one(-0.003, 1000))
+    assert [solver.zero(epoch) for epoch in (998, 999.5, 1000)] == [0.005, 0.005, -0.003]
+
+
+def test_an_old_epoch_keeps_its_correction_unless_a_person_asks():
+    solver = Solver()
+    for _ in range(2):
+        solver.hears(one(0.003))
+    solver.now_ns += FROZEN_NS
+    later = one(0.001, 1000 + FROZEN_NS // EPOCH_NS)
+    for _ in range(3):
+        assert solver.hears(one(0.03), later) <= 1
+    assert (solver.zero(), solver.zero(1000 + FROZEN_NS / EPOCH_NS)) == (0.003, 0.001)
+    assert solver.hears(one(0.03), later, asked=True) == 1
+    assert solver.zero() == 0.03
+
+
+def test_samples_that_come_hours_late_are_corrected():
+    solver = Solver()
+    solver.hears(one(0.003))
+    solver.now_ns += 10 * FROZEN_NS
+    late = one(0.004, machine="late")
+    assert [solver.hears(one(0.003), late, after_ns=EVERY_NS) for _ in range(2)] == [1, 1]
+    assert solver.zero(machine="late") == 0.004
+    solver.now_ns += FROZEN_NS
+    assert [solver.hears(one(0.003), one(0.04, machine="late")) for _ in range(3)] == [0] * 3
+
+
+def test_asked_for_it_takes_all_that_is_known_and_then_nothing_is_left_to_decide():
+    solver = Solver()
+    assert solver.hears(one(0.0001), asked=True) == 1
+    assert solver.hears(one(0.0001), asked=True) == 0
+    assert solver.hears(one(0.00011), asked=True) == 1
+
+
+def person(zero: float | None, *, machine: str = "a") -> CalibrationDecision:
+    corrections = () if zero is None else (Correction(machine, 0, LAST_NS, zero, 0.0, 0.0, ()),)
+    return CalibrationDecision(machine, PERSON, "why", NOW_NS, corrections)
+
+
+def test_a_person_s_correction_stands_until_it_is_taken_back():
+    solver = Solver()
+    for _ in range(2):
+        solver.hears(one(0.003))
+    solver.decisions.add(person(0.02))
+    assert (solver.zero(), solver.zero(3)) == (0.02, 0.02)
+    assert solver.decisions.newest("a").by == PERSON
+    solver.now_ns += EVERY_NS
+    assert [solver.hears(one(0.05), asked=asked) for asked in (False, False, True)] == [0, 0, 0]
+    solver.decisions.add(person(None))
+    assert (solver.zero(), solver.zero(3)) == (0.003, None)
+    assert solver.decisions.newest("a").by == SOLVER
+    assert [solver.hears(one(0.05)) for _ in range(2)] == [0, 1]
+
+
+def test_a_machine_without_a_correction_has_no_decision():
+    decisions = CalibrationDecisions([person(0.02), person(None)])
+    assert decisions.newest("a") is None
+    assert decisions.newest("b") is None
+    assert decisions.corrections == Corrections()
+
+
+def test_what_a_newer_version_wrote_is_refused():
+    body = person(0.02).body() | {"version": 2, "spans": {"another": "form"}}
+    with pytest.raises(NewerVersionError, match=r"version 2.*knows version 1"):
+        CalibrationDecision.from_body(body)
+    with pytest.raises(NewerVersionError, match="None"):
+        CalibrationDecision.from_body({"machine": "a"})
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_painted_spans_are_what_painting_each_time_by_itself_gives(seed):
+    draw, spans, times = np.random.default_rng(seed), [], np.full(60, np.nan)
+    for zero in range(40):
+        first, end = sorted(draw.choice(61, 2, replace=False).tolist())
+        paint(spans, Correction("a", first, end, float(zero), 0.0, 0.0, ()))
+        times[first:end] = zero
+        assert all(before.to_ns <= after.from_ns for before, after in pairwise(spans))
+        by_time = [at(spans, stamp) for stamp in range(60)]
+        assert np.array_equal([each.zero if each else np.nan for each in by_time], times, equal_nan=True)
+
+
+def test_the_order_in_which_machines_are_decided_is_no_matter():
+    made = [
+        CalibrationDecision(name, SOLVER, "", 1, (one(zero, machine=name),))
+        for name, zero in zip("abc", (1, 2, 3), strict=True)
+    ]
+    assert CalibrationDecisions(made).corrections == CalibrationDecisions(made[::-1]).corrections
