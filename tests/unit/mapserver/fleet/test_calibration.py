@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -281,11 +282,23 @@ def test_one_ramp_driven_both_ways_in_one_lane_shows_the_scale_by_itself() -> No
     assert {each.most_share for each in result.corrections} == {ANY_SHARE}
 
 
-def with_bad(scale: float, zero: float = 0.01) -> dict[str, Table]:
-    """The fleet, and a machine whose torque reads too much and whose antenna lies 3 m off."""
-    rows = fleet() | {"bad": drive(RAMP, Errors(zero, scale), seed=99)}
-    rows["bad"]["y_m"] += 3.0
+def with_bad(
+    scale: float,
+    zero: float = 0.01,
+    route: Sequence[tuple[float, float]] = RAMP,
+    off_m: float = 3.0,
+    site: Site = soils,
+) -> dict[str, Table]:
+    """The fleet, and a machine whose torque reads too much and whose antenna lies elsewhere."""
+    rows = fleet(site) | {"bad": drive(route, Errors(zero, scale), seed=99, site=site)}
+    rows["bad"]["y_m"] += off_m
     return rows
+
+
+@cache
+def usual() -> Calibration:
+    """Of the fleet as it is."""
+    return solve(fleet())
 
 
 def of_others(result: Calibration) -> tuple[Correction, ...]:
@@ -293,7 +306,7 @@ def of_others(result: Calibration) -> tuple[Correction, ...]:
 
 
 def test_a_machine_without_a_say_moves_nobody() -> None:
-    rows, without = with_bad(0.1), solve(fleet())
+    rows, without = with_bad(0.1), usual()
     excluded = solve(rows, ("bad",))
     assert of_others(excluded) == without.corrections
     assert excluded.common == without.common
@@ -303,9 +316,31 @@ def test_a_machine_without_a_say_moves_nobody() -> None:
 @pytest.mark.parametrize(("scale", "zero"), [(0.6, 0.01), (-0.45, 0.0), (0.1, 0.04)])
 def test_a_machine_at_fault_has_no_say_though_nobody_said_so(scale: float, zero: float) -> None:
     result = solve(with_bad(scale, zero))
-    assert of_others(result) == solve(fleet()).corrections
+    assert of_others(result) == usual().corrections
     assert max(np.divide(result.machines["bad"].beyond, FAULT_SIGMAS)) > 1
     assert all(max(np.divide(result.machines[name].beyond, FAULT_SIGMAS)) < 1 for name in FLEET)
+
+
+def test_a_machine_that_puts_the_slopes_in_doubt_is_the_one_that_is_far_off() -> None:
+    """Not as far as a fault in the common estimate, which has a say of its own; alone against the others it is."""
+    result = solve(with_bad(0.65, route=RAMP_AGAIN, off_m=6.0))
+    assert result.common.observed
+    assert of_others(result) == usual().corrections
+    assert result.machines["bad"].beyond[1] > FAULT_SIGMAS[1]
+
+
+def test_where_the_doubt_stays_nobody_is_left_out() -> None:
+    rows = with_bad(0.65, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
+    result = solve(rows)
+    assert result.common.reason == "ground_changes_with_slope"
+    assert result.machines["bad"].beyond[1] == 0.0
+    assert of_others(result) != of_others(solve(rows, ("bad",)))
+
+
+def test_what_is_beyond_a_data_sheet_is_beyond_it_for_sure() -> None:
+    state = solve(fleet(errors={"again": Errors(0.002, 0.6)})).machines["again"]
+    own_std = np.sqrt(state.scale_std**2 - SCALE_FLOOR**2)
+    assert state.beyond[1] == pytest.approx((state.scale - 2 * own_std) / SCALE_STD, rel=0.01)
 
 
 def test_where_most_seem_at_fault_all_have_a_say() -> None:
@@ -344,6 +379,20 @@ def test_a_machine_without_a_say_is_solved_against_the_ground_of_the_others() ->
     rows = fleet() | {"bad": drive(RAMP, Errors(0.003, 0.6), seed=99)}
     state = solve(rows, ("bad",)).machines["bad"]
     check(state, Errors(0.003, 0.6), zero=0.003, scale=0.04)
+
+
+def test_a_machine_without_a_say_that_shares_no_ground_shows_its_scale_by_its_own_edges() -> None:
+    state = solve(with_bad(0.6, off_m=12.0), ("bad",)).machines["bad"]
+    assert state.scale == pytest.approx(0.6, abs=0.06)
+    assert "edges" in state.scale_by
+
+
+def test_edges_of_a_machine_without_a_say_do_not_count_where_those_of_the_others_do_not() -> None:
+    rows = with_bad(0.2, off_m=12.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
+    result = solve(rows, ("bad",))
+    assert result.common.reason == "ground_changes_with_slope"
+    assert "edges" not in result.machines["bad"].scale_by
+    assert result.machines["bad"].beyond[1] == 0.0
 
 
 def test_rain_between_two_machines_is_not_their_error() -> None:
