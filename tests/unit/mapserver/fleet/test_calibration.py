@@ -16,10 +16,11 @@ from mapserver.fleet.calibration import (
     Calibration,
     MachineState,
     calibrate,
+    moved,
 )
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, corrected
 from mapserver.fleet.ledger import EPOCH_NS
-from mapserver.fleet.passages import passages
+from mapserver.fleet.passages import Epochs, passages
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
 from protocol.arrays import Floats, Table
 from protocol.site.site_config import KnownGround
@@ -45,6 +46,7 @@ FLEET = {
     "ramp": (RAMP, Errors(-0.006, 0.04, -0.003)),
     "again": (RAMP_AGAIN, Errors(0.008, 0.03, 0.0)),
 }
+ELSEWHERE = ((20.0, 60.0), (110.0, 60.0), (110.0, 90.0), (20.0, 90.0))  # over the same ramp in lanes of its own
 SEEDS = (0, 1, 2)
 
 
@@ -228,6 +230,31 @@ def test_a_step_of_the_zero_is_followed_from_epoch_to_epoch() -> None:
     check(result.machines["again"], FLEET["again"][1], zero=0.002, scale=0.025)
 
 
+def test_an_epoch_in_which_the_zero_steps_states_a_large_deviation() -> None:
+    stepped, still = (
+        solve({"a": drive(LOW, Errors(step=step, step_s=450.0), seconds=900.0)}).corrections for step in (0.015, 0.0)
+    )
+    assert np.sqrt(stepped[1].covariance[0][0]) == pytest.approx(0.004, abs=0.001)
+    assert max(np.sqrt(each.covariance[0][0]) for each in still) < 0.0015
+
+
+@pytest.mark.parametrize(
+    ("machines", "numbers", "expected"),
+    [
+        ([0, 0, 0], [7, 8, 9], [4e-6, 9e-6, 9e-6]),
+        ([0, 0, 1], [7, 8, 9], [4e-6, 4e-6, 0.0]),
+        ([0, 0, 0], [7, 8, 10], [4e-6, 4e-6, 0.0]),
+    ],
+)
+def test_zeros_that_differ_from_those_beside_them_are_less_sure(
+    machines: list[int], numbers: list[int], expected: list[float]
+) -> None:
+    epochs = Epochs(np.array(machines), np.array(numbers))
+    zeros, none = np.array([0.0, 0.004, 0.010]), np.zeros(3)
+    assert moved(epochs, zeros, none) == pytest.approx(expected)
+    assert moved(epochs, zeros, none + 0.01**2) == pytest.approx(0.0)  # by no more than what they are unsure of
+
+
 @pytest.mark.parametrize("step", [-0.02, 0.01, 0.02])
 def test_ramps_of_other_ground_change_nothing_on_the_slope(step: float) -> None:
     rows = fleet(lambda x, y, h: soils(x, y, h) + step * on_ramp(x))
@@ -382,17 +409,17 @@ def test_a_machine_without_a_say_is_solved_against_the_ground_of_the_others() ->
 
 
 def test_a_machine_without_a_say_that_shares_no_ground_shows_its_scale_by_its_own_edges() -> None:
-    state = solve(with_bad(0.6, off_m=12.0), ("bad",)).machines["bad"]
+    state = solve(with_bad(0.6, route=ELSEWHERE, off_m=0.0), ("bad",)).machines["bad"]
     assert state.scale == pytest.approx(0.6, abs=0.06)
-    assert "edges" in state.scale_by
+    assert state.scale_by == ("edges",)
 
 
 def test_edges_of_a_machine_without_a_say_do_not_count_where_those_of_the_others_do_not() -> None:
-    rows = with_bad(0.2, off_m=12.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
+    rows = with_bad(0.2, route=ELSEWHERE, off_m=0.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
     result = solve(rows, ("bad",))
     assert result.common.reason == "ground_changes_with_slope"
-    assert "edges" not in result.machines["bad"].scale_by
-    assert result.machines["bad"].beyond[1] == 0.0
+    assert result.machines["bad"].scale_by == ()
+    assert {each.scale for each in result.corrections if each.machine == "bad"} == {0.0}
 
 
 def test_rain_between_two_machines_is_not_their_error() -> None:
