@@ -38,6 +38,7 @@ from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
 from protocol.wire.messages import Ack, Refused, SampleBatch
+from protocol.wire.offer_codec import encode_offer
 
 log = logging.getLogger("mapserver.ingest.store")
 JOURNAL_FILE = "journal.db"
@@ -252,7 +253,9 @@ class Store:
         row = self.journal.append(admission, self._received_ns) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
-        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces), admission
+        offer = self._decisions.offer(batch.machine) if new else None
+        offered = encode_offer(offer) if offer else None
+        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces, offered), admission
 
     def _newest_but(self, machine: str) -> int:
         """The newest stamp of the machines in the map but one."""
