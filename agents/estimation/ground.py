@@ -177,7 +177,7 @@ class GroundEstimator:
                 self._follow(balance, pose)
 
     def consider(self, offer: Any) -> None:
-        """Judge what the map server offers, as it came; where it is good, it counts when the calibration changes next."""
+        """Judge what the map server offers, as it came; a good one counts when the calibration changes next."""
         if self._config.accept_calibration:
             self._offers.consider(offer, self._newest_reading_ns)
 

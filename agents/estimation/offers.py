@@ -42,12 +42,10 @@ class Offers:
         except MessageError as error:
             self.counters[f"refused_offer_{error.reason}"] += 1
             return
-        if offer.stamp_ns == self._newest_ns:  # it comes with each acknowledgement
-            return
         if problem := self._problem(offer, now_ns):
             self.counters[f"refused_offer_{problem}"] += 1
-            return
-        self._newest_ns, self._waiting = offer.stamp_ns, offer
+        elif offer.stamp_ns > self._newest_ns:  # else it is the last one: it comes with each acknowledgement
+            self._newest_ns, self._waiting = offer.stamp_ns, offer
 
     def take(self) -> CalibrationOffer | None:
         """The offer that waits, once."""
