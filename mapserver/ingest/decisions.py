@@ -17,6 +17,7 @@ from mapserver.trust import decisions as trust
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
 from protocol.errors import StoreError
 from protocol.wire.messages import CalibrationOffer
+from protocol.wire.offer_codec import encode_offer
 
 Decision = TrustDecision | CalibrationDecision
 KINDS = (trust.KIND, calibration.KIND)
@@ -41,13 +42,17 @@ class Decisions:
         self._take(event)
         self._conclude(event.id)
 
-    def offer(self, machine: str) -> CalibrationOffer | None:
-        """What a machine may take for its own calibration: what is taken off its newest samples; None for nothing."""
+    def offer(self, machine: str) -> dict[str, Any] | None:
+        """What a machine may take for its own calibration, as an acknowledgement has it; None for nothing.
+
+        It is what is taken off its newest samples.
+        """
         newest, decision = self.facts.corrections.newest(machine), self.calibration.newest(machine)
         if not newest or not decision or newest.to_ns < LAST_NS or not newest.covariance:
             return None
         (zz, zs, _), (_, ss, _), _ = newest.covariance
-        return CalibrationOffer(machine, decision.stamp_ns, newest.zero, newest.scale, zz, ss, zs)
+        offer = CalibrationOffer(machine, decision.stamp_ns, newest.zero, newest.scale, zz, ss, zs)
+        return encode_offer(offer)
 
     def _add_all(self, events: Iterable[Event], path: Path) -> None:
         number = 0

@@ -38,7 +38,6 @@ from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
 from protocol.wire.messages import Ack, Refused, SampleBatch
-from protocol.wire.offer_codec import encode_offer
 
 log = logging.getLogger("mapserver.ingest.store")
 JOURNAL_FILE = "journal.db"
@@ -254,8 +253,7 @@ class Store:
         if admission.lost and not new:
             self.journal.declare_lost(admission)
         offer = self._decisions.offer(batch.machine) if new else None
-        offered = encode_offer(offer) if offer else None
-        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces, offered), admission
+        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces, offer), admission
 
     def _newest_but(self, machine: str) -> int:
         """The newest stamp of the machines in the map but one."""
