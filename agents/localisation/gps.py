@@ -192,13 +192,15 @@ class Receivers(ModalSensors[Fix]):
         sensor = fix.sensor
         place = fix.position_m + self._shifts[sensor.name] if sensor.mode == RELATIVE else fix.position_m
         error, change = None, None
+        opens: tuple[slice, ...] = (measurements.PLACE,)
         if self._slow:
             error = self._layout.gps_error(self._states[sensor.name])
             self._drift_m2[sensor.name] = _drift_m2(fix)
             if sensor.name not in self._confirmed:  # a receiver brings its own unknown error
                 change = self._joining(fix, error)
+            # nobody knows whether receiver or filter went wrong, unless others tell: the motion will show
+            opens = (error,) if self._is_outvoted(fix) else (measurements.PLACE, error)
         R = np.diag(self._white(fix))
-        opens = error if error and self._is_outvoted(fix) else measurements.PLACE
         gate = sensor.gate(GATE_SIGMA)
         return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
 

@@ -40,7 +40,7 @@ def fix(
     lever_m: Floats,
     error: slice | None,
     gate: float,
-    opens: slice = PLACE,
+    opens: tuple[slice, ...] = (PLACE,),
     change: Change | None = None,
 ) -> Measurement:
     """A GPS fix (2,): z = [p + R r]_en + e.
@@ -81,7 +81,7 @@ def correction(
         H[:, b], H[:, d] = fade * EYE[:2, :2], EYE[:2, :2]
         return H
 
-    return Measurement(base, stamp_ns, off_m, R, h, jacobian, gate_sigma=gate, opens=d, change=change)
+    return Measurement(base, stamp_ns, off_m, R, h, jacobian, gate_sigma=gate, opens=(d,), change=change)
 
 
 def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_m: Floats, gate: float) -> Measurement:
@@ -215,7 +215,7 @@ def heading(
         H[0, YAW] = H[0, error] = 1.0
         return H
 
-    z, R, opens = np.array([yaw_rad]), np.array([[variance]]), slice(error, error + 1)
+    z, R, opens = np.array([yaw_rad]), np.array([[variance]]), (slice(error, error + 1),)
     return Measurement(sensor, stamp_ns, z, R, h, jacobian, (0,), gate_sigma=gate, opens=opens, change=change)
 
 

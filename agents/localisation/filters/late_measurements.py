@@ -16,6 +16,7 @@ import numpy as np
 from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, open_states
 from agents.localisation.filters.motion import MotionModel, motion
 from agents.localisation.filters.smoother import SmoothedPose
+from protocol.arrays import Floats
 
 WINDOW_S = 1.0  # how far back measurements may come; receivers and networks are late by less
 RELOCK = 15  # refusals in a row after which a sensor is accepted again: the filter is lost, not the sensor
@@ -140,8 +141,9 @@ class Fusion:
             if measurement.sensor in fresh:
                 self._judge(node, measurement, result)
             if not result.accepted and measurement.sensor in node.reopened:
-                opened = _opened(belief, result, measurement.opens)
-                result = self._engine.condition(opened, replace(measurement, gate_sigma=0.0))
+                for states in measurement.opens:
+                    belief = _opened(belief, result.innovation, states)
+                result = self._engine.condition(belief, replace(measurement, gate_sigma=0.0))
             belief = result.belief
         return belief
 
@@ -181,9 +183,6 @@ def _changed(belief: Belief, measurements: Iterable[Measurement]) -> Belief:
     return belief
 
 
-def _opened(belief: Belief, result: Conditioned, states: slice | None) -> Belief:
+def _opened(belief: Belief, innovation: Floats, states: slice) -> Belief:
     """The belief with states as unsure as a measurement of them is off."""
-    if states is None:
-        return belief
-    innovation = result.innovation
     return open_states(belief, states, np.outer(innovation, innovation) + np.eye(len(innovation)))

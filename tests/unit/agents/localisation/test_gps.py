@@ -9,14 +9,14 @@ import pytest
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Conditioned
 from agents.localisation.filters.ekf import Ekf
-from agents.localisation.filters.late_measurements import Fusion
+from agents.localisation.filters.late_measurements import RELOCK, Fusion
 from agents.localisation.filters.motion import MotionModel
 from agents.localisation.filters.state import POSITION, VELOCITY, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Receivers
 from agents.localisation.localiser import _layout_of
 from protocol.arrays import Floats
-from protocol.machine.machine_config import MachineConfig
+from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Reading
 from tests.unit.agents.drives import (
     PROJECTION,
@@ -40,6 +40,11 @@ ENGINES = {"ekf": Ekf(), "ukf": Ukf()}
 
 def at_rest(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: str = "ekf") -> Belief:
     """What is believed of a machine at rest, by one fix in a second with these errors (n, receivers, 2) each."""
+    return each_second(vehicle, errors_m, place_m, engine)[-1]
+
+
+def each_second(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: str = "ekf") -> list[Belief]:
+    """What is believed of it after each of those seconds; no fix comes in where an error is NaN."""
     layout = _layout_of(vehicle)
     receivers = Receivers(vehicle.sensors, PROJECTION, layout, slow=True, machine_share=vehicle.machine_share)
     reckoned = localiser(vehicle).dead_reckoning.pose
@@ -47,11 +52,13 @@ def at_rest(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: s
     variance[POSITION], variance[VELOCITY] = PLACE_STD_M**2, 1e-4
     model = MotionModel(layout, True, receivers.errors)
     fusion = Fusion(ENGINES[engine], model, Belief(START_NS, np.zeros(layout.n), np.diag(variance)))
-    sensors = [s for s in vehicle.sensors if s.kind == "gps"]
+    sensors, beliefs = [s for s in vehicle.sensors if s.kind == "gps"], []
     for i, row in enumerate(errors_m):
         stamp = START_NS + (i + 1) * SECOND
         fusion.add([measurements.standstill(stamp)])
         for sensor, error in zip(sensors, row, strict=True):
+            if np.isnan(error).any():
+                continue
             x, y = place_m + error
             one = receivers.fix(fix(sensor, stamp, float(x), float(y), 0.0, STATED_M2), reckoned)
             if receivers.needs_anchor(one):
@@ -62,7 +69,9 @@ def at_rest(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: s
             fusion.model = replace(fusion.model, gps_errors=receivers.errors)
             fusion.add([measurement])
             receivers.confirm(one, fusion.last[sensor.name])
-    return fusion.belief
+            fusion.model = replace(fusion.model, gps_errors=receivers.errors)
+        beliefs.append(fusion.belief)
+    return beliefs
 
 
 def sharing(receivers: int, share: float | None, **options: str) -> MachineConfig:
@@ -204,6 +213,92 @@ def test_receivers_that_go_off_together_are_followed(share: float) -> None:
     pose = located.run(moved(made.readings, 60.0, ("gps-1", "gps-2"), 20, 1e9))[-1]
     x, y, _ = made.at(pose.stamp_ns)
     assert math.dist((pose.x_m, pose.y_m), (x, y + 60)) < 4.0
+
+
+# --- a receiver that comes back wrong, or a machine that was carried -------------------------------------------------
+
+KNOWN_S, GAP_S = 60, 60
+RELOCKED_S = KNOWN_S + GAP_S + RELOCK - 1  # index of the second in which the filter accepts them again
+DRIFT_S = SensorConfig("gps-1", "gps").drift_time_s
+
+
+def returning(receivers: int, jumps_m: Floats, seconds: int) -> Floats:
+    """Errors of receivers that are right, silent for a minute, and then off by so much each (receivers, 2)."""
+    errors = np.zeros((KNOWN_S + GAP_S + RELOCK + seconds, receivers, 2))
+    errors[KNOWN_S : KNOWN_S + GAP_S] = np.nan
+    errors[KNOWN_S + GAP_S :] = jumps_m
+    return errors
+
+
+def outside(belief: Belief, place_m: Floats) -> float:
+    """How far a place lies from the believed one, over the 95 % ellipse."""
+    off = belief.x[:2] - place_m
+    return math.sqrt(off @ np.linalg.solve(belief.P[:2, :2], off) / 5.99)
+
+
+def fading(errors_m: Floats) -> Floats:
+    """The same, where what they are off after the gap fades as a slow error does."""
+    errors_m = errors_m.copy()
+    seconds = np.arange(len(errors_m) - KNOWN_S - GAP_S)
+    errors_m[KNOWN_S + GAP_S :] *= np.exp(-seconds / DRIFT_S)[:, None, None]
+    return errors_m
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("jump_m", [20.0, 60.0])
+def test_what_a_lone_receiver_is_off_by_is_half_its_own_and_half_the_places(engine: str, jump_m: float) -> None:
+    """As long as nothing says which it was: a variance of J^2 each leaves J^2 / 2 of either, and both are possible."""
+    vehicle, jump = sharing(1, None), jump_m * np.array([0.6, 0.8])
+    beliefs = each_second(vehicle, returning(1, jump, 1), np.zeros(2), engine)
+    assert np.hypot(*beliefs[RELOCKED_S - 1].x[:2]) < 0.1  # refused
+    belief, along = beliefs[RELOCKED_S], jump / jump_m
+    np.testing.assert_allclose(belief.x[:2], jump / 2, rtol=0.01)
+    np.testing.assert_allclose(belief.x[_layout_of(vehicle).gps_error(0)], jump / 2, rtol=0.01)
+    assert math.sqrt(along @ belief.P[:2, :2] @ along) == pytest.approx(math.sqrt(0.5) * jump_m, rel=0.01)
+    assert outside(belief, np.zeros(2)) < 1
+    assert outside(belief, jump) < 1
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("jump_m", [20.0, 60.0])
+def test_the_motion_shows_within_seconds_which_it_was(engine: str, jump_m: float) -> None:
+    """An error fades against dead reckoning, a place that went wrong stays."""
+    jump = jump_m * np.array([0.6, 0.8])
+    errors = returning(1, jump, 90)
+    for readings, true in ((fading(errors), np.zeros(2)), (errors, jump)):
+        beliefs = each_second(sharing(1, None), readings, np.zeros(2), engine)[RELOCKED_S:]
+        off_m = [math.dist(belief.x[:2], true) for belief in beliefs]
+        assert max(off_m[15:]) < 0.1 * jump_m
+        assert off_m[45] < 0.03 * jump_m
+        assert max(outside(belief, true) for belief in beliefs) < 1
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+@pytest.mark.parametrize("receivers", [2, 3])
+def test_receivers_that_come_back_alike_move_the_place_at_once(receivers: int, share: float) -> None:
+    """A machine that was towed, or carried by a ferry."""
+    carried = np.array([12.0, -16.0])
+    beliefs = each_second(sharing(receivers, share), returning(receivers, carried, 90), np.zeros(2))
+    for later_s in (0, 5, 45, 90):
+        belief = beliefs[RELOCKED_S + later_s]
+        assert math.dist(belief.x[:2], carried) < 1.0
+        assert outside(belief, carried) < 1
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_second_receiver_says_at_once_which_it_was(share: float, engine: str) -> None:
+    """It comes back a second after the first is accepted again, and is right, or as far off."""
+    jump = np.array([12.0, -16.0])
+    for second in (np.zeros(2), jump):
+        errors = returning(2, np.array([jump, second]), 90)
+        errors[KNOWN_S + GAP_S : RELOCKED_S + 1, 1] = np.nan
+        errors = errors if second.any() else fading(errors)
+        beliefs = each_second(sharing(2, share), errors, np.zeros(2), engine)[RELOCKED_S:]
+        assert 0.25 < math.dist(beliefs[0].x[:2], second) / 20.0 < 0.6
+        for belief in beliefs[1:]:
+            assert math.dist(belief.x[:2], second) < 1.0
+            assert outside(belief, second) < 1
 
 
 def test_results_that_could_not_be_computed_say_nothing_of_a_receiver() -> None:

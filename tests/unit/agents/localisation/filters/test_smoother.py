@@ -73,7 +73,7 @@ def drive(seed: int, seconds: float = 14.0, change: Any = None, off_m: float = 0
             first = change if i == 3 else None
             error = LAYOUT.gps_error(0)
             groups.append(
-                [measurements.fix(stamp + 7_000_000, "gps", place, np.eye(2) * 0.25, LEVER_M, error, 4.0, first)]
+                [measurements.fix(stamp + 7_000_000, "gps", place, np.eye(2) * 0.25, LEVER_M, error, 4.0, change=first)]
             )
     return groups
 
