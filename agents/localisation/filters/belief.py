@@ -60,8 +60,8 @@ class Measurement:
     h: measurements (m, k) that states (m, n) would give. jacobian: dh/dx (k, n) at a state (n,). angles: components of
     z that are angles [rad]. gate_sigma: refused if the innovation is this many standard deviations off, 0 never.
     relocks: accepted again after too many refusals in a row; false for assumptions, which no sensor measures. opens:
-    states, (k,) each, that become as unsure as the measurement is off then, each on its own: they share what it is off by
-    their variances, and the others follow by themselves. change: made to the belief at its stamp before any
+    states, (k,) each, that become as unsure as the measurement is off then, each on its own: they share what it is off
+    by their variances, and the others follow by themselves. change: made to the belief at its stamp before any
     measurement, as when a state that was unknown gets its first value. considers: states that it depends on, and does
     not change (Schmidt-Kalman: Schmidt 1966).
     """
