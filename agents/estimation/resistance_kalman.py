@@ -249,10 +249,10 @@ def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filte
     Q = _same_ground(walk + free) if on_one_ground else np.diag([walk + free, 0.0, 0.0])
     Q[SCALE, SCALE] = measured.scale_var
     x0 = (TRAIL_IS_LEAD if on_one_ground else IDENTITY) @ before.x
-    P0 = A @ before.P @ A.T + Q
+    P0 = (before.P if A is IDENTITY else A @ before.P @ A.T) + Q
     Ph = P0 @ measured.h
     K = Ph / (measured.h @ Ph + measured.r)
-    x, P = x0 + K * (step.raw - measured.h @ x0), P0 - np.outer(K, Ph)
+    x, P = x0 + K * (step.raw - measured.h @ x0), P0 - K[:, None] * Ph
     return _Filtered(measured, border, crossing_m, A, x0, P0, x, P, _judged(measured, x, P))
 
 
