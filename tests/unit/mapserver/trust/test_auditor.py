@@ -139,7 +139,9 @@ def test_a_machine_whose_corrected_samples_agree_is_accused_of_what_was_correcte
     verdicts = auditor.verdicts(known | {"d": state(*off)})
     assert accused(verdicts) == {"d": (Reason.BEYOND_DATA_SHEET,)}
     evidence = verdicts["d"].evidence
-    assert (evidence["zero"], evidence["scale"]) == off
+    assert (evidence["zero"], evidence["torque_gain"]) == (off[0], pytest.approx(1 + off[1]))
+    assert (evidence["zero_std"], evidence["torque_gain_std"]) == (0.001, 0.01)
+    assert (evidence["zero_by"], evidence["torque_gain_by"]) == (("heights",), ("edges",))
     assert evidence["excess"]["beyond_data_sheet"] > 1
     assert evidence["agrees_with"] == ("a", "b", "c")
     assert accused(auditor.verdicts(known | {"d": state(0.02, 0.29)})) == {}
@@ -153,6 +155,13 @@ def test_a_machine_at_fault_is_no_measure_for_the_others() -> None:
     by_right = auditor.verdicts({"c": state(0.0, 0.6)})["a"].evidence["gain"]
     assert by_all < 0.99
     assert by_right == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_machine_whose_clock_is_off_measures_the_ground_like_any_other() -> None:
+    late = fleet(0, GOOD, GOOD, {"gain": 1.1, "clock_s": -400.0})
+    verdicts = audit(late)
+    assert accused(verdicts) == {"c": (Reason.CLOCK,)}
+    assert verdicts["a"].evidence["gain"] < 0.99
 
 
 def test_gain_and_displacement_of_corrected_samples_are_told_apart() -> None:
