@@ -33,7 +33,7 @@ log = logging.getLogger("mapserver.follower.calibrating")
 
 
 class Calibrating:
-    """Ledgers of all machines, and what they come to. solved: the last solve; None before the first one.
+    """Ledgers of all machines, and what they come to. solved: the last solve, and the site's now then [ns].
 
     decide: is given each solve and the site's now [ns]. doubtful: machines that are to have no say now.
     """
@@ -48,7 +48,7 @@ class Calibrating:
         doubtful: Callable[[], frozenset[str]],
         ending: threading.Event,
     ) -> None:
-        self.solved: Calibration | None = None
+        self.solved: tuple[Calibration, int] = calibrate({}), 0
         self._writer, self._past, self._decide, self._doubtful, self._ending = writer, past, decide, doubtful, ending
         self._reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ledgers: dict[str, Ledger] = {}
@@ -88,7 +88,8 @@ class Calibrating:
         began_s, self._solved_ns = time.thread_time(), now_ns
         try:
             stays = {name: ledger.stays() for name, ledger in self._ledgers.items()}
-            self.solved = solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground)
+            solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground)
+            self.solved = solved, now_ns
         finally:
             took_s = time.thread_time() - began_s
             self._due_s = time.monotonic() + REST * took_s

@@ -8,6 +8,7 @@ import time
 from typing import Any
 
 from mapserver.follower.calibrating import Calibrating
+from mapserver.follower.calibration_state import calibration_of, decided_by_person
 from mapserver.follower.checkpointing import Checkpointing
 from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Publish
 from mapserver.follower.refolding import Refolding
@@ -19,6 +20,8 @@ from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError, StoreError
 from protocol.queries.answers import GroundChange
+from protocol.queries.calibration import CalibrationAnswer
+from protocol.queries.commands import CalibrateCommand
 
 # Between two turns, which is how late a change of the ground is published: where a large fleet drives everywhere at
 # once, each turn looks at all of the map again, and no more than a share of one core should go into that.
@@ -66,13 +69,33 @@ class Follower:
         Returns the state of the machine. Raises QueryError for a machine that has sent nothing, where the decision
         cannot be written, or after wait_s; then it is kept all the same.
         """
-        sent = self._writer.run(lambda store: store.machines())
-        if machine not in sent:
-            names = ", ".join(sorted(sent)) or "none"
-            raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
+        self._require_known(machine)
         number = self._refolding.decide(self._decision(machine, trusted, reason))
         self._refolding.wait(number, wait_s)
         return next(row for row in self.machines() if row["name"] == machine)
+
+    def calibration(self) -> CalibrationAnswer:
+        """What is taken off the samples of all machines, and what is known of their calibration."""
+        solved, solved_ns = self._calibrating.solved
+        version, corrections, sent = self._writer.run(
+            lambda store: (store.version, store.facts.corrections, store.machines())
+        )
+        machines = (
+            calibration_of(name, self._refolding.calibration(name), solved.machines.get(name), corrections)
+            for name in sorted(sent)
+        )
+        common = (solved_ns, solved.common.std, solved.common.reason)
+        return CalibrationAnswer(version.store, version.row, version.fact, *common, tuple(machines))
+
+    def correct(self, command: CalibrateCommand) -> None:
+        """Decide what is taken off the samples of one machine, or leave it to the solver; waits as `calibrate`.
+
+        Raises QueryError as that does, and for a machine that has sent nothing.
+        """
+        self._require_known(command.machine)
+        stamp_ns = self._writer.run(lambda store: store.newest_ns)
+        number = self._refolding.decide(decided_by_person(command, stamp_ns))
+        self._refolding.wait(number, command.wait_s)
 
     def calibrate(self, wait_s: float) -> None:
         """Calibrate all machines with all that is journalled by now; waits until the map is folded so.
@@ -94,6 +117,12 @@ class Follower:
         self._checkpointing.close()
         self._calibrating.close()
         self._reader.close()
+
+    def _require_known(self, machine: str) -> None:
+        sent = self._writer.run(lambda store: store.machines())
+        if machine not in sent:
+            names = ", ".join(sorted(sent)) or "none"
+            raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
 
     def _doubtful(self) -> frozenset[str]:
         """Machines without a say on what the ground is like: those left out, and those that contradict all others."""

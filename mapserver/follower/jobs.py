@@ -10,14 +10,17 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from mapserver.change import change_log
 from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.evidence.timeline import Block, TimedPage
+from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
@@ -106,13 +109,14 @@ class ChangeSearch:
 
 
 class Archiving:
-    """Moves journal rows that are old enough into hourly Parquet files."""
+    """Moves journal rows that are old enough into hourly Parquet files, and keeps decisions beside these."""
 
     name = "archiving"
 
     def __init__(self, writer: Writer, reader: JournalReader, ending: threading.Event) -> None:
         self._writer, self._reader, self._ending = writer, reader, ending
         self._due_s = 0.0
+        self._kept = 0  # number of the last decision that is beside the files
 
     def run(self) -> None:
         """Move the next hour of old rows, where it is time: an hour a turn, so that the end need not wait."""
@@ -127,6 +131,14 @@ class Archiving:
             self._writer.run(lambda store: store.journal.shrink())
             log.info("archived file=%s", path.name)
             self._due_s = 0.0  # there may be more hours
+        self._keep_decisions(folder)
+
+    def _keep_decisions(self, folder: Path) -> None:
+        """Have those about calibration beside the files, where there are any."""
+        newest = self._writer.run(lambda store: store.fact)
+        if folder.exists() and newest != self._kept:
+            archived_decisions.save(folder, self._writer.store_id, calibrations(self._reader))
+            self._kept = newest
 
     def _forget(self, until: int) -> int:
         if self._ending.is_set():  # what is in both meanwhile counts once, and the next start goes on with it
