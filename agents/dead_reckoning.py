@@ -9,12 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque
+from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque, WheelReading
 from protocol.units import GRAVITY_MPS2
 
 TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
 STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
 PAUSE_S = 1.0  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
+PAUSE_NS = round(PAUSE_S * 1e9)
 MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine
 MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
 MIN_NARROWING = 0.2  # of a bend for its inner wheel: one near the middle of the bend rolls too little to scale it up
@@ -105,7 +106,7 @@ class WheelSpeed:
 class _Wheel:
     """One wheel sensor: its last reading, how far it has rolled by then, and the machine's angle then."""
 
-    reading: Encoder | Odometry
+    reading: WheelReading
     offset_m: float
     angle_rad: float
     rolled_m: float = 0.0
@@ -145,7 +146,7 @@ class DeadReckoning:
         """Take in a reading of the wheels, or of a sensor that shows the turn; others change nothing."""
         if isinstance(reading, Imu) and sensor.frame == BASE and sensor.provides("rate"):
             self._turn(reading, sensor)
-        elif isinstance(reading, Encoder | Odometry):
+        elif isinstance(reading, WheelReading):
             if isinstance(reading, Odometry) and sensor.name == self._turn_sensor:
                 self._turn_by_odometry(reading)
             if sensor.provides("speed"):
@@ -170,7 +171,7 @@ class DeadReckoning:
         up = self._up[imu.sensor]
         dt = (imu.stamp_ns - self._gyro_ns.get(imu.sensor, imu.stamp_ns)) * 1e-9
         self._gyro_ns[imu.sensor] = imu.stamp_ns
-        speaking = sum(_speaks(last_ns, imu.stamp_ns) for last_ns in self._gyro_ns.values())
+        speaking = sum([_speaks(last_ns, imu.stamp_ns) for last_ns in self._gyro_ns.values()])
         rate = up[0] * imu.gyro_x_radps + up[1] * imu.gyro_y_radps + up[2] * imu.gyro_z_radps
         self.angle_rad += rate * min(dt, PAUSE_S) / speaking
         self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
@@ -182,7 +183,7 @@ class DeadReckoning:
             self.angle_rad += odometry.rate_z_radps * min(dt_s, PAUSE_S)
         self._turned_ns = odometry.stamp_ns
 
-    def _roll(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
+    def _roll(self, reading: WheelReading, sensor: SensorConfig) -> None:
         """Advance by what a wheel sensor rolled since its last reading, by its share in the mean."""
         stamp_ns, offset_m = reading.stamp_ns, sensor.mount.xyz_m[1]
         wheel = self._wheels.setdefault(reading.sensor, _Wheel(reading, offset_m, self.angle_rad))
@@ -196,7 +197,7 @@ class DeadReckoning:
         self.wheels = _mean_speed([wheel, *others])
         self._advance(wheel, rolled_m, 1 + len(others))
 
-    def _rolled_between(self, last: Encoder | Odometry, now: Encoder | Odometry, sensor: SensorConfig) -> float:
+    def _rolled_between(self, last: WheelReading, now: WheelReading, sensor: SensorConfig) -> float:
         dt_s = (now.stamp_ns - last.stamp_ns) * 1e-9
         if isinstance(now, Odometry):
             return now.speed_x_mps * min(dt_s, PAUSE_S)
@@ -234,7 +235,7 @@ def narrowing(curvature: float, offset_m: float) -> float:
 
 def _speaks(last_ns: int, now_ns: int) -> bool:
     """Whether a sensor that was last heard then still counts."""
-    return now_ns - last_ns <= PAUSE_S * 1e9
+    return now_ns - last_ns <= PAUSE_NS
 
 
 def _mean_speed(wheels: Sequence[_Wheel]) -> WheelSpeed:

@@ -87,27 +87,28 @@ class Positioning:
         """Smoothed poses that are not final, as known by now: the last words on them where the stream ends."""
         return self.localiser.remaining()
 
-    def accept(self, reading: Reading) -> Iterator[Accepted]:
-        """Take in one reading; yields what counts of the stamp that it ends.
+    def accept(self, reading: Reading) -> Iterable[Accepted]:
+        """Take in one reading; returns what counts of the stamp that it ends, to be iterated at once.
 
         The caller appends the poses to `poses`, one by one, before it takes the next.
         """
         sensor = self._sensors.get(reading.sensor)
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
-            return
+            return ()
         if isinstance(reading, Correction):  # of another one's clock, and late: it takes effect with the next readings
             self.localiser.take(replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)))
-            return
+            return ()
         if isinstance(reading, Gps) and sensor.mode == ABSOLUTE and not self._is_on_site(reading):
             self._counters["fix_outside_site"] += 1
-            return
+            return ()
         known_ns = max(reading.stamp_ns, sensor.true_ns(reading.stamp_ns))  # never before it was true
-        yield from self._accept(self._order.gather(reading, known_ns))
+        ended = self._order.gather(reading, known_ns)
+        return self._accept(ended) if ended else ()
 
-    def finish(self) -> Iterator[Accepted]:
+    def finish(self) -> Iterable[Accepted]:
         """Take in the readings of the last stamp, as the stream ends; like `accept`."""
-        yield from self._accept(self._order.rest())
+        return self._accept(self._order.rest())
 
     def _accept(self, readings: Sequence[Reading]) -> Iterator[Accepted]:
         for group in by_stamp(map(self._undelayed, readings)):

@@ -17,7 +17,7 @@ import numpy as np
 from agents.estimation.ground import GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
 from protocol.arrays import Table
-from protocol.machine.readings import Encoder, Odometry, Reading
+from protocol.machine.readings import Reading, WheelReading
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.rotations import wrap_angle
 
@@ -99,7 +99,7 @@ class Odometer:
     def update(self, reading: Reading, wheels_m: float, speed_mps: float) -> float:
         """Take in a reading, the wheels' distance so far and the filter's speed; returns the distance [m]."""
         now_ns = reading.stamp_ns
-        if isinstance(reading, Encoder | Odometry):
+        if isinstance(reading, WheelReading):
             self._wheels_ns = now_ns
         self._distance_m += wheels_m - self._wheels_m
         self._wheels_m = wheels_m

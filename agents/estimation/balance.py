@@ -19,7 +19,7 @@ from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import SlopeFilter
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
-from protocol.machine.readings import Articulation, Encoder, Imu, Odometry, Payload, Reading, Torque
+from protocol.machine.readings import Articulation, Imu, Payload, Reading, Torque, WheelReading
 from protocol.units import GRAVITY_MPS2
 
 STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
@@ -108,7 +108,7 @@ class Balancer:
             self._torque_ns, self._torque_nm = reading.stamp_ns, reading.torque_nm
             count, total = self._torque_sums
             self._torque_sums = count + 1, total + reading.torque_nm
-        elif isinstance(reading, Encoder | Odometry):
+        elif isinstance(reading, WheelReading):
             self._wheels_ns = reading.stamp_ns
         elif isinstance(reading, Articulation):
             self._bend_rad = reading.angle_rad

@@ -31,7 +31,6 @@ MAX_AGE_S = 30.0  # older ones are refused: by then a slow GPS error has mostly 
 MAX_AHEAD_S = 10.0  # so far ahead of the machine's own readings they wait for these; beyond that a clock is wrong
 REPEATS = 5  # the same error so often in a row is no measurement any more
 GATE_SIGMA = 4.0  # as of fixes
-TRUST = 0.95  # of the share found: the heading that it is judged by has followed the corrections a little
 LEAST_SHARE = 0.05  # a smaller one is none
 UNKNOWN = GpsError(1.0, 45.0)  # the slow error of a base that was not heard yet: any will do
 
@@ -73,9 +72,8 @@ class Corrections:
     def follow(self, belief: Belief) -> None:
         """Follow the machine by its believed velocity, which wheels and gyros show: dead reckoning in `map`."""
         if self._followed_ns:
-            self._track_m = self._reckoned_m(belief.stamp_ns)
-            dt_s = (belief.stamp_ns - self._followed_ns) * 1e-9
-            self._share.drive(float(np.hypot(*self._velocity_mps)) * dt_s)
+            before_m, self._track_m = self._track_m, self._reckoned_m(belief.stamp_ns)
+            self._share.drive(belief.stamp_ns, self._track_m - before_m)
         self._followed_ns = belief.stamp_ns
         self._velocity_mps = map_from_base(belief.x[ATTITUDE])[:2] @ belief.x[VELOCITY]
 
@@ -85,7 +83,7 @@ class Corrections:
             return
         antenna_m = map_from_base(belief.x[ATTITUDE])[:2] @ fix.lever_m
         off_m = fix.position_m - antenna_m - self._reckoned_m(fix.stamp_ns)
-        self._share.add_fix(fix.sensor.name, belief.stamp_ns, off_m, white_m2, error)
+        self._share.add_fix(fix.sensor.name, fix.stamp_ns, off_m, white_m2, error)
 
     # --- the filter --------------------------------------------------------------------------------------------------
 
@@ -98,7 +96,7 @@ class Corrections:
     @property
     def site_share(self) -> float:
         """How much of the slow variance machine and base have in common; rounded, so that it does not always change."""
-        return round(TRUST * self._share.share, 2) if self._accepted else 0.0
+        return round(self._share.share, 2) if self._accepted else 0.0
 
     def measurement(self, belief: Belief) -> Measurement | None:
         """The newest correction that is due, as a measurement at the belief's stamp; None where none is.
@@ -117,7 +115,8 @@ class Corrections:
         alike = max(1.0, age_s / (between_ns * 1e-9))
         variance_m2 = newest.white_m2 + newest.slow_m2 * (1 - fade**2) * alike
         off_m = np.array([newest.east_m, newest.north_m])
-        self._share.add_correction(belief.stamp_ns, off_m, newest)
+        for correction in due:
+            self._share.add_correction(correction)
         change = None if self._accepted else self._begin(newest)
         z, R, gate = off_m - self._offset_m, np.eye(2) * variance_m2, self._base.gate(GATE_SIGMA)
         return measurements.correction(belief.stamp_ns, self._base.name, z, R, fade, self._layout, gate, change)
@@ -137,7 +136,7 @@ class Corrections:
         elif not why and not self._accepted:
             why = "the machine does not know its heading yet"
         elif not why and share < LEAST_SHARE:
-            why = "its errors are not those of this machine"
+            why = "its errors are not those of this machine, or its clock is off"
         return {
             "name": self._base.name,
             "used": not why,

@@ -135,7 +135,7 @@ class Receivers(ModalSensors[Fix]):
 
     def expected(self, fix: Fix) -> tuple[float, GpsError]:
         """What a fix is off: variance of its white noise, per axis [m2], and the slow error of its receiver."""
-        return float(self._white(fix).mean()), GpsError(_drift_m2(fix), fix.sensor.drift_time_s)
+        return _mean(self._white(fix)), GpsError(_drift_m2(fix), fix.sensor.drift_time_s)
 
     def anchor(self, fix: Fix, belief: Belief) -> None:
         """Shift the receiver so that this fix lies at the believed antenna."""
@@ -164,7 +164,7 @@ class Receivers(ModalSensors[Fix]):
         if name in self._jumps and fix.stamp_ns - self._jumps[name][0] > FADED * fix.sensor.drift_time_s * 1e9:
             del self._jumps[name]
         if len(self._compared) > 1 and name in self._compared:
-            white_m2, slow_m2, time_s = float(self._white(fix).mean()), self._drift_m2[name], fix.sensor.drift_time_s
+            white_m2, slow_m2, time_s = _mean(self._white(fix)), self._drift_m2[name], fix.sensor.drift_time_s
             i, antenna = self._compared[name], fix.reckoned_antenna_m
             shared = SharedFix(i, fix.stamp_ns, fix.position_m, antenna, white_m2, slow_m2, time_s)
             self._estimator.add(shared, float(result.belief.x[YAW]) - fix.reckoned.angle_rad)
@@ -244,9 +244,15 @@ class Receivers(ModalSensors[Fix]):
         return np.maximum(variance, least)
 
 
+def _mean(variance_m2: Floats) -> float:
+    """Of both axes: a tenth of the time of `mean`."""
+    east_m2, north_m2 = variance_m2.tolist()
+    return float(east_m2 + north_m2) / 2
+
+
 def _drift_m2(fix: Fix) -> float:
     """Variance of the slow error."""
-    return max(fix.sensor.drift_share * float(fix.variance_m2.mean()), MIN_DRIFT_M2)
+    return max(fix.sensor.drift_share * _mean(fix.variance_m2), MIN_DRIFT_M2)
 
 
 def _antenna(belief: Belief, lever_m: Floats) -> tuple[Floats, Floats]:

@@ -27,6 +27,8 @@ from agents.localisation.measurements import GATE_SIGMA
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, BASE, RELATIVE, SensorConfig
+from protocol.machine.readings import Attitude
+from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
 
 UNKNOWN_STD = 1e4  # of a quantity that a sensor does not measure
 # Of absolute headings. Data sheets state 1 to 2 degrees, of a clean magnetic field; machines are of steel.
@@ -64,6 +66,7 @@ class References(ModalSensors[Orientation]):
     def __init__(self, sensors: Sequence[SensorConfig], layout: Layout, *, slow: bool) -> None:
         super().__init__()
         self._sensors = {s.name: s for s in sensors if s.kind == "attitude" and s.use}
+        self._base_from_sensor = {name: s.mount.frame_from_sensor() for name, s in self._sensors.items()}
         references, states = heading_references(sensors), range(layout.heading_errors.start, layout.heading_errors.stop)
         self._states = dict(zip((s.name for s in references), states, strict=False))
         self._turns: dict[str, float] = {}  # of relative ones
@@ -79,16 +82,16 @@ class References(ModalSensors[Orientation]):
 
     def measurements(self, step: FilterStep, belief: Belief) -> list[Measurement]:
         """Measurements of absolute references, at the stamp of the step; belief: the newest."""
-        absolute = [o for o in self._orientations(step) if o.sensor.mode == ABSOLUTE]
+        absolute = [a for a in step.attitudes.values() if self._sensors[a.sensor].mode == ABSOLUTE]
         if not self._slow:
-            return [self._attitude(o, step.stamp_ns, o.value.values) for o in absolute]
-        due = [o for o in absolute if step.stamp_ns - self._used_ns.get(o.sensor.name, 0) >= DUE_S * 1e9]
-        self._used_ns.update((o.sensor.name, step.stamp_ns) for o in due)
-        return [m for o in due for m in self._heading(o, step.stamp_ns, belief)]
+            return [self._attitude(o, step.stamp_ns, o.value.values) for o in map(self._orientation, absolute)]
+        due = [a for a in absolute if step.stamp_ns - self._used_ns.get(a.sensor, 0) >= DUE_S * 1e9]
+        self._used_ns.update((a.sensor, step.stamp_ns) for a in due)
+        return [m for a in due for m in self._heading(self._orientation(a), step.stamp_ns, belief)]
 
     def own_stamped(self, step: FilterStep) -> list[Orientation]:
         """Orientations of the other references, which become measurements of their own stamps."""
-        return [o for o in self._orientations(step) if o.sensor.mode != ABSOLUTE]
+        return [self._orientation(a) for a in step.attitudes.values() if self._sensors[a.sensor].mode != ABSOLUTE]
 
     def anchor(self, orientation: Orientation, belief: Belief) -> None:
         """Turn the reference so that this heading agrees with the believed one."""
@@ -102,15 +105,14 @@ class References(ModalSensors[Orientation]):
         turned = value.values + np.array([0.0, 0.0, self._turns[sensor.name]])
         return self._attitude(orientation, value.stamp_ns, turned, self._first_change(orientation))
 
-    def _orientations(self, step: FilterStep) -> list[Orientation]:
-        """With the variances that are configured, else their own; wide open where the sensor does not measure."""
-        orientations = []
-        for name, value in step.orientations.items():
-            sensor, names = self._sensors[name], ("tilt", "tilt", "heading")
-            stated = [sensor.std[n] ** 2 if n in sensor.std else v for n, v in zip(names, value.variances, strict=True)]
-            variances = np.where([sensor.provides(n) for n in names], stated, UNKNOWN_STD**2)
-            orientations.append(Orientation(sensor, StampedValue(value.stamp_ns, value.values, variances)))
-        return orientations
+    def _orientation(self, attitude: Attitude) -> Orientation:
+        """With the variances that are configured, else its own; wide open where the sensor does not measure."""
+        sensor, names = self._sensors[attitude.sensor], ("tilt", "tilt", "heading")
+        own = attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2
+        stated = [sensor.std[n] ** 2 if n in sensor.std else v for n, v in zip(names, own, strict=True)]
+        variances = np.where([sensor.provides(n) for n in names], stated, UNKNOWN_STD**2)
+        angles = rpy_of_base(attitude, self._base_from_sensor[attitude.sensor])
+        return Orientation(sensor, StampedValue(attitude.stamp_ns, angles, variances))
 
     def _heading(self, orientation: Orientation, stamp_ns: int, belief: Belief) -> list[Measurement]:
         """The heading of a reference, with the state of its error.
@@ -158,6 +160,12 @@ class References(ModalSensors[Orientation]):
         R = body_from_rates * mean.variances @ body_from_rates.T
         rates = body_from_rates @ mean.values
         return measurements.rotation(mean.stamp_ns, sensor.name, rates, R, sensor.gate(GATE_SIGMA))
+
+
+def rpy_of_base(attitude: Attitude, base_from_sensor: Floats) -> Floats:
+    """Roll, pitch, yaw (3,) [rad] of `base_link`: map_from_base = map_from_sensor sensor_from_base."""
+    map_from_sensor = matrix_from_quaternion((attitude.qx, attitude.qy, attitude.qz, attitude.qw))
+    return rpy_from_matrix(map_from_sensor.dot(base_from_sensor.T))
 
 
 def _anchor_heading(belief: Belief, states: slice, variance: float) -> Belief:

@@ -16,11 +16,9 @@ from agents.dead_reckoning import (
     narrowing,
     turn_source,
 )
-from agents.localisation.sensor_modes import StampedValue
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, SensorConfig
-from protocol.machine.readings import Articulation, Attitude, Encoder, Imu, Odometry, Reading, Steering
-from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
+from protocol.machine.readings import Articulation, Attitude, Imu, Odometry, Reading, Steering, WheelReading
 
 Sensed = tuple[Reading, SensorConfig]
 NOTHING = (0.0,) * 7  # count and sums
@@ -51,15 +49,15 @@ class Turn:
 class FilterStep:
     """Readings of fast sensors since the step before, up to a stamp.
 
-    reckoned: the dead-reckoned pose at its end. orientations: the last roll, pitch, yaw (3,) of each attitude
-    reference. wheels: their speed at its end. rolled: whether they were read in this step, and show a speed. traction:
+    reckoned: the dead-reckoned pose at its end. attitudes: the last one of each attitude reference that can be used.
+    wheels: their speed at its end. rolled: whether they were read in this step, and show a speed. traction:
     drive force over weight; still_s: how long without travel. turn: of a machine without IMU.
     """
 
     stamp_ns: int
     reckoned: DeadReckonedPose
     imu_means: dict[str, ImuMean]
-    orientations: dict[str, StampedValue]
+    attitudes: dict[str, Attitude]
     wheels: WheelSpeed
     rolled: bool
     traction: float
@@ -76,7 +74,7 @@ class StepGatherer:
         self._rotations = {s.name: s.mount.frame_from_sensor() for s in machine.sensors}  # into base_link or front_link
         self._front = {s.name for s in machine.sensors if s.frame == FRONT}
         self._sums: dict[str, tuple[float, ...]] = {}
-        self._attitudes: dict[str, Attitude] = {}  # the last of each: only that is made into angles
+        self._attitudes: dict[str, Attitude] = {}
         source = turn_source(machine)
         self._turn_sensor = source.name if source else ""
         self._steers = source is not None and source.kind == "steering"
@@ -104,10 +102,10 @@ class StepGatherer:
             self._add_attitude(reading, sensor)
         elif isinstance(reading, Steering) and sensor.name == self._turn_sensor:
             self._turn_values.append(math.tan(reading.angle_rad) / self._wheelbase_m)
-        elif isinstance(reading, Encoder | Odometry):
+        elif isinstance(reading, WheelReading):
             self._add_wheels(reading, sensor)
 
-    def _add_wheels(self, reading: Encoder | Odometry, sensor: SensorConfig) -> None:
+    def _add_wheels(self, reading: WheelReading, sensor: SensorConfig) -> None:
         if sensor.provides("speed"):
             self._rolled, self._rolled_ns = True, reading.stamp_ns
         if isinstance(reading, Odometry) and sensor.name == self._turn_sensor:
@@ -145,13 +143,6 @@ class StepGatherer:
         else:
             self._attitudes[attitude.sensor] = attitude
 
-    def _orientation(self, attitude: Attitude) -> StampedValue:
-        """Orientation of `base_link`: map_from_base = map_from_sensor sensor_from_base."""
-        map_from_sensor = matrix_from_quaternion((attitude.qx, attitude.qy, attitude.qz, attitude.qw))
-        map_from_base = map_from_sensor.dot(self._rotations[attitude.sensor].T)
-        variances = np.array([attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2])
-        return StampedValue(attitude.stamp_ns, rpy_from_matrix(map_from_base), variances)
-
     def _to_base(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
         """Values of the front frame in `base_link`: turned by the articulation in mid-step, less its rate."""
         angle = self._joint.travel_m - 0.5e-9 * self._step_ns * self._joint.speed_mps
@@ -163,15 +154,14 @@ class StepGatherer:
 
     def _finish(self, stamp_ns: int, dead_reckoning: DeadReckoning) -> FilterStep:
         imu_means = {name: self._mean(name) for name in self._sums}
-        orientations = {name: self._orientation(attitude) for name, attitude in self._attitudes.items()}
-        self._attitudes.clear()
+        attitudes, self._attitudes = self._attitudes, {}
         self._sums.clear()
         self._begin_ns = stamp_ns
         wheels, reckoned, traction = dead_reckoning.wheels, dead_reckoning.pose, dead_reckoning.traction
         rolled, self._rolled = self._rolled and wheels.is_known, False
         still_s = (stamp_ns - dead_reckoning.stands_since_ns) * 1e-9
         turn = self._turn(stamp_ns, wheels) if self._turn_values else None
-        return FilterStep(stamp_ns, reckoned, imu_means, orientations, wheels, rolled, traction, still_s, turn)
+        return FilterStep(stamp_ns, reckoned, imu_means, attitudes, wheels, rolled, traction, still_s, turn)
 
     def _turn(self, stamp_ns: int, wheels: WheelSpeed) -> Turn | None:
         """By the readings of this step; steering shows no turn without a speed."""

@@ -44,7 +44,12 @@ class MotionSensors:
         (self._slip, self._slip_soft), self._rolling = tyres, 0.0
         used = [s for s in machine.sensors if s.use]
         self._imus = {s.name: s for s in used if s.kind == "imu"}
+        self._whole = {s.name: self._whole_imu(i, s) for i, s in enumerate(self._imus.values())}
         self._wheels = [s for s in used if s.kind in ("encoder", "odometry") and s.provides("speed")]
+        # They slip together, so the mean of several is as unsure as the least sure of them.
+        forward_std = max((s.std.get("speed", measurements.SPEED_MPS) for s in self._wheels), default=0.0)
+        self._wheels_R = np.diag([forward_std**2, measurements.SIDE_MPS**2, measurements.SIDE_MPS**2])
+        self._wheels_gate = max((s.gate(GATE_SIGMA) for s in self._wheels), default=0.0)
         self._turn_sensor = turn_source(machine)
         self._turned_ns, self._wheelbase_m = 0, machine.wheelbase_m
 
@@ -60,10 +65,12 @@ class MotionSensors:
 
     def inertial(self, step: FilterStep) -> list[Measurement]:
         """One measurement per IMU with readings in the step, of those that measure anything of the state."""
-        imus = [(i, s) for i, s in enumerate(self._imus.values()) if s.name in step.imu_means]
+        means = step.imu_means
         if self._on_plane:
-            return [self._yaw_rate(step, i, sensor) for i, sensor in imus if sensor.provides("rate")]
-        return [self._inertial(step, i, sensor) for i, sensor in imus]
+            imus = [(i, s) for i, s in enumerate(self._imus.values()) if s.name in means and s.provides("rate")]
+            return [self._yaw_rate(step, i, sensor) for i, sensor in imus]
+        present = ((model, means[name]) for name, model in self._whole.items() if name in means)
+        return [m.at(step.stamp_ns, np.concatenate([mean.rates_radps, mean.force_mps2])) for m, mean in present]
 
     def turn(self, step: FilterStep) -> list[Measurement]:
         """The turn rate where no IMU measures it. Where nothing does, it shows in fixes alone and is very unsure."""
@@ -95,25 +102,21 @@ class MotionSensors:
         if not step.rolled or not self._wheels:
             return []
         if forces := self.forces(step):
-            ahead = float(np.mean([force[0] for force in forces]))
+            ahead = sum(float(force[0]) for force in forces) / len(forces)
             self._rolling = rolling_resistance(self._rolling, step.traction, ahead, self._step_s)
         slip = self._slip + self._slip_soft * self._rolling
         z = np.array([machine_speed(step.wheels.speed_mps, step.traction, slip), 0.0, 0.0])
-        # They slip together, so the mean of several is as unsure as the least sure of them.
-        forward_std = max(s.std.get("speed", measurements.SPEED_MPS) for s in self._wheels)
-        R = np.diag([forward_std**2, measurements.SIDE_MPS**2, measurements.SIDE_MPS**2])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
-        gate, offset_m = max(s.gate(GATE_SIGMA) for s in self._wheels), step.wheels.offset_m
+        R, gate, offset_m = self._wheels_R, self._wheels_gate, step.wheels.offset_m
         rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate, offset_m)
         return [rolled, measurements.standstill(step.stamp_ns)] if step.still_s >= STANDSTILL_S else [rolled]
 
-    def _inertial(self, step: FilterStep, index: int, sensor: SensorConfig) -> Measurement:
-        mean = step.imu_means[sensor.name]
+    def _whole_imu(self, index: int, sensor: SensorConfig) -> Measurement:
+        """A measurement of an IMU, of which only stamp and value are to be set."""
         rate_std = _gyro_std(sensor) if sensor.provides("rate") else UNKNOWN_STD
         force_std = sensor.std.get("force", measurements.FORCE_MPS2) if sensor.provides("force") else UNKNOWN_STD
-        z, R = np.concatenate([mean.rates_radps, mean.force_mps2]), np.diag([rate_std**2] * 3 + [force_std**2] * 3)
-        lever, gate = np.array(sensor.mount.xyz_m), sensor.gate(GATE_SIGMA)
-        return measurements.inertial(step.stamp_ns, sensor.name, z, R, lever, self._bias(index), gate)
+        R, lever = np.diag([rate_std**2] * 3 + [force_std**2] * 3), np.array(sensor.mount.xyz_m)
+        return measurements.inertial(0, sensor.name, np.zeros(6), R, lever, self._bias(index), sensor.gate(GATE_SIGMA))
 
     def _yaw_rate(self, step: FilterStep, index: int, sensor: SensorConfig) -> Measurement:
         rate, gate = float(step.imu_means[sensor.name].rates_radps[2]), sensor.gate(GATE_SIGMA)

@@ -123,6 +123,9 @@ class Encoder(Reading):
     right_ticks: float
 
 
+WheelReading = Encoder | Odometry  # of sensors that show how far the wheels rolled
+
+
 @dataclass(frozen=True, slots=True)
 class Torque(Reading):
     """Drive torque at the wheels, summed over all of them, positive when it drives forwards."""

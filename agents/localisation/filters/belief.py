@@ -6,7 +6,7 @@ Whatever changes a belief but motions and measurements is here, since it maps th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -74,6 +74,10 @@ class Measurement:
     opens: slice | None = None
     change: Change | None = None
     considers: tuple[int, ...] = ()
+
+    def at(self, stamp_ns: int, z: Floats) -> "Measurement":
+        """Another value of the same sensor, with the same model."""
+        return replace(self, stamp_ns=stamp_ns, z=z)
 
 
 @dataclass(frozen=True, slots=True)

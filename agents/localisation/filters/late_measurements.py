@@ -166,7 +166,8 @@ class Fusion:
     def _forget(self) -> None:
         """Drop nodes that are older than the window; one before it stays to start from."""
         oldest_ns = self._nodes[-1].stamp_ns - self._window_ns
-        stands = max(bisect_right(self._nodes, oldest_ns, key=_stamp) - 1, 0)
+        recent = next((i for i, node in enumerate(self._nodes) if node.stamp_ns > oldest_ns), len(self._nodes))
+        stands = max(recent - 1, 0)  # mostly one or two: no search is faster than a look at the first ones
         for node in self._nodes[:stands]:
             if node.belief and node.belief.past:
                 self._smoothed += node.belief.past.final

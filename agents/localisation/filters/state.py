@@ -5,6 +5,7 @@ map_from_base = Rz(yaw) Ry(pitch) Rx(roll).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 POSITION = slice(0, 3)  # [m], in map
 ATTITUDE = slice(3, 6)  # roll, pitch, yaw [rad]
@@ -41,40 +42,40 @@ class Layout:
         if self.base and not self.receivers:
             raise ValueError("base: no receiver is the base's")
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of states."""
         return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references + 2 * self.base
 
-    @property
+    @cached_property
     def gyro_biases(self) -> slice:
         """One per IMU [rad/s]."""
         return slice(BASE_STATES, BASE_STATES + self.imus)
 
-    @property
+    @cached_property
     def wheel_scales(self) -> slice:
         """The one wheel scale [-], or none."""
         first = self.gyro_biases.stop
         return slice(first, first + self.wheel_scale)
 
-    @property
+    @cached_property
     def gps_errors(self) -> slice:
         """Two per receiver [m]."""
         first = self.wheel_scales.stop
         return slice(first, first + 2 * self.receivers)
 
-    @property
+    @cached_property
     def heading_errors(self) -> slice:
         """One per reference [rad]."""
         first = self.gps_errors.stop
         return slice(first, first + self.references)
 
-    @property
+    @cached_property
     def base_error(self) -> slice:
         """Slow error of the base station: east, north [m]."""
         return self.gps_error(self.receivers - 1)
 
-    @property
+    @cached_property
     def base_offset(self) -> slice:
         """Lasting error of the base station: east, north [m]; none without one."""
         return slice(self.n - 2 * self.base, self.n)

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
+from scipy.linalg.blas import dtrsm
 
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
 from agents.localisation.filters.square_root import (
@@ -72,7 +72,9 @@ class Ukf:
         points = self._points(len(belief.x), k)
         of_x, d, mean = points.deviations(belief, measurement.h, measurement.angles)
         H = points.slope(d, belief)
-        together = points.root_W * np.concatenate([d, of_x])
+        together = np.empty((k + len(of_x), d.shape[1]))
+        np.multiply(points.root_W, d, out=together[:k])
+        np.multiply(points.root_W, of_x, out=together[k:])
         together[:k, -k:] = noise
         return conclude(belief, measurement, mean, together, H)
 
@@ -111,14 +113,13 @@ class SigmaPoints:
         """The linear map (j, n) that regresses d of g on the state; None of a belief without a past.
 
         The cross-covariance of g and x times P^-1 (statistical linearisation): for g' = (d_+ - d_-) / (2 gamma), its
-        deviations along the columns of L, that is g' L^-1.
+        deviations along the columns of L, that is g' L^-1. By the BLAS, as LAPACK's dtrtrs starts threads for it.
         """
         if belief.past is None:
             return None
         n = len(belief.x)
         along = (d[:, 1 : n + 1] - d[:, n + 1 : 2 * n + 1]) / (2 * self.gamma)
-        solved, _ = dtrtrs(root(belief), along.T, lower=1, trans=1)
-        slope: Floats = solved.T
+        slope: Floats = dtrsm(1.0, root(belief), along.T, lower=1, trans_a=1, overwrite_b=1).T
         return slope
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.filters.motion import map_from_base
+from agents.localisation.headings import rpy_of_base
 from agents.localisation.imu_steps import FilterStep, StepGatherer
 from agents.stream_order import by_stamp
 from protocol.arrays import Floats
@@ -149,10 +150,9 @@ def test_an_attitude_becomes_roll_pitch_yaw_at_any_mount(
 ) -> None:
     mount = Mount((0.0, 0.0, 1.0), rpy_deg)
     step = one(with_ahrs(mount), [attitude(rpy, mount), attitude(rpy, mount, 100, scale=-1.0005)])
-    value = step.orientations["ahrs"]
-    assert value.values == pytest.approx(rpy, abs=1e-9)
-    assert value.variances.tolist() == [0.01, 0.02, 0.03]
-    assert value.stamp_ns == step.stamp_ns
+    last = step.attitudes["ahrs"]
+    assert rpy_of_base(last, mount.frame_from_sensor()) == pytest.approx(rpy, abs=1e-9)
+    assert last.stamp_ns == step.stamp_ns
 
 
 def test_the_last_attitude_of_a_step_counts_once() -> None:
@@ -160,15 +160,15 @@ def test_the_last_attitude_of_a_step_counts_once() -> None:
     readings: list[Reading] = [attitude((0, 0, t / 100), Mount(), t) for t in (0, 50, 100)]
     readings.append(Encoder("wheels", START_NS + 200 * MS, 0.0, 0.0))
     first, second = gather(StepGatherer(vehicle, 0.1), vehicle, readings)
-    assert first.orientations["ahrs"].values[2] == pytest.approx(1.0)
-    assert second.orientations == {}
+    assert rpy_of_base(first.attitudes["ahrs"], np.eye(3))[2] == pytest.approx(1.0)
+    assert second.attitudes == {}
 
 
 def test_an_attitude_of_the_front_frame_is_counted_and_not_used() -> None:
     vehicle = with_ahrs(Mount(), FRONT)
     steps = StepGatherer(vehicle, 0.1)
     (step,) = gather(steps, vehicle, [attitude((0, 0, 1), Mount(), t) for t in (0, 100)])
-    assert step.orientations == {}
+    assert step.attitudes == {}
     assert steps.counters == {"front_attitude_unused": 2}
 
 
@@ -176,7 +176,7 @@ def test_an_attitude_of_zeros_is_counted_and_not_used() -> None:
     vehicle = with_ahrs(Mount())
     steps = StepGatherer(vehicle, 0.1)
     (step,) = gather(steps, vehicle, [attitude((0, 0, 1), Mount(), t, scale=0.0) for t in (0, 100)])
-    assert step.orientations == {}
+    assert step.attitudes == {}
     assert steps.counters == {"attitude_without_direction": 2}
 
 

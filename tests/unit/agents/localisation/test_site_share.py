@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.localisation.filters.motion import GpsError
-from agents.localisation.site_share import SiteShareEstimator
+from agents.localisation.site_share import WAIT_S, SiteShareEstimator
 from protocol.machine.readings import Correction
 
 T0 = 1_750_000_000_000_000_000
@@ -14,9 +14,9 @@ ERROR = GpsError(2.7, 45.0)
 WHITE_M2 = 0.06  # mean of a second
 
 
-def slow(rng: np.random.Generator, seconds: int) -> np.ndarray:
+def slow(rng: np.random.Generator, seconds: int, time_s: float = ERROR.time_s) -> np.ndarray:
     """A Gauss-Markov error (n, 2) of variance 1, once a second."""
-    keep = np.exp(-1 / ERROR.time_s)
+    keep = np.exp(-1 / time_s)
     white = rng.standard_normal((seconds, 2))
     out = np.empty_like(white)
     out[0] = white[0]
@@ -33,29 +33,49 @@ def errors(share: float, seconds: int, seed: int) -> tuple[np.ndarray, np.ndarra
     return std * (common + np.sqrt(1 - share) * machine), std * (common + np.sqrt(1 - share) * base)
 
 
-def follow(estimator: SiteShareEstimator, machine: np.ndarray, base: np.ndarray, seed: int, start: int = 0) -> None:
-    """Let a machine drive at 4 m/s beside a base; once a second."""
+def follow(
+    estimator: SiteShareEstimator, machine: np.ndarray, base: np.ndarray, seed: int, start: int = 0, late_s: int = 0
+) -> None:
+    """Let a machine drive round at 4 m/s beside a base; once a second. late_s: how long corrections are held up.
+
+    Its dead reckoning walks by 0.03 m per sqrt(m), and has scale and heading wrong by 0.015, which changes in a minute.
+    """
     rng = np.random.default_rng([seed, start, 1])
-    lost = np.cumsum(rng.standard_normal(machine.shape) * 0.15, axis=0)
-    for i, (e, b) in enumerate(zip(machine + lost, base, strict=True), start):
+    late: list[Correction] = []
+    heading = np.cumsum(rng.uniform(-0.1, 0.15, len(machine)))
+    shifts = 4.0 * np.exp(1j * heading)
+    wrong = 0.015 * slow(rng, len(machine), 60.0).view(complex)[:, 0] * shifts
+    lost = np.cumsum(wrong + rng.standard_normal((len(machine), 2)).view(complex)[:, 0] * 0.06).view(float)
+    for i, (e, b) in enumerate(zip(machine + lost.reshape(-1, 2), base, strict=True)):
         white = rng.standard_normal((2, 2)) * np.sqrt(WHITE_M2)
-        estimator.drive(4.0)
-        estimator.add_fix("gps-1", T0 + i * 10**9, e + white[0], WHITE_M2, ERROR)
-        of_base = Correction("base-1", T0 + i * 10**9, *(b + white[1]), WHITE_M2, ERROR.variance_m2, 45.0, 0, 0, 1.0)
-        estimator.add_correction(of_base.stamp_ns, np.array([of_base.east_m, of_base.north_m]), of_base)
+        stamp_ns = T0 + (start + i) * 10**9
+        estimator.drive(stamp_ns, np.array([shifts[i].real, shifts[i].imag]))
+        estimator.add_fix("gps-1", stamp_ns, e + white[0], WHITE_M2, ERROR)
+        east_m, north_m = (b + white[1]).tolist()
+        slow_m2, time_s = ERROR.variance_m2, ERROR.time_s
+        late.append(Correction("base-1", stamp_ns, east_m, north_m, WHITE_M2, slow_m2, time_s, 0.0, 0.0, 1.0))
+        if i >= late_s:
+            estimator.add_correction(late.pop(0))
 
 
-@pytest.mark.parametrize(
-    ("share", "low", "high"), [(0.0, 0.0, 0.1), (0.5, 0.3, 0.7), (0.8, 0.65, 0.9), (0.95, 0.87, 0.99)]
-)
+@pytest.mark.parametrize(("share", "off"), [(0.0, 0.1), (0.5, 0.12), (0.8, 0.05), (0.95, 0.02)])
 @pytest.mark.slow
-def test_share_is_found_in_ten_minutes(share: float, low: float, high: float) -> None:
+def test_share_is_found_in_ten_minutes_and_not_overstated(share: float, off: float) -> None:
     shares = []
-    for seed in range(3):
+    for seed in range(8):
         estimator = SiteShareEstimator()
         follow(estimator, *errors(share, 600, seed), seed)
         shares.append(estimator.share)
-    assert low <= np.mean(shares) <= high, shares
+    assert np.mean(shares) == pytest.approx(share, abs=off), shares
+
+
+@pytest.mark.slow
+def test_link_that_holds_corrections_up_costs_nothing_of_the_share() -> None:
+    machine, base = errors(0.9, 400, 4)
+    late, at_once = SiteShareEstimator(), SiteShareEstimator()
+    follow(at_once, machine, base, 4)
+    follow(late, machine, base, 4, late_s=WAIT_S - 1)
+    assert late.share == pytest.approx(at_once.share, abs=1e-9)
 
 
 @pytest.mark.slow
@@ -69,16 +89,23 @@ def test_base_that_repeats_what_is_long_past_loses_its_share() -> None:
     assert estimator.share < 0.3
 
 
-def test_offset_of_a_base_changes_nothing_and_a_jump_little() -> None:
-    machine, base = errors(0.9, 300, 3)
-    moved, off, jumps = base + 20.0, SiteShareEstimator(), SiteShareEstimator()
-    follow(off, machine, moved, 3)
-    true = SiteShareEstimator()
+def test_offset_of_a_base_changes_nothing() -> None:
+    machine, base = errors(0.9, 200, 3)
+    off, true = SiteShareEstimator(), SiteShareEstimator()
+    follow(off, machine, base + 20.0, 3)
     follow(true, machine, base, 3)
     assert off.share == pytest.approx(true.share, abs=0.05)
-    moved[:150] -= 20.0
-    follow(jumps, machine, moved, 3)
-    assert jumps.share > 0.6
+
+
+@pytest.mark.slow
+def test_jump_of_a_base_says_nothing_of_the_share() -> None:
+    machine, base = errors(0.9, 240, 3)
+    true = SiteShareEstimator()
+    follow(true, machine, base, 3)
+    for jump_m in (5.0, 20.0):
+        moved, jumps = base + [jump_m, 0.0] * (np.arange(len(base)) >= 150)[:, None], SiteShareEstimator()
+        follow(jumps, machine, moved, 3)
+        assert jumps.share == pytest.approx(true.share, abs=0.05)
 
 
 def test_nothing_is_taken_for_half_a_chance_of_nothing() -> None:
@@ -92,6 +119,6 @@ def test_another_receiver_speaks_only_when_the_first_is_silent() -> None:
         estimator.add_fix("gps-2", T0 + i * 10**9, np.full(2, 1e6), WHITE_M2, ERROR)
     assert np.isfinite(estimator.share)
     assert np.abs(estimator._x).max() < 10
-    for i in range(80, 90):
+    for i in range(80, 110):
         estimator.add_fix("gps-2", T0 + i * 10**9, np.full(2, 30.0), WHITE_M2, ERROR)
-    assert estimator._x[0, 0, 0] == pytest.approx(30.0, abs=8.0)
+    assert estimator._x[0, 0] == pytest.approx(30.0, abs=8.0)
