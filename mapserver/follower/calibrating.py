@@ -66,7 +66,9 @@ class Calibrating:
             now_ns = self._now_ns()
             if self._solved_ns is not None and self._solved_ns <= now_ns < self._solved_ns + EVERY_NS:
                 return
-            self._decide(self._solve(now_ns), now_ns)
+            solved = self._solve(now_ns)
+            if self._writer.config.calibration.automatic:
+                self._decide(solved, now_ns)
 
     def solve(self) -> tuple[Calibration, int]:
         """Solve with all that is journalled by now; what came out, and the site's now [ns]. For any thread."""

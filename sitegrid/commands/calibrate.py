@@ -38,9 +38,7 @@ def run(arguments: Namespace) -> int:
     if given and not arguments.machine:
         raise ConfigError(given[0], "is about one machine: name it")
     if arguments.machine and not given:
-        raise ConfigError(
-            arguments.machine, "give --zero, --scale or --across, or --auto; without a machine all are done"
-        )
+        raise ConfigError(arguments.machine, "give --zero, --scale, --across or --auto; without a machine all are done")
     if arguments.auto and len(given) > 1:
         raise ConfigError(given[0], "is a person's value, and --auto leaves it to the map server; give one of them")
     if len(given) > arguments.auto and not arguments.reason:
