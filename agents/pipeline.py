@@ -247,7 +247,7 @@ class Pipeline:
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
         speed_mps = float(belief.x[SPEED]) if belief else 0.0
         for reading, sensor in readings:
-            self._estimator.update(reading, sensor, dead_reckoning, self._known_c_rr())
+            self._estimator.update(reading, sensor, dead_reckoning, self._known_c_rr(), self.pose)
             distance_m = self._odometer.update(reading, dead_reckoning.distance_m, speed_mps)
         self._sampler.mark(stamp_ns, distance_m)
         made += self._due_samples()

@@ -61,7 +61,7 @@ def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:
         link, work = Link(writer), batches()
         before = list(islice(work, samples_of(hours) // BATCH))
         link.send(before)
-        audit = Audit(writer, reader, lambda *_: None, threading.Event())
+        audit = Audit(writer, reader, lambda *_: None, dict, threading.Event())
         search = ChangeSearch(writer, reader, lambda _: None, threading.Event())
         audit.run()
         search.run()

@@ -6,8 +6,8 @@ of both passages is
     (unbalanced_1 + unbalanced_2) / 2 = zero + scale (share_1 + share_2) / 2
 
 so flat ground shows the zero and slopes the scale. Loaders drive so all day. Where the site names an area of known
-resistance, one passage is enough. Both enter a Kalman filter over zero and scale error; a measurement that is far off,
-as at the border of a zone, is excluded.
+resistance, one passage is enough. Closed tours show the zero in one direction (`closed_tours`). All enter a Kalman
+filter over zero and scale error; a measurement that is far off, as at the border of a zone, is excluded.
 """
 
 import math
@@ -18,6 +18,7 @@ import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.balance import Balance
+from agents.estimation.closed_tours import Tour
 from protocol.arrays import Floats
 from protocol.machine.samples import APPLIED, LIMITS
 
@@ -35,7 +36,9 @@ KEPT = 400  # stretches: 200 m of distance
 MOST_ZERO, MOST_SCALE = (LIMITS[name][1] for name in APPLIED)  # that a sample may state as applied
 FLOOR = 0.0007  # error of the model: no number of pairs makes the zero surer than this, or the scale than ten times it
 GATE_SIGMA = 3.0  # pairs further off are excluded
-RELOCK = 12  # so many excluded in a row are right, and the calibration is wrong: a sensor worse than its class
+# So many excluded in a row are right, and the calibration is wrong: a sensor worse than its class. Tours are minutes
+# apart, stretches half a metre.
+RELOCK, RELOCK_TOURS = 12, 3
 EDGE_M = 3.0  # a machine is on known ground so far inside, and twice the standard deviation of its position
 
 
@@ -43,7 +46,7 @@ EDGE_M = 3.0  # a machine is on known ground so far inside, and twice the standa
 class Calibration:
     """Zero and scale error of the balance [-] with covariance (2, 2); stamp_ns: of the newest reading behind it, or 0.
 
-    passages: how many pairs and known stretches it comes from.
+    passages: how many pairs, known stretches and tours it comes from.
     """
 
     zero: float
@@ -112,15 +115,21 @@ class Calibrator:
         stretch = self._end_stretch(dead_reckoning)
         if known_c_rr is not None:
             cosine = math.cos(balance.slope_x)
-            self._learn(stretch, stretch.unbalanced - stretch.direction * cosine * known_c_rr, stretch.share, 1.0)
+            measured = stretch.unbalanced - stretch.direction * cosine * known_c_rr
+            self._learn(stretch.stamp_ns, measured, stretch.share, STRETCH_STD**2)
             self.counters["known_ground"] += 1
         elif partner := self._partner(stretch):
             self._past.remove(partner)  # a passage counts once
             mean, share = (stretch.unbalanced + partner.unbalanced) / 2, (stretch.share + partner.share) / 2
-            self._learn(stretch, mean, share, 0.5)
+            self._learn(stretch.stamp_ns, mean, share, STRETCH_STD**2 / 2)
             self.counters["pairs"] += 1
             return
         self._past.append(stretch)
+
+    def add_tour(self, tour: Tour) -> None:
+        """Add a closed tour."""
+        self._learn(tour.stamp_ns, tour.zero, 0.0, tour.std**2, RELOCK_TOURS)
+        self.counters["tours"] += 1
 
     def age(self, stamp_ns: int) -> None:
         """Let the zero drift until a stamp; it is never less sure than at first."""
@@ -157,17 +166,17 @@ class Calibrator:
                 partner, nearest_m = other, distance_m
         return partner
 
-    def _learn(self, stretch: _Stretch, measured: float, share: float, weight: float) -> None:
-        """Filter measured = zero + scale * share + noise; weight: its variance in units of that of a stretch."""
-        self.age(stretch.stamp_ns)
+    def _learn(self, stamp_ns: int, measured: float, share: float, variance: float, relock: int = RELOCK) -> None:
+        """Filter measured = zero + scale * share + noise. relock: how many excluded in a row are right."""
+        self.age(stamp_ns)
         h: Floats = np.array([1.0, share])
         Ph = self._P @ h
-        S = float(h @ Ph) + weight * STRETCH_STD**2
+        S = float(h @ Ph) + variance
         innovation = measured - float(h @ self._x)
         if innovation**2 > GATE_SIGMA**2 * S:
             self.counters["off"] += 1
             self._excluded.append(innovation)
-            if len(self._excluded) == RELOCK:
+            if len(self._excluded) >= relock:
                 self._P[0, 0] += float(np.mean(np.square(self._excluded)))
                 self._excluded.clear()
                 self.counters["relocked"] += 1
@@ -175,5 +184,5 @@ class Calibrator:
         self._excluded.clear()
         self._x = self._x + Ph / S * innovation
         self._P = self._P - np.outer(Ph, Ph) / S
-        self._stamp_ns = stretch.stamp_ns
+        self._stamp_ns = stamp_ns
         self._passages += 1

@@ -14,9 +14,11 @@ from typing import Any
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.balance import Balance, Balancer, BalanceStep
 from agents.estimation.calibration import UNCALIBRATED, ZERO_STD, Calibration, Calibrator
+from agents.estimation.closed_tours import ClosedTours
 from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility
 from agents.estimation.resistance_kalman import KalmanResistance
 from agents.estimation.resistance_rls import RecursiveGrade, RecursiveResistance
+from agents.localisation.filters.belief import PoseBelief
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Reading
 
@@ -25,6 +27,7 @@ MASSES = ("message", "known", "estimated")
 KEPT = 400  # steps: 20 s
 NEAR_NS = 200_000_000  # a stamp this far from a step has no slope
 SILENT_NS = 1_000_000_000  # other sensors have readings, but no step was made for so long
+UNFOLLOWED = frozenset({"accelerometer", "no_wheels", "slip"})  # then nobody knows how far it was, or how steep
 LOADING_S = 3.0  # a machine that stands so long may have loaded or dumped
 MODEL_STD = 0.0015  # error of the balance itself [-], which no calibration removes
 
@@ -35,12 +38,14 @@ class EstimationConfig:
 
     estimator: "kalman", or "rls" (least squares with multiple forgetting, as the paper has it). mass: "message" (the
     machine's, and what payload readings add), "known" (the machine's alone) or "estimated" (from forces). calibrate:
-    whether zero and scale of the force balance are found at work.
+    whether zero and scale of the force balance are found at work; closed_tours: by closed tours too, which takes a site
+    on which no track passes over another one.
     """
 
     estimator: str = "kalman"
     mass: str = "message"
     calibrate: bool = True
+    closed_tours: bool = True
 
     def __post_init__(self) -> None:
         for name, choices in (("estimator", ESTIMATORS), ("mass", MASSES)):
@@ -53,7 +58,7 @@ class GroundEstimate:
     """The ground at a stamp.
 
     c_rr, c_rr_var: NaN where `reason` states why c_rr is not known, "" else. slope_x, slope_y: rise over run ahead and
-    to the left, slope_var of either; NaN without accelerometer. zero, scale: of the calibration that was applied.
+    to the left, slope_var of either; NaN without accelerometer. zero, scale: of the calibration that is applied in it.
     """
 
     c_rr: float
@@ -76,13 +81,12 @@ NOTHING_KNOWN = GroundEstimate(math.nan, math.nan, math.nan, math.nan, math.nan,
 
 @dataclass(frozen=True, slots=True)
 class _JudgedBalance:
-    """A balance as it was judged, the slope ahead by the estimator in use [rad], and the calibration of that time."""
+    """A balance as it was judged, and the slope ahead by the estimator in use [rad]."""
 
     stamp_ns: int
     balance: Balance
     reason: str
     slope_x: float
-    applied: Calibration
 
 
 class GroundEstimator:
@@ -96,6 +100,7 @@ class GroundEstimator:
         self._balancer = Balancer(machine, weighs=config.mass == "message")
         self._plausibility = Plausibility()
         self._calibrator = Calibrator(calibration)
+        self._tours = ClosedTours()
         self._applied = UNCALIBRATED
         estimates_mass = config.mass == "estimated"
         self._resistance: KalmanResistance | RecursiveResistance = (
@@ -142,23 +147,31 @@ class GroundEstimator:
                 "age_s": age_s,
                 "passages": applied.passages,
                 **self._calibrator.counters,
+                "torn": self._tours.torn,
             },
         }
 
     def update(
-        self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning, known_c_rr: float | None = None
+        self,
+        reading: Reading,
+        sensor: SensorConfig,
+        dead_reckoning: DeadReckoning,
+        known_c_rr: float | None = None,
+        pose: PoseBelief | None = None,
     ) -> None:
         """Add a reading, after dead reckoning did. known_c_rr: of the ground here, where the site states it."""
         self._newest_reading_ns = max(self._newest_reading_ns, reading.stamp_ns)
         if balance := self._balancer.update(reading, sensor, dead_reckoning):
             self._step(balance, dead_reckoning, known_c_rr)
+            if self._config.calibrate and self._config.closed_tours:
+                self._follow(balance, pose)
 
     def at(self, stamp_ns: int) -> GroundEstimate:
         """The estimate for a recent stamp, with the steps after it."""
         judged = self._nearest(stamp_ns)
         if judged is None:
             return NOTHING_KNOWN
-        balance, applied = judged.balance, judged.applied
+        balance, applied = judged.balance, self._applied
         resistance = None if judged.reason else self._resistance.at(stamp_ns)
         c_rr, variance = math.nan, math.nan
         if resistance:
@@ -185,7 +198,7 @@ class GroundEstimator:
         raw = self._applied.corrected(balance)
         reason = self._plausibility.judge(balance, balance.direction * raw / cosine)
         slope_x = self._grade.update(balance.dt_s, balance.sine_x) if self._grade else balance.slope_x
-        self._judged.append(_JudgedBalance(balance.stamp_ns, balance, reason, slope_x, self._applied))
+        self._judged.append(_JudgedBalance(balance.stamp_ns, balance, reason, slope_x))
         if reason == "standstill":
             self._stand(balance)
         if reason:
@@ -197,6 +210,14 @@ class GroundEstimator:
         if self._config.calibrate:
             self._calibrator.update(balance, dead_reckoning, known_c_rr)
 
+    def _follow(self, balance: Balance, pose: PoseBelief | None) -> None:
+        """Follow the track; what a tour shows takes effect at once, since a machine on tours may never stand."""
+        if self._judged[-1].reason in UNFOLLOWED:
+            self._tours.interrupt()
+        elif tour := self._tours.update(balance, pose):
+            self._calibrator.add_tour(tour)
+            self._apply_calibration(balance.stamp_ns)
+
     def _balance_step(self, balance: Balance, distance_m: float, raw: float, regressor: float) -> BalanceStep:
         machine, forwards = self._machine, balance.direction > 0
         axles = (1.0, 0.0, 0.0)
@@ -207,7 +228,7 @@ class GroundEstimator:
         return BalanceStep(balance.stamp_ns, balance.dt_s, distance_m, raw, regressor, balance.share, *axles)
 
     def _stand(self, balance: Balance) -> None:
-        """A new calibration takes effect while the machine stands: the ground must not seem to change as it drives."""
+        """What stretches show takes effect while the machine stands: it comes in small steps, each half a metre."""
         self._stands_s += balance.dt_s
         self._apply_calibration(balance.stamp_ns)
         self._resistance.stand(changes_load=self._stands_s > LOADING_S)
@@ -215,4 +236,7 @@ class GroundEstimator:
     def _apply_calibration(self, stamp_ns: int) -> None:
         if self._config.calibrate:
             self._calibrator.age(stamp_ns)
-            self._applied = self._calibrator.calibration
+            before, self._applied = self._applied, self._calibrator.calibration
+            zero, scale = self._applied.zero - before.zero, self._applied.scale - before.scale
+            if zero or scale:
+                self._resistance.recalibrate(zero, scale)

@@ -24,6 +24,7 @@ so that a border lies where it is and not where it was noticed. The smoother nev
 
 import math
 from bisect import bisect_left
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -121,6 +122,20 @@ class KalmanResistance:
         """Free the scale error, where it is estimated, if the load may change."""
         self._load_has_changed = self._load_has_changed or (self._estimates_mass and changes_load)
 
+    def recalibrate(self, zero: float, scale: float) -> None:
+        """Filter all steps again: the calibration that their raw values have applied has changed by so much.
+
+        So the ground does not seem to change where the calibration does.
+        """
+        first = self._first.measured.step
+        shift = (zero + scale * first.share) / first.regressor
+        self._first = self._first._replace(x=self._first.x - shift * np.array([1.0, 1.0, 0.0]))
+        self._noise.interrupt()
+        for i, old in enumerate(self._steps):
+            step = old.measured.step
+            step = replace(step, raw=step.raw - zero - scale * step.share)
+            self._steps[i] = _filtered(self._before(i), old.measured._replace(step=step), border=old.border)
+
     def at(self, stamp_ns: int) -> tuple[float, float] | None:
         """c_rr and its variance under the load centre at a recent stamp, smoothed by the steps after it."""
         index = bisect_left(self._steps, stamp_ns, key=lambda filtered: filtered.measured.step.stamp_ns)
@@ -191,6 +206,10 @@ class _Noise:
     def __init__(self) -> None:
         self.density = NOISE**2
         self._last: BalanceStep | None = None
+
+    def interrupt(self) -> None:
+        """The next step does not follow the last one."""
+        self._last = None
 
     def update(self, step: BalanceStep) -> None:
         last, self._last = self._last, step

@@ -54,9 +54,11 @@ class RecursiveResistance:
         forget, most = np.array([FORGET_MASS, FORGET]), MAX_VARIANCE * [estimates_mass, 1]
         self._squares = MultipleForgetting(np.array([0.0, FIRST_C_RR]), variance, forget, most)
         self._stamp_ns = 0
+        self._force = (0.0, 1.0)  # share and regressor of the last step
 
     def update(self, step: BalanceStep) -> None:
         """Add a step."""
+        self._force = (step.share, step.regressor)
         self._squares.update(step.dt_s, step.raw, np.array([step.share, step.regressor]))
         self._stamp_ns = step.stamp_ns
 
@@ -64,6 +66,11 @@ class RecursiveResistance:
         """Forget the mass faster for once, if the load may change."""
         if changes_load:
             self._squares.variance[0] = min(10 * self._squares.variance[0], MAX_VARIANCE[0])
+
+    def recalibrate(self, zero: float, scale: float) -> None:
+        """The calibration that raw values have applied has changed by so much."""
+        share, regressor = self._force
+        self._squares.parameters[1] -= (zero + scale * share) / regressor
 
     def at(self, stamp_ns: int) -> tuple[float, float] | None:
         """The newest c_rr and its variance; None where no step was usable near the stamp.

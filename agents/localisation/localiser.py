@@ -18,12 +18,13 @@ from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import SmoothedPose, nothing_past
-from agents.localisation.filters.state import Layout, X, Y, Z
+from agents.localisation.filters.state import YAW, Layout, X, Y, Z
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Fix, Receivers, drifting
 from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
+from agents.localisation.measurements import STANDSTILL
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig
@@ -31,9 +32,10 @@ from protocol.machine.readings import Correction, Gps, GpsVelocity
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
-# Without GPS for so long, wheels and IMUs teach neither the wheels' scale s nor the place: h = (1 + s) v is linearised
-# at a speed that jitters from step to step, which looks like information about s. While fixes show the distance, they
-# outweigh it; without them it bent the scale by 6 % in ten minutes.
+# Without GPS for so long, wheels and IMUs teach neither place and heading nor the wheels' scale s and the gyros' bias:
+# they show none of them, but h = (1 + s) v and the centripetal w x v are linearised at a speed and a rate that jitter
+# from step to step, which looks like information. Fixes outweigh it; without them it bent the scale by 6 % and the bias
+# by 0.4 degrees per second in ten minutes. Standstills and absolute headings still teach all that correlates with them.
 UNPLACED_S = 5.0
 COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
 Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
@@ -197,15 +199,18 @@ class Localiser:
             return self._filter_modal(fusion, self._receivers, event)
         absolute = self._references.measurements(event, fusion.belief)
         errors = self._references.errors
-        fusion.model = replace(fusion.model, traction=event.traction, heading_errors=errors)
+        layout = fusion.model.layout
+        unplaced = layout.wheel_scale and event.stamp_ns - self._placed_ns > UNPLACED_S * 1e9
+        reckons = unplaced and bool(self._placed_ns or self._config.start)  # else the fix that aligned it comes at once
+        fusion.model = replace(fusion.model, traction=event.traction, heading_errors=errors, reckons=reckons)
         beliefs: list[Belief] = []
         for orientation in self._references.own_stamped(event):
             beliefs += self._filter_modal(fusion, self._references, orientation)
         inertial, turn, wheels = self._body.inertial(event), self._body.turn(event), self._body.wheels(event)
-        layout = fusion.model.layout
-        if layout.wheel_scale and event.stamp_ns - self._placed_ns > UNPLACED_S * 1e9:
-            considers = (X, Y, Z, layout.wheel_scales.start)
-            inertial, wheels = ([replace(m, considers=considers) for m in several] for several in (inertial, wheels))
+        if unplaced:
+            headed = (YAW, *range(layout.gyro_biases.start, layout.gyro_biases.stop)) if reckons else ()
+            considers = (X, Y, Z, layout.wheel_scales.start, *headed)
+            inertial, wheels = ([_considering(m, considers) for m in several] for several in (inertial, wheels))
         measurements = [*inertial, *absolute, *turn, *wheels]
         return beliefs + (fusion.add(measurements) if measurements else [])
 
@@ -267,6 +272,11 @@ class Localiser:
         self._fixes.clear()
         self._velocities.clear()
         return beliefs
+
+
+def _considering(measurement: Measurement, states: tuple[int, ...]) -> Measurement:
+    """The measurement, which leaves these states as they are; a standstill is no jitter, and teaches."""
+    return measurement if measurement.sensor == STANDSTILL else replace(measurement, considers=states)
 
 
 def _engine(config: LocalisationConfig) -> Filter:

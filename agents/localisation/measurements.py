@@ -25,6 +25,7 @@ SPEED_MPS = 0.04  # of wheels
 SIDE_MPS = 0.04  # how fast a machine slides sideways
 STILL_MPS = 0.005  # of a machine at rest
 STILL_R = np.diag([STILL_MPS**2] * 3 + [(0.1 * RATE_RADPS) ** 2] * 3)
+STANDSTILL = "standstill"  # the name that its measurement counts under
 GATE_SIGMA = 6.0  # measurements further off are refused; mounting and slip are not Gaussian
 
 ROLL, PITCH, YAW = range(ATTITUDE.start, ATTITUDE.stop)
@@ -260,7 +261,7 @@ def standstill(stamp_ns: int) -> Measurement:
     Gated without relocking: an articulated machine turns its rear frame as it steers, also while its wheels stand.
     """
     model = _picked(slice(VELOCITY.start, RATE.stop))
-    return Measurement("standstill", stamp_ns, np.zeros(6), STILL_R, *model, gate_sigma=GATE_SIGMA, relocks=False)
+    return Measurement(STANDSTILL, stamp_ns, np.zeros(6), STILL_R, *model, gate_sigma=GATE_SIGMA, relocks=False)
 
 
 def _picked(states: slice) -> tuple[Model, Model]:

@@ -1,4 +1,4 @@
-"""The cases on which calibration is judged: what is driven, what is wrong with the samples, who has no say."""
+"""The cases on which calibration is judged: what is driven, what is wrong with machines or samples, who is let in."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ PAPER = "paper_site"
 STEEP = 0.13  # gradient beyond which a cell or a place is on a ramp
 GAIN, STEP, RAIN = 1.6, 0.015, 0.02
 RAMP_STEPS = (-0.02, 0.005, 0.01, 0.02)
+PRESETS = ("paper", "harsh", "standalone")  # of sensors, beside `dgps`, which all other cases have
 DIRT = (0.03, 0.05)  # c_rr of the ground that rain makes heavier
 
 
@@ -37,10 +38,11 @@ Tamper = Callable[[Rows, Scene], Tampered]
 
 @dataclass(frozen=True)
 class FleetCase:
-    """One case. machines: how many of a drive of four loaders, or of all of a scenario, take part.
+    """One case. machines: how many of a drive of the paper's site, or 0 for all of a scenario, take part.
 
-    excluded: machines without a say, by their place; judged: whether they are in the map all the same, as after a
-    person's decision. spans: in which the true errors are constant. first_s: so much of the recording.
+    preset: of sensors, "" for those of the scenario. bad, let_in: machines by their place that have the faults of
+    `bad_machine`, and that are in the map by a person's decision, whatever trust says. spans: in which the true errors
+    are constant. first_s: so much of the recording.
     """
 
     name: str
@@ -48,8 +50,9 @@ class FleetCase:
     machines: int = 3
     tamper: str = "nothing"
     argument: float = 0.0
-    excluded: tuple[int, ...] = ()
-    judged: bool = False
+    preset: str = ""
+    bad: tuple[int, ...] = ()
+    let_in: tuple[int, ...] = ()
     calibrates: bool = True
     spans: int = 1
     first_s: float = 0.0
@@ -120,13 +123,14 @@ CASES = (
     FleetCase("first_180_s", first_s=180.0),
     FleetCase("reversing", "loading", machines=0, calibrates=False),
     FleetCase("loading", "loading", machines=0),
-    FleetCase("bad_machine", "bad_machine", machines=0, excluded=(1,)),
-    FleetCase("gain_1.6", machines=4, tamper="gain", argument=GAIN, excluded=(1,), judged=True),
+    FleetCase("bad_machine", machines=4, bad=(1,)),
+    FleetCase("gain_1.6", machines=4, tamper="gain", argument=GAIN, let_in=(1,)),
     FleetCase("majority_off", machines=4, tamper="majority_off", argument=STEP),
     FleetCase("step_at_half", tamper="step_at_half", argument=STEP, spans=2),
     *(FleetCase(f"ramp_of_other_ground_{step:+g}", tamper="other_ramps", argument=step) for step in RAMP_STEPS),
     FleetCase("haul_road", "haul_road", machines=0),
     FleetCase("rain", tamper="rain", argument=RAIN),
+    *(FleetCase(f"preset_{preset}", preset=preset) for preset in PRESETS),
 )
 
 

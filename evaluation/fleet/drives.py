@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +17,8 @@ from evaluation.ground.lag import final_samples
 from evaluation.ground.truth import LoadTrack, read_load_track
 from protocol.arrays import Table
 from protocol.machine.log_folder import open_log
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Gps, Reading, Torque
 from sim.recorder import TRACKS_FOLDER
 from sim.scenario.file import load_scenario
 from sim.truth import MAP_FILE, TruthMap
@@ -36,7 +38,7 @@ class FleetDrive(PlannedDrive):
         top = {"base": self.setup.scenario, "world": self.setup.world}
         if not self.count:
             return f"{toml_of(top)}\n"
-        first = replace(load_scenario(self.setup.scenario).fleet[0], count=self.count)
+        first = replace(load_scenario(self.setup.scenario).fleet[0], count=self.count, preset=self.preset)
         return f"{toml_of(top)}\n\n[[fleet]]\n{toml_of(vars(first))}\n"
 
     @property
@@ -45,24 +47,29 @@ class FleetDrive(PlannedDrive):
         return self.count or sum(fleet.size for fleet in load_scenario(self.setup.scenario).fleet)
 
 
-def planned(scenario: str, seed: int, seconds: float, count: int = 0) -> FleetDrive:
-    """A drive of a scenario with the sensors that its file has."""
-    preset = load_scenario(scenario).fleet[0].preset
+def planned(scenario: str, seed: int, seconds: float, count: int = 0, preset: str = "") -> FleetDrive:
+    """A drive of a scenario with the sensors of a preset, or with those that its file has."""
+    preset = preset or load_scenario(scenario).fleet[0].preset
     return FleetDrive(seed, seconds, preset, Setup(scenario, (), (), ()), count)
 
 
 @dataclass(frozen=True)
 class Agent:
-    """One machine of a drive, by its place among the names. calibrates: by its own work; first_s: of the recording."""
+    """One machine of a drive, by its place among the names.
+
+    calibrates: by its own work; first_s: of the recording; bad: see `spoiled`.
+    """
 
     index: int
     calibrates: bool = True
     first_s: float = 0.0
+    bad: bool = False
 
     @property
     def name(self) -> str:
         """Short and unique."""
-        return f"machine{self.index}" + "-plain" * (not self.calibrates) + f"-{self.first_s:g}s" * (self.first_s > 0)
+        first = f"-{self.first_s:g}s" * (self.first_s > 0)
+        return f"machine{self.index}" + "-plain" * (not self.calibrates) + "-bad" * self.bad + first
 
 
 @dataclass(frozen=True)
@@ -105,12 +112,34 @@ def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
     """Run one machine's pipeline."""
     assert task.drive
     log = open_log(_logs(task.drive.folder(cache))[task.variant.index])
-    readings = tuple(log.readings())
+    machine, readings = log.machine, tuple(log.readings())
     if task.variant.first_s:
         end_ns = readings[0].stamp_ns + round(task.variant.first_s * 1e9)
         readings = tuple(reading for reading in readings if reading.stamp_ns <= end_ns)
+    if task.variant.bad:
+        machine, readings = spoiled(machine, readings)
     options = PipelineConfig(estimation=EstimationConfig(calibrate=task.variant.calibrates))
-    return AgentSamples(np.asarray(final_samples(Pipeline(log.site, log.machine, options), readings)))
+    return AgentSamples(np.asarray(final_samples(Pipeline(log.site, machine, options), readings)))
+
+
+def spoiled(machine: MachineConfig, readings: Iterable[Reading]) -> tuple[MachineConfig, tuple[Reading, ...]]:
+    """A machine and its readings with the faults of the scenario `bad_machine`, on whatever recording.
+
+    That an antenna sits elsewhere than is configured is the same as a configuration that says so of one that does not.
+    """
+    (fault,) = load_scenario("bad_machine").fault
+    off = np.array(fault.antenna_off_m)
+    sensors = tuple(
+        replace(each, mount=replace(each.mount, xyz_m=tuple((each.mount.xyz_m - off).tolist())))
+        if each.kind == Gps.kind
+        else each
+        for each in machine.sensors
+    )
+    scaled = (
+        replace(each, torque_nm=fault.torque_scale * each.torque_nm) if isinstance(each, Torque) else each
+        for each in readings
+    )
+    return replace(machine, sensors=sensors), tuple(scaled)
 
 
 EXPERIMENT = Experiment("fleet", AgentSamples, SOURCES, _samples)

@@ -3,23 +3,29 @@
 The fixes of recordings are made anew, so that machine and base share a part of their slow errors. The base runs as an
 agent would run it, on fixes of its own; a link holds up its corrections. It has stood there for an hour when the
 machine starts, unless it is new.
+
+Poses as they are known at once are judged, so nothing is smoothed. One task is all the cases of a drive with one share:
+they are one recording, and up to where a base fails one run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from agents.base_station import BaseStation
+from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import PipelineConfig, Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Goal, Report, Row, judge, rounded
 from evaluation.campaign.recordings import PlannedDrive
+from evaluation.campaign.truth import Truth
 from evaluation.positions.configurations import select
-from evaluation.positions.replay import Score, replay, score
+from evaluation.positions.replay import STEP_NS, Score, Trace, continued, replay, score
 from evaluation.positions.substitution import GpsErrors, gps_errors, true_motion, with_gps_errors
 from evaluation.positions.table import paired_ratio, values
 from protocol.machine.machine_config import MachineConfig, SensorConfig
@@ -55,11 +61,6 @@ class BaseCase:
     case: str
 
     @property
-    def name(self) -> str:
-        """A name for files."""
-        return f"{self.case}-{self.site_share:g}"
-
-    @property
     def survey_off_m(self) -> float:
         """How far east of the true place the base is surveyed."""
         return float(self.case.rpartition("_")[2].removesuffix("m")) if "off_" in self.case else 0.0
@@ -79,6 +80,30 @@ class BaseRun(Score):
     share: float
 
 
+@dataclass(frozen=True)
+class SharedSite:
+    """All rows of one share."""
+
+    site_share: float
+
+    @property
+    def name(self) -> str:
+        """A name for files."""
+        return f"share{self.site_share:g}"
+
+    @property
+    def rows(self) -> list[BaseCase]:
+        """The row without a base is the first."""
+        return [row for row in ROWS if row.site_share == self.site_share]
+
+
+@dataclass(frozen=True)
+class BaseRuns:
+    """The fields of a `BaseRun` of every case, by its name."""
+
+    cases: dict[str, dict[str, float]]
+
+
 ROWS = [BaseCase(0.0, "none"), BaseCase(0.0, "good")]
 ROWS += [BaseCase(share, case) for share in SHARES[1:] for case in CASES]
 GOALS = [
@@ -91,12 +116,15 @@ GOALS = [
 ]
 
 
-def run(runner: Runner, seeds: Sequence[int], seconds: float) -> tuple[Report, list[BaseRun]]:
+def run(runner: Runner, seeds: Sequence[int], seconds: float) -> tuple[Report, list[BaseRuns]]:
     """Record, replay and score every row with all seeds."""
-    drives = [PlannedDrive(seed, seconds) for seed in seeds]
-    pairs = [(drive, row) for drive in drives for row in ROWS]
-    runs = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
-    of_row = {row: [r for (_, other), r in zip(pairs, runs, strict=True) if other == row] for row in ROWS}
+    sites = [SharedSite(share) for share in SHARES]
+    tasks = [replay_task(site, PlannedDrive(seed, seconds)) for seed in seeds for site in sites]
+    runs = runner.run(EXPERIMENT, tasks)
+    of_row: dict[BaseCase, list[BaseRun]] = {row: [] for row in ROWS}
+    for task, several in zip(tasks, runs, strict=True):
+        for row in task.variant.rows:
+            of_row[row].append(BaseRun(**several.cases[row.case]))  # type: ignore[arg-type]  # counts are whole
     rows = [_summarise(row, several, of_row[BaseCase(row.site_share, "none")]) for row, several in of_row.items()]
     report: Report = {"seeds": list(seeds), "seconds": seconds, "gps": 1, "link_s": LINK_S, "stood_s": STOOD_S}
     return {**report, "rows": rows, "goals": judge(GOALS, rows)}, runs
@@ -129,47 +157,77 @@ def _summarise(row: BaseCase, runs: Sequence[BaseRun], without: Sequence[BaseRun
 # --- in the worker processes -----------------------------------------------------------------------------------------
 
 
-def _solve(task: Task[BaseCase], cache: Path) -> BaseRun:
-    """Replay one drive with the corrections of one base."""
-    row, recording = task.variant, task.recording(cache)
+def _solve(task: Task[SharedSite], cache: Path) -> BaseRuns:
+    """Replay one drive without a base and with all that one may be."""
+    share, recording = task.variant.site_share, task.recording(cache)
     assert task.drive
     preset = load_preset(task.drive.preset)
-    noise = replace(preset.gps, site_share=row.site_share, machine_share=row.site_share)
+    noise = replace(preset.gps, site_share=share, machine_share=share)
     until_ns = recording.readings[-1].stamp_ns
     # Of all rows the errors are those from STOOD_S on, so that they are paired.
     errors = _later(gps_errors(recording.machine, noise, task.seed, until_ns + STOOD_S * 10**9))
     recording = with_gps_errors(recording, true_motion(task.drive.folder(cache)), errors)
     machine = select(recording.machine, gps=1, imu=1)
     readings = [r for r in recording.readings if (sensor := machine.sensor(r.sensor)) and sensor.use]
-    if row.case != "none":
-        base = base_config("base", replace(preset, gps=noise))
-        machine = replace(machine, sensors=(*machine.sensors, SensorConfig(base.name, Correction.kind)))
-        made = corrections(recording.site, base, noise, row, task.seed, until_ns)
-        readings = arrivals(readings, list(failing(made, row.case, START_NS + round(task.seconds * 5e8))), LINK_S)
-    positioning = Positioning(recording.site, machine, PipelineConfig())
-    trace = replay(positioning, readings)
+    config = PipelineConfig(localisation=LocalisationConfig(lag_s=0.0))
+    trace = replay(alone := Positioning(recording.site, machine, config), readings)
+    cases = {"none": _run(trace, alone, recording.truth)}
+
+    base = base_config("base", replace(preset, gps=noise))
+    machine = replace(machine, sensors=(*machine.sensors, SensorConfig(base.name, Correction.kind)))
+    off = _later(gps_errors(base, noise, task.seed, until_ns + STOOD_S * 10**9, NUMBER))[base.sensors[0].name]
+    middle_ns = START_NS + round(task.seconds * 5e8) // STEP_NS * STEP_NS
+    made = {row: corrections(recording.site, base, noise, off, row, middle_ns) for row in task.variant.rows[1:]}
+    heard = {
+        row: arrivals(readings, list(failing(corrected, row.case, middle_ns)), LINK_S)
+        for row, corrected in made.items()
+    }
+    core = Positioning(recording.site, machine, config)
+    for row, trace, positioning in _traces(core, heard, middle_ns):
+        cases[row.case] = _run(trace, positioning, recording.truth)
+    return BaseRuns({case: asdict(run) for case, run in cases.items()})
+
+
+def _traces(
+    core: Positioning, heard: Mapping[BaseCase, Sequence[Reading]], middle_ns: int
+) -> Iterator[tuple[BaseCase, Trace, Positioning]]:
+    """Replay what is heard in each case; up to the middle once, where the base is good until then."""
+    good = next(mixed for row, mixed in heard.items() if row.case == "good")
+    first = good[: _until(good, middle_ns)]
+    halfway = deepcopy(core)
+    before = replay(halfway, first)
+    for row, mixed in heard.items():
+        if row.case in ("good", *FAULTS):
+            positioning = deepcopy(halfway)
+            yield row, continued(before, replay(positioning, mixed[len(first) :])), positioning
+        else:
+            positioning = deepcopy(core)
+            yield row, replay(positioning, mixed), positioning
+
+
+def _run(trace: Trace, positioning: Positioning, truth: Truth) -> BaseRun:
     counters, state = positioning.counters, positioning.localiser.base_report()
-    return BaseRun(
-        **vars(score(trace, recording.truth)),
-        used=counters["base_used"],
-        gated=counters["base_gated"],
-        share=state["share"] if state else 0.0,
-    )
+    used, gated, share = counters["base_used"], counters["base_gated"], state["share"] if state else 0.0
+    return BaseRun(**vars(score(trace, truth)), used=used, gated=gated, share=share)
+
+
+def _until(arriving: Sequence[Reading], stamp_ns: int) -> int:
+    """How many come before the machine's own first reading at a stamp or after it."""
+    own = (i for i, r in enumerate(arriving) if not isinstance(r, Correction) and r.stamp_ns >= stamp_ns)
+    return next(own, len(arriving))
 
 
 def corrections(
-    site: SiteConfig, base: MachineConfig, noise: GpsNoise, row: BaseCase, seed: int, until_ns: int
+    site: SiteConfig, base: MachineConfig, noise: GpsNoise, errors: GpsErrors, row: BaseCase, middle_ns: int
 ) -> list[Correction]:
-    """What a base publishes from the start of a drive on until a stamp."""
+    """What a base publishes from the start of a drive on. errors: of its receiver. middle_ns: when it would jump."""
     projection, (receiver,) = Projection(site), base.sensors
-    errors = _later(gps_errors(base, noise, seed, until_ns + STOOD_S * 10**9, NUMBER))[receiver.name]
     begun = errors.stamp_ns >= START_NS - row.stood_s * 10**9
     seconds = (errors.stamp_ns - START_NS) * 1e-9
     heard = begun & (seconds % noise.outage_period_s >= noise.outage_s)
     off_m = errors.total_m.copy()
     if row.case == "jumps":
-        middle_s = (until_ns - START_NS) * 5e-10
-        off_m[seconds >= middle_s, 0] += JUMP_M
+        off_m[errors.stamp_ns >= middle_ns, 0] += JUMP_M
     places = projection.to_geodetic_many(*(np.array([*PLACE_M, 0.0]) + off_m).T)
     stated = errors.stated_m2.tolist()
     surveyed = PLACE_M[0] + row.survey_off_m, PLACE_M[1]
@@ -205,4 +263,4 @@ def _later(errors: dict[str, GpsErrors]) -> dict[str, GpsErrors]:
     return {name: replace(e, stamp_ns=e.stamp_ns - STOOD_S * 10**9) for name, e in errors.items()}
 
 
-EXPERIMENT = Experiment("base", BaseRun, SOURCES, _solve)
+EXPERIMENT = Experiment("base", BaseRuns, SOURCES, _solve)

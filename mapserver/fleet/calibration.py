@@ -14,6 +14,7 @@ import numpy as np
 from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.observability import CommonScale, Observed, observe
+from mapserver.fleet.passages import Epochs
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, against, estimate, problem
 from protocol.arrays import Bools, Floats, Table
 from protocol.site.site_config import KnownGround
@@ -159,8 +160,23 @@ def _applied(pb: Problem, result: Estimate, observed: Observed, absolute: Bools)
         if not absolute[index]:
             left[at, :] = left[:, at] = 0.0
             left[at, at] = covariance[at, at] if far[index] else SCALE_STD**2
+    zeros = np.arange(len(pb.epochs.number))
+    left[zeros, zeros] += moved(pb.epochs, x[zeros], left[zeros, zeros])
     beyond[:, 1] *= absolute  # of machines that differ nobody knows which is at fault
     return _Applied(x, left, absolute | far, beyond)
+
+
+def moved(epochs: Epochs, zero: Floats, variance: Floats) -> Floats:
+    """Variance (e,) of a zero within its epoch, by how far it is from those of the epochs beside it.
+
+    One that steps is off by the whole difference until it steps, one that drifts by less than half: half is taken, of
+    what is more than the estimates' own noise.
+    """
+    machine, number = epochs.machine, epochs.number
+    beside = (np.diff(machine) == 0) & (np.diff(number) == 1)
+    noise = SURE**2 * (variance[1:] + variance[:-1])
+    apart = np.where(beside, np.maximum(np.diff(zero) ** 2 - noise, 0.0) / 4, 0.0)
+    return np.asarray(np.maximum(np.append(apart, 0.0), np.append(0.0, apart)), np.float64)
 
 
 def _corrections(pb: Problem, applied: _Applied) -> list[Correction]:

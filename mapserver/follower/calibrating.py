@@ -9,12 +9,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from mapserver.evidence.fold_config import is_foldable
-from mapserver.fleet.calibration import Calibration, calibrate
+from mapserver.fleet.calibration import Calibration, MachineState, calibrate
 from mapserver.fleet.ledger import Ledger
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
@@ -58,6 +58,10 @@ class Calibrating:
         self._due_s = 0.0
         self._turn = threading.Lock()  # of all that is used here: `solve` is for any thread
 
+    def states(self) -> Mapping[str, MachineState]:
+        """What the last solve says of machines, by name."""
+        return self.solved[0].machines
+
     def run(self) -> None:
         """Follow the journal; where that is done and it is time, solve, and have it decided."""
         with self._turn:
@@ -67,7 +71,7 @@ class Calibrating:
             if self._solved_ns is not None and self._solved_ns <= now_ns < self._solved_ns + EVERY_NS:
                 return
             solved = self._solve(now_ns)
-            if self._writer.config.calibration.automatic:
+            if self._writer.config.calibration.automatic and not self._ending.is_set():
                 self._decide(solved, now_ns)
 
     def solve(self) -> tuple[Calibration, int]:

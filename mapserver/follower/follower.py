@@ -1,16 +1,17 @@
-"""The follower: a thread beside the writer that runs five jobs in turn, and one that folds the map again."""
+"""The follower: a thread beside the writer that runs four jobs in turn, one that calibrates, one that folds again."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
+from collections.abc import Iterable
 from typing import Any
 
 from mapserver.follower.calibrating import Calibrating
 from mapserver.follower.calibration_state import calibration_of, decided_by_person
 from mapserver.follower.checkpointing import Checkpointing
-from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Publish
+from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Job, Publish
 from mapserver.follower.refolding import Refolding
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
@@ -27,6 +28,7 @@ from protocol.queries.commands import CalibrateCommand
 # once, each turn looks at all of the map again, and no more than a share of one core should go into that.
 TURN_S, LATEST_S = 1.0, 5.0
 SHARE = 0.2
+END_S = 5.0  # a solve may take so long in the end
 log = logging.getLogger("mapserver.follower.follower")
 
 
@@ -41,14 +43,20 @@ class Follower:
         self._reader = reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ending = threading.Event()
         self._refolding = Refolding(writer, past)
-        self._audit = Audit(writer, reader, self._refolding.judge, self._ending)
         self._calibrating = Calibrating(writer, past, self._refolding.calibrate, self._doubtful, self._ending)
+        self._audit = Audit(writer, reader, self._refolding.judge, self._calibrating.states, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
         archiving = Archiving(writer, reader, self._ending)
-        self._jobs = (self._audit, self._calibrating, self._changes, archiving, self._checkpointing)
-        self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
-        self._thread.start()
+        jobs = {
+            "follower": (self._audit, self._changes, archiving, self._checkpointing),
+            "calibration": (self._calibrating,),  # which may take seconds at a time
+        }
+        self._threads = [
+            threading.Thread(target=self._run, args=(some,), name=name, daemon=True) for name, some in jobs.items()
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def facts(self) -> Facts:
         """What the map is folded with."""
@@ -113,9 +121,12 @@ class Follower:
         """End the threads."""
         self._ending.set()
         self._refolding.close()
-        self._thread.join()
+        following, calibrating = self._threads
+        following.join()
         self._checkpointing.close()
-        self._calibrating.close()
+        calibrating.join(END_S)
+        if not calibrating.is_alive():  # else it ends with the process: what it solves is of no use any more
+            self._calibrating.close()
         self._reader.close()
 
     def _require_known(self, machine: str) -> None:
@@ -151,10 +162,10 @@ class Follower:
             return TrustDecision(machine, not contradicts, AUDIT, reason or "left to the audit", stamp_ns)
         return TrustDecision(machine, trusted, PERSON, reason, stamp_ns)
 
-    def _run(self) -> None:
+    def _run(self, jobs: Iterable[Job]) -> None:
         while not self._ending.is_set():
             began_s = time.thread_time()
-            for job in self._jobs:
+            for job in jobs:
                 if self._ending.is_set():
                     break
                 try:

@@ -9,14 +9,19 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Protocol
+
+import numpy as np
 
 from mapserver.change import change_log
 from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.evidence.timeline import Block, TimedPage
+from mapserver.fleet.calibration import MachineState
+from mapserver.fleet.correction import UNCORRECTED
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
@@ -29,24 +34,41 @@ from protocol.queries.answers import GroundChange
 LOOK_BLOCKS = 256  # for changes, at a time: the writer copies their pages, and batches wait meanwhile
 LOOK_S = 60.0  # between two looks for rows that are old enough: files are of whole hours
 Report = Callable[[Mapping[str, Verdict], int], None]
+States = Callable[[], Mapping[str, MachineState]]
 Publish = Callable[[GroundChange], None]
 log = logging.getLogger("mapserver.follower.jobs")
 
 
-class Audit:
-    """Hands what is journalled to an auditor, and judges all machines from time to time.
+class Job(Protocol):
+    """Work that is looked after again and again. name: for the log."""
 
-    report: is given all verdicts, and the site's now [ns].
+    name: str
+
+    def run(self) -> None:
+        """Do what is due, and return soon."""
+
+
+class Audit:
+    """Hands what is journalled, corrected as in the map, to an auditor, and judges all machines from time to time.
+
+    report: is given all verdicts, and the site's now [ns]. states: what calibration knows of machines, by name.
     """
 
     name = "audit"
 
-    def __init__(self, writer: Writer, reader: JournalReader, report: Report, ending: threading.Event) -> None:
+    def __init__(
+        self, writer: Writer, reader: JournalReader, report: Report, states: States, ending: threading.Event
+    ) -> None:
         self.verdicts: Mapping[str, Verdict] = {}
-        self._writer, self._reader, self._report, self._ending = writer, reader, report, ending
-        self._auditor = Auditor(writer.site.cell_m, writer.config.fold)
-        self._followed = reader.archived_row
+        self._writer, self._reader, self._report, self._states, self._ending = writer, reader, report, states, ending
+        self._corrections = UNCORRECTED
+        self._begin()
         self._due_s = 0.0
+
+    def _begin(self) -> None:
+        """Begin anew, with the first row that is not archived."""
+        self._auditor = Auditor(self._writer.site.cell_m, self._writer.config.fold)
+        self._followed = self._reader.archived_row
 
     def run(self) -> None:
         """Follow the journal, then judge where it is time."""
@@ -55,16 +77,22 @@ class Audit:
         finally:  # a row that cannot be read must not keep the machines from being judged by the others
             if time.monotonic() >= self._due_s:
                 self._due_s = time.monotonic() + self._writer.config.trust.judge_s
-                self.verdicts = self._auditor.verdicts()
+                self.verdicts = self._auditor.verdicts(self._states())
                 self._report(self.verdicts, self._writer.run(lambda store: store.newest_ns))
 
     def _follow(self) -> None:
+        corrections = self._writer.run(lambda store: store.facts.corrections)
+        if corrections != self._corrections:  # a map of a machine is of samples that were all corrected alike
+            self._corrections = corrections
+            self._begin()
         until = self._reader.last_row  # what comes in meanwhile waits for the next turn: a busy site has no end
-        for row in self._reader.read(after=max(self._followed, self._reader.archived_row), until=until):
-            self._auditor.add(row.machine, row.rows)
-            self._followed = row.row
-            if self._ending.is_set():
-                return
+        for rows in self._reader.read_many(after=max(self._followed, self._reader.archived_row), until=until):
+            machine = np.repeat(rows.machine, rows.lengths)
+            for row in replace(rows, samples=corrections.applied(rows.samples, rows.machines, machine)):
+                self._auditor.add(row.machine, row.rows)
+                self._followed = row.row
+                if self._ending.is_set():
+                    return
 
 
 class ChangeSearch:

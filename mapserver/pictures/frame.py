@@ -45,13 +45,12 @@ def compose(
     title: str,
     classes: Sequence[LegendEntry],
     machines: Sequence[LegendEntry] = (),
-    note: str = "",
+    notes: Sequence[str] = (),
 ) -> Image:
-    """Set the painted ground into a figure that is large enough for everything around it."""
+    """Set the painted ground into a figure that is large enough for everything around it. notes: lines below."""
     named = [LegendEntry(machine.colour, machine.text[:MAX_NAME]) for machine in machines[:MAX_LISTED]]
-    notes = [note] if note else []
     if len(machines) > MAX_LISTED:
-        notes.append(f"and {len(machines) - MAX_LISTED} more machines")
+        notes = [f"and {len(machines) - MAX_LISTED} more machines", *notes]
     words = [*(entry.text for entry in [*classes, *named]), *notes]
     panel_width = max(MIN_PANEL_PX, SWATCH_PX + 10 + max(text_size(word)[0] for word in words))
     panel_height = LINE_PX * (len(words) + 1) + COMPASS_PX

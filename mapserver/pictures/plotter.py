@@ -62,12 +62,14 @@ class _Scale:
         return np.stack([x_px, y_px], axis=-1) - 0.5  # pixel centres
 
 
-def draw_resistance(region: Region, tracks: Sequence[Track] = (), title: str = "Rolling resistance") -> Image:
-    """Draw the layer `resistance` in the paper's classes and colours."""
+def draw_resistance(
+    region: Region, tracks: Sequence[Track] = (), title: str = "Rolling resistance", notes: Sequence[str] = ()
+) -> Image:
+    """Draw the layer `resistance` in the paper's classes and colours. notes: lines below the legend."""
     entries = [LegendEntry(zone.bgr, f"{zone.name}  {zone.c_rr:g}") for zone in ZONES]
     scale = _scale(region)
     ground = _paint(resistance_class(region["resistance"]), entries, scale)
-    return _finish(ground, scale, entries, tracks, title)
+    return _finish(ground, scale, entries, tracks, title, notes)
 
 
 def draw_grade(region: Region, tracks: Sequence[Track] = (), title: str = "Grade") -> Image:
@@ -76,7 +78,7 @@ def draw_grade(region: Region, tracks: Sequence[Track] = (), title: str = "Grade
     scale, classes = _scale(region), slope_class(region["grade_east"], region["grade_north"])
     ground = _paint(classes, entries, scale)
     _draw_arrows(ground, region, classes, scale)
-    return _finish(ground, scale, entries, tracks, title, note="arrows: uphill" if (classes == SLOPE).any() else "")
+    return _finish(ground, scale, entries, tracks, title, ["arrows: uphill"] if (classes == SLOPE).any() else ())
 
 
 def draw_difference(region: Region, truth: NamedLayers, kind: Literal["resistance", "grade"]) -> Image:
@@ -168,12 +170,17 @@ def _draw_arrows(ground: Image, region: Region, classes: Ints, scale: _Scale) ->
 
 
 def _finish(
-    ground: Image, scale: _Scale, entries: Sequence[LegendEntry], tracks: Sequence[Track], title: str, note: str = ""
+    ground: Image,
+    scale: _Scale,
+    entries: Sequence[LegendEntry],
+    tracks: Sequence[Track],
+    title: str,
+    notes: Sequence[str] = (),
 ) -> Image:
     """Draw the tracks on the painted ground and set it into its frame."""
     _draw_tracks(ground, tracks, scale)
     machines = [LegendEntry(colour, track.name) for track, colour in zip(tracks, _colours(tracks), strict=True)]
-    return compose(ground, scale.axes, title, [*entries, LegendEntry(UNKNOWN_COLOUR, "unknown")], machines, note)
+    return compose(ground, scale.axes, title, [*entries, LegendEntry(UNKNOWN_COLOUR, "unknown")], machines, notes)
 
 
 # --- tracks ----------------------------------------------------------------------------------------------------------

@@ -49,8 +49,8 @@ class Verdict:
 
     reasons: empty unless it contradicts all others. evidence: plain values; what could not be compared is missing.
     cells, gain, offset_east_m, offset_north_m, offset_std_m, agreement [-], spread and spread_of_others (of the levels)
-    against the map of all others in good standing; clock_s: ahead of the others; zero, scale: by which its samples are
-    corrected; excess: by reason, 1 at its limit;
+    against the map of all others in good standing; clock_s: ahead of the others; zero, torque_gain, their standard
+    deviations and what shows them: of the calibration; excess: by reason, 1 at its limit;
     agrees_with, disagrees_with, undecided_with: machines.
     """
 
@@ -101,7 +101,9 @@ class Auditor:
             judgements[Reason.BEYOND_DATA_SHEET] = beyond_data_sheet(known[i])
             reasons = tuple(r for r in Reason if groups[r][i] and judgements[r].state == DISAGREE)
             excess = {str(r): round(j.excess, 3) for r, j in judgements.items() if j.excess}
-            evidence = _measured(difference) | lead | _off(known[i]) | {"excess": excess} | _sides(names, votes, i)
+            evidence = (
+                _measured(difference) | lead | _calibrated(known[i]) | {"excess": excess} | _sides(names, votes, i)
+            )
             verdicts[names[i]] = Verdict(names[i], reasons, evidence, bool(reasons))
         return verdicts
 
@@ -156,9 +158,14 @@ def _measured(difference: Difference | None) -> dict[str, Any]:
     return {name: round(value, 3) for name, value in values.items()}
 
 
-def _off(state: MachineState | None) -> dict[str, Any]:
+def _calibrated(state: MachineState | None) -> dict[str, Any]:
     """What calibration knows of a machine, in plain values."""
-    return {} if state is None else {"zero": round(state.zero, 5), "scale": round(state.scale, 4)}
+    if state is None:
+        return {}
+    values = {"zero": state.zero, "zero_std": state.zero_std}
+    values |= {"torque_gain": 1 + state.scale, "torque_gain_std": state.scale_std}
+    known_by = {"zero_by": state.zero_by, "torque_gain_by": state.scale_by}
+    return {name: round(value, 5) for name, value in values.items()} | known_by
 
 
 def _sides(names: Sequence[str], votes: Mapping[Reason, Ints], i: int) -> dict[str, Any]:

@@ -58,6 +58,7 @@ def add_options(parser: ArgumentParser) -> None:
         (blackout, "errors over the time without GPS"),
         (ground, "estimates along the track, errors by place"),
         (merge, "the maps of the first seed and the table"),
+        (fleet, "the maps of the first seed before and after, and the table"),
     ):
         action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
     for action, seconds in (
@@ -209,7 +210,7 @@ def _fleet(arguments: Namespace) -> Report:
     from evaluation.fleet import experiment
 
     work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
-    return _experiment(arguments, "machines drive, and are calibrated by the ground", work)
+    return _experiment(arguments, "machines drive, and are calibrated by the ground", work, "evaluation.fleet.plots")
 
 
 def _experiment(

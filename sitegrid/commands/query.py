@@ -16,6 +16,7 @@ from protocol.errors import ConfigError
 from protocol.files import whole_file
 from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, Region
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
+from protocol.queries.explanations import calibrated, why
 from protocol.queries.pieces import Progress
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
@@ -159,16 +160,16 @@ def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> A
 
 def _machines(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     machines = client.machines(after=arguments.after)
-    head = ["machine", "trusted", "since", "samples", "lost", "newest", "why"]
+    head = ["machine", "trusted", "since", "samples", "lost", "newest", "accelerometer zero", "torque gain", "why"]
     return {"machines": machines}, _table(head, map(_machine_row, machines))
 
 
 def _machine_row(machine: MachineState) -> list[str]:
-    reasons = ", ".join([*machine.reasons, *filter(None, [machine.reason])])
     trusted = ("yes" if machine.trusted else "NO") + (f", by {machine.by}" if machine.by else "")
     since = utc_text(machine.since_ns) if machine.since_ns else "-"
     counts = [str(machine.samples), str(machine.lost)]
-    return [machine.name, trusted, since, *counts, utc_text(machine.newest_ns), reasons or "-"]
+    calibration = [calibrated(machine, name) or "-" for name in ("zero", "torque_gain")]
+    return [machine.name, trusted, since, *counts, utc_text(machine.newest_ns), *calibration, why(machine) or "-"]
 
 
 def _calibration(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:

@@ -141,7 +141,7 @@ def _draw(plan: DemoPlan, client: Client, tracks: TrackRecorder) -> tuple[Region
     """Write the final pictures; returns the map and their files."""
     region = client.region(tuple(_whole(plan)))  # type: ignore[arg-type]
     pictures = {
-        "map.png": draw_both(region, tracks.tracks()),
+        "map.png": draw_both(region, tracks.tracks(), machines=client.machines()),
         "difference.png": draw_differences(region, plan.true_map),
     }
     for name, images in pictures.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from mapserver.pictures.frame import Image
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError
-from protocol.queries.answers import Region
+from protocol.queries.answers import MachineState, Region
+from protocol.queries.explanations import calibrations
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_pose
@@ -72,7 +74,7 @@ def draw(
     empty: what the title says of a map without any ground, on which machines drive.
     """
     region = client.region(_bounds(client, bounds), LAYERS)
-    image = side_by_side(draw_both(region, tracks, empty))
+    image = side_by_side(draw_both(region, tracks, empty, client.machines()))
     difference = side_by_side(draw_differences(region, truth)) if truth else None
     write_image(out, image)
     if difference is not None:
@@ -85,9 +87,12 @@ def beside(out: Path) -> Path:
     return out.with_stem(f"{out.stem}-difference")
 
 
-def draw_both(region: Region, tracks: list[Track], empty: str = SAMPLES_FOLLOW) -> list[Image]:
-    """Resistance and grade; the title of a map without any resistance says why."""
-    return [draw_resistance(region, tracks, _title(region, tracks, empty)), draw_grade(region, tracks)]
+def draw_both(
+    region: Region, tracks: list[Track], empty: str = SAMPLES_FOLLOW, machines: Sequence[MachineState] = ()
+) -> list[Image]:
+    """Resistance and grade; the title of a map without any resistance says why. machines: calibrated ones are noted."""
+    resistance = draw_resistance(region, tracks, _title(region, tracks, empty), calibrations(machines))
+    return [resistance, draw_grade(region, tracks)]
 
 
 def _title(region: Region, tracks: list[Track], empty: str) -> str:

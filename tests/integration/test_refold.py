@@ -40,7 +40,7 @@ def site(tmp_path: Path, children: Children, monkeypatch: pytest.MonkeyPatch) ->
     """A site whose store has samples of ten machines, and no snapshot."""
     run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
     options = tmp_path / "server.toml"
-    options.write_text("[store]\narchive_after_h = 0.0\n")
+    options.write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
     monkeypatch.setattr(merge_restart, "SITE", load_site(run.site_file))
     merge_restart.build(tmp_path / "store", ROWS, tail_rows=ROWS)
     run.start_router()

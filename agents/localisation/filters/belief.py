@@ -42,12 +42,15 @@ class Motion:
 
     f: states (m, n) after the step from those before it, angles not wrapped. jacobian: df/dx (n, n) at a state (n,).
     Q: noise (n, n). angles: components of the state that are angles [rad]; a filter brings their mean into +-pi.
+    at_centre: the mean moves as one state would, and is not the mean of all that the belief holds for possible. Places
+    under an unsure heading lie on an arc, and their mean inside of it, where no machine can be.
     """
 
     f: Model
     jacobian: Model
     Q: Floats
     angles: tuple[int, ...]
+    at_centre: bool = False
 
 
 @dataclass(frozen=True, slots=True)

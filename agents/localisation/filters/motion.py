@@ -90,7 +90,7 @@ class MotionModel:
     on_plane: whether the machine moves on a plane. gps_errors: one per receiver of the layout. heading_errors:
     of the first references of the layout; headings of the others count from an anchor, and their errors walk. traction:
     drive force over weight [-], 0 where it is not known. turn_error_radps: standard deviation of the lasting error of
-    an odometry's turn rate, 0 where the turn comes from another sensor.
+    an odometry's turn rate, 0 where the turn comes from another sensor. reckons: whether nothing shows the place.
     """
 
     layout: Layout
@@ -99,6 +99,7 @@ class MotionModel:
     heading_errors: tuple[HeadingError, ...] = ()
     traction: float = 0.0
     turn_error_radps: float = 0.0
+    reckons: bool = False
 
     def __post_init__(self) -> None:
         if len(self.gps_errors) != self.layout.receivers:
@@ -132,7 +133,7 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     def jacobian(x: Floats) -> Floats:
         return _jacobian(x * scale, dt_s) * scale
 
-    return Motion(f, jacobian, Q, ANGLES)
+    return Motion(f, jacobian, Q, ANGLES, model.reckons)
 
 
 @lru_cache

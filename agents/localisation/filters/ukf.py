@@ -60,7 +60,9 @@ class Ukf:
         """Move the belief through the motion."""
         points = self._points(len(belief.x), 0)
         _, d, mean = points.deviations(belief, motion.f, ())
-        P = points.W * d.dot(d.T) + motion.Q
+        P = points.W * d.dot(d.T) + motion.Q  # with beta = alpha^2 around the centre
+        if motion.at_centre:
+            mean = motion.f(belief.x[None])[0]
         return conclude_motion(belief, motion, stamp_ns, mean, P, points.slope(d, belief))
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:

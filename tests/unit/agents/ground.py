@@ -15,6 +15,7 @@ from agents.estimation.calibration import Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEstimator
 from agents.estimation.resistance_kalman import KalmanResistance
 from agents.estimation.resistance_rls import RecursiveResistance
+from agents.localisation.filters.belief import PoseBelief
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
@@ -73,23 +74,33 @@ class EstimatorRun:
         lag_s: float = 1.5,
         calibration: Calibration | None = None,
         known_c_rr: float | None = None,
+        knows_place: bool = False,
     ) -> None:
+        """knows_place: by dead reckoning."""
         self.estimator = GroundEstimator(machine, config or EstimationConfig(), calibration)
         self.dead_reckoning = DeadReckoning(machine, 0.0)
         self.estimates: list[tuple[int, GroundEstimate]] = []
         self._machine, self._lag_ns, self._known_c_rr = machine, round(lag_s * 1e9), known_c_rr
         self._asked_ns = 0
+        self._knows_place = knows_place
 
     def feed(self, readings: Iterable[Reading]) -> EstimatorRun:
         for reading in readings:
             sensor = self._machine.sensor(reading.sensor)
             self.dead_reckoning.update(reading, sensor)
-            self.estimator.update(reading, sensor, self.dead_reckoning, self._known_c_rr)
+            self.estimator.update(reading, sensor, self.dead_reckoning, self._known_c_rr, self._pose())
             if reading.stamp_ns - self._asked_ns >= 100_000_000:
                 self._asked_ns = reading.stamp_ns
                 stamp_ns = reading.stamp_ns - self._lag_ns
                 self.estimates.append((stamp_ns, self.estimator.at(stamp_ns)))
         return self
+
+    def _pose(self) -> PoseBelief | None:
+        at = self.dead_reckoning.pose
+        speed_mps = self.dead_reckoning.wheels.speed_mps
+        return (
+            PoseBelief(at.stamp_ns, at.x_m, at.y_m, at.angle_rad, speed_mps, np.eye(2)) if self._knows_place else None
+        )
 
     @property
     def last(self) -> GroundEstimate:

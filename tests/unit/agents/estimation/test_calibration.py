@@ -12,7 +12,9 @@ from agents.dead_reckoning import DeadReckonedPose, DeadReckoning
 from agents.estimation import calibration as module
 from agents.estimation.balance import Balance
 from agents.estimation.calibration import FLOOR, SCALE_STD, STRETCH_STD, UNCALIBRATED, ZERO_STD, Calibration, Calibrator
+from agents.estimation.closed_tours import Tour
 from protocol.arrays import Floats
+from protocol.machine.samples import LIMITS
 from tests.unit.agents.drives import START_NS
 from tests.unit.agents.ground import STEADY, STEP_S
 
@@ -387,3 +389,46 @@ def test_old_zero_that_moved_is_found_again() -> None:
 def test_uncalibrated_is_how_large_errors_usually_are() -> None:
     assert (UNCALIBRATED.zero, UNCALIBRATED.scale, UNCALIBRATED.stamp_ns, UNCALIBRATED.passages) == (0.0, 0.0, 0, 0)
     assert np.array(UNCALIBRATED.covariance) == pytest.approx(np.diag([0.0045**2, 0.045**2]))
+
+
+# --- closed tours ----------------------------------------------------------------------------------------------------
+
+
+def tour(zero: float, seconds: float = 0.0, std: float = 1e-3) -> Tour:
+    return Tour(START_NS + round(seconds * 1e9), zero, std, 300.0)
+
+
+def test_a_tour_is_one_measurement_of_the_zero() -> None:
+    calibrator = Calibrator()
+    calibrator.add_tour(tour(0.006))
+    gain = ZERO_STD**2 / (ZERO_STD**2 + 1e-6)
+    calibration = calibrator.calibration
+    assert calibration.zero == pytest.approx(gain * 0.006)
+    assert calibration.covariance[0][0] == pytest.approx((1 - gain) * ZERO_STD**2)
+    assert (calibration.scale, calibration.covariance[1][1]) == (0.0, pytest.approx(SCALE_STD**2))
+    assert (calibration.passages, calibrator.counters["tours"]) == (1, 1)
+
+
+def test_no_number_of_tours_gets_below_the_floor() -> None:
+    calibrator = Calibrator()
+    for i in range(100):
+        calibrator.add_tour(tour(0.006, 0.01 * i))
+    assert calibrator.calibration.covariance[0][0] == FLOOR**2
+
+
+def test_one_tour_that_is_far_off_is_excluded_and_three_that_agree_are_right() -> None:
+    calibrator = Calibrator()
+    for i in range(module.RELOCK_TOURS):
+        assert abs(calibrator.calibration.zero) < 1e-12
+        calibrator.add_tour(tour(0.03, 90.0 * i))
+    calibrator.add_tour(tour(0.03, 300.0))
+    assert calibrator.calibration.zero == pytest.approx(0.03, abs=1e-3)
+    assert (calibrator.counters["off"], calibrator.counters["relocked"]) == (module.RELOCK_TOURS, 1)
+
+
+def test_what_is_applied_can_be_stated_in_a_sample() -> None:
+    """A sensor that is worse than any: its samples would be refused."""
+    for sign in (1.0, -1.0):
+        beyond = Calibration(sign * 0.08, sign * 0.7, ((1e-6, 0.0), (0.0, 1e-4)))
+        calibration = Calibrator(beyond).calibration
+        assert (calibration.zero, calibration.scale) == (sign * LIMITS["applied_zero"][1], sign * 0.5)

@@ -386,17 +386,25 @@ def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
             assert (plain.zero, plain.scale) == (0.0, 0.0)
 
 
-def test_an_estimate_keeps_the_calibration_of_its_time() -> None:
-    """It is made 2 s later, when the machine may stand, and have another."""
-    known = Calibration(0.004, 0.1, ((1e-7, 0.0), (0.0, 1e-4)), START_NS - 10**10, 400)
-    made = drive([STAND, START, Leg(6), STOP, Leg(3)], VEHICLE).readings
-    run = EstimatorRun(VEHICLE, EstimationConfig(), lag_s=4.0, calibration=known)
-    run.feed(made[: len(made) * 3 // 4])
-    asked_ns = made[len(made) // 2].stamp_ns
-    before = run.estimator.at(asked_ns)
-    run.estimator._applied = Calibration(-0.02, 0.3, known.covariance)
-    assert run.estimator.at(asked_ns) == before
-    assert (before.zero, before.scale) == (known.zero, known.scale)
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_machine_that_drives_round_and_round_finds_its_zero_and_applies_it_as_it_drives(estimator: str) -> None:
+    """At 2 m/s round a circle of 20 m; it never stands again. Where the calibration changes the ground does not."""
+    readings = off(drive([STAND, START, Leg(150, turn_radps=0.1)], VEHICLE).readings, 0.06)
+    zero = -0.06 / GRAVITY_MPS2
+    run = EstimatorRun(VEHICLE, EstimationConfig(estimator), knows_place=True).feed(readings)
+    health = run.estimator.health()["calibration"]
+    assert health["zero"] == pytest.approx(zero, abs=0.001)
+    assert (health["tours"], health["torn"]) == (2, 0)
+    assert np.mean([e.c_rr for e in run.between(20, 60) if not e.reason]) == pytest.approx(0.04 + zero, abs=1e-3)
+    last = [e for e in run.between(75, 150) if not e.reason]
+    assert np.mean([e.c_rr for e in last]) == pytest.approx(0.04, abs=1.5e-3)
+    assert {e.zero for e in last} <= {e.zero for e in run.between(0, 150)}
+    settled = [e.c_rr + e.zero for e in run.between(20, 150)]  # as measured
+    assert np.ptp(settled) < 1e-3
+    plain = EstimatorRun(VEHICLE, EstimationConfig(estimator, closed_tours=False), knows_place=True).feed(readings)
+    assert plain.estimator.health()["calibration"]["zero"] == 0.0
+    assert EstimatorRun(VEHICLE, EstimationConfig(estimator)).feed(readings).estimator.calibration.zero == 0.0
 
 
 def test_calibration_from_before_is_used_at_once() -> None:

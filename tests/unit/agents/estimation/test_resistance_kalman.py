@@ -437,3 +437,34 @@ def test_mass_that_is_known_stays_known() -> None:
     kalman.stand(changes_load=True)
     feed(kalman, at_work(0.2, 30, 1, start=700))
     assert scale_of(kalman) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("steps", [30, 230])
+def test_recalibrated_is_as_if_all_steps_had_had_the_new_calibration(steps: int) -> None:
+    rng = np.random.default_rng(3)
+    raw = np.where(np.arange(300) < steps - 20, 0.04, 0.07) + white_noise(NOISE, 300, rng)
+    changed = fed(raw[:steps])
+    changed.recalibrate(0.005, 0.1)
+    new = raw - 0.005 - 0.1 * 0.04
+    feed(changed, level_steps(new)[steps:])
+    always = fed(new)
+    assert borders(changed) == borders(always)
+    for index in range(max(250 - resistance_kalman.KEPT, 20), 300, 7):
+        assert at_step(changed, index) == pytest.approx(at_step(always, index), abs=3e-5)
+
+
+def test_a_change_of_the_calibration_is_no_border() -> None:
+    kalman = fed(np.full(200, 0.04))
+    kalman.recalibrate(0.02, 0.0)
+    feed(kalman, level_steps(np.full(300, 0.02))[200:])
+    assert not borders(kalman)
+    for index in (150, 199, 200, 250):
+        assert at_step(kalman, index)[0] == pytest.approx(0.02, abs=1e-6)
+
+
+def test_a_calibration_counts_by_direction() -> None:
+    kalman = KalmanResistance()
+    reverse = [replace(step, regressor=-1.0, raw=-0.04) for step in level_steps(np.zeros(100))]
+    feed(kalman, reverse)
+    kalman.recalibrate(0.02, 0.0)
+    assert at_step(kalman, 99)[0] == pytest.approx(0.06, abs=1e-5)

@@ -1,10 +1,12 @@
 """The algorithm against its formulas, and what it follows: a mass that stays and a ground that jumps."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from agents.estimation.balance import BalanceStep
 from agents.estimation.resistance_rls import MultipleForgetting, RecursiveGrade, RecursiveResistance
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
@@ -190,3 +192,15 @@ def test_grade_is_the_slope_of_the_mean_sine(slope_rad: float) -> None:
 
 def test_grade_survives_nonsense() -> None:
     assert math.isfinite(RecursiveGrade().update(STEP_S, 40.0))
+
+
+@pytest.mark.parametrize("regressor", [1.0, -1.0])
+def test_recalibrated_goes_on_from_what_it_would_have_been(regressor: float) -> None:
+    def steps(raw: float) -> list[BalanceStep]:
+        return [replace(step, regressor=regressor, raw=regressor * raw) for step in level_steps(np.full(400, raw))]
+
+    estimator = RecursiveResistance()
+    feed(estimator, steps(0.04))
+    estimator.recalibrate(0.005, 0.1)
+    c_rr, _ = estimator.at(START_NS + 399 * round(STEP_S * 1e9))
+    assert c_rr == pytest.approx(0.04 - regressor * (0.005 + 0.1 * 0.04), abs=1e-4)

@@ -29,6 +29,7 @@ from tests.unit.agents.drives import (
     fix,
     localiser,
     machine,
+    noisy,
     simulated,
     with_ahrs,
 )
@@ -350,6 +351,46 @@ def test_a_given_start_may_lie_anywhere() -> None:
     x, y, heading = made.at(last.stamp_ns)
     assert (last.x_m, last.y_m) == pytest.approx((-500 - (x - 10), 70 - (y - 20)), abs=0.6)
     assert abs(math.remainder(last.heading_rad - heading - math.pi, math.tau)) < 0.02
+
+
+BENDS = (Leg(4, 1.0), *(Leg(3, 0.0, rate) for rate in (0.3, -0.2, 0.25, -0.35, 0.3, -0.3)))
+
+
+@FILTERS
+def test_without_gps_the_motion_teaches_nothing_that_it_does_not_show(engine: str) -> None:
+    """Forces that are off on one side are neither a turn nor a bias of the gyro; wheels do not show their own scale."""
+    vehicle = machine(receivers=0)
+    made = drive(BENDS, vehicle)
+    off = [replace(r, force_y_mps2=r.force_y_mps2 + 0.8) if isinstance(r, Imu) else r for r in made.readings]
+    located = localiser(vehicle, start=START, filter=engine)
+    beliefs = located.run(noisy(off, 1))
+    layout = Layout(imus=1, wheel_scale=True)
+    assert state(located)[layout.gyro_biases.start : layout.wheel_scales.stop].tolist() == [0.0, 0.0]
+    turned = [abs(math.remainder(b.heading_rad - made.at(b.stamp_ns)[2], math.tau)) for b in beliefs]
+    assert max(turned) < 0.06  # noise of the gyro, and a step in which it turns at 0.35 rad/s
+
+
+def test_without_gps_a_standstill_still_shows_the_gyro_bias() -> None:
+    vehicle = machine(receivers=0)
+    made = drive([*BENDS, Leg(4, -1.0), Leg(6)], vehicle, without=("torque",))
+    located = localiser(vehicle, start=START)
+    beliefs = located.run(biased(made.readings, 0.004))
+    assert state(located)[GYRO_BIAS] == pytest.approx(0.004, abs=1e-4)
+    off_rad = math.remainder(beliefs[-1].heading_rad - made.heading_rad[-1], math.tau)
+    assert abs(off_rad) < 0.25 * 0.004 * 28  # and most of what it turned the machine by
+
+
+@FILTERS
+def test_without_gps_an_unsure_heading_does_not_shorten_the_distance(engine: str) -> None:
+    """Two minutes straight on: the gyro's bias may have turned the machine by a right angle, most likely it did not."""
+    vehicle = machine(receivers=0)
+    made = drive([Leg(4, 1.0), Leg(116)], vehicle)
+    located = localiser(vehicle, start=START, filter=engine)
+    last = located.run(made.readings)[-1]
+    assert located.belief.P[YAW, YAW] > 0.4**2
+    x, y, _ = made.at(last.stamp_ns)
+    driven_m = math.dist(START[:2], (x, y))
+    assert math.dist(START[:2], (last.x_m, last.y_m)) == pytest.approx(driven_m, rel=0.01)
 
 
 @pytest.mark.slow

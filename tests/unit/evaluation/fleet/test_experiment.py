@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from evaluation.campaign.figures import judge
 from evaluation.fleet import experiment
 from evaluation.fleet.cases import CASES, RAMP_STEPS, FleetCase, tampered
-from evaluation.fleet.drives import Scene, planned
-from evaluation.fleet.experiment import CaseResult, calibrated, judged, solved, summarise, true_errors
+from evaluation.fleet.drives import Scene, planned, spoiled
+from evaluation.fleet.experiment import summarise
+from evaluation.fleet.solving import FIGURES, MAPS, CaseResult, JudgedMap, calibrated, judged, solved
+from evaluation.fleet.true_errors import true_errors
 from evaluation.ground.truth import LoadTrack
 from protocol.arrays import Table
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Encoder, Torque
 from sim.truth import TruthMap
 from sitegrid import cli
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive, height_slope, soils
@@ -57,7 +63,7 @@ def test_truth_shows_the_errors_of_a_machine(scene) -> None:
 
 def test_after_is_better_than_before_and_near_the_oracle(scene) -> None:
     result = solved(case("machines_3"), *scene)
-    wrong = {name: row["wrong_pct"] for name, row in result.maps.items()}
+    wrong = {name: each.figures["wrong_pct"] for name, each in result.maps.items()}
     assert wrong["oracle"] <= wrong["after"] + 1.0
     assert wrong["after"] < wrong["before"] / 2
     assert result.common == (True, "")
@@ -89,7 +95,7 @@ def test_ramps_of_other_ground_leave_the_slope_alone(scene, step: float) -> None
     result = solved(chosen, *scene)
     if abs(step) > 0.005:
         assert result.common == (False, "ground_changes_with_slope")
-        assert result.maps["after"]["slope_pct"] <= result.maps["before"]["slope_pct"] + 1.0
+        assert result.maps["after"].figures["slope_pct"] <= result.maps["before"].figures["slope_pct"] + 1.0
 
 
 def test_it_rains_for_the_machine_that_drives_late(scene) -> None:
@@ -106,27 +112,81 @@ def test_it_rains_for_the_machine_that_drives_late(scene) -> None:
 def test_a_map_of_right_samples_is_right(scene) -> None:
     rows = {name: drive(route, seed=i, late=False) for i, (name, (route, _)) in enumerate(ROUTES.items())}
     true = Scene(truth(), {name: track(table) for name, table in rows.items()})
-    figures = judged(rows, tampered(case("machines_3"), rows, true), true)
+    figures = judged(rows, tampered(case("machines_3"), rows, true), true).figures
     assert figures["interior_pct"] < 2.0
     assert calibrated(rows, {"a"}).machines["a"].zero == pytest.approx(0.0, abs=0.003)
 
 
+def judged_map(*figures: float) -> JudgedMap:
+    return JudgedMap(
+        dict(zip(FIGURES, figures, strict=True)), *[np.zeros((1, 1), np.int64)] * 2, np.ones((1, 1), np.bool_)
+    )
+
+
 def test_rows_are_means_over_the_seeds() -> None:
-    maps = {name: {"wrong_pct": 2.0, "interior_pct": 1.0, "slope_pct": np.nan} for name in experiment.MAPS}
-    one = CaseResult(maps, np.array([0.001]), np.array([0.02]), np.array([1.0, 2.0]), (True, ""))
+    maps = dict.fromkeys(MAPS, judged_map(2.0, 1.0, np.nan))
+    one = CaseResult(maps, np.array([0.001]), np.array([0.02]), np.array([1.0, 2.0]), (True, ""), {})
     other = CaseResult(
-        {**maps, "after": {**maps["after"], "wrong_pct": 4.0}},
+        {**maps, "after": judged_map(4.0, 1.0, np.nan)},
         np.array([-0.001]),
         np.array([0.0]),
         np.array([0.0, 0.0]),
         (False, "no_slope_both_ways"),
+        {"b": "offset"},
     )
     after, before = (summarise(case("machines_2"), name, [one, other]) for name in ("after", "before"))
     assert (after["wrong_pct"], after["wrong_by_seed_pct"], after["max_wrong_pct"]) == (3.0, [2.0, 4.0], 4.0)
     assert (after["rms_zero"], after["rms_scale"], after["normalised"]) == (0.001, 0.0141, 1.25)
     assert (after["common_scale_observed"], after["reasons"]) == (1, ["no_slope_both_ways"])
+    assert (after["change_pct"], after["above_before_pct"], after["max_above_oracle_pct"]) == (1.0, 1.0, 2.0)
+    assert after["distrusted"] == [{}, {"b": "offset"}]
     assert before["wrong_pct"] == 2.0
+    assert before["change_pct"] is None
+    assert list(before) == list(after)
     assert np.isnan(before["rms_zero"])
+
+
+def test_better_than_before_is_not_above_it() -> None:
+    maps = {name: judged_map(wrong, wrong, wrong) for name, wrong in (("before", 9.0), ("after", 2.0))}
+    result = CaseResult({**maps, "oracle": maps["after"]}, *[np.zeros(1)] * 3, (True, ""), {})
+    row = summarise(case("machines_3"), "after", [result])
+    assert (row["change_pct"], row["slope_change_pct"]) == (-7.0, -7.0)
+    assert (row["above_before_pct"], row["max_above_before_pct"], row["above_oracle_pct"]) == (0.0, 0.0, 0.0)
+
+
+def test_goals_are_of_cases_and_figures_that_there_are() -> None:
+    result = CaseResult(dict.fromkeys(MAPS, judged_map(1.0, 1.0, 1.0)), *[np.zeros(1)] * 3, (True, ""), {})
+    rows = [summarise(each, "after", [result]) for each in CASES]
+    judgements = judge(experiment.GOALS, rows)
+    assert len(judgements) == len(experiment.GOALS)
+    assert {each["row"].split()[0] for each in judgements} <= {each.name for each in CASES}
+
+
+@pytest.mark.slow
+def test_a_bad_machine_is_distrusted_and_the_others_are_as_without_it(scene) -> None:
+    rows, true = scene
+    d = drive(RAMP, Errors(0.002, 0.6), seed=9, late=False)
+    places = {**true.tracks, "bad": track(d)}
+    d["y_m"] += 3.0
+    with_bad = solved(replace(case("machines_4"), machines=0), {**rows, "bad": d}, Scene(true.truth, places))
+    without = solved(case("machines_3"), rows, true)
+    assert list(with_bad.distrusted) == ["bad"]
+    assert "beyond_data_sheet" in with_bad.distrusted["bad"]
+    assert {n: each.figures for n, each in with_bad.maps.items()} == {n: m.figures for n, m in without.maps.items()}
+    let_in = replace(case("machines_4"), machines=0, let_in=(2,))
+    result = solved(let_in, {**rows, "bad": d}, Scene(true.truth, places))
+    assert result.maps["after"].figures["wrong_pct"] < result.maps["before"].figures["wrong_pct"]
+    assert len(result.zeros) == len(without.zeros) + 1
+
+
+def test_a_bad_machine_is_made_of_a_good_ones_recording() -> None:
+    machine = MachineConfig("a", mass_kg=1.0, wheel_radius_m=1.0)
+    gps = SensorConfig("gps-1", "gps", Mount((0.5, 0.0, 3.0)))
+    other = SensorConfig("imu-1", "imu", Mount((0.5, 0.0, 3.0)))
+    readings = [Torque(1, "torque", 100.0), Encoder(2, "encoder", 1.0, 2.0)]
+    bad, changed = spoiled(replace(machine, sensors=(gps, other)), readings)
+    assert [each.mount.xyz_m for each in bad.sensors] == [(0.5, -3.0, 3.0), (0.5, 0.0, 3.0)]
+    assert changed == (Torque(1, "torque", 160.0), readings[1])
 
 
 def test_cases_share_the_recordings_of_the_papers_site() -> None:
@@ -134,6 +194,11 @@ def test_cases_share_the_recordings_of_the_papers_site() -> None:
     assert drive_of.machines == 4
     assert "count = 4" in drive_of.scenario_toml
     assert planned("haul_road", 3, 900.0).machines == 5
+    shared = {experiment._drive(each, 3, 900.0) for each in CASES if each.scenario == "paper_site" and not each.preset}
+    assert shared == {drive_of}
+    harsh = experiment._drive(case("preset_harsh"), 3, 900.0)
+    assert (harsh.preset, harsh.machines) == ("harsh", 3)
+    assert 'preset = "harsh"' in harsh.scenario_toml
 
 
 def test_command_prints_rows(monkeypatch, capsys, tmp_path: Path) -> None:

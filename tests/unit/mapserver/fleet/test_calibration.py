@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -15,10 +16,11 @@ from mapserver.fleet.calibration import (
     Calibration,
     MachineState,
     calibrate,
+    moved,
 )
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, corrected
 from mapserver.fleet.ledger import EPOCH_NS
-from mapserver.fleet.passages import passages
+from mapserver.fleet.passages import Epochs, passages
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
 from protocol.arrays import Floats, Table
 from protocol.site.site_config import KnownGround
@@ -44,6 +46,7 @@ FLEET = {
     "ramp": (RAMP, Errors(-0.006, 0.04, -0.003)),
     "again": (RAMP_AGAIN, Errors(0.008, 0.03, 0.0)),
 }
+ELSEWHERE = ((20.0, 60.0), (110.0, 60.0), (110.0, 90.0), (20.0, 90.0))  # over the same ramp in lanes of its own
 SEEDS = (0, 1, 2)
 
 
@@ -227,6 +230,31 @@ def test_a_step_of_the_zero_is_followed_from_epoch_to_epoch() -> None:
     check(result.machines["again"], FLEET["again"][1], zero=0.002, scale=0.025)
 
 
+def test_an_epoch_in_which_the_zero_steps_states_a_large_deviation() -> None:
+    stepped, still = (
+        solve({"a": drive(LOW, Errors(step=step, step_s=450.0), seconds=900.0)}).corrections for step in (0.015, 0.0)
+    )
+    assert np.sqrt(stepped[1].covariance[0][0]) == pytest.approx(0.004, abs=0.001)
+    assert max(np.sqrt(each.covariance[0][0]) for each in still) < 0.0015
+
+
+@pytest.mark.parametrize(
+    ("machines", "numbers", "expected"),
+    [
+        ([0, 0, 0], [7, 8, 9], [4e-6, 9e-6, 9e-6]),
+        ([0, 0, 1], [7, 8, 9], [4e-6, 4e-6, 0.0]),
+        ([0, 0, 0], [7, 8, 10], [4e-6, 4e-6, 0.0]),
+    ],
+)
+def test_zeros_that_differ_from_those_beside_them_are_less_sure(
+    machines: list[int], numbers: list[int], expected: list[float]
+) -> None:
+    epochs = Epochs(np.array(machines), np.array(numbers))
+    zeros, none = np.array([0.0, 0.004, 0.010]), np.zeros(3)
+    assert moved(epochs, zeros, none) == pytest.approx(expected)
+    assert moved(epochs, zeros, none + 0.01**2) == pytest.approx(0.0)  # by no more than what they are unsure of
+
+
 @pytest.mark.parametrize("step", [-0.02, 0.01, 0.02])
 def test_ramps_of_other_ground_change_nothing_on_the_slope(step: float) -> None:
     rows = fleet(lambda x, y, h: soils(x, y, h) + step * on_ramp(x))
@@ -281,11 +309,23 @@ def test_one_ramp_driven_both_ways_in_one_lane_shows_the_scale_by_itself() -> No
     assert {each.most_share for each in result.corrections} == {ANY_SHARE}
 
 
-def with_bad(scale: float, zero: float = 0.01) -> dict[str, Table]:
-    """The fleet, and a machine whose torque reads too much and whose antenna lies 3 m off."""
-    rows = fleet() | {"bad": drive(RAMP, Errors(zero, scale), seed=99)}
-    rows["bad"]["y_m"] += 3.0
+def with_bad(
+    scale: float,
+    zero: float = 0.01,
+    route: Sequence[tuple[float, float]] = RAMP,
+    off_m: float = 3.0,
+    site: Site = soils,
+) -> dict[str, Table]:
+    """The fleet, and a machine whose torque reads too much and whose antenna lies elsewhere."""
+    rows = fleet(site) | {"bad": drive(route, Errors(zero, scale), seed=99, site=site)}
+    rows["bad"]["y_m"] += off_m
     return rows
+
+
+@cache
+def usual() -> Calibration:
+    """Of the fleet as it is."""
+    return solve(fleet())
 
 
 def of_others(result: Calibration) -> tuple[Correction, ...]:
@@ -293,7 +333,7 @@ def of_others(result: Calibration) -> tuple[Correction, ...]:
 
 
 def test_a_machine_without_a_say_moves_nobody() -> None:
-    rows, without = with_bad(0.1), solve(fleet())
+    rows, without = with_bad(0.1), usual()
     excluded = solve(rows, ("bad",))
     assert of_others(excluded) == without.corrections
     assert excluded.common == without.common
@@ -303,9 +343,31 @@ def test_a_machine_without_a_say_moves_nobody() -> None:
 @pytest.mark.parametrize(("scale", "zero"), [(0.6, 0.01), (-0.45, 0.0), (0.1, 0.04)])
 def test_a_machine_at_fault_has_no_say_though_nobody_said_so(scale: float, zero: float) -> None:
     result = solve(with_bad(scale, zero))
-    assert of_others(result) == solve(fleet()).corrections
+    assert of_others(result) == usual().corrections
     assert max(np.divide(result.machines["bad"].beyond, FAULT_SIGMAS)) > 1
     assert all(max(np.divide(result.machines[name].beyond, FAULT_SIGMAS)) < 1 for name in FLEET)
+
+
+def test_a_machine_that_puts_the_slopes_in_doubt_is_the_one_that_is_far_off() -> None:
+    """Not as far as a fault in the common estimate, which has a say of its own; alone against the others it is."""
+    result = solve(with_bad(0.65, route=RAMP_AGAIN, off_m=6.0))
+    assert result.common.observed
+    assert of_others(result) == usual().corrections
+    assert result.machines["bad"].beyond[1] > FAULT_SIGMAS[1]
+
+
+def test_where_the_doubt_stays_nobody_is_left_out() -> None:
+    rows = with_bad(0.65, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
+    result = solve(rows)
+    assert result.common.reason == "ground_changes_with_slope"
+    assert result.machines["bad"].beyond[1] == 0.0
+    assert of_others(result) != of_others(solve(rows, ("bad",)))
+
+
+def test_what_is_beyond_a_data_sheet_is_beyond_it_for_sure() -> None:
+    state = solve(fleet(errors={"again": Errors(0.002, 0.6)})).machines["again"]
+    own_std = np.sqrt(state.scale_std**2 - SCALE_FLOOR**2)
+    assert state.beyond[1] == pytest.approx((state.scale - 2 * own_std) / SCALE_STD, rel=0.01)
 
 
 def test_where_most_seem_at_fault_all_have_a_say() -> None:
@@ -344,6 +406,20 @@ def test_a_machine_without_a_say_is_solved_against_the_ground_of_the_others() ->
     rows = fleet() | {"bad": drive(RAMP, Errors(0.003, 0.6), seed=99)}
     state = solve(rows, ("bad",)).machines["bad"]
     check(state, Errors(0.003, 0.6), zero=0.003, scale=0.04)
+
+
+def test_a_machine_without_a_say_that_shares_no_ground_shows_its_scale_by_its_own_edges() -> None:
+    state = solve(with_bad(0.6, route=ELSEWHERE, off_m=0.0), ("bad",)).machines["bad"]
+    assert state.scale == pytest.approx(0.6, abs=0.06)
+    assert state.scale_by == ("edges",)
+
+
+def test_edges_of_a_machine_without_a_say_do_not_count_where_those_of_the_others_do_not() -> None:
+    rows = with_bad(0.2, route=ELSEWHERE, off_m=0.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
+    result = solve(rows, ("bad",))
+    assert result.common.reason == "ground_changes_with_slope"
+    assert result.machines["bad"].scale_by == ()
+    assert {each.scale for each in result.corrections if each.machine == "bad"} == {0.0}
 
 
 def test_rain_between_two_machines_is_not_their_error() -> None:

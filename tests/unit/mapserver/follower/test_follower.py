@@ -12,6 +12,9 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
+from mapserver.fleet.calibration import MachineState
+from mapserver.fleet.correction import Correction
+from mapserver.fleet.decisions import SOLVER, CalibrationDecision
 from mapserver.follower import follower, refolding
 from mapserver.follower.follower import Follower
 from mapserver.follower.jobs import Archiving, Audit
@@ -19,6 +22,7 @@ from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.reader import JournalReader
+from mapserver.trust.judgement import Reason
 from protocol.errors import QueryError, StoreError
 from protocol.queries.answers import GroundChange
 from protocol.site.ground_classes import ZONES
@@ -285,9 +289,9 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
 # --- the audit -------------------------------------------------------------------------------------------------------
 
 
-def audit_of(writer: Writer, reader: JournalReader, report: Any, judge_s: float = 1e-9) -> Audit:
+def audit_of(writer: Writer, reader: JournalReader, report: Any, judge_s: float = 1e-9, states: Any = dict) -> Audit:
     writer.config = ServerConfig(trust=TrustConfig(judge_s))
-    return Audit(writer, reader, report, threading.Event())
+    return Audit(writer, reader, report, states, threading.Event())
 
 
 def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(store, monkeypatch):
@@ -300,10 +304,34 @@ def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(
 
     audit = audit_of(writer, reader, lambda *report: reports.append(report))
     audit.run()
-    monkeypatch.setattr(reader, "read", damaged)
+    monkeypatch.setattr(reader, "read_many", damaged)
     with pytest.raises(StoreError):
         audit.run()
     assert [(list(verdicts), stamp_ns) for verdicts, stamp_ns in reports] == [(["a"], NOW_NS + 4 * 10**9)] * 2
+
+
+def test_corrected_samples_are_judged_also_those_that_came_before_the_correction(store):
+    writer, reader = store
+    sent = fleet({})
+    for rows in sent["c"]:  # its torque reads too much, and most of it is spent on a slope
+        rows["c_rr"] += 0.6 * (rows["c_rr"] + rows["grade_e"])
+    for name, (first, second) in sent.items():
+        send(writer, [incoming(np.concatenate([first, second]), 1, name)])
+    states: dict[str, MachineState] = {}
+    audit = audit_of(writer, reader, lambda *_: None, states=lambda: states)
+    audit.run()
+    assert audit.verdicts["c"].reasons
+    states["c"] = MachineState(0.0, 0.001, 0.6, 0.01, 0.0, 0.001, (), (), (0.0, 13.0))
+    with closing(refolding.Refolding(writer, past_of(writer))) as refolds:
+        whole = Correction("c", 0, 2**62, 0.0, 0.375, 0.0, ())
+        refolds.wait(refolds.decide(CalibrationDecision("c", SOLVER, "", NOW_NS, (whole,))), 20.0)
+    audit.run()
+    assert audit.verdicts["c"].reasons == (Reason.BEYOND_DATA_SHEET,)
+    assert audit.verdicts["c"].evidence["gain"] == pytest.approx(1.0, abs=0.02)
+    states.clear()
+    audit.run()
+    assert not audit.verdicts["c"].contradicts
+    assert not any(audit.verdicts[name].contradicts for name in "abd")
 
 
 @pytest.mark.parametrize(("judge_s", "times"), [(1e-9, 3), (60.0, 1)])

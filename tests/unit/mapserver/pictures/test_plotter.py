@@ -135,6 +135,15 @@ def test_drawing_leaves_the_region_as_it_was():
     assert (here["resistance"] == np.float32(0.04)).all()
 
 
+def test_notes_stand_below_the_legend():
+    ground = region(20, 20, resistance=0.02)
+    plain = draw_resistance(ground)
+    noted = draw_resistance(ground, notes=["a: zero -0.0034 +- 0.0005, heights and crossings of headings", "b"])
+    assert noted.shape[1] > plain.shape[1]
+    below = slice(frame.TOP + 6 * frame.LINE_PX, frame.TOP + 8 * frame.LINE_PX)
+    assert (noted[below, -120:] < 128).any()
+
+
 def test_side_by_side_pads_the_smaller():
     small, large = (np.zeros((size, size, 3), np.uint8) for size in (10, 20))
     pair = side_by_side([small, large])

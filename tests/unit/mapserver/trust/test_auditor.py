@@ -139,7 +139,9 @@ def test_a_machine_whose_corrected_samples_agree_is_accused_of_what_was_correcte
     verdicts = auditor.verdicts(known | {"d": state(*off)})
     assert accused(verdicts) == {"d": (Reason.BEYOND_DATA_SHEET,)}
     evidence = verdicts["d"].evidence
-    assert (evidence["zero"], evidence["scale"]) == off
+    assert (evidence["zero"], evidence["torque_gain"]) == (off[0], pytest.approx(1 + off[1]))
+    assert (evidence["zero_std"], evidence["torque_gain_std"]) == (0.001, 0.01)
+    assert (evidence["zero_by"], evidence["torque_gain_by"]) == (("heights",), ("edges",))
     assert evidence["excess"]["beyond_data_sheet"] > 1
     assert evidence["agrees_with"] == ("a", "b", "c")
     assert accused(auditor.verdicts(known | {"d": state(0.02, 0.29)})) == {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import threading
 from argparse import Namespace
@@ -299,9 +300,11 @@ def test_commands_need_their_words(words: list[str]):
 def test_machines_are_a_table_for_people(server: FakeServer, capsys):
     assert sitegrid(server, "query", "machines") == 0
     head, first, second = capsys.readouterr().out.splitlines()
-    assert head.split() == ["machine", "trusted", "since", "samples", "lost", "newest", "why"]
-    assert first.split() == ["a", "yes", "-", "1200", "3", "2025-06-15", "15:06:40Z", "-"]
-    assert second.startswith("b        NO, by audit  2025-06-15 15:07:40Z  7        0     2025-06-15 15:06:40Z  gain")
+    named = ["machine", "trusted", "since", "samples", "lost", "newest", "accelerometer zero", "torque gain", "why"]
+    assert re.split("  +", head) == named
+    assert re.split("  +", first) == ["a", "yes", "-", "1200", "3", "2025-06-15 15:06:40Z", "-", "-", "-"]
+    assert second.startswith("b        NO, by audit  2025-06-15 15:07:40Z  7        0     2025-06-15 15:06:40Z  ")
+    assert second.endswith("  measures 1.60 times the resistance that the others do")
     assert sitegrid(server, "query", "--after", "3", "machines", "--json") == 0
     assert json.loads(capsys.readouterr().out) == {"machines": plain(MACHINES)}
     assert server.asked[-1] == MachinesQuery(Freshness(3))

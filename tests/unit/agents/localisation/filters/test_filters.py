@@ -186,6 +186,21 @@ def test_ukf_is_nearer_to_the_truth_than_ekf_where_the_heading_is_uncertain() ->
     assert ukf_P < 0.4 * ekf_P
 
 
+@pytest.mark.parametrize("kind", BOTH, ids=name)
+def test_a_machine_that_reckons_moves_as_its_mean_does_and_is_as_unsure_of_it(kind: Filter) -> None:
+    """A heading known to 0.5 rad: the mean of all places lies a metre short, at the centre of an arc's chord."""
+    x = np.zeros(15)
+    x[VELOCITY] = 10.0, 0.0, 0.0
+    belief = believed(x, np.diag([*[0.01] * 5, 0.25, *[0.01] * 9]))
+    model = MotionModel(Layout())
+    reckoned, placed = (
+        kind.predict(belief, motion(replace(model, reckons=reckons), belief, 1.0), 1) for reckons in (True, False)
+    )
+    np.testing.assert_allclose(reckoned.x, motion(model, belief, 1.0).f(x[None])[0])
+    np.testing.assert_array_equal(reckoned.P, placed.P)
+    assert reckoned.P[0, 0] > (reckoned.x[0] - placed.x[0]) ** 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BOTH, ids=name)
 def test_it_is_as_sure_as_it_is_right(kind: Filter) -> None:

@@ -1,0 +1,158 @@
+"""One case: its samples through the server's ledger, solver, trust, correction, fold and read, and the maps judged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from evaluation.fleet.cases import FleetCase, Rows, Tampered, tampered
+from evaluation.fleet.drives import Scene
+from evaluation.fleet.true_errors import INTERIOR_M, TrueError, true_errors
+from evaluation.maps.cases import CELL_M
+from evaluation.maps.score import border_distance, driven_cells
+from mapserver.config import ServerConfig
+from mapserver.evidence.fold_config import is_foldable
+from mapserver.evidence.grid import Grid
+from mapserver.fleet.calibration import Calibration, calibrate
+from mapserver.fleet.correction import Correction, corrected
+from mapserver.fleet.ledger import Ledger
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD
+from mapserver.query.views import read_cells, view_of
+from mapserver.trust.auditor import Auditor
+from protocol.arrays import Bools, Floats, Ints, Table
+from protocol.queries.answers import MapVersion, Region
+from protocol.site.geometry import CellWindow
+from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
+
+MAPS = ("before", "after", "oracle")
+FIGURES = ("wrong_pct", "interior_pct", "slope_pct")
+BATCH = 100  # samples of one machine at a time, as trust sees them
+
+
+@dataclass(frozen=True)
+class JudgedMap:
+    """One map: FIGURES by name; of its cells (rows, columns) the classes, estimated and true, and which were passed."""
+
+    figures: Mapping[str, float]
+    estimated: Ints
+    true: Ints
+    passed: Bools
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """One case with one seed, each map by its name. zeros, scales: errors of the corrections, over their std too.
+
+    common: whether the common scale is observed, and why not. distrusted: by trust, with reasons.
+    """
+
+    maps: Mapping[str, JudgedMap]
+    zeros: Floats
+    scales: Floats
+    normalised: Floats
+    common: tuple[bool, str]
+    distrusted: Mapping[str, str]
+
+
+def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
+    """Calibrate a case's samples, and judge its maps."""
+    data = tampered(case, recorded, true)
+    names = sorted(data.rows)
+    distrusted = accused(data.rows, calibrated(data.rows))
+    result = calibrated(data.rows, set(distrusted))
+    let_in = {names[index] for index in case.let_in}
+    shown = [name for name in names if name in let_in or name not in distrusted]
+    errors = {name: true_errors(data, name, true, case.spans) for name in shown}
+    by_truth = {name: [_as_correction(name, error) for error in errors[name]] for name in shown}
+    own = {name: of_machine(result, name) for name in shown}
+    of_maps: tuple[Mapping[str, Sequence[Correction]], ...] = (dict.fromkeys(shown, ()), own, by_truth)
+    maps = {
+        title: judged({name: corrected(data.rows[name], of_map[name]) for name in shown}, data, true)
+        for title, of_map in zip(MAPS, of_maps, strict=True)
+    }
+    off = [_off(data.rows[name], own[name], error) for name in shown for error in errors[name]]
+    zeros, scales, zero_std, scale_std = np.array(off).T
+    normalised = np.concatenate([zeros / zero_std, scales / scale_std])
+    common = result.common.observed, result.common.reason
+    return CaseResult(maps, zeros, scales, normalised, common, distrusted)
+
+
+def of_machine(result: Calibration, name: str) -> list[Correction]:
+    """The corrections of one machine."""
+    return [each for each in result.corrections if each.machine == name]
+
+
+def accused(rows: Rows, result: Calibration) -> dict[str, str]:
+    """Machines that the server's trust excludes, and why: it judges corrected samples, which come in turn."""
+    auditor = Auditor(CELL_M)
+    right = {name: corrected(table, of_machine(result, name)) for name, table in rows.items()}
+    for first in range(0, max(map(len, right.values())), BATCH):
+        for name, table in sorted(right.items()):
+            auditor.add(name, table[first : first + BATCH])
+    verdicts = auditor.verdicts(result.machines)
+    return {name: ", ".join(verdict.reasons) for name, verdict in verdicts.items() if verdict.contradicts}
+
+
+def calibrated(rows: Rows, excluded: Collection[str] = ()) -> Calibration:
+    """What the server's ledger and solver make of samples."""
+    config, stays = ServerConfig(), {}
+    for name, table in rows.items():
+        ledger = Ledger()
+        ledger.add(table[is_foldable(table, config.fold)])
+        stays[name] = ledger.stays()
+    return calibrate(stays, excluded)
+
+
+def judged(rows: Rows, data: Tampered, true: Scene) -> JudgedMap:
+    """The server's map of these samples, over the cells that the machines truly passed."""
+    truth, config, c_rr = true.truth, ServerConfig(), data.c_rr
+    lines, columns = c_rr.shape
+    window = CellWindow(round(truth.west_m / truth.cell_m), round(truth.south_m / truth.cell_m), columns, lines)
+    grid = Grid(truth.cell_m, config.fold)
+    for name, table in rows.items():
+        grid.fold(table, name)
+    layers = read_cells(view_of(grid, window, config), window, ("resistance",), truth.cell_m, config)
+    estimated, classes = resistance_class(layers["resistance"]), resistance_class(c_rr)
+    passed = driven_cells(_region(true), [true.tracks[name].place_m for name in data.passed_by or rows]) & (
+        classes != UNKNOWN
+    )
+    inner = passed & (border_distance(classes, truth.cell_m) > INTERIOR_M)
+    steep = passed & (slope_class(truth.grade_east, truth.grade_north) == SLOPE)
+
+    def wrong(where: Bools) -> float:
+        return wrong_percent(estimated[where], classes[where])
+
+    figures = dict(zip(FIGURES, map(wrong, (passed, inner, steep)), strict=True))
+    return JudgedMap(figures, estimated, classes, passed)
+
+
+def _region(true: Scene) -> Region:
+    """The cells of a scene, without layers."""
+    truth = true.truth
+    lines, columns = truth.c_rr.shape
+    x_m, y_m = (
+        np.asarray(corner + (np.arange(n) + 0.5) * truth.cell_m, np.float64)
+        for corner, n in ((truth.west_m, columns), (truth.south_m, lines))
+    )
+    return Region(x_m, y_m, truth.cell_m, {}, MapVersion("", 0, 0), 0)
+
+
+def _as_correction(name: str, error: TrueError) -> Correction:
+    """What takes the true error off."""
+    scale = error.scale / (1 + error.scale)
+    return Correction(name, error.from_ns, error.to_ns, error.zero, scale, error.across, ())
+
+
+def _off(rows: Table, own: Sequence[Correction], error: TrueError) -> tuple[float, float, float, float]:
+    """Errors of a machine's corrections, of the zero and of the scale k, and what they state as standard deviation."""
+    if not own:
+        return -error.zero, -error.scale, ZERO_STD, SCALE_STD
+    stamps = rows["stamp_ns"][(rows["stamp_ns"] >= error.from_ns) & (rows["stamp_ns"] < error.to_ns)]
+    count = np.array([((stamps >= each.from_ns) & (stamps < each.to_ns)).sum() for each in own], np.float64)
+    weight = count / count.sum()
+    zero, scale = weight @ [each.zero for each in own], weight @ [each.scale / (1 - each.scale) for each in own]
+    zero_var, scale_var = (weight @ [each.covariance[i][i] for each in own] for i in (0, 1))
+    return zero - error.zero, scale - error.scale, math.sqrt(zero_var), math.sqrt(scale_var)

@@ -1,0 +1,56 @@
+"""What an answer says of a machine, in words for people: why it is judged so, and how it is calibrated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+from protocol.queries.answers import MachineState
+
+MOST_LISTED = 12  # machines beside a picture
+
+
+def why(machine: MachineState) -> str:
+    """In what it contradicts the others or its data sheet, and what was decided about it; empty for nothing."""
+    said = [_sentence(reason, machine.evidence) for reason in machine.reasons]
+    if machine.reason != ", ".join(machine.reasons):
+        said.append(machine.reason)
+    return "; ".join(filter(None, said))
+
+
+def _sentence(reason: str, evidence: Mapping[str, Any]) -> str:
+    """A reason with its figures; its name where it has none, or where a newer server says other things."""
+    with suppress(KeyError):
+        match reason:
+            case "gain":
+                return f"measures {evidence['gain']:.2f} times the resistance that the others do"
+            case "offset":
+                return f"places {math.hypot(evidence['offset_east_m'], evidence['offset_north_m']):.1f} m off"
+            case "clock":
+                return f"clock {evidence['clock_s']:+.0f} s off"
+            case "disagrees":
+                return f"agrees with the others on {100 * evidence['agreement']:.0f} % of the ground"
+            case "beyond_data_sheet":
+                off = f"torque reads {evidence['torque_gain']:.2f} times what it should"
+                return f"beyond its data sheet: {off}, accelerometer {evidence['zero']:.4f} off; a person may let it in"
+    return reason
+
+
+def calibrated(machine: MachineState, name: str) -> str:
+    """The figure `zero` or `torque_gain`, how sure it is, and what shows it; empty where nothing is known."""
+    known = machine.evidence
+    if name not in known:
+        return ""
+    return f"{known[name]:.4f} +- {known[f'{name}_std']:.4f}, {'+'.join(known[f'{name}_by']) or 'data sheet'}"
+
+
+def calibrations(machines: Sequence[MachineState]) -> list[str]:
+    """Two lines for each machine that has a calibration which the ground shows, if they are not too many."""
+    known = [one for one in machines if one.evidence.get("zero_by") or one.evidence.get("torque_gain_by")]
+    lines = []
+    for machine in known[:MOST_LISTED]:
+        lines.append(f"{machine.name}: zero {calibrated(machine, 'zero')}")
+        lines.append(f"  torque x {calibrated(machine, 'torque_gain')}")
+    return [*lines, f"and of {len(known) - MOST_LISTED} more"] if len(known) > MOST_LISTED else lines

@@ -1,0 +1,58 @@
+"""Answers about machines in words: each reason with its figures, calibrations with what shows them."""
+
+from typing import Any
+
+import pytest
+
+from protocol.queries.explanations import MOST_LISTED, calibrated, calibrations, why
+from tests.unit.records import machine_state
+
+CALIBRATED = {"zero": -0.0034, "zero_std": 0.0005, "torque_gain": 1.49, "torque_gain_std": 0.012}
+CALIBRATED |= {"zero_by": ("heights", "crossings"), "torque_gain_by": ()}
+
+
+@pytest.mark.parametrize(
+    ("reasons", "evidence", "words"),
+    [
+        (("offset",), {"offset_east_m": 3.0, "offset_north_m": -4.0}, "places 5.0 m off"),
+        (("clock",), {"clock_s": -600.0}, "clock -600 s off"),
+        (("disagrees",), {"agreement": 0.41}, "agrees with the others on 41 % of the ground"),
+        (
+            ("beyond_data_sheet",),
+            CALIBRATED,
+            (
+                "beyond its data sheet: torque reads 1.49 times what it should, accelerometer -0.0034 off; "
+                "a person may let it in"
+            ),
+        ),
+        (("gain", "stuck"), {"gain": 0.6}, "measures 0.60 times the resistance that the others do; stuck"),
+        (("offset",), {}, "offset"),
+        (("new",), {}, "new"),
+    ],
+)
+def test_reasons_are_said_in_words_with_their_figures(
+    reasons: tuple[str, ...], evidence: dict[str, Any], words: str
+) -> None:
+    decided = {"reason": ", ".join(reasons), "by": "audit"}
+    assert why(machine_state("b", reasons=reasons, evidence=evidence, **decided)) == words
+    person = machine_state("b", reasons=reasons, evidence=evidence, by="person", reason="hit a wall")
+    assert why(person) == f"{words}; hit a wall"
+
+
+def test_the_calibration_of_a_machine_says_what_shows_it() -> None:
+    machine = machine_state("b", evidence=CALIBRATED)
+    assert calibrated(machine, "zero") == "-0.0034 +- 0.0005, heights+crossings"
+    assert calibrated(machine, "torque_gain") == "1.4900 +- 0.0120, data sheet"
+    assert calibrated(machine_state("b"), "zero") == ""
+    assert why(machine) == ""
+
+
+def test_calibrations_that_the_ground_shows_are_listed_and_no_others() -> None:
+    unknown = CALIBRATED | {"zero_by": ()}
+    machines = [machine_state("a", evidence=CALIBRATED), machine_state("b", evidence=unknown), machine_state("c")]
+    assert calibrations(machines) == [
+        "a: zero -0.0034 +- 0.0005, heights+crossings",
+        "  torque x 1.4900 +- 0.0120, data sheet",
+    ]
+    many = calibrations([machine_state(f"m{i}", evidence=CALIBRATED) for i in range(MOST_LISTED + 3)])
+    assert (len(many), many[-1]) == (2 * MOST_LISTED + 1, "and of 3 more")
