@@ -54,7 +54,7 @@ class Calibrating:
         self._ledgers: dict[str, Ledger] = {}
         self._followed = 0
         self._from_ns: int | None = None  # of samples that are read: until it has caught up, those of the last days
-        self._solved_ns: int | None = None
+        self._solved_ns = self._now_ns()  # or the start: what was known by then is decided already
         self._due_s = 0.0
         self._turn = threading.Lock()  # of all that is used here: `solve` is for any thread
 
@@ -68,7 +68,7 @@ class Calibrating:
             if not self._follow(TURN_SAMPLES) or time.monotonic() < self._due_s:
                 return
             now_ns = self._now_ns()
-            if self._solved_ns is not None and self._solved_ns <= now_ns < self._solved_ns + EVERY_NS:
+            if self._solved_ns <= now_ns < self._solved_ns + EVERY_NS:
                 return
             solved = self._solve(now_ns)
             if self._writer.config.calibration.automatic and not self._ending.is_set():
