@@ -14,7 +14,7 @@ import numpy as np
 from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.observability import CommonScale, Observed, observe
-from mapserver.fleet.passages import Epochs
+from mapserver.fleet.passages import Epochs, sound
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, against, estimate, problem
 from protocol.arrays import Bools, Floats, Table
 from protocol.site.site_config import KnownGround
@@ -68,7 +68,7 @@ def calibrate(
     c_rr the site states. priors: of machines of which more is known than their data sheet.
     """
     priors = priors or {}
-    known = {name: table for name, table in ledgers.items() if len(table)}
+    known = {name: stays for name, table in ledgers.items() if len(stays := sound(table))}
     trusted = {name: table for name, table in known.items() if name not in excluded}
     if not trusted:
         return Calibration((), {}, CommonScale(False, SCALE_STD, "no_machine"))

@@ -495,3 +495,13 @@ def test_nothing_is_solved_of_nothing() -> None:
     assert solve({"a": drive(LOW, seconds=10.0)}, ("a",)).corrections == ()
     one = solve({"a": drive(LOW, seconds=10.0)[:1]})
     assert one.machines["a"].zero == 0.0
+
+
+@pytest.mark.parametrize("excluded", [(), ("flood",)])
+def test_a_machine_that_sends_nothing_but_nonsense_keeps_nobody_from_being_calibrated(
+    excluded: tuple[str, ...],
+) -> None:
+    rows = drive(LOW, seconds=10.0)[:1]
+    result = solve(fleet() | {"flood": np.repeat(rows, 5000)}, excluded)
+    assert result.corrections == usual().corrections
+    assert solve({"flood": np.repeat(rows, 5000)}).machines == {}

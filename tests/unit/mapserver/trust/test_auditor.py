@@ -157,6 +157,13 @@ def test_a_machine_at_fault_is_no_measure_for_the_others() -> None:
     assert by_right == pytest.approx(1.0, abs=0.01)
 
 
+def test_a_machine_whose_clock_is_off_measures_the_ground_like_any_other() -> None:
+    late = fleet(0, GOOD, GOOD, {"gain": 1.1, "clock_s": -400.0})
+    verdicts = audit(late)
+    assert accused(verdicts) == {"c": (Reason.CLOCK,)}
+    assert verdicts["a"].evidence["gain"] < 0.99
+
+
 def test_gain_and_displacement_of_corrected_samples_are_told_apart() -> None:
     """The gain is corrected, and the offset stays: it is no business of calibration."""
     auditor = Auditor(1.0)
