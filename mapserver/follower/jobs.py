@@ -74,12 +74,11 @@ class Audit:
             self._begin()
         until = self._reader.last_row  # what comes in meanwhile waits for the next turn: a busy site has no end
         for rows in self._reader.read_many(after=max(self._followed, self._reader.archived_row), until=until):
-            machine = np.repeat(rows.machine, rows.lengths)
-            for row in replace(rows, samples=corrections.applied(rows.samples, rows.machines, machine)):
-                self._auditor.add(row.machine, row.rows)
-                self._followed = row.row
-                if self._ending.is_set():
-                    return
+            samples = corrections.applied(rows.samples, rows.machines, np.repeat(rows.machine, rows.lengths))
+            self._auditor.add_all(replace(rows, samples=samples))
+            self._followed = int(rows.numbers[-1])
+            if self._ending.is_set():
+                return
 
 
 class ChangeSearch:

@@ -20,6 +20,7 @@ from mapserver.follower.follower import Follower
 from mapserver.follower.jobs import Archiving, Audit
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
+from mapserver.journal import reader as journal_reader
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.judgement import Reason
@@ -344,7 +345,9 @@ def test_machines_are_judged_so_often(store, judge_s, times):
     assert len(reports) == times
 
 
-def test_an_audit_that_is_to_end_ends_after_a_row(store):
+def test_an_audit_that_is_to_end_ends_after_what_it_read(store, monkeypatch):
+    monkeypatch.setattr(journal_reader, "BYTES_AT_ONCE", 1)
+    monkeypatch.setattr(journal_reader, "ROWS_AT_ONCE", 1)
     writer, reader = store
     send(writer, [incoming(samples(5), machine=name) for name in "abc"])
     audit = audit_of(writer, reader, lambda *_: None)
