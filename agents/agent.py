@@ -96,6 +96,7 @@ class Agent:
             if clock() >= second_s:
                 second_s = clock() + EVERY_S
                 self._write()
+                self._consider_offer()
                 self._calibration_file.write(self._pipeline.calibration)
                 self._yield_name()
                 self._presence.show_health(self._newest_ns, self.report(driver))
@@ -165,6 +166,12 @@ class Agent:
             return
         self._spool_problem = ""
         self._uplink_thread.wake()
+
+    def _consider_offer(self) -> None:
+        """Hand what the map server offers to the calibration, once."""
+        offer, self._uplink.offer = self._uplink.offer, None  # one that comes in between comes again
+        if offer is not None:
+            self._pipeline.consider(offer)
 
     def _yield_name(self) -> None:
         """Send nothing while an earlier agent of the same name runs; the samples wait in the spool."""

@@ -207,6 +207,10 @@ class Pipeline:
         self._sampler.withheld["no_pose"] += self._sampler.waiting
         return samples
 
+    def consider(self, offer: Any) -> None:
+        """Judge what the map server offers for the calibration."""
+        self._estimator.consider(offer)
+
     @property
     def calibration(self) -> Calibration:
         """The calibration that the ground estimator has by now."""

@@ -13,6 +13,7 @@ It is one module because an action and the event that it leads to are read toget
 import math
 from collections import Counter
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -157,7 +158,7 @@ class Uplink:
 
     held: why nothing is sent although it could be, empty if it is. problem: what keeps samples from the server now;
     stuck: the same, where only a person can mend it. ack_s_max: the longest time from the first sending of a batch
-    until samples of it were acknowledged.
+    until samples of it were acknowledged. offer: the last that came for the machine's calibration, None for none.
     """
 
     def __init__(
@@ -173,6 +174,7 @@ class Uplink:
         self.counters: Counter[str] = Counter()
         self.problem = self.stuck = self.held = ""
         self.ack_s_max = 0.0
+        self.offer: Any = None
         self._frame = frame
         self._pacing = pacing or Pacing()
         self._rng = rng or np.random.default_rng()
@@ -259,6 +261,7 @@ class Uplink:
             self.stuck = self.problem
             return self._back_off()
         self._compare_row(ack, head)
+        self.offer = self.offer if ack.offer is None else ack.offer
         if not len(head.rows):  # an earlier run is closed, even if the server is older than the run
             return Delete(head.spool_id, max(ack.watermark, head.first_seq - 1), ack.store)
         if head.newest is not None and ack.watermark > head.newest:

@@ -19,8 +19,10 @@ import numpy as np
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.balance import Balance
 from agents.estimation.closed_tours import Tour
+from agents.estimation.offers import intersected
 from protocol.arrays import Floats
 from protocol.machine.samples import APPLIED, LIMITS
+from protocol.wire.messages import CalibrationOffer
 
 # Standard deviations before anything is measured: of the zero, as a share of gravity (0.044 m/s2), and of the scale of
 # drive force over weight.
@@ -36,6 +38,7 @@ KEPT = 400  # stretches: 200 m of distance
 MOST_ZERO, MOST_SCALE = (LIMITS[name][1] for name in APPLIED)  # that a sample may state as applied
 FLOOR = 0.0007  # error of the model: no number of pairs makes the zero surer than this, or the scale than ten times it
 GATE_SIGMA = 3.0  # pairs further off are excluded
+GATE_OFFER_SIGMA = 4.0  # an offer is of many samples: further off, one of both is wrong, and a person has to look
 # So many excluded in a row are right, and the calibration is wrong: a sensor worse than its class. Tours are minutes
 # apart, stretches half a metre.
 RELOCK, RELOCK_TOURS = 12, 3
@@ -46,7 +49,8 @@ EDGE_M = 3.0  # a machine is on known ground so far inside, and twice the standa
 class Calibration:
     """Zero and scale error of the balance [-] with covariance (2, 2); stamp_ns: of the newest reading behind it, or 0.
 
-    passages: how many pairs, known stretches and tours it comes from.
+    passages: how many pairs, known stretches and tours it comes from. offer_ns: stamp of the last offer of the map
+    server that is in it, or 0.
     """
 
     zero: float
@@ -54,6 +58,7 @@ class Calibration:
     covariance: tuple[tuple[float, float], tuple[float, float]]
     stamp_ns: int = 0
     passages: int = 0
+    offer_ns: int = 0
 
     def variance(self, share: float) -> float:
         """Variance that it leaves in a balance with this drive force over weight."""
@@ -91,7 +96,7 @@ class Calibrator:
         self._x = np.array([start.zero, start.scale])
         self._P = np.array(start.covariance)
         self._stamp_ns, self._passages = start.stamp_ns, start.passages
-        self._aged_ns = start.stamp_ns
+        self._aged_ns, self._offer_ns = start.stamp_ns, start.offer_ns
         self._past: deque[_Stretch] = deque(maxlen=KEPT)
         self._stretch: list[Balance] = []  # of the present stretch
         self._excluded: list[float] = []  # innovations, since the last that passed the gate
@@ -102,7 +107,7 @@ class Calibrator:
         (zz, zs), (_, ss) = self._P.tolist()
         zz, ss = max(zz, FLOOR**2), max(ss, (10 * FLOOR) ** 2)  # raised variances keep a covariance definite
         zero, scale = np.clip(self._x, (-MOST_ZERO, -MOST_SCALE), (MOST_ZERO, MOST_SCALE)).tolist()
-        return Calibration(zero, scale, ((zz, zs), (zs, ss)), self._stamp_ns, self._passages)
+        return Calibration(zero, scale, ((zz, zs), (zs, ss)), self._stamp_ns, self._passages, self._offer_ns)
 
     def update(self, balance: Balance, dead_reckoning: DeadReckoning, known_c_rr: float | None) -> None:
         """Add a usable balance; known_c_rr: of the ground here, where the site states it."""
@@ -130,6 +135,21 @@ class Calibrator:
         """Add a closed tour."""
         self._learn(tour.stamp_ns, tour.zero, 0.0, tour.std**2, RELOCK_TOURS)
         self.counters["tours"] += 1
+
+    def take(self, offer: CalibrationOffer, now_ns: int) -> None:
+        """Take an offer of the map server, no surer than what is measured here, unless it contradicts that."""
+        self.age(now_ns)
+        passed_s = max(now_ns - offer.stamp_ns, 0) * 1e-9
+        offered: Floats = np.array([offer.zero, offer.scale])
+        zz = max(offer.zero_var, FLOOR**2) + ZERO_WALK**2 * passed_s
+        B: Floats = np.array([[zz, offer.covariance], [offer.covariance, max(offer.scale_var, (10 * FLOOR) ** 2)]])
+        off = offered - self._x
+        if float(off @ np.linalg.solve(self._P + B, off)) > GATE_OFFER_SIGMA**2:
+            self.counters["refused_offer_off"] += 1
+            return
+        self._x, self._P = intersected(self._x, self._P, offered, B)
+        self._offer_ns, self._stamp_ns = offer.stamp_ns, max(self._stamp_ns, offer.stamp_ns)
+        self.counters["offers"] += 1
 
     def age(self, stamp_ns: int) -> None:
         """Let the zero drift until a stamp; it is never less sure than at first."""

@@ -11,7 +11,7 @@ from agents.estimation.calibration import MOST_SCALE, MOST_ZERO, Calibration
 from protocol.errors import StoreError
 from protocol.files import PRIVATE, write_whole
 
-VERSION = 2
+VERSION = 3
 
 
 class CalibrationFile:
@@ -80,10 +80,10 @@ def _parse(path: Path, table: dict[str, Any]) -> Calibration:
     try:
         (zz, zs), (sz, ss) = ((float(a), float(b)) for a, b in table["covariance"])
         zero, scale = float(table["zero"]), float(table["scale"])
-        stamp_ns, passages = int(table["stamp_ns"]), int(table["passages"])
+        stamp_ns, passages, offer_ns = (int(table[name]) for name in ("stamp_ns", "passages", "offer_ns"))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StoreError(path, f"is no calibration: {error}") from None
     sound = math.isfinite(zero + scale + zz + zs + ss) and zz > 0 and ss > 0 and zs * zs <= zz * ss and zs == sz
-    if not (sound and abs(zero) <= MOST_ZERO and abs(scale) <= MOST_SCALE and stamp_ns >= 0 and passages >= 0):
+    if not (sound and abs(zero) <= MOST_ZERO and abs(scale) <= MOST_SCALE and min(stamp_ns, passages, offer_ns) >= 0):
         raise StoreError(path, "is no calibration: its numbers make no sense")
-    return Calibration(zero, scale, ((zz, zs), (sz, ss)), stamp_ns, passages)
+    return Calibration(zero, scale, ((zz, zs), (sz, ss)), stamp_ns, passages, offer_ns)

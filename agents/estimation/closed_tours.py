@@ -109,20 +109,29 @@ class ClosedTours:
         """Leave a mark in this cell, or close a tour if there is one."""
         cell, sums = (math.floor(pose.x_m / CELL_M), math.floor(pose.y_m / CELL_M)), self._sums
         mark = self._marks.setdefault(cell, sums)
-        if abs(sums.net_m - mark.net_m) < LEAST_M:
-            if len(self._marks) > KEPT:
-                del self._marks[next(iter(self._marks))]
+        if len(self._marks) > KEPT:
+            del self._marks[next(iter(self._marks))]
+        tour = _tour(balance, mark, sums)
+        if tour is None:
             return None
         while next(reversed(self._marks)) != cell:
             self._marks.popitem()
         self._sums = mark
-        return _tour(balance, mark, sums)
+        return tour
 
 
-def _tour(balance: Balance, start: _Mark, end: _Mark) -> Tour:
-    """What a tour from a mark back to its cell shows."""
+def _tour(balance: Balance, start: _Mark, end: _Mark) -> Tour | None:
+    """What a tour from a mark back to its cell shows; None where it is too short, or would close on a steep slope.
+
+    There the two places in the cell may differ by more height than all else; a cell after the slope serves as well.
+    """
     net_m, driven_m = end.net_m - start.net_m, end.driven_m - start.driven_m
+    if abs(net_m) < LEAST_M:
+        return None
     apart_m2 = CELL_M**2 / 6 + start.variance_m2 + end.variance_m2  # of two places in one cell, along an axis
     slope = math.hypot(math.tan(balance.slope_x), math.tan(balance.slope_y))
-    rise_m2 = CLOSING_M**2 + RISE_NOISE**2 * driven_m + apart_m2 * slope**2
-    return Tour(balance.stamp_ns, (start.rise_m - end.rise_m) / net_m, math.sqrt(rise_m2) / abs(net_m), net_m)
+    by_slope_m2, by_distance_m2 = apart_m2 * slope**2, CLOSING_M**2 + RISE_NOISE**2 * driven_m
+    if by_slope_m2 > by_distance_m2:
+        return None
+    std_m = math.sqrt(by_slope_m2 + by_distance_m2)
+    return Tour(balance.stamp_ns, (start.rise_m - end.rise_m) / net_m, std_m / abs(net_m), net_m)

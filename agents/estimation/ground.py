@@ -15,6 +15,7 @@ from agents.dead_reckoning import DeadReckoning
 from agents.estimation.balance import Balance, Balancer, BalanceStep
 from agents.estimation.calibration import UNCALIBRATED, ZERO_STD, Calibration, Calibrator
 from agents.estimation.closed_tours import ClosedTours
+from agents.estimation.offers import Offers
 from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility
 from agents.estimation.resistance_kalman import KalmanResistance
 from agents.estimation.resistance_rls import RecursiveGrade, RecursiveResistance
@@ -39,18 +40,23 @@ class EstimationConfig:
     estimator: "kalman", or "rls" (least squares with multiple forgetting, as the paper has it). mass: "message" (the
     machine's, and what payload readings add), "known" (the machine's alone) or "estimated" (from forces). calibrate:
     whether zero and scale of the force balance are found at work; closed_tours: by closed tours too, which takes a site
-    on which no track passes over another one.
+    on which no track passes over another one. accept_calibration: whether what the map server offers counts as well.
     """
 
     estimator: str = "kalman"
     mass: str = "message"
     calibrate: bool = True
     closed_tours: bool = True
+    accept_calibration: bool = False
 
     def __post_init__(self) -> None:
         for name, choices in (("estimator", ESTIMATORS), ("mass", MASSES)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: {getattr(self, name)!r} is none of {', '.join(choices)}")
+        if self.accept_calibration and not self.calibrate:
+            raise ValueError(
+                "accept_calibration: an offer is one estimate among the machine's own: set `calibrate` too"
+            )
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,7 @@ class GroundEstimator:
         self._plausibility = Plausibility()
         self._calibrator = Calibrator(calibration)
         self._tours = ClosedTours()
+        self._offers = Offers(machine.name, calibration.offer_ns if calibration else 0)
         self._applied = UNCALIBRATED
         estimates_mass = config.mass == "estimated"
         self._resistance: KalmanResistance | RecursiveResistance = (
@@ -148,6 +155,9 @@ class GroundEstimator:
                 "passages": applied.passages,
                 **self._calibrator.counters,
                 "torn": self._tours.torn,
+                "accepts_offers": self._config.accept_calibration,
+                "offer_ns": applied.offer_ns,
+                **self._offers.counters,
             },
         }
 
@@ -165,6 +175,11 @@ class GroundEstimator:
             self._step(balance, dead_reckoning, known_c_rr)
             if self._config.calibrate and self._config.closed_tours:
                 self._follow(balance, pose)
+
+    def consider(self, offer: Any) -> None:
+        """Judge what the map server offers, as it came; a good one counts when the calibration changes next."""
+        if self._config.accept_calibration:
+            self._offers.consider(offer, self._newest_reading_ns)
 
     def at(self, stamp_ns: int) -> GroundEstimate:
         """The estimate for a recent stamp, with the steps after it."""
@@ -236,6 +251,8 @@ class GroundEstimator:
     def _apply_calibration(self, stamp_ns: int) -> None:
         if self._config.calibrate:
             self._calibrator.age(stamp_ns)
+            if offer := self._offers.take():
+                self._calibrator.take(offer, stamp_ns)
             before, self._applied = self._applied, self._calibrator.calibration
             zero, scale = self._applied.zero - before.zero, self._applied.scale - before.scale
             if zero or scale:

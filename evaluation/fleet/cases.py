@@ -41,8 +41,8 @@ class FleetCase:
     """One case. machines: how many of a drive of the paper's site, or 0 for all of a scenario, take part.
 
     preset: of sensors, "" for those of the scenario. bad, let_in: machines by their place that have the faults of
-    `bad_machine`, and that are in the map by a person's decision, whatever trust says. spans: in which the true errors
-    are constant. first_s: so much of the recording.
+    `bad_machine`, and that are in the map by a person's decision, whatever trust says. calibrates, closed_tours: what
+    agents do by themselves. spans: in which the true errors are constant. first_s: so much of the recording.
     """
 
     name: str
@@ -54,6 +54,7 @@ class FleetCase:
     bad: tuple[int, ...] = ()
     let_in: tuple[int, ...] = ()
     calibrates: bool = True
+    closed_tours: bool = False
     spans: int = 1
     first_s: float = 0.0
 
@@ -120,6 +121,7 @@ TAMPERS: dict[str, Callable[[Rows, Scene, float], Tampered]] = {
 FLEETS = tuple(FleetCase(f"machines_{count}", machines=count) for count in (1, 2, 3, 4))
 CASES = (
     *FLEETS,
+    FleetCase("agents", closed_tours=True),
     FleetCase("first_180_s", first_s=180.0),
     FleetCase("reversing", "loading", machines=0, calibrates=False),
     FleetCase("loading", "loading", machines=0),

@@ -57,11 +57,12 @@ def planned(scenario: str, seed: int, seconds: float, count: int = 0, preset: st
 class Agent:
     """One machine of a drive, by its place among the names.
 
-    calibrates: by its own work; first_s: of the recording; bad: see `spoiled`.
+    calibrates: by its own work; closed_tours: by these as well; first_s: of the recording; bad: see `spoiled`.
     """
 
     index: int
     calibrates: bool = True
+    closed_tours: bool = False
     first_s: float = 0.0
     bad: bool = False
 
@@ -69,7 +70,13 @@ class Agent:
     def name(self) -> str:
         """Short and unique."""
         first = f"-{self.first_s:g}s" * (self.first_s > 0)
-        return f"machine{self.index}" + "-plain" * (not self.calibrates) + "-bad" * self.bad + first
+        return (
+            f"machine{self.index}"
+            + "-plain" * (not self.calibrates)
+            + "-tours" * self.closed_tours
+            + "-bad" * self.bad
+            + first
+        )
 
 
 @dataclass(frozen=True)
@@ -118,8 +125,9 @@ def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
         readings = tuple(reading for reading in readings if reading.stamp_ns <= end_ns)
     if task.variant.bad:
         machine, readings = spoiled(machine, readings)
-    options = PipelineConfig(estimation=EstimationConfig(calibrate=task.variant.calibrates))
-    return AgentSamples(np.asarray(final_samples(Pipeline(log.site, machine, options), readings)))
+    estimation = EstimationConfig(calibrate=task.variant.calibrates, closed_tours=task.variant.closed_tours)
+    pipeline = Pipeline(log.site, machine, PipelineConfig(estimation=estimation))
+    return AgentSamples(np.asarray(final_samples(pipeline, readings)))
 
 
 def spoiled(machine: MachineConfig, readings: Iterable[Reading]) -> tuple[MachineConfig, tuple[Reading, ...]]:

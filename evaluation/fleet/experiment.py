@@ -39,6 +39,7 @@ GOALS = (
     Goal({"case": "machines_3", "map": "after"}, "normalised", ">=", 0.3),
     *_goals("machines_3", normalised=1.5),
     *_goals("machines_1", wrong_pct=1.6),
+    Goal({"case": "agents", "map": "before"}, "rms_zero", "<=", 0.0012),
     *_goals("first_180_s", median_wrong_pct=3.5),
     *_goals("bad_machine", wrong_pct=2.8, above_oracle_pct=0.3),
     *(
@@ -90,22 +91,23 @@ def _drive(case: FleetCase, seed: int, seconds: float) -> FleetDrive:
 
 def _agents(case: FleetCase, drive: FleetDrive) -> list[Agent]:
     places = range(case.machines or drive.machines)
-    return [Agent(index, case.calibrates, case.first_s, index in case.bad) for index in places]
+    own = (case.calibrates, case.closed_tours)
+    return [Agent(index, *own, case.first_s, index in case.bad) for index in places]
 
 
 def summarise(case: FleetCase, name: str, results: Sequence[CaseResult]) -> Row:
-    """One row: means over the seeds; errors of zeros and scales of `after` alone."""
+    """One row: means over the seeds; of `before` the errors of the zeros that agents applied in the end."""
     maps = [result.maps[name] for result in results]
     wrong = [each.figures["wrong_pct"] for each in maps]
     row: Row = {"case": case.name, "map": name}
     row |= {figure: _mean([each.figures[figure] for each in maps]) for figure in FIGURES}
     after = name == "after"
-    zeros, scales, normalised = (
-        np.concatenate([getattr(result, part) for result in results]) if after else np.zeros(0)
-        for part in ("zeros", "scales", "normalised")
+    zeros, scales, normalised, applied = (
+        np.concatenate([getattr(result, part) for result in results]) if name == of_map else np.zeros(0)
+        for part, of_map in (("zeros", "after"), ("scales", "after"), ("normalised", "after"), ("applied", "before"))
     )
     row |= {
-        "rms_zero": root_mean_square(zeros),
+        "rms_zero": root_mean_square(applied if name == "before" else zeros),
         "rms_scale": root_mean_square(scales),
         "normalised": float(np.mean(normalised**2)) if after else math.nan,
         "median_wrong_pct": float(np.median(wrong)),

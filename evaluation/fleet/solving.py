@@ -46,13 +46,15 @@ class JudgedMap:
 class CaseResult:
     """One case with one seed, each map by its name. zeros, scales: errors of the corrections, over their std too.
 
-    common: whether the common scale is observed, and why not. distrusted: by trust, with reasons.
+    applied: errors of the zeros that agents applied in the end. common: whether the common scale is observed, and why
+    not. distrusted: by trust, with reasons.
     """
 
     maps: Mapping[str, JudgedMap]
     zeros: Floats
     scales: Floats
     normalised: Floats
+    applied: Floats
     common: tuple[bool, str]
     distrusted: Mapping[str, str]
 
@@ -76,8 +78,9 @@ def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
     off = [_off(data.rows[name], own[name], error) for name in shown for error in errors[name]]
     zeros, scales, zero_std, scale_std = np.array(off).T
     normalised = np.concatenate([zeros / zero_std, scales / scale_std])
+    applied = np.array([data.rows[name]["applied_zero"][-1] - errors[name][-1].zero for name in shown], np.float64)
     common = result.common.observed, result.common.reason
-    return CaseResult(maps, zeros, scales, normalised, common, distrusted)
+    return CaseResult(maps, zeros, scales, normalised, applied, common, distrusted)
 
 
 def of_machine(result: Calibration, name: str) -> list[Correction]:

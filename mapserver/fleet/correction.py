@@ -99,6 +99,11 @@ class Corrections:
         hashed.update("/".join(one.machine for one, hit in zip(self.each, early, strict=True) if hit).encode())
         return hashed.hexdigest()
 
+    def newest(self, machine: str) -> Correction | None:
+        """The last one of a machine; None for none."""
+        _, end = self._places.get(machine, (0, 0))
+        return self.each[end - 1] if end else None
+
     def applied(self, rows: Table, machines: Sequence[str], machine: Ints) -> Table:
         """Samples (n,) without their machines' errors; those that no correction covers stay bytes as they were.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.fleet import decisions as calibration
-from mapserver.fleet.correction import Corrections
+from mapserver.fleet.correction import LAST_NS, Corrections
 from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions, NewerVersionError
 from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalQueries
@@ -16,6 +16,8 @@ from mapserver.journal.rows import Event
 from mapserver.trust import decisions as trust
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
 from protocol.errors import StoreError
+from protocol.wire.messages import CalibrationOffer
+from protocol.wire.offer_codec import encode_offer
 
 Decision = TrustDecision | CalibrationDecision
 KINDS = (trust.KIND, calibration.KIND)
@@ -39,6 +41,18 @@ class Decisions:
         """Have one more decision count; NewerVersionError where a newer version wrote it."""
         self._take(event)
         self._conclude(event.id)
+
+    def offer(self, machine: str) -> dict[str, Any] | None:
+        """What a machine may take for its own calibration, as an acknowledgement has it; None for nothing.
+
+        It is what is taken off its newest samples.
+        """
+        newest, decision = self.facts.corrections.newest(machine), self.calibration.newest(machine)
+        if not newest or not decision or newest.to_ns < LAST_NS or not newest.covariance:
+            return None
+        (zz, zs, _), (_, ss, _), _ = newest.covariance
+        offer = CalibrationOffer(machine, decision.stamp_ns, newest.zero, newest.scale, zz, ss, zs)
+        return encode_offer(offer)
 
     def _add_all(self, events: Iterable[Event], path: Path) -> None:
         number = 0

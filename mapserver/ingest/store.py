@@ -252,7 +252,8 @@ class Store:
         row = self.journal.append(admission, self._received_ns) if new else self.journalled
         if admission.lost and not new:
             self.journal.declare_lost(admission)
-        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces), admission
+        offer = self._decisions.offer(batch.machine) if new else None
+        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces, offer), admission
 
     def _newest_but(self, machine: str) -> int:
         """The newest stamp of the machines in the map but one."""

@@ -183,7 +183,8 @@ def encode_reply(reply: Ack | Refused) -> bytes:
     table: dict[str, Any]
     if isinstance(reply, Ack):
         table = {"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed}
-        return pack({**table, "store": reply.store} | ({"replaces": reply.replaces} if reply.replaces else {}))
+        table |= {"store": reply.store} | ({"replaces": reply.replaces} if reply.replaces else {})
+        return pack(table | ({"offer": reply.offer} if reply.offer else {}))
     table = {"ack": False, "reason": reply.reason, "problem": reply.problem, "expected": reply.expected}
     return pack(table | ({"retry_after_s": reply.retry_after_s} if reply.retry_after_s else {}))
 
@@ -193,7 +194,8 @@ def decode_reply(data: bytes) -> Ack | Refused:
     table = unpack(data, MAX_SMALL_BYTES)
     if take(table, "ack", bool):
         watermark, row, trimmed = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
-        return Ack(watermark, row, trimmed, take_store(table), take_store(table, "replaces", optional=True))
+        replaces = take_store(table, "replaces", optional=True)
+        return Ack(watermark, row, trimmed, take_store(table), replaces, table.get("offer"))
     expected, retry_after_s = _take_int(table, "expected", 0, MAX_SEQ), take(table, "retry_after_s", float, 0.0)
     if not 0 <= retry_after_s <= MAX_RETRY_S:
         problem = f"{retry_after_s} is not between 0 and {MAX_RETRY_S}"

@@ -44,11 +44,29 @@ class PackedBatch:
 
 
 @dataclass(frozen=True)
+class CalibrationOffer:
+    """What the map server takes off the newest samples of a machine, counted from what it measured.
+
+    zero, scale: as a sample states them. zero_var, scale_var, covariance: of what is left. stamp_ns: the site's now
+    when that was decided.
+    """
+
+    machine: str
+    stamp_ns: int
+    zero: float
+    scale: float
+    zero_var: float
+    scale_var: float
+    covariance: float
+
+
+@dataclass(frozen=True)
 class Ack:
     """Everything up to `watermark` is on the server's disk.
 
     row: the journal row; trimmed: samples it had already. store: id of the server's store; replaces: that of the batch,
-    where it is another one, whose place this store takes.
+    where it is another one, whose place this store takes. offer: a table of `CalibrationOffer`, or None; it is not
+    checked with the acknowledgement, which holds whatever is offered.
     """
 
     watermark: int
@@ -56,6 +74,7 @@ class Ack:
     trimmed: int = 0
     store: str = ""
     replaces: str = ""
+    offer: Any = None
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,17 @@ from protocol.queries import answers as records
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
 from protocol.wire import codec, correction_codec
-from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle, SiteCorrection
+from protocol.wire.messages import (
+    Ack,
+    CalibrationOffer,
+    Health,
+    Pose,
+    Refused,
+    SampleBatch,
+    SensorBundle,
+    SiteCorrection,
+)
+from protocol.wire.offer_codec import encode_offer
 
 FOLDER = Path(__file__).parent
 STORE = "0123456789abcdef"
@@ -130,6 +140,7 @@ def decode_correction(data: bytes) -> SiteCorrection:
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
 LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60, store=STORE)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
+OFFER = CalibrationOffer("loader-1", T0, 0.00390625, -0.0625, 2.0**-22, 2.0**-16, 2.0**-20)
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
 CORRECTION = SiteCorrection("0123abcd", Correction("base-1", T0, 1.25, -0.5, 0.25, 1.5, 45.0, 0.125, -0.0625, 0.0625))
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
@@ -198,6 +209,7 @@ GOLDEN: dict[str, Golden] = {
     "batch_empty.bin": Golden(ASK, codec.encode_batch, decode_batch),
     "ack.bin": Golden(Ack(43, 17, 2, STORE), codec.encode_reply, codec.decode_reply),
     "ack_replaces.bin": Golden(Ack(43, 17, 2, STORE, "fedcba9876543210"), codec.encode_reply, codec.decode_reply),
+    "ack_offer.bin": Golden(Ack(43, 17, 0, STORE, offer=encode_offer(OFFER)), codec.encode_reply, codec.decode_reply),
     "refused.bin": Golden(Refused("gap", "first_seq: 41: 12 is expected", 12), codec.encode_reply, codec.decode_reply),
     "refused_later.bin": Golden(
         Refused("overloaded", "too many batches are waiting", retry_after_s=1.5), codec.encode_reply, codec.decode_reply

@@ -13,10 +13,13 @@ import pytest
 from agents.agent import EVERY_S, SILENT_S, Agent, Places
 from agents.config import AgentConfig
 from agents.delivery.spool import Spool, SpoolConfig
+from agents.estimation.ground import EstimationConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from agents.sampling import LAG_S
 from protocol.machine.readings import Gps, Reading, Torque
+from protocol.wire.messages import CalibrationOffer
+from protocol.wire.offer_codec import encode_offer
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from tests.unit.agents.drives import S_BEND, SITE, VEHICLE, drive
 
@@ -175,3 +178,43 @@ def test_without_a_lag_nothing_is_ever_pending(session: Any, tmp_path: Path) -> 
     run(session, tmp_path, stream, config=config)
     assert {seen["pending"] for seen in stream.seen} == {0}
     assert in_spool(tmp_path).tobytes() == np.concatenate(by_pipeline(READINGS, config=config)).tobytes()
+
+
+class Offering(Stream):
+    """A stream during which the map server offers something."""
+
+    offer: Any = None
+
+    def read(self, timeout_s: float) -> Sequence[Reading] | None:
+        readings = super().read(timeout_s)
+        if readings and self.agent and self.now_s < 55.0:
+            self.agent._uplink.offer = self.offer  # as an acknowledgement does
+        return readings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("accepts", [True, False])
+def test_an_offer_reaches_the_samples_of_an_agent_that_accepts_it(session: Any, tmp_path: Path, accepts: bool) -> None:
+    stream = Offering([replace(r) for r in READINGS])
+    stamp_ns = READINGS[0].stamp_ns
+    stream.offer = encode_offer(CalibrationOffer(VEHICLE.name, stamp_ns, 0.004, 0.02, 4e-7, 2e-5, 0.0))
+    config = replace(CONFIG, estimation=EstimationConfig(accept_calibration=accepts))
+    report = run(session, tmp_path, stream, config=config)
+    calibration = report["pipeline"]["ground"]["calibration"]
+    assert calibration.get("offers", 0) == accepts
+    assert calibration["offer_ns"] == (stamp_ns if accepts else 0)
+    zeros = in_spool(tmp_path)["applied_zero"]
+    assert (np.abs(zeros - 0.004) < 1e-4).all() == accepts
+
+
+def test_a_bad_offer_is_counted_once_and_the_agent_goes_on(session: Any, tmp_path: Path) -> None:
+    stream = Stream(READINGS[:200])
+    config = replace(CONFIG, estimation=EstimationConfig(accept_calibration=True))
+    places = Places(tmp_path / "spool.db")
+    agent = stream.agent = Agent(session, SITE, VEHICLE, AgentConfig(config, linger_s=0.0), places)
+    agent._uplink.offer = {"zero": float("nan")}
+    try:
+        report = agent.run(stream, lambda: False, lambda: stream.now_s, stream.wait)
+    finally:
+        agent.close()
+    assert report["pipeline"]["ground"]["calibration"]["refused_offer_not_finite"] == 1

@@ -697,3 +697,16 @@ def test_a_run_remembers_its_store_when_the_spool_is_opened_again(tmp_path: Path
         spool.acknowledge(head.spool_id, 3, FIRST)
         spool.record(ROWS[3:4])
         assert spool.head(10).store == ""  # the new run is bound to none
+
+
+def test_an_offer_is_kept_from_an_acknowledgement_that_is_believed() -> None:
+    delivery = met(3)
+    delivery.payload()
+    delivery.reply(Ack(1, 1, store=FIRST, offer={"zero": 0.004}))
+    assert delivery.uplink.offer == {"zero": 0.004}
+    delivery.payload()
+    delivery.reply(Ack(2, 2, store=FIRST))
+    assert delivery.uplink.offer == {"zero": 0.004}
+    delivery.payload()
+    delivery.reply(Ack(3, 3, store="f" * 16, offer={"zero": 0.1}))  # of a store that the run is not bound to
+    assert delivery.uplink.offer == {"zero": 0.004}

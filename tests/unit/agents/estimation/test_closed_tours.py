@@ -201,10 +201,18 @@ def test_a_parked_machine_whose_position_wanders_shows_nothing() -> None:
 def test_a_tour_that_closes_on_a_slope_is_less_sure_by_its_places() -> None:
     on_level = Track(ramp).drive(*SQUARE, (20.0, 0.0)).shown[0]
     places = ((45.0, 0.0), *SQUARE[1:], (59.0, 0.0))
-    on_slope = Track(ramp).drive(*places).shown[0]
+    on_slope = Track(lambda x, y: ramp(x, y) / 2).drive(*places).shown[0]
     apart_m = math.sqrt(closed_tours.CELL_M**2 / 6 + 2 * 0.7**2)
-    expected = math.hypot(on_level.std * LAP_M, 0.2 * apart_m) / LAP_M
+    expected = math.hypot(on_level.std * LAP_M, 0.1 * apart_m) / LAP_M
     assert on_slope.std == pytest.approx(expected, rel=0.05)
+
+
+def test_a_tour_closes_after_a_steep_slope_and_not_on_it() -> None:
+    track = Track(lambda x, y: 2 * ramp(x, y)).drive((45.0, 0.0), *SQUARE[1:], (59.0, 0.0))
+    assert not track.shown
+    track.drive((59.0, 0.0), (75.0, 0.0))
+    assert [tour.zero for tour in track.shown] == pytest.approx([ZERO], abs=3e-4)
+    assert track.shown[0].std == pytest.approx(RISE_STD_M / LAP_M, rel=0.1)
 
 
 def test_short_tours_do_not_count_and_long_ones_are_surer() -> None:

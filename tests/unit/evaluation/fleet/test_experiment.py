@@ -98,6 +98,16 @@ def test_ramps_of_other_ground_leave_the_slope_alone(scene, step: float) -> None
         assert result.maps["after"].figures["slope_pct"] <= result.maps["before"].figures["slope_pct"] + 1.0
 
 
+def test_what_agents_took_off_themselves_is_judged_against_the_truth(scene) -> None:
+    rows, true = scene
+    sent = {name: table.copy() for name, table in rows.items()}
+    for table in sent.values():
+        table["applied_zero"][-1] = 0.004
+    result = solved(case("agents"), sent, true)
+    assert result.applied == pytest.approx([0.004 - errors.zero for _, errors in ROUTES.values()], abs=1e-3)
+    assert result.applied == pytest.approx(0.004 + solved(case("machines_3"), *scene).applied, abs=1e-4)
+
+
 def test_it_rains_for_the_machine_that_drives_late(scene) -> None:
     rows, true = scene
     data = tampered(case("rain"), rows, true)
@@ -125,16 +135,19 @@ def judged_map(*figures: float) -> JudgedMap:
 
 def test_rows_are_means_over_the_seeds() -> None:
     maps = dict.fromkeys(MAPS, judged_map(2.0, 1.0, np.nan))
-    one = CaseResult(maps, np.array([0.001]), np.array([0.02]), np.array([1.0, 2.0]), (True, ""), {})
+    one = CaseResult(maps, np.array([0.001]), np.array([0.02]), np.array([1.0, 2.0]), np.array([0.003]), (True, ""), {})
     other = CaseResult(
         {**maps, "after": judged_map(4.0, 1.0, np.nan)},
         np.array([-0.001]),
         np.array([0.0]),
         np.array([0.0, 0.0]),
+        np.array([-0.001]),
         (False, "no_slope_both_ways"),
         {"b": "offset"},
     )
-    after, before = (summarise(case("machines_2"), name, [one, other]) for name in ("after", "before"))
+    after, before, oracle = (
+        summarise(case("machines_2"), name, [one, other]) for name in ("after", "before", "oracle")
+    )
     assert (after["wrong_pct"], after["wrong_by_seed_pct"], after["max_wrong_pct"]) == (3.0, [2.0, 4.0], 4.0)
     assert (after["rms_zero"], after["rms_scale"], after["normalised"]) == (0.001, 0.0141, 1.25)
     assert (after["common_scale_observed"], after["reasons"]) == (1, ["no_slope_both_ways"])
@@ -143,20 +156,22 @@ def test_rows_are_means_over_the_seeds() -> None:
     assert before["wrong_pct"] == 2.0
     assert before["change_pct"] is None
     assert list(before) == list(after)
-    assert np.isnan(before["rms_zero"])
+    assert before["rms_zero"] == pytest.approx(np.sqrt(5) * 1e-3, abs=1e-6)
+    assert np.isnan(before["rms_scale"])
+    assert np.isnan(oracle["rms_zero"])
 
 
 def test_better_than_before_is_not_above_it() -> None:
     maps = {name: judged_map(wrong, wrong, wrong) for name, wrong in (("before", 9.0), ("after", 2.0))}
-    result = CaseResult({**maps, "oracle": maps["after"]}, *[np.zeros(1)] * 3, (True, ""), {})
+    result = CaseResult({**maps, "oracle": maps["after"]}, *[np.zeros(1)] * 4, (True, ""), {})
     row = summarise(case("machines_3"), "after", [result])
     assert (row["change_pct"], row["slope_change_pct"]) == (-7.0, -7.0)
     assert (row["above_before_pct"], row["max_above_before_pct"], row["above_oracle_pct"]) == (0.0, 0.0, 0.0)
 
 
 def test_goals_are_of_cases_and_figures_that_there_are() -> None:
-    result = CaseResult(dict.fromkeys(MAPS, judged_map(1.0, 1.0, 1.0)), *[np.zeros(1)] * 3, (True, ""), {})
-    rows = [summarise(each, "after", [result]) for each in CASES]
+    result = CaseResult(dict.fromkeys(MAPS, judged_map(1.0, 1.0, 1.0)), *[np.zeros(1)] * 4, (True, ""), {})
+    rows = [summarise(each, name, [result]) for each in CASES for name in MAPS]
     judgements = judge(experiment.GOALS, rows)
     assert len(judgements) == len(experiment.GOALS)
     assert {each["row"].split()[0] for each in judgements} <= {each.name for each in CASES}

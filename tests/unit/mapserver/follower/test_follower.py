@@ -13,8 +13,7 @@ import pytest
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import MachineState
-from mapserver.fleet.correction import Correction
-from mapserver.fleet.decisions import SOLVER, CalibrationDecision
+from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
 from mapserver.follower import follower, refolding
 from mapserver.follower.follower import Follower
 from mapserver.follower.jobs import Archiving, Audit
@@ -318,18 +317,17 @@ def test_corrected_samples_are_judged_also_those_that_came_before_the_correction
         rows["c_rr"] += 0.6 * (rows["c_rr"] + rows["grade_e"])
     for name, (first, second) in sent.items():
         send(writer, [incoming(np.concatenate([first, second]), 1, name)])
-    states: dict[str, MachineState] = {}
-    audit = audit_of(writer, reader, lambda *_: None, states=lambda: states)
+    whole = Corrections([Correction("c", 0, 2**62, 0.0, 0.375, 0.0, ())])
+    state = MachineState(0.0, 0.001, 0.6, 0.01, 0.0, 0.001, (), (), (0.0, 13.0))
+    known: list[Any] = [UNCORRECTED, {}]
+    audit = audit_of(writer, reader, lambda *_: None, known=lambda: known)
     audit.run()
     assert audit.verdicts["c"].reasons
-    states["c"] = MachineState(0.0, 0.001, 0.6, 0.01, 0.0, 0.001, (), (), (0.0, 13.0))
-    with closing(refolding.Refolding(writer, past_of(writer))) as refolds:
-        whole = Correction("c", 0, 2**62, 0.0, 0.375, 0.0, ())
-        refolds.wait(refolds.decide(CalibrationDecision("c", SOLVER, "", NOW_NS, (whole,))), 20.0)
+    known[:] = whole, {"c": state}
     audit.run()
     assert audit.verdicts["c"].reasons == (Reason.BEYOND_DATA_SHEET,)
     assert audit.verdicts["c"].evidence["gain"] == pytest.approx(1.0, abs=0.02)
-    states.clear()
+    known[1] = {}
     audit.run()
     assert not audit.verdicts["c"].contradicts
     assert not any(audit.verdicts[name].contradicts for name in "abd")

@@ -12,11 +12,14 @@ import numpy as np
 import pytest
 
 from mapserver.evidence import snapshot
+from mapserver.fleet.correction import LAST_NS, Correction
+from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.store import Store
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import Refusal, StoreError
-from protocol.wire.messages import Ack, Refused
+from protocol.wire.messages import Ack, CalibrationOffer, Refused
+from protocol.wire.offer_codec import decode_offer
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
@@ -474,3 +477,53 @@ def test_samples_that_are_missing_are_counted_until_they_are_declared_lost(tmp_p
     assert store.machines()["a"]["lost"] == 2
     assert "declared lost machine=a samples=2" in caplog.text
     store.close()
+
+
+# --- what is offered -------------------------------------------------------------------------------------------------
+
+COVARIANCE = ((4e-7, 1e-7, 0.0), (1e-7, 2e-5, 0.0), (0.0, 0.0, 1e-6))
+
+
+def calibrated(machine, *spans, by=SOLVER, stamp_ns=NOW_NS):
+    """A decision about a machine: spans of from_ns, to_ns, zero, covariance."""
+    corrections = tuple(Correction(machine, start, end, zero, 0.05, 0.0, cov) for start, end, zero, cov in spans)
+    return CalibrationDecision(machine, by, "", stamp_ns, corrections)
+
+
+def offered(store, machine="a"):
+    """What comes with the acknowledgement of one more sample."""
+    seq = store.journal.watermark(machine, 7).seq + 1
+    table = store.commit([incoming(samples(1), seq, machine=machine)])[0].offer
+    return table and decode_offer(table)
+
+
+def test_a_machine_is_offered_what_is_taken_off_its_newest_samples(store):
+    assert offered(store) is None
+    early, late = (0, NOW_NS, 0.001, COVARIANCE), (NOW_NS, LAST_NS, 0.004, COVARIANCE)
+    store.decide(calibrated("a", early, late))
+    assert offered(store) == CalibrationOffer("a", NOW_NS, 0.004, 0.05, 4e-7, 2e-5, 1e-7)
+    assert offered(store, "b") is None
+    store.decide(calibrated("a", (0, LAST_NS, 0.02, COVARIANCE), by=PERSON, stamp_ns=NOW_NS + 5))
+    assert (offered(store).zero, offered(store).stamp_ns) == (0.02, NOW_NS + 5)
+
+
+@pytest.mark.parametrize("span", [(0, NOW_NS, 0.004, COVARIANCE), (0, LAST_NS, 0.004, ())])
+def test_what_has_ended_or_is_of_unknown_quality_is_not_offered(store, span):
+    store.decide(calibrated("a", span))
+    assert offered(store) is None
+
+
+def test_a_machine_that_is_not_trusted_is_offered_nothing(store):
+    store.decide(calibrated("a", (0, LAST_NS, 0.004, COVARIANCE)))
+    store.decide(TrustDecision("a", trusted=False, by="person", reason="moved", stamp_ns=1))
+    assert offered(store) is None
+
+
+def test_an_acknowledgement_without_new_samples_offers_nothing(store):
+    store.decide(calibrated("a", (0, LAST_NS, 0.004, COVARIANCE)))
+    batch = incoming(samples(2))
+    assert store.commit([batch])[0].offer
+    assert store.commit([batch, incoming(samples(0), 3)]) == [
+        Ack(2, 1, trimmed=2, store=store.identity.id),
+        Ack(2, 1, store=store.identity.id),
+    ]
