@@ -289,9 +289,15 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
 # --- the audit -------------------------------------------------------------------------------------------------------
 
 
-def audit_of(writer: Writer, reader: JournalReader, report: Any, judge_s: float = 1e-9, states: Any = dict) -> Audit:
+def audit_of(
+    writer: Writer,
+    reader: JournalReader,
+    report: Any,
+    judge_s: float = 1e-9,
+    known: Any = lambda: (UNCORRECTED, {}),
+) -> Audit:
     writer.config = ServerConfig(trust=TrustConfig(judge_s))
-    return Audit(writer, reader, report, states, threading.Event())
+    return Audit(writer, reader, report, known, threading.Event())
 
 
 def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(store, monkeypatch):
