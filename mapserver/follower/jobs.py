@@ -10,6 +10,8 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -20,8 +22,10 @@ from mapserver.change.validity import around
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.fleet.calibration import MachineState
 from mapserver.fleet.correction import UNCORRECTED
+from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
@@ -33,6 +37,15 @@ Report = Callable[[Mapping[str, Verdict], int], None]
 States = Callable[[], Mapping[str, MachineState]]
 Publish = Callable[[GroundChange], None]
 log = logging.getLogger("mapserver.follower.jobs")
+
+
+class Job(Protocol):
+    """Work that is looked after again and again. name: for the log."""
+
+    name: str
+
+    def run(self) -> None:
+        """Do what is due, and return soon."""
 
 
 class Audit:
@@ -124,13 +137,14 @@ class ChangeSearch:
 
 
 class Archiving:
-    """Moves journal rows that are old enough into hourly Parquet files."""
+    """Moves journal rows that are old enough into hourly Parquet files, and keeps decisions beside these."""
 
     name = "archiving"
 
     def __init__(self, writer: Writer, reader: JournalReader, ending: threading.Event) -> None:
         self._writer, self._reader, self._ending = writer, reader, ending
         self._due_s = 0.0
+        self._kept = 0  # number of the last decision that is beside the files
 
     def run(self) -> None:
         """Move the next hour of old rows, where it is time: an hour a turn, so that the end need not wait."""
@@ -145,6 +159,14 @@ class Archiving:
             self._writer.run(lambda store: store.journal.shrink())
             log.info("archived file=%s", path.name)
             self._due_s = 0.0  # there may be more hours
+        self._keep_decisions(folder)
+
+    def _keep_decisions(self, folder: Path) -> None:
+        """Have those about calibration beside the files, where there are any."""
+        newest = self._writer.run(lambda store: store.fact)
+        if folder.exists() and newest != self._kept:
+            archived_decisions.save(folder, self._writer.store_id, calibrations(self._reader))
+            self._kept = newest
 
     def _forget(self, until: int) -> int:
         if self._ending.is_set():  # what is in both meanwhile counts once, and the next start goes on with it

@@ -138,7 +138,7 @@ class Refolding:
             return self._decided
 
     def _keep(self, store: Store, decision: Decision) -> int:
-        event, facts = store.decide(decision)
+        facts = store.decide(decision)
         if isinstance(decision, TrustDecision):
             values = (decision.machine, decision.trusted, decision.by, decision.reason)
             log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
@@ -146,7 +146,7 @@ class Refolding:
             spans = (decision.machine, len(decision.corrections), decision.by, decision.reason)
             log.info("calibration machine=%s spans=%d by=%s reason=%r", *spans)
         with self._changed:
-            self._decisions.add(event)
+            self._decisions.add(decision, facts.number)
             self._wanted = facts
             self._decided += 1
             self._changed.notify_all()

@@ -38,7 +38,7 @@ from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu
 from protocol.queries import requests
 from protocol.queries.answers import MapVersion
-from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command, parse_command
+from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
@@ -56,7 +56,7 @@ from tests.paths import CONFIG
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 SITE = SiteConfig("paper", 49.0, 8.0)
-PLAIN = ("health", "info", "machines", "machine", "changes", "change")  # people see these as JSON
+PLAIN = ("health", "info", "machines", "machine", "changes", "change", "calibration")  # people see these as JSON
 
 
 @cache
@@ -148,6 +148,9 @@ def _selectors() -> Iterator[Decoder]:
         TrustCommand("loader-2", False, "moved; x = 3", 60.0),
         TrustCommand("loader-2", None),
         AcceptCommand("0123456789abcdef", "disk died"),
+        CalibrateCommand(wait_s=60.0),
+        CalibrateCommand("loader-2", 0.004, -0.03, 0.0, reason="levelled; 12 May"),
+        CalibrateCommand("loader-2", auto=True),
     )
     seeds = tuple(f"{command.name}?{selector_of(encode_command(command))}".encode() for command in commands)
     yield Decoder("command", seeds, _command, (QueryError,), texts)
