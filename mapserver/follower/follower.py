@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from mapserver.fleet.calibration import MachineState, state_of
+from mapserver.fleet.correction import Corrections
 from mapserver.follower.calibrating import Calibrating
 from mapserver.follower.calibration_state import calibration_of, decided_by_person
 from mapserver.follower.checkpointing import Checkpointing
@@ -44,7 +46,7 @@ class Follower:
         self._ending = threading.Event()
         self._refolding = Refolding(writer, past)
         self._calibrating = Calibrating(writer, past, self._refolding.calibrate, self._doubtful, self._ending)
-        self._audit = Audit(writer, reader, self._refolding.judge, self._calibrating.states, self._ending)
+        self._audit = Audit(writer, reader, self._refolding.judge, self._known, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
         archiving = Archiving(writer, reader, self._ending)
@@ -128,6 +130,12 @@ class Follower:
         if not calibrating.is_alive():  # else it ends with the process: what it solves is of no use any more
             self._calibrating.close()
         self._reader.close()
+
+    def _known(self) -> tuple[Corrections, Mapping[str, MachineState]]:
+        """Corrections that are decided, and what is known of machines: by the last solve, else by their corrections."""
+        corrections = self._refolding.corrections()
+        by_corrections = {one.machine: state_of(one) for one in corrections.each}
+        return corrections, {**by_corrections, **self._calibrating.states()}
 
     def _require_known(self, machine: str) -> None:
         sent = self._writer.run(lambda store: store.machines())
