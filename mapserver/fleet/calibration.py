@@ -24,6 +24,7 @@ ZERO_FLOOR, SCALE_FLOOR = 0.0004, 0.004
 FAULTY_SIGMAS = 3.0  # of the data sheet: a scale so far off is worse than anything that a slope may hide
 FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a zero, and a scale of 30 %, that no sensor of its kind has
 SURE = 2.0  # standard deviations by which an estimate must be beyond a limit
+KNOWN = CommonScale(True, 0.0, "")  # of machines that are solved together: what their estimate says is all there is
 # A sensor that measures less than half or more than twice of the drive force has no gain: it is stuck, or on its head.
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 
@@ -139,9 +140,6 @@ class _Applied:
     covariance: Floats
     scaled: Bools
     beyond: Floats
-
-
-KNOWN = CommonScale(True, 0.0, "")
 
 
 def _said(
