@@ -65,8 +65,8 @@ def calibrate(
 ) -> Calibration:
     """Solve for all machines.
 
-    ledgers: stays by machine, as `Ledger.stays` has them. excluded: machines without a say. areas: whose
-    c_rr the site states. priors: of machines of which more is known than their data sheet.
+    ledgers: stays by machine, as `Ledger.stays` has them. excluded: machines without a say, beside those that are at
+    fault. areas: whose c_rr the site states. priors: of machines of which more is known than their data sheet.
     """
     priors = priors or {}
     known = {name: stays for name, table in ledgers.items() if len(stays := sound(table))}
