@@ -133,9 +133,9 @@ class Follower:
 
     def _known(self) -> tuple[Corrections, Mapping[str, MachineState]]:
         """Corrections that are decided, and what is known of machines: by the last solve, else by their corrections."""
-        corrections = self._refolding.corrections()
-        by_corrections = {one.machine: state_of(one) for one in corrections.each}
-        return corrections, {**by_corrections, **self._calibrating.states()}
+        corrections, solved = self._refolding.corrections(), self._calibrating.states()
+        newest = {one.machine: one for one in corrections.each if one.machine not in solved}
+        return corrections, {name: state_of(one) for name, one in newest.items()} | dict(solved)
 
     def _require_known(self, machine: str) -> None:
         sent = self._writer.run(lambda store: store.machines())

@@ -423,12 +423,27 @@ def test_edges_of_a_machine_without_a_say_do_not_count_where_those_of_the_others
     assert {each.scale for each in result.corrections if each.machine == "bad"} == {0.0}
 
 
-def test_nobody_is_at_fault_against_ground_that_may_itself_be_off() -> None:
-    rows = with_bad(0.6, off_m=0.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
-    result = solve(rows, ("bad",))
-    assert not result.common.observed
-    assert result.machines["bad"].scale == pytest.approx(0.6, abs=0.1)
-    assert result.machines["bad"].beyond[1] == 0.0
+def test_a_fault_is_one_also_against_ground_that_may_itself_be_off_by_what_data_sheets_allow() -> None:
+    site: Site = lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x)  # noqa: E731
+    for scale, fault in ((0.6, True), (0.36, False)):
+        result = solve(with_bad(scale, off_m=0.0, site=site), ("bad",))
+        assert not result.common.observed
+        state = result.machines["bad"]
+        assert state.scale == pytest.approx(scale, abs=0.1)
+        assert (state.beyond[1] > FAULT_SIGMAS[1]) == fault
+
+
+def test_on_level_ground_a_gain_unlike_all_others_is_a_fault_and_corrected() -> None:
+    rows = {name: drive(LOW, Errors(0.002), seed=i) for i, name in enumerate("abc")}
+    rows["d"] = drive(LOW, Errors(0.002, 0.6), seed=9)
+    result = solve(rows)
+    assert result.common.reason == "no_slope_both_ways"
+    assert result.machines["d"].beyond[1] > FAULT_SIGMAS[1]
+    (first, *_) = [each for each in result.corrections if each.machine == "d"]
+    assert first.scale == pytest.approx(0.6 / 1.6, abs=0.05)
+    assert {each.scale for each in result.corrections if each.machine != "d"} == {0.0}
+    two = solve({"a": rows["a"], "d": rows["d"]})  # nobody knows which of them is wrong
+    assert all(state.beyond[1] < FAULT_SIGMAS[1] for state in two.machines.values())
 
 
 def test_rain_between_two_machines_is_not_their_error() -> None:
