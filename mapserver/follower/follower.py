@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from mapserver.fleet.calibration import MachineState
+from mapserver.fleet.correction import Corrections
 from mapserver.follower.calibrating import Calibrating
 from mapserver.follower.calibration_state import calibration_of, decided_by_person
 from mapserver.follower.checkpointing import Checkpointing
@@ -44,7 +46,7 @@ class Follower:
         self._ending = threading.Event()
         self._refolding = Refolding(writer, past)
         self._calibrating = Calibrating(writer, past, self._refolding.calibrate, self._doubtful, self._ending)
-        self._audit = Audit(writer, reader, self._refolding.judge, self._calibrating.states, self._ending)
+        self._audit = Audit(writer, reader, self._refolding.judge, self._known, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
         archiving = Archiving(writer, reader, self._ending)
@@ -134,6 +136,10 @@ class Follower:
         if machine not in sent:
             names = ", ".join(sorted(sent)) or "none"
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
+
+    def _known(self) -> tuple[Corrections, Mapping[str, MachineState]]:
+        """Corrections that are decided, and what the last solve says of machines."""
+        return self._refolding.corrections(), self._calibrating.states()
 
     def _doubtful(self) -> frozenset[str]:
         """Machines without a say on what the ground is like: those left out, and those that contradict all others."""

@@ -17,6 +17,7 @@ from typing import TypeVar
 
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.correction import Corrections
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import JOURNAL_FILE, Store
@@ -66,6 +67,11 @@ class Refolding:
         """The newest decision about the trust in a machine that counts."""
         with self._changed:
             return self._decisions.trust.newest(machine)
+
+    def corrections(self) -> Corrections:
+        """Those that decisions come to, also of machines that are left out."""
+        with self._changed:
+            return self._decisions.calibration.corrections
 
     def calibration(self, machine: str) -> CalibrationDecision | None:
         """The newest decision about the calibration of a machine that counts."""
