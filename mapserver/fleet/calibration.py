@@ -232,3 +232,23 @@ def _states(
             beyond=(float(applied.beyond[index, 0]), float(applied.beyond[index, 1])),
         )
     return out
+
+
+def state_of(correction: Correction) -> MachineState:
+    """What a correction in force says of its machine, where nothing has been solved yet."""
+    k = correction.scale / (1 - correction.scale)
+    zero_std, scale_std, across_std = np.sqrt(np.diag(correction.covariance or np.zeros((3, 3)))).tolist()
+    return MachineState(
+        zero=correction.zero,
+        zero_std=zero_std,
+        scale=k,
+        scale_std=scale_std,
+        across=correction.across,
+        across_std=across_std,
+        zero_by=(),
+        scale_by=(),
+        beyond=(
+            max(abs(correction.zero) - SURE * zero_std, 0.0) / ZERO_STD,
+            max(abs(k) - SURE * scale_std, 0.0) / SCALE_STD,
+        ),
+    )

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from mapserver.fleet.calibration import MachineState
+from mapserver.fleet.calibration import MachineState, state_of
 from mapserver.fleet.correction import Corrections
 from mapserver.follower.calibrating import Calibrating
 from mapserver.follower.calibration_state import calibration_of, decided_by_person
@@ -131,15 +131,17 @@ class Follower:
             self._calibrating.close()
         self._reader.close()
 
+    def _known(self) -> tuple[Corrections, Mapping[str, MachineState]]:
+        """Corrections that are decided, and what is known of machines: by the last solve, else by their corrections."""
+        corrections = self._refolding.corrections()
+        by_corrections = {one.machine: state_of(one) for one in corrections.each}
+        return corrections, {**by_corrections, **self._calibrating.states()}
+
     def _require_known(self, machine: str) -> None:
         sent = self._writer.run(lambda store: store.machines())
         if machine not in sent:
             names = ", ".join(sorted(sent)) or "none"
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
-
-    def _known(self) -> tuple[Corrections, Mapping[str, MachineState]]:
-        """Corrections that are decided, and what the last solve says of machines."""
-        return self._refolding.corrections(), self._calibrating.states()
 
     def _doubtful(self) -> frozenset[str]:
         """Machines without a say on what the ground is like: those left out, and those that contradict all others."""

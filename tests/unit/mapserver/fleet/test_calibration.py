@@ -17,6 +17,7 @@ from mapserver.fleet.calibration import (
     MachineState,
     calibrate,
     moved,
+    state_of,
 )
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, corrected
 from mapserver.fleet.ledger import EPOCH_NS
@@ -422,6 +423,14 @@ def test_edges_of_a_machine_without_a_say_do_not_count_where_those_of_the_others
     assert {each.scale for each in result.corrections if each.machine == "bad"} == {0.0}
 
 
+def test_nobody_is_at_fault_against_ground_that_may_itself_be_off() -> None:
+    rows = with_bad(0.6, off_m=0.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
+    result = solve(rows, ("bad",))
+    assert not result.common.observed
+    assert result.machines["bad"].scale == pytest.approx(0.6, abs=0.1)
+    assert result.machines["bad"].beyond[1] == 0.0
+
+
 def test_rain_between_two_machines_is_not_their_error() -> None:
     wet: Site = lambda x, y, h: soils(x, y, h) + 0.02  # noqa: E731
     rows = {
@@ -505,3 +514,17 @@ def test_a_machine_that_sends_nothing_but_nonsense_keeps_nobody_from_being_calib
     result = solve(fleet() | {"flood": np.repeat(rows, 5000)}, excluded)
     assert result.corrections == usual().corrections
     assert solve({"flood": np.repeat(rows, 5000)}).machines == {}
+
+
+def test_a_correction_says_of_its_machine_what_the_solve_said() -> None:
+    result = solve(fleet(errors={"again": Errors(0.002, 0.6)}))
+    for name in ("again", "ramp"):
+        newest = [each for each in result.corrections if each.machine == name][-1]
+        state, known = state_of(newest), result.machines[name]
+        assert (state.zero, state.scale, state.across) == pytest.approx(
+            (known.zero, known.scale, known.across), abs=5e-5
+        )
+        assert (state.zero_std, state.scale_std) == pytest.approx((known.zero_std, known.scale_std), rel=1e-3)
+        assert (state.beyond[1] > FAULT_SIGMAS[1]) == (name == "again")
+    by_hand = state_of(Correction("a", 0, 1, 0.03, 0.375, 0.0, ()))
+    assert by_hand.beyond == pytest.approx((0.03 / ZERO_STD, 0.6 / SCALE_STD))

@@ -47,15 +47,14 @@ def test_a_broken_machine_is_named_left_out_and_let_in_by_a_person(tmp_path: Pat
     with closing(writer), closing(Follower(writer, lambda _: None, past_of(writer))) as site:
         deliver(writer, SENT)
         wait_for(lambda: site.facts().excluded == {"bad"})
-        site.calibrate(20.0)
-        wait_for(lambda: "beyond_data_sheet" in seen(site)["reasons"])  # by gain too, until it is corrected
         row = seen(site)
-        assert (row["trusted"], row["by"]) == (False, "audit")
-        assert row["evidence"]["torque_gain"] == pytest.approx(1 + GAIN, abs=0.05)
+        assert (row["trusted"], row["by"]) == (False, "audit")  # for its gain, where the audit was there first
+        site.calibrate(20.0)
         before = site.facts().corrections
         assert {one.machine for one in before.each} == set(SENT) - {"bad"}
         wait_for(lambda: seen(site)["evidence"]["gain"] == pytest.approx(1.0, abs=0.1))  # what is corrected agrees
         assert seen(site)["reasons"] == ["beyond_data_sheet"]
+        assert seen(site)["evidence"]["torque_gain"] == pytest.approx(1 + GAIN, abs=0.05)
         row = site.trust("bad", True, "its torque is corrected", 20.0)
         assert (row["trusted"], row["by"], row["contradicts"]) == (True, "person", True)
         site.calibrate(20.0)
@@ -68,3 +67,7 @@ def test_a_broken_machine_is_named_left_out_and_let_in_by_a_person(tmp_path: Pat
         right = site.facts().corrections.applied(SENT["bad"], ("bad",), np.zeros(len(SENT["bad"]), np.int64))
         true = drive(RAMP, Errors(), seed=99)
         assert abs(np.median(right["c_rr"] - true["c_rr"])) < 0.003
+    again = open_writer(tmp_path / "store", CONFIG)
+    with closing(again), closing(Follower(again, lambda _: None, past_of(again))) as site:
+        wait_for(lambda: seen(site)["reasons"] == ["beyond_data_sheet"])  # before it has solved anything
+        assert seen(site)["evidence"]["torque_gain"] == pytest.approx(1 + GAIN, abs=0.05)
