@@ -26,7 +26,7 @@ from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 
 DAYS = 2  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
 EVERY_NS = 60 * 10**9  # of site time, between two solves: a fifth of an epoch
-REST = 20.0  # times as long as a solve took; so a replayed log does not keep a core busy with solving
+REST = 50.0  # times as long as a solve took: 2 % of a core, also where a log is replayed
 TURN_SAMPLES = 200_000  # read in one turn, in about 0.2 s
 Decide = Callable[[Calibration, int], object]
 log = logging.getLogger("mapserver.follower.calibrating")
