@@ -18,7 +18,7 @@ import pytest
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import LAST_NS, Correction, Corrections
-from mapserver.fleet.decisions import PERSON, CalibrationDecision
+from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.journal.journal import Journal
 from mapserver.journal.reader import JournalReader
@@ -26,6 +26,7 @@ from protocol.arrays import Table
 from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
+from sim.simulator import START_NS
 from sitegrid.process.children import Child, Children
 from tests.integration.site_run import READY_S, SiteRun, kill
 from tests.integration.test_evidence import Senders
@@ -47,12 +48,12 @@ ZERO = 0.02
 @pytest.fixture
 def site(tmp_path: Path, children: Children) -> SiteRun:
     run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
-    (tmp_path / "server.toml").write_text(ASKED)
     run.start_router()
     return run
 
 
 def serve(site: SiteRun) -> Child:
+    (site.folder / "server.toml").write_text(ASKED)
     return site.start_server("--config", str(site.folder / "server.toml"))
 
 
@@ -217,3 +218,35 @@ def test_the_map_of_an_archive_and_its_facts_is_the_live_one(site: SiteRun):
     assert archived.returncode == 0, archived.stderr
     with stored(folder / "of-store", site) as store:
         assert same_evidence(store.grid, live)
+
+
+def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path: Path, children: Children):
+    """It comes with the first acknowledgement of samples, and counts at a standstill or at the end of a tour."""
+    sim = SimConfig(machines=2, seconds=240, speed=10, seed=3, world="fast")
+    site = SiteRun(tmp_path, children, free_endpoint(), sim)
+    one, other = (config.stem for config in site.configs)
+    with site.configs[0].open("a", encoding="utf-8") as text:
+        text.write("[pipeline.estimation]\naccept_calibration = true\n")
+    site.start_router()
+    serve(site).stop()
+    config, path = load_site(site.site_file), tmp_path / "store" / JOURNAL_FILE
+    covariance = ((4e-7, 0.0, 0.0), (0.0, 2e-5, 0.0), (0.0, 0.0, 1e-6))
+    with closing(Journal(path, config.name, config.frame)) as journal:
+        for name in (one, other):
+            offered = Correction(name, 0, LAST_NS, 0.004, 0.03, 0.0, covariance)
+            decision = CalibrationDecision(name, SOLVER, "", START_NS, (offered,))
+            journal.append_event("calibration", START_NS, decision.body())
+    server = serve(site)
+    site.start_agents()
+    site.start_sim()
+    calibrations = {name: report["pipeline"]["ground"]["calibration"] for name, report in site.delivered().items()}
+    assert (calibrations[one]["offers"], calibrations[one]["offer_ns"]) == (1, START_NS)
+    assert "offers" not in calibrations[other]
+    server.stop()
+    with JournalReader(path) as reader:
+        stated = {
+            name: np.concatenate([row.rows["applied_scale"] for row in reader.read() if row.machine == name])
+            for name in (one, other)
+        }
+    assert np.abs(stated[one] - 0.03).min() < 0.015
+    assert np.abs(stated[other] - 0.03).min() > 0.015
