@@ -433,6 +433,13 @@ def test_a_fault_is_one_also_against_ground_that_may_itself_be_off_by_what_data_
         assert (state.beyond[1] > FAULT_SIGMAS[1]) == fault
 
 
+def test_a_scale_against_ground_whose_scale_nobody_knows_is_not_applied() -> None:
+    result = solve(with_bad(0.1, off_m=0.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x)), ("bad",))
+    assert not result.common.observed
+    assert {each.scale for each in result.corrections} == {0.0}
+    assert result.machines["bad"].scale_std == pytest.approx(SCALE_STD, rel=0.05)
+
+
 def test_on_level_ground_a_gain_unlike_all_others_is_a_fault_and_corrected() -> None:
     rows = {name: drive(LOW, Errors(0.002), seed=i) for i, name in enumerate("abc")}
     rows["d"] = drive(LOW, Errors(0.002, 0.6), seed=9)
