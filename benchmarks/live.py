@@ -22,6 +22,7 @@ from benchmarks.measure import START_NS, Report, machine
 from benchmarks.merge_work import BATCH, Batches, batches, samples_of, seconds_of
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import warm_up
+from mapserver.fleet.correction import UNCORRECTED
 from mapserver.follower.jobs import Audit, ChangeSearch
 from mapserver.ingest.backlog import GROUP_BATCHES
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
@@ -61,7 +62,7 @@ def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:
         link, work = Link(writer), batches()
         before = list(islice(work, samples_of(hours) // BATCH))
         link.send(before)
-        audit = Audit(writer, reader, lambda *_: None, dict, threading.Event())
+        audit = Audit(writer, reader, lambda *_: None, lambda: (UNCORRECTED, {}), threading.Event())
         search = ChangeSearch(writer, reader, lambda _: None, threading.Event())
         audit.run()
         search.run()

@@ -47,6 +47,16 @@ class TrustConfig:
 
 
 @dataclass(frozen=True)
+class CalibrationConfig:
+    """What follows from the calibration of machines.
+
+    automatic: whether samples are corrected by what the server finds, or by nothing until a person asks.
+    """
+
+    automatic: bool = True
+
+
+@dataclass(frozen=True)
 class ServerConfig:
     """All options, one table per component."""
 
@@ -55,6 +65,7 @@ class ServerConfig:
     read: ReadConfig = field(default_factory=ReadConfig)
     change: ChangeConfig = field(default_factory=ChangeConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     query_threads: int = 2
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ from protocol.queries.answers import (
     SiteInfo,
     TrustAnswer,
 )
+from protocol.queries.calibration import CalibrationAnswer, CorrectedSpan, MachineCalibration
 from protocol.queries.map_tiles import MapTile, TilesAnswer
 from protocol.queries.reasons import CellReasons, Votes
 from protocol.site.geometry import Bounds
@@ -25,6 +26,7 @@ from sitegrid.listener import Listener
 __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
 __all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
+__all__ += ["CalibrationAnswer", "CorrectedSpan", "MachineCalibration"]
 __all__ += ["CellReasons", "MapTile", "MapVersion", "TilesAnswer", "Votes"]
 __all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __version__ = package_version()

@@ -22,7 +22,8 @@ from protocol.queries.answers import (
     ServerAlive,
     TrustAnswer,
 )
-from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command
+from protocol.queries.calibration import CalibrationAnswer, decode_calibration
+from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command
 from protocol.queries.map_tiles import TilesAnswer, decode_tiles
 from protocol.queries.parameters import selector_of
 from protocol.queries.pieces import Progress, joined
@@ -36,6 +37,7 @@ from sitegrid.security.join import join
 # Nobody answers, at once: the server starts again, or has just connected (Zenoh issue 2767). It may answer in a moment.
 AGAIN_S = 0.1
 PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
+SOLVE_S = 30.0  # likewise, that it has to calibrate a fleet for: a large one on a busy host
 REGION_ATTEMPTS = 3
 TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 
@@ -149,6 +151,10 @@ class Client:
         asked = requests.MachinesQuery(requests.Freshness(after, wait_s))
         return list(answer_codec.decode_machines(self._ask(asked)).machines)
 
+    def calibration(self, *, after: int = 0, wait_s: float = 10.0) -> CalibrationAnswer:
+        """What the server takes off the samples of each machine, and what it knows of their calibration."""
+        return decode_calibration(self._ask(requests.CalibrationQuery(requests.Freshness(after, wait_s))))
+
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with an id beyond `after`: when, where, how many cells, from what to what."""
         changes = list(answer_codec.decode_changes(self._ask(requests.ChangesQuery(after))).changes)
@@ -179,6 +185,27 @@ class Client:
     def judge_automatically(self, machine: str, *, wait_s: float = 30.0) -> TrustAnswer:
         """Leave it to the server again whether a machine's samples are used."""
         return self._command(TrustCommand(machine, None, "", wait_s))
+
+    def calibrate(self, *, wait_s: float = 30.0) -> CalibrationAnswer:
+        """Calibrate all machines with all samples that there are, and have the map follow; what is known then."""
+        return self._calibrate(CalibrateCommand(wait_s=wait_s))
+
+    def correct(
+        self,
+        machine: str,
+        reason: str,
+        *,
+        zero: float | None = None,
+        scale: float | None = None,
+        across: float | None = None,
+        wait_s: float = 30.0,
+    ) -> CalibrationAnswer:
+        """Take these errors off all samples of a machine, whatever the server finds; 0 for what is not given."""
+        return self._calibrate(CalibrateCommand(machine, zero, scale, across, reason=reason, wait_s=wait_s))
+
+    def calibrate_automatically(self, machine: str, *, wait_s: float = 30.0) -> CalibrationAnswer:
+        """Leave it to the server again what is taken off a machine's samples."""
+        return self._calibrate(CalibrateCommand(machine, auto=True, wait_s=wait_s))
 
     def accept(self, store: str, reason: str) -> MapInfo:
         """Let the map server's store take the place of another one, which is gone: machines go on with it."""
@@ -212,6 +239,10 @@ class Client:
     def _command(self, command: TrustCommand) -> TrustAnswer:
         key = keys.admin(self.site, command.name)
         return answer_codec.decode_machine(self._get(key, encode_command(command), command.wait_s))
+
+    def _calibrate(self, command: CalibrateCommand) -> CalibrationAnswer:
+        key = keys.admin(self.site, command.name)
+        return decode_calibration(self._get(key, encode_command(command), SOLVE_S + command.wait_s))
 
     def _get(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
         selector = zenoh.Selector(key, selector_of(parameters)) if parameters else zenoh.Selector(key)

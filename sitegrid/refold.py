@@ -8,7 +8,7 @@ import sys
 import time
 from argparse import Namespace
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -16,8 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.config import ServerConfig
+from mapserver.fleet.decisions import CalibrationDecision
+from mapserver.ingest.decisions import calibrations, plain
 from mapserver.ingest.losses import lacking
 from mapserver.ingest.store import ACCEPTED, JOURNAL_FILE, Store
+from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.copier import Copier, merged
@@ -42,7 +45,7 @@ COMMIT_ROWS = 500
 class SampleSource:
     """Rows of a file or a store. site: where it is known; first_ns: when its first row was received.
 
-    stores: ids of the stores whose samples these are, or whose place that store took.
+    stores: ids of the stores whose samples these are, or whose place that store took. decisions: about calibration.
     """
 
     path: Path
@@ -55,6 +58,7 @@ class SampleSource:
     rows: Iterator[JournalRow]
     stores: tuple[str, ...]
     watermarks: Mapping[SpoolKey, Watermark] = field(default_factory=dict)
+    decisions: Sequence[CalibrationDecision] = ()
 
 
 def run(arguments: Namespace) -> int:
@@ -131,7 +135,8 @@ def _sources(path: Path, selection: Selection, opened: ExitStack) -> Iterator[Sa
     for file in map(ArchiveFile, files):
         header, site, rows = file.header, file.header.site, file.read(selection=in_time)
         contents = (frozenset(header.machines), file.samples, file.first_received_ns, rows, (header.store,))
-        yield SampleSource(file.path, site.name, header.frame, site, *contents)
+        decisions = archived_decisions.load(file.path.parent)
+        yield SampleSource(file.path, site.name, header.frame, site, *contents, decisions=decisions)
 
 
 def _store(path: Path, selection: Selection, opened: ExitStack) -> SampleSource:
@@ -148,7 +153,8 @@ def _store(path: Path, selection: Selection, opened: ExitStack) -> SampleSource:
     site = _site_of(path)
     identity, accepted = journal.identity(), (event.body["store"] for event in journal.events(ACCEPTED))
     stores = (identity.id, *identity.descends, *accepted)
-    return SampleSource(path, journal.site, journal.frame, site, machines, samples, first_ns, rows, stores, watermarks)
+    contents = (machines, samples, first_ns, rows, stores, watermarks, calibrations(journal))
+    return SampleSource(path, journal.site, journal.frame, site, *contents)
 
 
 def _site_of(store: Path) -> SiteConfig | None:
@@ -189,7 +195,7 @@ def _config(arguments: Namespace) -> tuple[ServerConfig, str]:
 
 
 def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: Selection, *, headless: bool) -> Copier:
-    """Write the journal of the new store."""
+    """Write the journal of the new store: samples, and what was decided about their corrections."""
     stores = dict.fromkeys(store for source in sources for store in source.stores)
     journal = Journal(part / JOURNAL_FILE, site.name, site.frame, stores)
     copier = Copier(journal, site.frame, selection)
@@ -212,6 +218,8 @@ def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: 
         copier.excluded["time"] += max(0, total - done)  # whole batches and files that were passed over
         copier.finish({spool: watermark.seq for source in sources for spool, watermark in source.watermarks.items()})
         journal.commit()
+        for decision in dict.fromkeys(decision for source in sources for decision in source.decisions):
+            journal.append_event(*plain(decision))
     if not copier.kept.total():
         raise ConfigError("sitegrid fold", f"no sample is left: {json.dumps(copier.excluded)} are excluded")
     return copier

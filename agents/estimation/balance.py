@@ -132,8 +132,8 @@ class Balancer:
             self._begin_ns, self._force_sums, self._torque_sums = imu.stamp_ns, NO_SUMS, (0, 0.0)
             return None
         rotation, wheels = self._rotation[imu.sensor], dead_reckoning.wheels
-        gyro = (rotation @ (imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)).tolist()
-        ahead, left, up = (rotation @ (imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)).tolist()
+        gyro = rotation.dot((imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)).tolist()
+        ahead, left, up = rotation.dot((imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)).tolist()
         ahead += (gyro[1] ** 2 + gyro[2] ** 2) * sensor.mount.xyz_m[0]  # what turning adds at the sensor's place
         shows_speed = wheels.is_known and self._wheels_s() < MAX_PAUSE_S
         accel, speed = (wheels.accel_mps2, wheels.speed_mps) if shows_speed else (0.0, 0.0)

@@ -181,8 +181,9 @@ class Calibrator:
             if other.direction == stretch.direction:
                 continue
             distance_m = math.hypot(stretch.x_m - other.x_m, stretch.y_m - other.y_m)
-            turn_rad = abs(math.remainder(stretch.angle_rad - other.angle_rad, math.tau))
-            if distance_m < nearest_m and turn_rad < PAIR_RAD:
+            if distance_m >= nearest_m:
+                continue
+            if abs(math.remainder(stretch.angle_rad - other.angle_rad, math.tau)) < PAIR_RAD:
                 partner, nearest_m = other, distance_m
         return partner
 

@@ -48,6 +48,7 @@ JUMP_SIGMA, JUMP, JUMP_STD = 5.5, 0.006, 0.1
 LEAST_BEHIND = 4  # steps before and behind a border: fewer may be an outlier of the noise
 SEARCHED = 40  # steps that are searched for a border: 2 s
 
+BEHIND = np.triu(np.ones((SEARCHED, SEARCHED)))  # row i: the steps from i on
 IDENTITY = np.eye(3)
 TRAIL_IS_LEAD = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 LEAD_UNKNOWN = np.diag([0.0, 1.0, 1.0])
@@ -69,6 +70,7 @@ class _Filtered(NamedTuple):
 
     border: whether the leading axle crossed one before it. crossing_m: distance at which the crossing under way began,
     NaN if none is. A: transition from the step before (3, 3); x0, P0: belief before the measurement; x, P: after it.
+    judged: what a jump before or behind it is judged by, as plain numbers, since each is judged some forty times.
     """
 
     measured: _Measured
@@ -79,6 +81,7 @@ class _Filtered(NamedTuple):
     P0: Floats
     x: Floats
     P: Floats
+    judged: tuple[float, ...]
 
     @property
     def is_crossing(self) -> bool:
@@ -129,7 +132,8 @@ class KalmanResistance:
         """
         first = self._first.measured.step
         shift = (zero + scale * first.share) / first.regressor
-        self._first = self._first._replace(x=self._first.x - shift * np.array([1.0, 1.0, 0.0]))
+        x = self._first.x - shift * np.array([1.0, 1.0, 0.0])
+        self._first = self._first._replace(x=x, judged=_judged(self._first.measured, x, self._first.P))
         self._noise.interrupt()
         for i, old in enumerate(self._steps):
             step = old.measured.step
@@ -163,7 +167,7 @@ class KalmanResistance:
         first = LEAST_BEHIND + (max(n - SEARCHED, 0) if last is None else last + 1)  # something is known before it
         if n - first < LEAST_BEHIND:
             return
-        best, sigma = _likeliest_jump([self._before(i) for i in range(first, n)], self._steps[first:])
+        best, sigma = _likeliest_jump(self._steps[first - 1 :])
         if sigma > JUMP_SIGMA:
             self._set_border(first + best, border=True)
 
@@ -225,7 +229,7 @@ def _start(scale_var: float) -> _Filtered:
     x, P = np.array([FIRST_C_RR, FIRST_C_RR, 0.0]), _same_ground(FIRST_STD**2)
     P[SCALE, SCALE] = scale_var
     measured = _Measured(BalanceStep(0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, np.zeros(3), 1.0, 0.0)
-    return _Filtered(measured, border=False, crossing_m=math.nan, A=IDENTITY, x0=x, P0=P, x=x, P=P)
+    return _Filtered(measured, False, math.nan, IDENTITY, x, P, x, P, _judged(measured, x, P))
 
 
 def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filtered:
@@ -245,37 +249,38 @@ def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filte
     Q = _same_ground(walk + free) if on_one_ground else np.diag([walk + free, 0.0, 0.0])
     Q[SCALE, SCALE] = measured.scale_var
     x0 = (TRAIL_IS_LEAD if on_one_ground else IDENTITY) @ before.x
-    P0 = A @ before.P @ A.T + Q
+    P0 = (before.P if A is IDENTITY else A @ before.P @ A.T) + Q
     Ph = P0 @ measured.h
     K = Ph / (measured.h @ Ph + measured.r)
-    x, P = x0 + K * (step.raw - measured.h @ x0), P0 - np.outer(K, Ph)
-    return _Filtered(measured, border, crossing_m, A, x0, P0, x, P)
+    x, P = x0 + K * (step.raw - measured.h @ x0), P0 - K[:, None] * Ph
+    return _Filtered(measured, border, crossing_m, A, x0, P0, x, P, _judged(measured, x, P))
 
 
-def _likeliest_jump(before: list[_Filtered], steps: list[_Filtered]) -> tuple[int, float]:
+def _likeliest_jump(steps: list[_Filtered]) -> tuple[int, float]:
     """Index of the step before which c_rr most likely jumped, and how many standard deviations that jump is large.
 
-    before: for each step the one before it, whose belief the jump starts from. At least LEAST_BEHIND steps lie behind
-    the jump; one below JUMP counts as none.
+    steps: those that are tried, and the one before them; a jump starts from the belief of the step before it. At least
+    LEAST_BEHIND steps lie behind a jump; one below JUMP counts as none.
     """
-    z, h, r, distance, lead, base = np.array([_columns(filtered) for filtered in steps]).T
-    x, P = np.array([(filtered.x[LEAD], filtered.P[LEAD, LEAD]) for filtered in before]).T
+    rows, n = np.array([filtered.judged for filtered in steps]), len(steps) - 1
+    z, h, r, distance, lead, base = rows[1:, :6].T
+    x, P = rows[:-1, 6:].T
     # Row i: a jump before step i, and the share of it that each step would show.
-    shows = np.triu(np.where(distance - distance[:, None] < base, lead, 1.0)) * h
+    shows = np.where(distance - distance[:, None] < base, lead, 1.0) * BEHIND[:n, :n] * h
     weight = shows / r
     total = (weight * shows).sum(axis=1)
     jump = (weight @ z - (weight @ h) * x) / total
     sigma = np.sqrt(1 / total + P * (weight @ h / total) ** 2)
-    likely = np.where(np.abs(jump) > JUMP, np.abs(jump) / sigma, 0.0)[: len(steps) - LEAST_BEHIND + 1]
+    likely = np.where(np.abs(jump) > JUMP, np.abs(jump) / sigma, 0.0)[: n - LEAST_BEHIND + 1]
     best = int(likely.argmax())
     return best, float(likely[best])
 
 
-def _columns(filtered: _Filtered) -> tuple[float, ...]:
-    """What a jump is judged by: raw c_rr without the scale error, regressor, variance, distance, and the axles."""
-    m = filtered.measured
-    raw = m.step.raw - m.h[SCALE] * filtered.x[SCALE]
-    return raw, m.step.regressor, m.r, m.distance_m, m.step.lead_share, m.step.wheelbase_m
+def _judged(m: _Measured, x: Floats, P: Floats) -> tuple[float, ...]:
+    """Raw c_rr without the scale error, regressor, variance, distance, the axles; c_rr as believed, its variance."""
+    raw = m.step.raw - m.h[SCALE] * x[SCALE]
+    of_step = float(raw), m.step.regressor, m.r, m.distance_m, m.step.lead_share, m.step.wheelbase_m
+    return *of_step, float(x[LEAD]), float(P[LEAD, LEAD])
 
 
 def _same_ground(variance: float) -> Floats:

@@ -7,7 +7,9 @@ machine's too. The filter has states for its slow error b and for a part that la
 
 The noise of b is correlated with that of the machine's error, by the share that `site_share` finds. So nothing has to
 be switched: a base that has nothing in common with the machine is of no use and does no harm, one that falls silent is
-forgotten as its error fades, and corrections of one that jumps are refused until d has been opened for them.
+forgotten as its error fades, and corrections of one that jumps are refused until d has been opened for them. They are
+averaged over a second: of single ones, whose white noise is half a metre, some would always pass the gate, and a jump
+would come in by little steps as if it were b.
 """
 
 import math
@@ -18,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from agents.localisation import measurements
-from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, reset_states
+from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, open_states, reset_states
 from agents.localisation.filters.motion import GpsError, map_from_base
 from agents.localisation.filters.state import ATTITUDE, VELOCITY, Layout
 from agents.localisation.gps import Fix
@@ -31,6 +33,8 @@ MAX_AGE_S = 30.0  # older ones are refused: by then a slow GPS error has mostly 
 MAX_AHEAD_S = 10.0  # so far ahead of the machine's own readings they wait for these; beyond that a clock is wrong
 REPEATS = 5  # the same error so often in a row is no measurement any more
 GATE_SIGMA = 4.0  # as of fixes
+MEAN_NS = 1_000_000_000  # corrections of so long are one measurement,
+REFUSALS = 3  # and so many refused ones in a row are a base that has jumped
 LEAST_SHARE = 0.05  # a smaller one is none
 UNKNOWN = GpsError(1.0, 45.0)  # the slow error of a base that was not heard yet: any will do
 
@@ -49,7 +53,10 @@ class Corrections:
         self._newest: Correction | None = None  # of those that count
         self._repeats = 0
         self._why = "no correction has come in"
-        self._due_ns = 0  # stamp of the last that was due
+        self._due: list[Correction] = []  # since the last measurement
+        self._measured_ns = self._measured_to_ns = 0  # stamps of that: the mean, and the last one in it
+        self._refused = 0  # measurements in a row
+        self._jump_m2 = 0.0  # how far the base has jumped, until d has been opened by that
         self._offset_m: Floats | None = None  # what the base said of d at first: the state counts from there
         self._accepted = False
         self._followed_ns = 0
@@ -99,7 +106,7 @@ class Corrections:
         return round(self._share.share, 2) if self._accepted else 0.0
 
     def measurement(self, belief: Belief) -> Measurement | None:
-        """The newest correction that is due, as a measurement at the belief's stamp; None where none is.
+        """The mean of the corrections of a second that are due, as a measurement at the belief's stamp; else None.
 
         With the base's b of now, one of age t is exp(-t / tau) b + d, and what b did since is noise, which corrections
         of the same time have in common.
@@ -108,23 +115,35 @@ class Corrections:
         if not due:
             return None
         self._waiting = [c for c in self._waiting if c.stamp_ns > belief.stamp_ns]
-        newest = max(due, key=lambda c: c.stamp_ns)
-        between_ns, self._due_ns = newest.stamp_ns - self._due_ns, newest.stamp_ns
-        age_s = (belief.stamp_ns - newest.stamp_ns) * 1e-9
-        fade = math.exp(-age_s / newest.time_s)
-        alike = max(1.0, age_s / (between_ns * 1e-9))
-        variance_m2 = newest.white_m2 + newest.slow_m2 * (1 - fade**2) * alike
-        off_m = np.array([newest.east_m, newest.north_m])
         for correction in due:
             self._share.add_correction(correction)
-        change = None if self._accepted else self._begin(newest)
+        self._due += due
+        newest = max(self._due, key=lambda c: c.stamp_ns)
+        if newest.stamp_ns - self._measured_to_ns < MEAN_NS:
+            return None
+        recent = [c for c in self._due if c.stamp_ns > newest.stamp_ns - MEAN_NS]
+        self._due, self._measured_to_ns = [], newest.stamp_ns
+        stamp_ns = newest.stamp_ns - sum(newest.stamp_ns - c.stamp_ns for c in recent) // len(recent)
+        between_ns, self._measured_ns = stamp_ns - self._measured_ns, stamp_ns
+        age_s = (belief.stamp_ns - stamp_ns) * 1e-9
+        fade = math.exp(-age_s / newest.time_s)
+        alike = max(1.0, age_s / (between_ns * 1e-9))
+        white_m2 = sum(c.white_m2 for c in recent) / len(recent) ** 2
+        variance_m2 = white_m2 + newest.slow_m2 * (1 - fade**2) * alike
+        off_m = np.mean([(c.east_m, c.north_m) for c in recent], axis=0)
+        change = self._change(newest)
         z, R, gate = off_m - self._offset_m, np.eye(2) * variance_m2, self._base.gate(GATE_SIGMA)
         return measurements.correction(belief.stamp_ns, self._base.name, z, R, fade, self._layout, gate, change)
 
     def confirm(self, result: Conditioned) -> None:
-        """Note what the filter made of a correction."""
+        """Note what the filter made of a measurement."""
         self._accepted |= result.accepted
         self._why = "" if result.accepted else "the filter refuses them: the base jumped, or was moved"
+        self._refused = 0 if result.accepted else self._refused + 1
+        if self._refused >= REFUSALS:
+            self._refused = 0
+            self._jump_m2 = float((result.innovation**2).sum())
+            self.counters["correction_base_jumped"] += 1
 
     def report(self, now_ns: int) -> dict[str, Any]:
         """Whether corrections are used, how old the last one is, and why they are not, in plain values."""
@@ -158,10 +177,14 @@ class Corrections:
         self._repeats = self._repeats + 1 if same else 0
         return "repeated" if self._repeats >= REPEATS else ""
 
-    def _begin(self, first: Correction) -> Change:
-        """What gives b and d their first values."""
-        self._offset_m = np.array([first.offset_e_m, first.offset_n_m])
-        return partial(_begun, layout=self._layout, slow_m2=first.slow_m2, offset_m2=first.offset_m2)
+    def _change(self, newest: Correction) -> Change | None:
+        """What gives b and d their first values, or opens d for a base that jumped."""
+        jump_m2, self._jump_m2 = self._jump_m2, 0.0
+        if not self._accepted:
+            self._offset_m = np.array([newest.offset_e_m, newest.offset_n_m])
+            return partial(_begun, layout=self._layout, slow_m2=newest.slow_m2, offset_m2=newest.offset_m2 + jump_m2)
+        opened_m2 = np.eye(2) * jump_m2
+        return partial(open_states, states=self._layout.base_offset, covariance=opened_m2) if jump_m2 else None
 
     def _reckoned_m(self, stamp_ns: int) -> Floats:
         """Where the machine is by dead reckoning (2,), around the last step."""

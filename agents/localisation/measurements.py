@@ -70,7 +70,7 @@ def fix(
 def correction(
     stamp_ns: int, base: str, off_m: Floats, R: Floats, fade: float, layout: Layout, gate: float, change: Change | None
 ) -> Measurement:
-    """What a base station is off (2,): z = fade b + d."""
+    """What a base station is off (2,): z = fade b + d. After a jump it is for a change to open d."""
     b, d = layout.base_error, layout.base_offset
 
     def h(x: Floats) -> Floats:
@@ -81,7 +81,7 @@ def correction(
         H[:, b], H[:, d] = fade * EYE[:2, :2], EYE[:2, :2]
         return H
 
-    return Measurement(base, stamp_ns, off_m, R, h, jacobian, gate_sigma=gate, opens=(d,), change=change)
+    return Measurement(base, stamp_ns, off_m, R, h, jacobian, gate_sigma=gate, relocks=False, change=change)
 
 
 def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_m: Floats, gate: float) -> Measurement:

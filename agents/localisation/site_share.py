@@ -27,13 +27,15 @@ from protocol.machine.readings import Correction
 
 CANDIDATES = np.array([0.0, 0.25, 0.5, 0.7, 0.85, 0.93, 0.98])
 NONE_AT_FIRST = 0.5  # probability of no common part before anything is known: a base has to earn its weight
-MEMORY_S = 300.0  # how long what was seen counts: a base that goes wrong must lose its weight
+# A share lasts for so long on average, and then it may be any: however long a base did well, evidence of half a minute
+# against it is enough.
+LASTS_S = 3600.0
 SPAN_NS = 1_000_000_000  # fixes and corrections of a second are averaged
 # Believed velocities against the truth: what they miss within a second, the rest is a wrong scale and heading,
 WALK_M2_PER_M = 0.03**2
 TURN_STD, TURN_TIME_S = 0.02, 60.0  # of 0.01 to 0.02 each, which change within a minute, as ground and belief do
 UNKNOWN_M2 = 10.0**2  # of q and d at first
-WAIT_S = 10  # a span is judged so much later: links hold corrections up, and with the stamps wrong by 2 s none is alike
+WAIT_S = 5  # a span is judged so much later: links hold corrections up, and with the stamps wrong by 2 s none is alike
 SILENT_NS = 10_000_000_000  # a receiver without fixes for so long makes room for another
 GATE_SIGMA = 4.0  # corrections further off under every candidate tell nothing of a share,
 RELOCK = 3  # and after so many spans of them in a row the base counts as another one; a few more, and they look likely
@@ -75,8 +77,8 @@ class SiteShareEstimator:
 
     def __init__(self) -> None:
         others = len(CANDIDATES) - 1
-        self._at_first = np.log([NONE_AT_FIRST, *[(1 - NONE_AT_FIRST) / others] * others])
-        self._log = self._at_first.copy()
+        self._at_first = np.array([NONE_AT_FIRST, *[(1 - NONE_AT_FIRST) / others] * others])
+        self._weights = self._at_first
         self._x = np.zeros((len(CANDIDATES), STATES))
         self._P = np.zeros((len(CANDIDATES), STATES, STATES))
         self._machine, self._base = GpsError(1.0, 45.0), GpsError(1.0, 45.0)
@@ -88,8 +90,7 @@ class SiteShareEstimator:
     @property
     def share(self) -> float:
         """Mean over the candidates, 0 to 1."""
-        weights = np.exp(self._log - self._log.max())
-        return float(weights.dot(CANDIDATES) / weights.sum())
+        return float(self._weights.dot(CANDIDATES))
 
     def drive(self, stamp_ns: int, shift_m: Floats) -> None:
         """Note a step (2,) [m] by dead reckoning, which loses its place with it."""
@@ -133,13 +134,13 @@ class SiteShareEstimator:
             self._filtered = number
         dt_s, self._filtered = (number - self._filtered) * SPAN_NS * 1e-9, number
         self._predict(dt_s, span)
-        keep = math.exp(-dt_s / MEMORY_S)
-        self._log = keep * self._log + (1 - keep) * self._at_first
+        lasts, likelihood = math.exp(-dt_s / LASTS_S), np.zeros(len(CANDIDATES))
         if span.fixes.count:
-            self._log += self._condition(Q, E, span.fixes)[0]
+            likelihood += self._condition(Q, E, span.fixes)[0]
         if span.corrections.count:
-            self._log += self._condition_on_correction(span.corrections)
-        self._log -= self._log.max()
+            likelihood += self._condition_on_correction(span.corrections)
+        weights = (lasts * self._weights + (1 - lasts) * self._at_first) * np.exp(likelihood - likelihood.max())
+        self._weights = weights / weights.sum()
 
     def _predict(self, dt_s: float, span: _Span) -> None:
         machine, base = self._machine, self._base

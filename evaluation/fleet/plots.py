@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from evaluation.campaign.figures import Report, Row, select
 from evaluation.campaign.pictures import EAST, NORTH, ZONE_RGB, head
 from evaluation.fleet.cases import FleetCase
 from evaluation.fleet.experiment import GOALS
-from evaluation.fleet.solving import MAPS, CaseResult
+from evaluation.fleet.solving import MAPS, CaseResult, JudgedMap
 from evaluation.maps.cases import CELL_M
 from protocol.arrays import Floats, Ints
 from protocol.site.ground_classes import UNKNOWN, ZONES
@@ -55,13 +56,18 @@ def draw_maps(case: FleetCase, seed: int, result: CaseResult) -> Figure:
         _image(axes[1], 1 - pale[..., None] * (1 - _rgb(true)))
         north, east = (judged.passed & (judged.estimated != true)).nonzero()
         axes[1].plot((east + 0.5) * CELL_M, (north + 0.5) * CELL_M, "s", color=WRONG_RGB, ms=2.5)
-        head(axes[1], f"{name}: {judged.figures['wrong_pct']:.1f} % of the cells passed are wrong")
+        head(axes[1], f"{name}: {_percent(judged)} of the cells passed are wrong")
         axes[1].set_xlabel(EAST)
     for axes in (panels[0, 0], panels[1, 1]):
         axes.set_ylabel(NORTH)
-    oracle = result.maps["oracle"].figures["wrong_pct"]
-    head(figure, f"{case.name}, seed {seed}; with the true zeros and scales {oracle:.1f} % are wrong", 11)
+    oracle = _percent(result.maps["oracle"])
+    head(figure, f"{case.name}, seed {seed}; with the true zeros and scales {oracle} are wrong", 11)
     return figure
+
+
+def _percent(judged: JudgedMap) -> str:
+    wrong = judged.figures["wrong_pct"]
+    return "none known" if math.isnan(wrong) else f"{wrong:.1f} %"
 
 
 def _image(axes: Axes, rgb: Floats) -> None:
@@ -97,7 +103,7 @@ def draw_table(report: Report) -> Figure:
     handles: list[Any] = [Patch(color=colour, label=name) for name, colour in COLOUR.items()]
     handles.append(Line2D([], [], color="black", lw=2, label="goal"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4)
-    head(axes, f"Means of {len(report['seeds'])} seeds; dots: single ones")
+    head(axes, f"Means over the seeds ({len(report['seeds'])}); dots: single ones")
     return figure
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.observability import CommonScale, Observed, observe
-from mapserver.fleet.passages import Epochs
+from mapserver.fleet.passages import Epochs, sound
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, against, estimate, problem
 from protocol.arrays import Bools, Floats, Table
 from protocol.site.site_config import KnownGround
@@ -24,6 +24,7 @@ ZERO_FLOOR, SCALE_FLOOR = 0.0004, 0.004
 FAULTY_SIGMAS = 3.0  # of the data sheet: a scale so far off is worse than anything that a slope may hide
 FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a zero, and a scale of 30 %, that no sensor of its kind has
 SURE = 2.0  # standard deviations by which an estimate must be beyond a limit
+KNOWN = CommonScale(True, 0.0, "")  # of machines that are solved together: what their estimate says is all there is
 # A sensor that measures less than half or more than twice of the drive force has no gain: it is stuck, or on its head.
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 
@@ -64,22 +65,21 @@ def calibrate(
 ) -> Calibration:
     """Solve for all machines.
 
-    ledgers: stays by machine, as `Ledger.stays` has them. excluded: machines without a say. areas: whose
-    c_rr the site states. priors: of machines of which more is known than their data sheet.
+    ledgers: stays by machine, as `Ledger.stays` has them. excluded: machines without a say, beside those that are at
+    fault. areas: whose c_rr the site states. priors: of machines of which more is known than their data sheet.
     """
     priors = priors or {}
-    known = {name: table for name, table in ledgers.items() if len(table)}
+    known = {name: stays for name, table in ledgers.items() if len(stays := sound(table))}
     trusted = {name: table for name, table in known.items() if name not in excluded}
     if not trusted:
         return Calibration((), {}, CommonScale(False, SCALE_STD, "no_machine"))
     pb, result = _common_ground(trusted, areas, priors)
     observed = observe(pb, result)
-    corrections, states = _said(pb, result, observed, observed.absolute)
+    corrections, states = _said(pb, result, observed)
     for name in sorted(set(known) - set(pb.names)):
         own = problem({name: known[name]}, areas, priors)
         alone = against(own, pb, result)
-        shown = observe(own, alone)
-        more, state = _said(own, alone, shown, shown.absolute & observed.common.observed)
+        more, state = _said(own, alone, observe(own, alone), observed.common)
         corrections, states = corrections + more, states | state
     return Calibration(tuple(corrections), dict(sorted(states.items())), observed.common)
 
@@ -116,9 +116,14 @@ def _oddest(pb: Problem, result: Estimate) -> str:
     return pb.names[worst] if far[worst].max() > 1 else ""
 
 
-def _beyond(pb: Problem, result: Estimate) -> Floats:
-    """By how many standard deviations of the data sheet the largest zero and the scale (m, 2) are off, for sure."""
-    surely = np.maximum(np.abs(result.x) - SURE * np.sqrt(np.diag(result.covariance())), 0.0)
+def _beyond(pb: Problem, result: Estimate, others_std: float = 0.0) -> Floats:
+    """By how many standard deviations of the data sheet the largest zero and the scale (m, 2) are off, for sure.
+
+    others_std: of the scale of those against whose ground the machine was solved.
+    """
+    std = np.sqrt(np.diag(result.covariance()))
+    std[pb.layout.scales] = np.hypot(std[pb.layout.scales], others_std)
+    surely = np.maximum(np.abs(result.x) - SURE * std, 0.0)
     zeros = [surely[pb.layout.zeros][pb.epochs.machine == index].max() for index in range(len(pb.names))]
     out: Floats = np.stack([np.array(zeros) / ZERO_STD, surely[pb.layout.scales] / SCALE_STD], axis=1)
     return out
@@ -138,22 +143,25 @@ class _Applied:
 
 
 def _said(
-    pb: Problem, result: Estimate, observed: Observed, absolute: Bools
+    pb: Problem, result: Estimate, observed: Observed, others: CommonScale = KNOWN
 ) -> tuple[list[Correction], dict[str, MachineState]]:
-    """Corrections and states of the machines of a problem. absolute (m,): whose scale the evidence shows."""
-    applied = _applied(pb, result, observed, absolute)
+    """Corrections and states of the machines of a problem. others: of those whose ground it was solved against."""
+    applied = _applied(pb, result, observed, others)
     return _corrections(pb, applied), _states(pb, applied, observed.by)
 
 
-def _applied(pb: Problem, result: Estimate, observed: Observed, absolute: Bools) -> _Applied:
+def _applied(pb: Problem, result: Estimate, observed: Observed, others: CommonScale) -> _Applied:
     """Scales count where the evidence shows them, and where they are so far off that any value is better than none.
 
     There the estimate itself is taken: what is not observed of it is no more than what the data sheet leaves open. But
     not where slopes contradict each other: nobody knows then who is far off.
     """
     scales = np.arange(pb.layout.scales.start, pb.layout.scales.stop)
-    covariance, beyond = result.covariance(), _beyond(pb, result)
-    far = (beyond[:, 1] > FAULTY_SIGMAS) & (not result.edges)
+    absolute = observed.absolute & others.observed
+    covariance, beyond = result.covariance(), _beyond(pb, result, 0.0 if others.observed else others.std)
+    if result.edges:
+        beyond[:, 1] *= absolute
+    far = beyond[:, 1] > FAULTY_SIGMAS
     x, left = observed.x.copy(), observed.covariance.copy()
     x[scales] = np.where(absolute, x[scales], np.where(far, result.x[scales], 0.0))
     for index, at in enumerate(scales.tolist()):
@@ -162,7 +170,6 @@ def _applied(pb: Problem, result: Estimate, observed: Observed, absolute: Bools)
             left[at, at] = covariance[at, at] if far[index] else SCALE_STD**2
     zeros = np.arange(len(pb.epochs.number))
     left[zeros, zeros] += moved(pb.epochs, x[zeros], left[zeros, zeros])
-    beyond[:, 1] *= absolute  # of machines that differ nobody knows which is at fault
     return _Applied(x, left, absolute | far, beyond)
 
 
@@ -232,3 +239,23 @@ def _states(
             beyond=(float(applied.beyond[index, 0]), float(applied.beyond[index, 1])),
         )
     return out
+
+
+def state_of(correction: Correction) -> MachineState:
+    """What a correction in force says of its machine, where nothing has been solved yet."""
+    k = correction.scale / (1 - correction.scale)
+    zero_std, scale_std, across_std = np.sqrt(np.diag(correction.covariance or np.zeros((3, 3)))).tolist()
+    return MachineState(
+        zero=correction.zero,
+        zero_std=zero_std,
+        scale=k,
+        scale_std=scale_std,
+        across=correction.across,
+        across_std=across_std,
+        zero_by=(),
+        scale_by=(),
+        beyond=(
+            max(abs(correction.zero) - SURE * zero_std, 0.0) / ZERO_STD,
+            max(abs(k) - SURE * scale_std, 0.0) / SCALE_STD,
+        ),
+    )

@@ -111,9 +111,9 @@ class Corrections:
         them only what a sample does not state as applied is taken off. Values leave the limits of a sample by nothing:
         they end there.
         """
-        places = np.array([self._places.get(name, (0, 0)) for name in machines], np.int64).reshape(-1, 2)
-        if not len(rows) or not places.any():
+        if not any(name in self._places for name in machines) or not len(rows):
             return rows
+        places = np.array([self._places.get(name, (0, 0)) for name in machines], np.int64)
         out = rows.copy()
         _correct(out, machine, places, self._spans, self._values, UNIT_VECTORS)
         return out

@@ -56,13 +56,17 @@ class Epochs:
     number: Ints
 
 
+def sound(table: Table) -> Table:
+    """The stays that a machine can have made."""
+    return table[(table["n"] <= MOST_SAMPLES) & (table["n"] > 0)]
+
+
 def passages(ledgers: Mapping[str, Table]) -> tuple[Passages, Epochs, Ints]:
     """Stays of machines by name, the names in order; their epochs; and the numbers of the cells that indices mean."""
     parts, epochs, numbers = [], [], []
     count = 0
     for index, name in enumerate(sorted(ledgers)):
-        table = ledgers[name]
-        table = table[(table["n"] <= MOST_SAMPLES) & (table["n"] > 0)]
+        table = sound(ledgers[name])
         own, which = np.unique(st.slot(table["key"]) // EPOCH_SLOTS, return_inverse=True)
         parts.append(_in_order(table, index, which + count))
         epochs.append(np.full(len(own), index))

@@ -26,14 +26,14 @@ from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 
 DAYS = 2  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
 EVERY_NS = 60 * 10**9  # of site time, between two solves: a fifth of an epoch
-REST = 20.0  # times as long as a solve took; so a replayed log does not keep a core busy with solving
+REST = 50.0  # times as long as a solve took: 2 % of a core, also where a log is replayed
 TURN_SAMPLES = 200_000  # read in one turn, in about 0.2 s
 Decide = Callable[[Calibration, int], object]
 log = logging.getLogger("mapserver.follower.calibrating")
 
 
 class Calibrating:
-    """Ledgers of all machines, and what they come to. solved: the last solve; None before the first one.
+    """Ledgers of all machines, and what they come to. solved: the last solve, and the site's now then [ns].
 
     decide: is given each solve and the site's now [ns]. doubtful: machines that are to have no say now.
     """
@@ -48,19 +48,19 @@ class Calibrating:
         doubtful: Callable[[], frozenset[str]],
         ending: threading.Event,
     ) -> None:
-        self.solved: Calibration | None = None
+        self.solved: tuple[Calibration, int] = calibrate({}), 0
         self._writer, self._past, self._decide, self._doubtful, self._ending = writer, past, decide, doubtful, ending
         self._reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ledgers: dict[str, Ledger] = {}
         self._followed = 0
         self._from_ns: int | None = None  # of samples that are read: until it has caught up, those of the last days
-        self._solved_ns: int | None = None
+        self._solved_ns = self._now_ns()  # or the start: what was known by then is decided already
         self._due_s = 0.0
         self._turn = threading.Lock()  # of all that is used here: `solve` is for any thread
 
     def states(self) -> Mapping[str, MachineState]:
         """What the last solve says of machines, by name."""
-        return self.solved.machines if self.solved else {}
+        return self.solved[0].machines
 
     def run(self) -> None:
         """Follow the journal; where that is done and it is time, solve, and have it decided."""
@@ -68,9 +68,11 @@ class Calibrating:
             if not self._follow(TURN_SAMPLES) or time.monotonic() < self._due_s:
                 return
             now_ns = self._now_ns()
-            if self._solved_ns is not None and self._solved_ns <= now_ns < self._solved_ns + EVERY_NS:
+            if self._solved_ns <= now_ns < self._solved_ns + EVERY_NS:
                 return
-            self._decide(self._solve(now_ns), now_ns)
+            solved = self._solve(now_ns)
+            if self._writer.config.calibration.automatic and not self._ending.is_set():
+                self._decide(solved, now_ns)
 
     def solve(self) -> tuple[Calibration, int]:
         """Solve with all that is journalled by now; what came out, and the site's now [ns]. For any thread."""
@@ -92,7 +94,8 @@ class Calibrating:
         began_s, self._solved_ns = time.thread_time(), now_ns
         try:
             stays = {name: ledger.stays() for name, ledger in self._ledgers.items()}
-            self.solved = solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground)
+            solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground)
+            self.solved = solved, now_ns
         finally:
             took_s = time.thread_time() - began_s
             self._due_s = time.monotonic() + REST * took_s

@@ -1,15 +1,19 @@
-"""The follower: a thread beside the writer that runs five jobs in turn, and one that folds the map again."""
+"""The follower: a thread beside the writer that runs four jobs in turn, one that calibrates, one that folds again."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from mapserver.fleet.calibration import MachineState, state_of
+from mapserver.fleet.correction import Corrections
 from mapserver.follower.calibrating import Calibrating
+from mapserver.follower.calibration_state import calibration_of, decided_by_person
 from mapserver.follower.checkpointing import Checkpointing
-from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Publish
+from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Job, Publish
 from mapserver.follower.refolding import Refolding
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
@@ -19,11 +23,14 @@ from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError, StoreError
 from protocol.queries.answers import GroundChange
+from protocol.queries.calibration import CalibrationAnswer
+from protocol.queries.commands import CalibrateCommand
 
 # Between two turns, which is how late a change of the ground is published: where a large fleet drives everywhere at
 # once, each turn looks at all of the map again, and no more than a share of one core should go into that.
 TURN_S, LATEST_S = 1.0, 5.0
 SHARE = 0.2
+END_S = 5.0  # a solve may take so long in the end
 log = logging.getLogger("mapserver.follower.follower")
 
 
@@ -39,13 +46,19 @@ class Follower:
         self._ending = threading.Event()
         self._refolding = Refolding(writer, past)
         self._calibrating = Calibrating(writer, past, self._refolding.calibrate, self._doubtful, self._ending)
-        self._audit = Audit(writer, reader, self._refolding.judge, self._calibrating.states, self._ending)
+        self._audit = Audit(writer, reader, self._refolding.judge, self._known, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
         archiving = Archiving(writer, reader, self._ending)
-        self._jobs = (self._audit, self._calibrating, self._changes, archiving, self._checkpointing)
-        self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
-        self._thread.start()
+        jobs = {
+            "follower": (self._audit, self._changes, archiving, self._checkpointing),
+            "calibration": (self._calibrating,),  # which may take seconds at a time
+        }
+        self._threads = [
+            threading.Thread(target=self._run, args=(some,), name=name, daemon=True) for name, some in jobs.items()
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def facts(self) -> Facts:
         """What the map is folded with."""
@@ -66,13 +79,33 @@ class Follower:
         Returns the state of the machine. Raises QueryError for a machine that has sent nothing, where the decision
         cannot be written, or after wait_s; then it is kept all the same.
         """
-        sent = self._writer.run(lambda store: store.machines())
-        if machine not in sent:
-            names = ", ".join(sorted(sent)) or "none"
-            raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
+        self._require_known(machine)
         number = self._refolding.decide(self._decision(machine, trusted, reason))
         self._refolding.wait(number, wait_s)
         return next(row for row in self.machines() if row["name"] == machine)
+
+    def calibration(self) -> CalibrationAnswer:
+        """What is taken off the samples of all machines, and what is known of their calibration."""
+        solved, solved_ns = self._calibrating.solved
+        version, corrections, sent = self._writer.run(
+            lambda store: (store.version, store.facts.corrections, store.machines())
+        )
+        machines = (
+            calibration_of(name, self._refolding.calibration(name), solved.machines.get(name), corrections)
+            for name in sorted(sent)
+        )
+        common = (solved_ns, solved.common.std, solved.common.reason)
+        return CalibrationAnswer(version.store, version.row, version.fact, *common, tuple(machines))
+
+    def correct(self, command: CalibrateCommand) -> None:
+        """Decide what is taken off the samples of one machine, or leave it to the solver; waits as `calibrate`.
+
+        Raises QueryError as that does, and for a machine that has sent nothing.
+        """
+        self._require_known(command.machine)
+        stamp_ns = self._writer.run(lambda store: store.newest_ns)
+        number = self._refolding.decide(decided_by_person(command, stamp_ns))
+        self._refolding.wait(number, command.wait_s)
 
     def calibrate(self, wait_s: float) -> None:
         """Calibrate all machines with all that is journalled by now; waits until the map is folded so.
@@ -90,10 +123,25 @@ class Follower:
         """End the threads."""
         self._ending.set()
         self._refolding.close()
-        self._thread.join()
+        following, calibrating = self._threads
+        following.join()
         self._checkpointing.close()
-        self._calibrating.close()
+        calibrating.join(END_S)
+        if not calibrating.is_alive():  # else it ends with the process: what it solves is of no use any more
+            self._calibrating.close()
         self._reader.close()
+
+    def _known(self) -> tuple[Corrections, Mapping[str, MachineState]]:
+        """Corrections that are decided, and what is known of machines: by the last solve, else by their corrections."""
+        corrections, solved = self._refolding.corrections(), self._calibrating.states()
+        newest = {one.machine: one for one in corrections.each if one.machine not in solved}
+        return corrections, {name: state_of(one) for name, one in newest.items()} | dict(solved)
+
+    def _require_known(self, machine: str) -> None:
+        sent = self._writer.run(lambda store: store.machines())
+        if machine not in sent:
+            names = ", ".join(sorted(sent)) or "none"
+            raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
 
     def _doubtful(self) -> frozenset[str]:
         """Machines without a say on what the ground is like: those left out, and those that contradict all others."""
@@ -122,10 +170,10 @@ class Follower:
             return TrustDecision(machine, not contradicts, AUDIT, reason or "left to the audit", stamp_ns)
         return TrustDecision(machine, trusted, PERSON, reason, stamp_ns)
 
-    def _run(self) -> None:
+    def _run(self, jobs: Iterable[Job]) -> None:
         while not self._ending.is_set():
             began_s = time.thread_time()
-            for job in self._jobs:
+            for job in jobs:
                 if self._ending.is_set():
                     break
                 try:

@@ -10,6 +10,8 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -19,9 +21,11 @@ from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.fleet.calibration import MachineState
-from mapserver.fleet.correction import UNCORRECTED
+from mapserver.fleet.correction import UNCORRECTED, Corrections
+from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
@@ -30,24 +34,34 @@ from protocol.queries.answers import GroundChange
 LOOK_BLOCKS = 256  # for changes, at a time: the writer copies their pages, and batches wait meanwhile
 LOOK_S = 60.0  # between two looks for rows that are old enough: files are of whole hours
 Report = Callable[[Mapping[str, Verdict], int], None]
-States = Callable[[], Mapping[str, MachineState]]
+Known = Callable[[], tuple[Corrections, Mapping[str, MachineState]]]
 Publish = Callable[[GroundChange], None]
 log = logging.getLogger("mapserver.follower.jobs")
 
 
-class Audit:
-    """Hands what is journalled, corrected as in the map, to an auditor, and judges all machines from time to time.
+class Job(Protocol):
+    """Work that is looked after again and again. name: for the log."""
 
-    report: is given all verdicts, and the site's now [ns]. states: what calibration knows of machines, by name.
+    name: str
+
+    def run(self) -> None:
+        """Do what is due, and return soon."""
+
+
+class Audit:
+    """Hands what is journalled, corrected, to an auditor, and judges all machines from time to time.
+
+    report: is given all verdicts, and the site's now [ns]. known: the corrections that are decided, also of machines
+    that are left out, and what calibration knows of machines, by name.
     """
 
     name = "audit"
 
     def __init__(
-        self, writer: Writer, reader: JournalReader, report: Report, states: States, ending: threading.Event
+        self, writer: Writer, reader: JournalReader, report: Report, known: Known, ending: threading.Event
     ) -> None:
         self.verdicts: Mapping[str, Verdict] = {}
-        self._writer, self._reader, self._report, self._states, self._ending = writer, reader, report, states, ending
+        self._writer, self._reader, self._report, self._known, self._ending = writer, reader, report, known, ending
         self._corrections = UNCORRECTED
         self._begin()
         self._due_s = 0.0
@@ -64,22 +78,21 @@ class Audit:
         finally:  # a row that cannot be read must not keep the machines from being judged by the others
             if time.monotonic() >= self._due_s:
                 self._due_s = time.monotonic() + self._writer.config.trust.judge_s
-                self.verdicts = self._auditor.verdicts(self._states())
+                self.verdicts = self._auditor.verdicts(self._known()[1])
                 self._report(self.verdicts, self._writer.run(lambda store: store.newest_ns))
 
     def _follow(self) -> None:
-        corrections = self._writer.run(lambda store: store.facts.corrections)
+        corrections, _ = self._known()
         if corrections != self._corrections:  # a map of a machine is of samples that were all corrected alike
             self._corrections = corrections
             self._begin()
         until = self._reader.last_row  # what comes in meanwhile waits for the next turn: a busy site has no end
         for rows in self._reader.read_many(after=max(self._followed, self._reader.archived_row), until=until):
-            machine = np.repeat(rows.machine, rows.lengths)
-            for row in replace(rows, samples=corrections.applied(rows.samples, rows.machines, machine)):
-                self._auditor.add(row.machine, row.rows)
-                self._followed = row.row
-                if self._ending.is_set():
-                    return
+            samples = corrections.applied(rows.samples, rows.machines, np.repeat(rows.machine, rows.lengths))
+            self._auditor.add_all(replace(rows, samples=samples))
+            self._followed = int(rows.numbers[-1])
+            if self._ending.is_set():
+                return
 
 
 class ChangeSearch:
@@ -124,13 +137,14 @@ class ChangeSearch:
 
 
 class Archiving:
-    """Moves journal rows that are old enough into hourly Parquet files."""
+    """Moves journal rows that are old enough into hourly Parquet files, and keeps decisions beside these."""
 
     name = "archiving"
 
     def __init__(self, writer: Writer, reader: JournalReader, ending: threading.Event) -> None:
         self._writer, self._reader, self._ending = writer, reader, ending
         self._due_s = 0.0
+        self._kept = 0  # number of the last decision that is beside the files
 
     def run(self) -> None:
         """Move the next hour of old rows, where it is time: an hour a turn, so that the end need not wait."""
@@ -145,6 +159,14 @@ class Archiving:
             self._writer.run(lambda store: store.journal.shrink())
             log.info("archived file=%s", path.name)
             self._due_s = 0.0  # there may be more hours
+        self._keep_decisions(folder)
+
+    def _keep_decisions(self, folder: Path) -> None:
+        """Have those about calibration beside the files, where there are any."""
+        newest = self._writer.run(lambda store: store.fact)
+        if folder.exists() and newest != self._kept:
+            archived_decisions.save(folder, self._writer.store_id, calibrations(self._reader))
+            self._kept = newest
 
     def _forget(self, until: int) -> int:
         if self._ending.is_set():  # what is in both meanwhile counts once, and the next start goes on with it

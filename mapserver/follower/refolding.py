@@ -17,6 +17,7 @@ from typing import TypeVar
 
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.correction import Corrections
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import JOURNAL_FILE, Store
@@ -66,6 +67,11 @@ class Refolding:
         """The newest decision about the trust in a machine that counts."""
         with self._changed:
             return self._decisions.trust.newest(machine)
+
+    def corrections(self) -> Corrections:
+        """Those that decisions come to, also of machines that are left out."""
+        with self._changed:
+            return self._decisions.calibration.corrections
 
     def calibration(self, machine: str) -> CalibrationDecision | None:
         """The newest decision about the calibration of a machine that counts."""
@@ -138,7 +144,7 @@ class Refolding:
             return self._decided
 
     def _keep(self, store: Store, decision: Decision) -> int:
-        event, facts = store.decide(decision)
+        facts = store.decide(decision)
         if isinstance(decision, TrustDecision):
             values = (decision.machine, decision.trusted, decision.by, decision.reason)
             log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
@@ -146,7 +152,7 @@ class Refolding:
             spans = (decision.machine, len(decision.corrections), decision.by, decision.reason)
             log.info("calibration machine=%s spans=%d by=%s reason=%r", *spans)
         with self._changed:
-            self._decisions.add(event)
+            self._decisions.add(decision, facts.number)
             self._wanted = facts
             self._decided += 1
             self._changed.notify_all()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,14 +33,18 @@ class Decisions:
     @classmethod
     def of_journal(cls, journal: JournalQueries) -> Decisions:
         """Those that a journal has; StoreError where one was written by a newer version."""
-        decisions = cls()
-        decisions._add_all(decided(journal), journal.path)
+        decisions, number = cls(), 0
+        for event in journal.events():
+            if event.kind in KINDS:
+                decisions._take(_decision(event, journal.path))
+                number = event.id
+        decisions._conclude(number)
         return decisions
 
-    def add(self, event: Event) -> None:
-        """Have one more decision count; NewerVersionError where a newer version wrote it."""
-        self._take(event)
-        self._conclude(event.id)
+    def add(self, decision: Decision, number: int) -> None:
+        """Have one more decision count. number: of its event."""
+        self._take(decision)
+        self._conclude(number)
 
     def offer(self, machine: str) -> dict[str, Any] | None:
         """What a machine may take for its own calibration, as an acknowledgement has it; None for nothing.
@@ -54,22 +58,11 @@ class Decisions:
         offer = CalibrationOffer(machine, decision.stamp_ns, newest.zero, newest.scale, zz, ss, zs)
         return encode_offer(offer)
 
-    def _add_all(self, events: Iterable[Event], path: Path) -> None:
-        number = 0
-        for event in events:
-            try:
-                self._take(event)
-            except NewerVersionError as error:
-                problem = f"event {event.id}: {error}; open it with that version, or choose another --store"
-                raise StoreError(path, problem) from None
-            number = event.id
-        self._conclude(number)
-
-    def _take(self, event: Event) -> None:
-        if event.kind == calibration.KIND:
-            self.calibration.add(CalibrationDecision.from_body(event.body))
+    def _take(self, decision: Decision) -> None:
+        if isinstance(decision, CalibrationDecision):
+            self.calibration.add(decision)
         else:
-            self.trust.add(TrustDecision(**event.body))
+            self.trust.add(decision)
 
     def _conclude(self, number: int) -> None:
         excluded, corrections = self.trust.distrusted, self.calibration.corrections
@@ -78,13 +71,24 @@ class Decisions:
         self.facts = Facts(excluded, corrections, number)
 
 
-def decided(journal: JournalQueries) -> list[Event]:
-    """Events of all decisions about machines, in the order in which they were made."""
-    return [event for event in journal.events() if event.kind in KINDS]
+def calibrations(journal: JournalQueries) -> list[CalibrationDecision]:
+    """Decisions about calibration that a journal has, in their order; StoreError as `Decisions.of_journal`."""
+    decisions = (_decision(event, journal.path) for event in journal.events(calibration.KIND))
+    return [decision for decision in decisions if isinstance(decision, CalibrationDecision)]
 
 
-def plain(decision: Decision) -> tuple[str, Mapping[str, Any]]:
-    """Kind and body of the event that keeps a decision."""
+def plain(decision: Decision) -> tuple[str, int, Mapping[str, Any]]:
+    """Kind, stamp and body of the event that keeps a decision."""
     if isinstance(decision, CalibrationDecision):
-        return calibration.KIND, decision.body()
-    return trust.KIND, asdict(decision)
+        return calibration.KIND, decision.stamp_ns, decision.body()
+    return trust.KIND, decision.stamp_ns, asdict(decision)
+
+
+def _decision(event: Event, path: Path) -> Decision:
+    if event.kind == trust.KIND:
+        return TrustDecision(**event.body)
+    try:
+        return CalibrationDecision.from_body(event.body)
+    except NewerVersionError as error:
+        problem = f"event {event.id}: {error}; open it with that version, or choose another --store"
+        raise StoreError(path, problem) from None

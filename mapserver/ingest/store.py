@@ -25,12 +25,11 @@ from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.decisions import Decision, Decisions, plain
 from mapserver.ingest.losses import by_machine, name_shortfalls
 from mapserver.ingest.store_folder import hold
-from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import Journal
 from mapserver.journal.refold import fold_history, release_memory
-from mapserver.journal.rows import Admission, Event, Selection
+from mapserver.journal.rows import Admission, Selection
 from mapserver.past import checkpoints
 from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
@@ -88,7 +87,7 @@ class Store:
             self.merged, self.grid = loaded
             self.snapshot_row = self.merged
             in_snapshot = self.grid.counts()
-            fold_history(self.grid, self._history(), self.merged, selection=Selection.by(facts))
+            fold_history(self.grid, History.beside(self.journal), self.merged, selection=Selection.by(facts))
             release_memory()
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
@@ -169,22 +168,20 @@ class Store:
         """
         grid.touch_all()
         selection = Selection.by(facts)
-        for rows in read_history(self._history(), after=row, selection=selection):
+        for rows in read_history(History.beside(self.journal), after=row, selection=selection):
             grid.fold_all(*rows.selected(selection))
         self.grid, self.facts = grid, facts
         self._count_decisions()
         self.snapshot_row = self._snapshot_samples = 0  # what is on disk was folded with other facts
 
-    def decide(self, decision: Decision) -> tuple[Event, Facts]:
-        """Keep a decision with the journal; returns it as an event, and the facts that the map is to follow.
+    def decide(self, decision: Decision) -> Facts:
+        """Keep a decision with the journal; returns the facts that the map is to follow.
 
         It counts at once, unless the map has to be folded again for it.
         """
-        kind, body = plain(decision)
-        event = Event(self.journal.append_event(kind, decision.stamp_ns, body), kind, decision.stamp_ns, body)
-        self._decisions.add(event)
+        self._decisions.add(decision, self.journal.append_event(*plain(decision)))
         self._count_decisions()
-        return event, self._decisions.facts
+        return self._decisions.facts
 
     def accept(self, store: str, reason: str) -> None:
         """Take the place of another store for good, since a person says so: its runs are taken on here."""
@@ -206,6 +203,8 @@ class Store:
             "descends": list(self.identity.descends),
             "accepted": sorted(self.accepted),
             "fact": self.fact,
+            "decided": self._decisions.facts.number,
+            "corrections": len(self.facts.corrections.each),
             "journalled": self.journalled,
             "merged": self.merged,
             "snapshot": self.snapshot_row,
@@ -295,6 +294,3 @@ class Store:
         """Count further decisions as followed where they come to the facts that the grid has."""
         if self._decisions.facts == self.facts:
             self.facts = self._decisions.facts
-
-    def _history(self) -> History:
-        return History(self.journal, Archive(self.folder / FOLDER))

@@ -25,7 +25,8 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
 from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
-from protocol.queries.commands import AcceptCommand, TrustCommand, parse_command
+from protocol.queries.calibration import CalibrationAnswer, encode_calibration
+from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, parse_command
 from protocol.queries.map_tiles import TilesAnswer, encode_tiles
 from protocol.queries.reasons import CellReasons, encode_why
 from protocol.queries.requests import (
@@ -70,6 +71,8 @@ class Answers:
         if isinstance(command, AcceptCommand):
             self._writer.run(lambda store: store.accept(command.store, command.reason))
             return codec.encode_info(self.info())
+        if isinstance(command, CalibrateCommand):
+            return encode_calibration(self.calibrate(command))
         return codec.encode_machine(self.trust(command))
 
     def answer(self, query: MapQuery) -> bytes:
@@ -87,10 +90,18 @@ class Answers:
                 return encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
+            case _:
+                return self._of_server(query)
+
+    def _of_server(self, query: MapQuery) -> bytes:
+        """Answers that are not about cells."""
+        match query:
             case requests.AliveQuery():
                 return codec.encode_alive(self._writer.alive())
             case requests.MachinesQuery():
                 return codec.encode_machines(self._follower.machines(), self._version())
+            case requests.CalibrationQuery():
+                return encode_calibration(self._follower.calibration())
             case requests.ChangesQuery():
                 changes = self._follower.changes(query.after)[: codec.MAX_CHANGES]
                 return codec.encode_changes(changes, self._version())
@@ -168,6 +179,14 @@ class Answers:
         row = self._follower.trust(command.machine, command.trusted, command.reason, command.wait_s)
         version = self._version()
         return {**row, "store": version.store, "merged": version.row, "fact": version.fact}
+
+    def calibrate(self, command: CalibrateCommand) -> CalibrationAnswer:
+        """What is known of all machines once the command counts."""
+        if command.machine:
+            self._follower.correct(command)
+        else:
+            self._follower.calibrate(command.wait_s)
+        return self._follower.calibration()
 
     def _version(self) -> MapVersion:
         return self._writer.run(lambda store: store.version)

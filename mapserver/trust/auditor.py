@@ -19,6 +19,7 @@ import numpy as np
 
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
 from mapserver.fleet.calibration import MachineState
+from mapserver.journal.rows import JournalRows
 from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
 from mapserver.trust.comparison import ComparedMap, Difference, compare, reverse
 from mapserver.trust.judgement import (
@@ -70,18 +71,33 @@ class Auditor:
         self._clocks = ClockLeads()
 
     def add(self, machine: str, rows: Table) -> None:
-        """Add samples of one machine, corrected; rows in the order of the journal.
+        """Add samples of one machine, corrected; in the order of the journal.
 
         The maps depend on no order. The clocks do: compared is what the machines sent at about the same time, and the
         order of the journal shows that better than the time of receipt, which steps where the server's clock is set.
         """
+        if len(rows):
+            self._add(machine, rows)
+            self._clocks.add(machine, int(rows["stamp_ns"].max()))
+
+    def add_all(self, rows: JournalRows) -> None:
+        """Add many journal rows at once, as one by one. Their samples are corrected."""
+        machine = np.repeat(rows.machine, rows.lengths)
+        for index, name in enumerate(rows.machines):
+            self._add(name, rows.samples[machine == index])
+        some = rows.lengths > 0
+        starts = (np.cumsum(rows.lengths) - rows.lengths)[some]
+        newest = np.maximum.reduceat(rows.samples["stamp_ns"], starts) if len(starts) else starts
+        for index, stamp_ns in zip(rows.machine[some].tolist(), newest.tolist(), strict=True):
+            self._clocks.add(rows.machines[index], stamp_ns)
+
+    def _add(self, machine: str, rows: Table) -> None:
         if not len(rows):
             return
         if machine not in self._maps:
             self._maps[machine] = CoarseMap(self._cell_m)
         sure = is_foldable(rows, self._fold)
         self._maps[machine].add(rows if sure.all() else rows[sure])
-        self._clocks.add(machine, int(rows["stamp_ns"].max()))
 
     def verdicts(self, states: Mapping[str, MachineState] | None = None) -> dict[str, Verdict]:
         """Judge every machine. states: what calibration knows of them, by name."""

@@ -9,6 +9,8 @@ from protocol.site.site_config import NAME
 from protocol.wire.codec import STORE_ID
 
 MAX_WAIT_S = 60.0
+# By which a person may correct: an accelerometer that lies on its side, a torque that reads twice or half as much.
+MOST_OFF = {"zero": 0.5, "scale": 0.9, "across": 0.5}
 _WORDS = {"yes": True, "no": False, "auto": None}
 
 
@@ -38,16 +40,52 @@ class AcceptCommand:
     name = "accept"
 
 
-Command = TrustCommand | AcceptCommand
+@dataclass(frozen=True)
+class CalibrateCommand:
+    """Calibrate all machines with all samples that there are, or decide what is taken off those of one.
+
+    machine: empty for all. zero, scale, across: of that one, as in `protocol.queries.calibration.CorrectedSpan`, for
+    all of its samples; None for what is not given. auto: leaves that machine to the server again. reason: one line,
+    required with values. wait_s: how long to wait for the map to be folded again.
+    """
+
+    machine: str = ""
+    zero: float | None = None
+    scale: float | None = None
+    across: float | None = None
+    auto: bool = False
+    reason: str = ""
+    wait_s: float = 30.0
+
+    name = "calibrate"
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Those that are given, by name."""
+        given = {"zero": self.zero, "scale": self.scale, "across": self.across}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+Command = TrustCommand | AcceptCommand | CalibrateCommand
 
 
 def encode_command(command: Command) -> dict[str, str]:
     """Selector parameters."""
     if isinstance(command, AcceptCommand):
         return {"store": command.store, "reason": ps.quoted(command.reason)}
+    if isinstance(command, CalibrateCommand):
+        return _of_calibrate(command)
     word = next(word for word, trusted in _WORDS.items() if trusted is command.trusted)
     parameters = {"machine": command.machine, "trusted": word, "wait": ps.text_of(command.wait_s)}
     return parameters | ({"reason": ps.quoted(command.reason)} if command.reason else {})
+
+
+def _of_calibrate(command: CalibrateCommand) -> dict[str, str]:
+    parameters = {"machine": command.machine} if command.machine else {}
+    parameters |= {name: ps.text_of(value) for name, value in command.values.items()}
+    parameters |= {"auto": "yes"} if command.auto else {}
+    parameters |= {"reason": ps.quoted(command.reason)} if command.reason else {}
+    return parameters | {"wait": ps.text_of(command.wait_s)}
 
 
 def parse_command(name: str, parameters: Mapping[str, str]) -> Command:
@@ -69,10 +107,35 @@ def _parse_accept(parameters: ps.Parameters) -> AcceptCommand:
     return AcceptCommand(store, reason)
 
 
-def _parse_trust(parameters: ps.Parameters) -> TrustCommand:
-    machine, word = ps.required(parameters, "machine"), ps.required(parameters, "trusted")
+def _parse_calibrate(parameters: ps.Parameters) -> CalibrateCommand:
+    machine = _machine(parameters) if "machine" in parameters else ""
+    values = {name: ps.number(parameters, name) for name in MOST_OFF if name in parameters}
+    auto, reason = parameters.get("auto", "no"), ps.free_text(parameters, "reason")
+    if auto not in ("yes", "no"):
+        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `auto`: {auto[:40]!r} is none of yes, no")
+    if beyond := [name for name, value in values.items() if abs(value) > MOST_OFF[name]]:
+        problem = f"parameter `{beyond[0]}`: {values[beyond[0]]:g} is not between -{MOST_OFF[beyond[0]]:g} and"
+        raise QueryError(Refusal.OUT_OF_RANGE, f"{problem} {MOST_OFF[beyond[0]]:g}")
+    if bool(machine) != bool(values or auto == "yes"):
+        problem = "`machine` comes with one of `zero`, `scale`, `across`, or with `auto=yes`; neither calibrates all"
+        raise QueryError(Refusal.MISSING_FIELD, problem)
+    if values and auto == "yes":
+        raise QueryError(Refusal.OUT_OF_RANGE, "parameter `auto`: with values of a person it means nothing")
+    if values and not reason:
+        raise QueryError(Refusal.MISSING_FIELD, "parameter `reason` is missing: say where the values are from")
+    wait_s = ps.seconds(parameters, "wait", 30.0, MAX_WAIT_S)
+    return CalibrateCommand(machine, **values, auto=auto == "yes", reason=reason, wait_s=wait_s)
+
+
+def _machine(parameters: ps.Parameters) -> str:
+    machine = ps.required(parameters, "machine")
     if not NAME.fullmatch(machine):
         raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `machine`: {machine[:70]!r} is not a name")
+    return machine
+
+
+def _parse_trust(parameters: ps.Parameters) -> TrustCommand:
+    machine, word = _machine(parameters), ps.required(parameters, "trusted")
     if word not in _WORDS:
         raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `trusted`: {word[:40]!r} is none of {', '.join(_WORDS)}")
     reason = ps.free_text(parameters, "reason")
@@ -84,4 +147,5 @@ def _parse_trust(parameters: ps.Parameters) -> TrustCommand:
 _COMMANDS: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], Command]]] = {
     TrustCommand.name: (("machine", "trusted", "reason", "wait"), _parse_trust),
     AcceptCommand.name: (("store", "reason"), _parse_accept),
+    CalibrateCommand.name: (("machine", *MOST_OFF, "auto", "reason", "wait"), _parse_calibrate),
 }

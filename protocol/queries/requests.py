@@ -119,6 +119,15 @@ class MachinesQuery:
 
 
 @dataclass(frozen=True)
+class CalibrationQuery:
+    """What is taken off the samples of each machine, and what is known of its calibration."""
+
+    fresh: Freshness = Freshness()
+
+    name = "calibration"
+
+
+@dataclass(frozen=True)
 class ChangesQuery:
     """Changes of the ground with a number beyond `after`."""
 
@@ -156,7 +165,7 @@ class WhyQuery:
 
 
 CellQuery = PointQuery | RegionQuery | PieceQuery | HistoryQuery | WhyQuery
-MapQuery = CellQuery | TilesQuery | InfoQuery | AliveQuery | MachinesQuery | ChangesQuery
+MapQuery = CellQuery | TilesQuery | InfoQuery | AliveQuery | MachinesQuery | CalibrationQuery | ChangesQuery
 
 
 def check_size(columns: int, rows: int) -> None:
@@ -283,6 +292,7 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "piece": (("cursor", "number"), _parse_piece),
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
+    "calibration": (_FRESH, lambda parameters: CalibrationQuery(_freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
     "tiles": (("store", "row", "fact", "as_of", "place"), _parse_tiles),
     "why": (("x", "y", "as_of"), _parse_why),

@@ -15,6 +15,7 @@ from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.files import whole_file
 from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, Region
+from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
 from protocol.queries.explanations import calibrated, why
 from protocol.queries.pieces import Progress
 from sitegrid.client import Client, connect
@@ -53,6 +54,7 @@ def add_options(parser: ArgumentParser) -> None:
     _add_times(history, ("from", "samples from this time on"), ("to", "samples up to this time; default the newest"))
     history.add_argument("--span", type=positive, metavar="SECONDS", help="length of one span; default 5 minutes")
     _add_query(queries, _machines, "state of each machine: samples, trust, reasons")
+    _add_query(queries, _calibration, "what is taken off the samples of each machine")
     changes = _add_query(queries, _changes, "list of ground changes: place and time")
     changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
     _add_query(queries, _info, "state of the map and its server")
@@ -168,6 +170,33 @@ def _machine_row(machine: MachineState) -> list[str]:
     counts = [str(machine.samples), str(machine.lost)]
     calibration = [calibrated(machine, name) or "-" for name in ("zero", "torque_gain")]
     return [machine.name, trusted, since, *counts, utc_text(machine.newest_ns), *calibration, why(machine) or "-"]
+
+
+def _calibration(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
+    answer = client.calibration(after=arguments.after)
+    return answer, calibration_table(answer)
+
+
+def calibration_table(answer: CalibrationAnswer) -> list[str]:
+    """A line for each machine, and what is known of their common scale."""
+    head = ["machine", "zero", "+-", "scale", "+-", "across", "+-", "known by", "taken off since", "by"]
+    lines = _table(head, map(_calibration_row, answer.machines))
+    if answer.common_scale_unknown:
+        lines.append(f"nothing shows the mean scale of all machines: {answer.common_scale_unknown}")
+    return lines
+
+
+def _calibration_row(machine: MachineCalibration) -> list[str]:
+    """Zeros and slopes in m/m; of what counts, the newest span."""
+    values = (machine.zero, machine.zero_std, machine.scale, machine.scale_std, machine.across, machine.across_std)
+    shown = [f"{name} {'+'.join(by)}" for name, by in (("zero", machine.zero_by), ("scale", machine.scale_by)) if by]
+    newest, decided = "nothing", "-"
+    if machine.spans:
+        span = machine.spans[-1]
+        since = utc_text(span.from_ns) if span.from_ns else "ever"
+        newest = f"{span.zero:g}, {span.scale:g}, {span.across:g} {since}"
+        decided = machine.by + (f": {machine.reason}" if machine.reason else "")
+    return [machine.name, *map(_value, values), "; ".join(shown) or "-", newest, decided]
 
 
 def _changes(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:

@@ -25,6 +25,11 @@ def add_decision(parser: ArgumentParser) -> None:
     """Options of every decision about a machine."""
     parser.add_argument("machine", metavar="MACHINE")
     add_site(parser)
+    add_wait(parser)
+
+
+def add_wait(parser: ArgumentParser) -> None:
+    """How long to wait for what follows from a decision."""
     waits = "seconds to wait until the map is folded again (default %(default)g)"
     parser.add_argument("--wait", type=not_negative, default=30.0, help=waits)
 

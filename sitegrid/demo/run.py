@@ -17,6 +17,7 @@ from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.queries.answers import Region
+from protocol.queries.commands import MAX_WAIT_S
 from protocol.site.site_file import load_site
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import TruthMap
@@ -80,6 +81,7 @@ def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: D
                 return None
         for child in [*bases, *agents.values()]:
             child.expect("ended", READY_S)
+        client.calibrate(wait_s=MAX_WAIT_S)  # with the last samples too, and the map that we read has it
         region, pictures = _draw(plan, client, tracks)
         rmse_m = position_rmse(tracks.poses(), plan.truth)
         tracks.close()

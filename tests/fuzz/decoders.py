@@ -38,24 +38,25 @@ from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu
 from protocol.queries import requests
 from protocol.queries.answers import MapVersion
-from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command, parse_command
+from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.messages import SampleBatch
+from protocol.wire.offer_codec import decode_offer, encode_offer
 from sim.config import load_sim
 from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml
 from tests.fuzz.messages import messages
 from tests.fuzz.mutations import files, texts
 from tests.fuzz.verdict import Decoder
-from tests.golden.make import EXTENT_M, FOLDER, GOLDEN, NEWER, T0, rows
+from tests.golden.make import EXTENT_M, FOLDER, GOLDEN, NEWER, OLDER, T0, rows
 from tests.paths import CONFIG
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 SITE = SiteConfig("paper", 49.0, 8.0)
-PLAIN = ("health", "info", "machines", "machine", "changes", "change")  # people see these as JSON
+PLAIN = ("health", "info", "machines", "machine", "changes", "change", "calibration")  # people see these as JSON
 
 
 @cache
@@ -78,10 +79,11 @@ def decoders() -> tuple[Decoder, ...]:
 
 
 def _messages() -> Iterator[Decoder]:
-    batches = ("batch.bin", "batch_lost.bin", "batch_empty.bin", NEWER)
+    batches = ("batch.bin", "batch_lost.bin", "batch_empty.bin", OLDER, NEWER)
     golden = {name: ((FOLDER / f"{name}.bin").read_bytes(),) for name in _SINGLE}
     several = {"batch": tuple((FOLDER / name).read_bytes() for name in batches)}
-    several["reply"] = tuple((FOLDER / name).read_bytes() for name in ("ack.bin", "refused.bin", "refused_later.bin"))
+    replies = ("ack.bin", "ack_offer.bin", "refused.bin", "refused_later.bin")
+    several["reply"] = tuple((FOLDER / name).read_bytes() for name in replies)
     for name, seeds in {**golden, **several}.items():
         file = {"batch": "batch.bin", "reply": "ack.bin"}.get(name, f"{name}.bin")
         encode, decode = GOLDEN[file].encode, GOLDEN[file].decode
@@ -114,6 +116,9 @@ def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], 
         assert str(value).isprintable()
     if name == "reply":
         assert getattr(value, "problem", "").isprintable()
+        with suppress(MessageError):  # of an offer alone: the acknowledgement holds
+            offer = decode_offer(getattr(value, "offer", None))
+            assert decode_offer(encode_offer(offer)) == offer
     if name in PLAIN:
         json.dumps(value.values if name == "health" else value, default=asdict)
     written = encode(value)
@@ -143,6 +148,9 @@ def _selectors() -> Iterator[Decoder]:
         TrustCommand("loader-2", False, "moved; x = 3", 60.0),
         TrustCommand("loader-2", None),
         AcceptCommand("0123456789abcdef", "disk died"),
+        CalibrateCommand(wait_s=60.0),
+        CalibrateCommand("loader-2", 0.004, -0.03, 0.0, reason="levelled; 12 May"),
+        CalibrateCommand("loader-2", auto=True),
     )
     seeds = tuple(f"{command.name}?{selector_of(encode_command(command))}".encode() for command in commands)
     yield Decoder("command", seeds, _command, (QueryError,), texts)

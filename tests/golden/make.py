@@ -29,6 +29,13 @@ from protocol.machine.readings import (
 from protocol.machine.samples import APPLIED, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
+from protocol.queries.calibration import (
+    CalibrationAnswer,
+    CorrectedSpan,
+    MachineCalibration,
+    decode_calibration,
+    encode_calibration,
+)
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
 from protocol.wire import codec, correction_codec
@@ -180,6 +187,23 @@ CHANGE = records.GroundChange(
 TILES = TilesAnswer(
     VERSION, T0, 0.5, whole=True, tiles=(MapTile(-1, 2, 17, 3, T0, zlib.compress(bytes(range(256)) * 96, 6)),)
 )
+SPAN = CorrectedSpan(T0, T0 + 300_000_000_000, 0.00251, -0.03125, -0.0005, 100.0)
+CALIBRATED = MachineCalibration(
+    name="loader-1",
+    by="solver",
+    reason="",
+    since_ns=T0 + 1,
+    zero=0.0025,
+    zero_std=0.0005,
+    scale=-0.03125,
+    scale_std=0.0078125,
+    across=None,
+    across_std=None,
+    zero_by=("heights", "same_ground"),
+    scale_by=(),
+    spans=(SPAN,),
+)
+CALIBRATION = CalibrationAnswer(STORE, 17, 3, T0 + 2, 0.03125, "no_slope_both_ways", (CALIBRATED,))
 VOTES = Votes((0.01, 0.1), (1.5, 0.0), (0.0, 2.25))
 WHY = CellReasons(
     store=STORE,
@@ -227,6 +251,7 @@ GOLDEN: dict[str, Golden] = {
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
     "why.bin": Golden(WHY, encode_why, decode_why),
+    "calibration.bin": Golden(CALIBRATION, encode_calibration, decode_calibration),
     "piece.bin": Golden(piece(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
     "machines.bin": Golden(

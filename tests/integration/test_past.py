@@ -72,7 +72,7 @@ def is_fold_from_the_start(client: Client, sent: Sent, stamp_ns: int, without: s
 def test_the_past_of_a_server_killed_in_mid_checkpoint_and_after_a_distrust(tmp_path: Path):
     sent = filled_journal(tmp_path / "store")
     (tmp_path / "site.toml").write_text("\n".join(toml_lines(asdict(SITE))))
-    (tmp_path / "server.toml").write_text("[store]\narchive_after_h = 0.0\n")
+    (tmp_path / "server.toml").write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
     folder, endpoint = tmp_path / "store" / "checkpoints", free_endpoint()
     late_ns, between_ns = START_NS + 2 * HOUR_NS + HOUR_NS // 10, START_NS + HOUR_NS + HOUR_NS // 2
 

@@ -34,7 +34,7 @@ SENDER = ROOT / "tests" / "clients" / "plain_sender.py"
 SITE, SAMPLES, KILLS = "lot", 1200, 8
 MACHINES = ("digger-1", "digger-2")
 READY_S, DELIVERED_S = 40.0, 120.0
-SAMPLE = struct.Struct(plain_sender.ROW)
+SAMPLE = struct.Struct(f"{plain_sender.ROW}ff")  # and a calibration: none, as nothing is stated
 HEAD = struct.Struct("<qqQqB")
 
 
@@ -50,7 +50,7 @@ def test_the_plain_clients_know_nothing_of_this_project():
 
 
 def test_the_plain_sender_writes_a_batch_as_the_golden_file_has_it():
-    golden = msgpack.unpackb((GOLDEN / "batch.bin").read_bytes())
+    golden = msgpack.unpackb((GOLDEN / "batch_older.bin").read_bytes())  # it has no calibration of its own
     run = plain_sender.Run(golden["spool_id"], 0, 0, golden.get("store", ""))
     sender = plain_sender.Sender(None, "", golden["machine"], golden["frame"], None, None)  # type: ignore[arg-type]
     columns = [struct.unpack(f"<{golden['n']}{kind}", golden["cols"][name]) for name, kind in plain_sender.COLUMNS]
@@ -120,6 +120,7 @@ def journal(store: Path) -> Counter[tuple[str, int, int, int]]:
             machine = record[HEAD.size : begin].decode()
             for i, sample in enumerate(SAMPLE.iter_unpack(record[begin:-4])):
                 counts[machine, run, first + i, sample[0]] += 1
+                assert sample[-2:] == (0.0, 0.0)
     return counts
 
 

@@ -16,6 +16,7 @@ from benchmarks import merge_restart
 from benchmarks.merge_work import batches
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.ingest.store import Store
 from protocol.errors import QueryError, Refusal
 from protocol.site.site_file import load_site
@@ -25,6 +26,7 @@ from sitegrid import Client
 from sitegrid.process.children import Child, Children, wait_until
 from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
 from tests.integration.test_operation import Sender, end, session_of
+from tests.reference.correction import in_numpy
 from tests.unit.mapserver.data import same
 
 pytestmark = pytest.mark.processes
@@ -38,7 +40,7 @@ def site(tmp_path: Path, children: Children, monkeypatch: pytest.MonkeyPatch) ->
     """A site whose store has samples of ten machines, and no snapshot."""
     run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
     options = tmp_path / "server.toml"
-    options.write_text("[store]\narchive_after_h = 0.0\n")
+    options.write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
     monkeypatch.setattr(merge_restart, "SITE", load_site(run.site_file))
     merge_restart.build(tmp_path / "store", ROWS, tail_rows=ROWS)
     run.start_router()
@@ -128,6 +130,25 @@ def test_a_server_killed_between_decision_and_map_comes_back_without_the_machine
         serve(site)
         assert list(client.info().distrusted) == ["loader-3"]
         assert not next(row for row in client.machines() if row.name == "loader-3").trusted
+
+
+def test_a_server_killed_between_a_correction_and_its_map_comes_back_with_it(site: SiteRun):
+    server, zero = serve(site), 0.02
+    with site.connect() as client, pytest.raises(QueryError, match="the decision is kept") as late:
+        client.correct("loader-3", "a test", zero=zero, wait_s=0.0)
+    kill(server)
+    assert late.value.reason == Refusal.AFTER_TIMEOUT
+    server = serve(site)
+    with site.connect() as client:
+        info = client.info()
+        assert (info.fact, info.decided, info.corrections) == (1, 1, 1)
+    end(server)
+    correction = Correction("loader-3", 0, LAST_NS, zero, 0.0, 0.0, ())
+    expected = Grid(load_site(site.site_file).cell_m, ServerConfig().fold)
+    for name, rows in islice(batches(), ROWS):
+        expected.fold(in_numpy(rows, correction) if name == "loader-3" else rows, name)
+    with store_of(site) as store:
+        assert same(store.grid, expected)
 
 
 def test_decisions_of_several_operators_at_once_all_count(site: SiteRun):

@@ -29,7 +29,7 @@ def site_info(site: SiteConfig) -> SiteInfo:
 
 
 def map_info(site: SiteConfig, **values: Any) -> MapInfo:
-    rows = ("fact", "journalled", "merged", "snapshot")
+    rows = ("fact", "decided", "corrections", "journalled", "merged", "snapshot")
     zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "first_ns", "stamp_ns", "wall_ns")
     defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
     defaults |= {"site": site_info(site), "version": "1.0", "bounds": None}

@@ -15,6 +15,7 @@ from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MODES, QUANTITIES
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, columns
 from protocol.machine.samples import COLUMNS
+from protocol.queries import calibration as cal
 from protocol.queries import commands, parameters, requests
 from protocol.queries.answers import GroundChange, MachineState, MapInfo, SampleCounts
 from protocol.site.geometry import MAX_CELLS
@@ -24,6 +25,7 @@ from protocol.wire import codec
 from protocol.wire.messages import Pose
 from tests.paths import DOCS
 
+CALIBRATION = (cal.CalibrationAnswer, cal.MachineCalibration, cal.CorrectedSpan)
 WIRE, LOGS = ((DOCS / name).read_text() for name in ("protocol.md", "log-folders.md"))
 
 
@@ -33,7 +35,9 @@ def undocumented(names: Iterable[str], page: str) -> list[str]:
 
 def test_every_name_of_the_wire_is_documented():
     records = (
-        field.name for record in (Pose, MapInfo, SampleCounts, MachineState, GroundChange) for field in fields(record)
+        field.name
+        for record in (Pose, MapInfo, SampleCounts, MachineState, GroundChange, *CALIBRATION)
+        for field in fields(record)
     )
     assert undocumented([*COLUMNS, *KINDS, *records, *Refusal], WIRE) == []
 
@@ -42,6 +46,14 @@ def test_every_column_of_a_reading_is_documented():
     wide = WIRE.replace("`gyro_{x,y,z}_radps`", "`gyro_x_radps` `gyro_y_radps` `gyro_z_radps`")
     wide = wide.replace("`force_{x,y,z}_mps2`", "`force_x_mps2` `force_y_mps2` `force_z_mps2`")
     assert undocumented((name for kind in KINDS for name in columns(kind)), wide) == []
+
+
+def test_the_table_of_calibration_has_the_fields_of_the_answer_and_of_a_machine():
+    section = WIRE[WIRE.index("\n### Calibration of machines\n") + 1 :].partition("\n### ")[0]
+    rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    names = re.findall(r"`(.*?)`", "".join(rows))
+    both = [field.name for record in CALIBRATION[:2] for field in fields(record)]
+    assert names == [name for name in both if name not in ("store", "merged", "fact")]
 
 
 def test_limits_are_the_documented_ones():

@@ -14,7 +14,11 @@ import pytest
 
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.fleet import decisions
+from mapserver.fleet.correction import LAST_NS, Correction
+from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
+from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.reader import JournalReader
@@ -133,6 +137,81 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert again.identity.id != old.id
     assert again.identity.descends == (old.id,)
     again.close()
+
+
+FACTS = [
+    CalibrationDecision("a", SOLVER, "", T0 + 600 * S, (Correction("a", T0 + 300 * S, LAST_NS, 0.02, 0.1, 0.01, ()),)),
+    CalibrationDecision("b", PERSON, "levelled", T0 + 700 * S, (Correction("b", 0, LAST_NS, -0.03, 0.0, 0.0, ()),)),
+    CalibrationDecision("a", SOLVER, "", T0 + 1200 * S, (Correction("a", T0 + 600 * S, LAST_NS, -0.01, 0.0, 0.0, ()),)),
+]
+
+
+def decide(store: Path) -> Grid:
+    """Have corrections with a store, as its server decides them; returns its map."""
+    with closing(Store(store, SITE, ServerConfig(), time.time_ns)) as opened_store:
+        for decision in FACTS:
+            opened_store.decide(decision)
+        archived_decisions.save(store / FOLDER, opened_store.identity.id, FACTS)
+    with closing(Store(store, SITE, ServerConfig(), time.time_ns)) as opened_store:
+        return opened_store.grid
+
+
+def test_corrections_go_with_the_samples_and_the_map_is_the_live_one(tmp_path: Path):
+    source = make_store(tmp_path / "source", archived=2)
+    before = folded()
+    live = decide(source)
+    assert not same_evidence(live, before)
+    assert run(source, "--out", tmp_path / "new") == 0
+    assert identities(tmp_path / "new") == identities(source), "samples are copied as they were sent"
+    with closing(opened(tmp_path / "new")) as new:
+        assert same_evidence(new.grid, live)
+        assert (new.fact, new.snapshot_row) == (3, 18)
+    assert run(tmp_path / "new", "--out", tmp_path / "again") == 0
+    with closing(opened(tmp_path / "again")) as again:
+        assert same_evidence(again.grid, live)
+
+
+def test_corrections_are_beside_the_files_of_an_archive_too(tmp_path: Path):
+    source = make_store(tmp_path / "source", archived=9)
+    live = decide(source)
+    assert run(source / FOLDER, "--out", tmp_path / "new") == 0
+    with closing(opened(tmp_path / "new")) as new:
+        assert same_evidence(new.grid, live)
+        assert new.fact == 3, "of six files, each once"
+    (source / FOLDER / archived_decisions.FILE).unlink()
+    assert run(source / FOLDER, "--out", tmp_path / "plain") == 0
+    with closing(opened(tmp_path / "plain")) as plain_store:
+        assert same_evidence(plain_store.grid, folded())
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda text: text.replace("0.02", "0.03"), "calibration.json: is damaged"),
+        (lambda text: text[:-20], "calibration.json: cannot be read"),
+    ],
+)
+def test_damaged_corrections_of_an_archive_are_not_folded_without(tmp_path: Path, capsys, change, problem):
+    source = make_store(tmp_path / "source", archived=9)
+    decide(source)
+    path = source / FOLDER / archived_decisions.FILE
+    path.write_text(change(path.read_text()))
+    assert run(source / FOLDER, "--out", tmp_path / "new") == 1
+    assert problem in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_corrections_of_a_newer_version_are_refused(tmp_path: Path, capsys, monkeypatch):
+    source = make_store(tmp_path / "source", archived=9)
+    with monkeypatch.context() as later:
+        later.setattr(decisions, "VERSION", 2)
+        with closing(Store(source, SITE, ServerConfig(), time.time_ns)) as opened_store:
+            opened_store.decide(FACTS[0])
+            archived_decisions.save(source / FOLDER, opened_store.identity.id, FACTS)
+    for path in (source, source / FOLDER):
+        assert run(path, "--out", tmp_path / "new") == 1
+        assert "version 2, by a newer version of this program; this one knows version 1" in capsys.readouterr().err
+        assert not (tmp_path / "new").exists()
 
 
 def test_a_store_that_lacks_what_was_acknowledged_is_not_folded_without_a_word(tmp_path: Path, capsys):

@@ -442,9 +442,12 @@ def test_mass_that_is_known_stays_known() -> None:
 @pytest.mark.parametrize("steps", [30, 230])
 def test_recalibrated_is_as_if_all_steps_had_had_the_new_calibration(steps: int) -> None:
     rng = np.random.default_rng(3)
-    raw = np.where(np.arange(300) < steps - 20, 0.04, 0.07) + white_noise(NOISE, 300, rng)
+    raw = np.where(np.arange(300) < steps - 20, 0.04, 0.1) + white_noise(NOISE, 300, rng)
     changed = fed(raw[:steps])
+    before = borders(changed)
+    assert before
     changed.recalibrate(0.005, 0.1)
+    assert borders(changed) == before
     new = raw - 0.005 - 0.1 * 0.04
     feed(changed, level_steps(new)[steps:])
     always = fed(new)

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.campaign.experiment import Runner
 from evaluation.campaign.figures import judge
-from evaluation.fleet import experiment
+from evaluation.fleet import experiment, plots
 from evaluation.fleet.cases import CASES, RAMP_STEPS, FleetCase, tampered
 from evaluation.fleet.drives import Scene, planned, spoiled
 from evaluation.fleet.experiment import summarise
@@ -202,6 +203,19 @@ def test_a_bad_machine_is_made_of_a_good_ones_recording() -> None:
     bad, changed = spoiled(replace(machine, sensors=(gps, other)), readings)
     assert [each.mount.xyz_m for each in bad.sensors] == [(0.5, -3.0, 3.0), (0.5, 0.0, 3.0)]
     assert changed == (Torque(1, "torque", 160.0), readings[1])
+
+
+@pytest.mark.slow
+def test_pictures_are_drawn_also_of_a_map_that_knows_nothing(tmp_path: Path) -> None:
+    known, unknown = judged_map(2.0, 1.0, 1.0), judged_map(np.nan, np.nan, np.nan)
+    results = {
+        case("machines_3"): [CaseResult(dict.fromkeys(MAPS, known), *[np.zeros(1)] * 4, (True, ""), {})],
+        case("preset_standalone"): [CaseResult(dict.fromkeys(MAPS, unknown), *[np.zeros(1)] * 4, (False, "x"), {})],
+    }
+    rows = [summarise(each, name, of_case) for each, of_case in results.items() for name in MAPS]
+    paths = plots.draw({"seeds": [3], "rows": rows}, results, Runner(tmp_path), tmp_path)
+    assert [path.name for path in paths] == ["table.png", "machines_3.png", "preset_standalone.png"]
+    assert all(path.stat().st_size > 5000 for path in paths)
 
 
 def test_cases_share_the_recordings_of_the_papers_site() -> None:

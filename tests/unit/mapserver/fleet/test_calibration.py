@@ -17,6 +17,7 @@ from mapserver.fleet.calibration import (
     MachineState,
     calibrate,
     moved,
+    state_of,
 )
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, corrected
 from mapserver.fleet.ledger import EPOCH_NS
@@ -422,6 +423,36 @@ def test_edges_of_a_machine_without_a_say_do_not_count_where_those_of_the_others
     assert {each.scale for each in result.corrections if each.machine == "bad"} == {0.0}
 
 
+def test_a_fault_is_one_also_against_ground_that_may_itself_be_off_by_what_data_sheets_allow() -> None:
+    site: Site = lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x)  # noqa: E731
+    for scale, fault in ((0.6, True), (0.36, False)):
+        result = solve(with_bad(scale, off_m=0.0, site=site), ("bad",))
+        assert not result.common.observed
+        state = result.machines["bad"]
+        assert state.scale == pytest.approx(scale, abs=0.1)
+        assert (state.beyond[1] > FAULT_SIGMAS[1]) == fault
+
+
+def test_a_scale_against_ground_whose_scale_nobody_knows_is_not_applied() -> None:
+    result = solve(with_bad(0.1, off_m=0.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x)), ("bad",))
+    assert not result.common.observed
+    assert {each.scale for each in result.corrections} == {0.0}
+    assert result.machines["bad"].scale_std == pytest.approx(SCALE_STD, rel=0.05)
+
+
+def test_on_level_ground_a_gain_unlike_all_others_is_a_fault_and_corrected() -> None:
+    rows = {name: drive(LOW, Errors(0.002), seed=i) for i, name in enumerate("abc")}
+    rows["d"] = drive(LOW, Errors(0.002, 0.6), seed=9)
+    result = solve(rows)
+    assert result.common.reason == "no_slope_both_ways"
+    assert result.machines["d"].beyond[1] > FAULT_SIGMAS[1]
+    (first, *_) = [each for each in result.corrections if each.machine == "d"]
+    assert first.scale == pytest.approx(0.6 / 1.6, abs=0.05)
+    assert {each.scale for each in result.corrections if each.machine != "d"} == {0.0}
+    two = solve({"a": rows["a"], "d": rows["d"]})  # nobody knows which of them is wrong
+    assert all(state.beyond[1] < FAULT_SIGMAS[1] for state in two.machines.values())
+
+
 def test_rain_between_two_machines_is_not_their_error() -> None:
     wet: Site = lambda x, y, h: soils(x, y, h) + 0.02  # noqa: E731
     rows = {
@@ -495,3 +526,27 @@ def test_nothing_is_solved_of_nothing() -> None:
     assert solve({"a": drive(LOW, seconds=10.0)}, ("a",)).corrections == ()
     one = solve({"a": drive(LOW, seconds=10.0)[:1]})
     assert one.machines["a"].zero == 0.0
+
+
+@pytest.mark.parametrize("excluded", [(), ("flood",)])
+def test_a_machine_that_sends_nothing_but_nonsense_keeps_nobody_from_being_calibrated(
+    excluded: tuple[str, ...],
+) -> None:
+    rows = drive(LOW, seconds=10.0)[:1]
+    result = solve(fleet() | {"flood": np.repeat(rows, 5000)}, excluded)
+    assert result.corrections == usual().corrections
+    assert solve({"flood": np.repeat(rows, 5000)}).machines == {}
+
+
+def test_a_correction_says_of_its_machine_what_the_solve_said() -> None:
+    result = solve(fleet(errors={"again": Errors(0.002, 0.6)}))
+    for name in ("again", "ramp"):
+        newest = [each for each in result.corrections if each.machine == name][-1]
+        state, known = state_of(newest), result.machines[name]
+        assert (state.zero, state.scale, state.across) == pytest.approx(
+            (known.zero, known.scale, known.across), abs=5e-5
+        )
+        assert (state.zero_std, state.scale_std) == pytest.approx((known.zero_std, known.scale_std), rel=1e-3)
+        assert (state.beyond[1] > FAULT_SIGMAS[1]) == (name == "again")
+    by_hand = state_of(Correction("a", 0, 1, 0.03, 0.375, 0.0, ()))
+    assert by_hand.beyond == pytest.approx((0.03 / ZERO_STD, 0.6 / SCALE_STD))

@@ -13,13 +13,13 @@ import pytest
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import MachineState
-from mapserver.fleet.correction import Correction
-from mapserver.fleet.decisions import SOLVER, CalibrationDecision
+from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
 from mapserver.follower import follower, refolding
 from mapserver.follower.follower import Follower
 from mapserver.follower.jobs import Archiving, Audit
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
+from mapserver.journal import reader as journal_reader
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.judgement import Reason
@@ -289,9 +289,15 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
 # --- the audit -------------------------------------------------------------------------------------------------------
 
 
-def audit_of(writer: Writer, reader: JournalReader, report: Any, judge_s: float = 1e-9, states: Any = dict) -> Audit:
+def audit_of(
+    writer: Writer,
+    reader: JournalReader,
+    report: Any,
+    judge_s: float = 1e-9,
+    known: Any = lambda: (UNCORRECTED, {}),
+) -> Audit:
     writer.config = ServerConfig(trust=TrustConfig(judge_s))
-    return Audit(writer, reader, report, states, threading.Event())
+    return Audit(writer, reader, report, known, threading.Event())
 
 
 def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(store, monkeypatch):
@@ -317,18 +323,17 @@ def test_corrected_samples_are_judged_also_those_that_came_before_the_correction
         rows["c_rr"] += 0.6 * (rows["c_rr"] + rows["grade_e"])
     for name, (first, second) in sent.items():
         send(writer, [incoming(np.concatenate([first, second]), 1, name)])
-    states: dict[str, MachineState] = {}
-    audit = audit_of(writer, reader, lambda *_: None, states=lambda: states)
+    whole = Corrections([Correction("c", 0, 2**62, 0.0, 0.375, 0.0, ())])
+    state = MachineState(0.0, 0.001, 0.6, 0.01, 0.0, 0.001, (), (), (0.0, 13.0))
+    known: list[Any] = [UNCORRECTED, {}]
+    audit = audit_of(writer, reader, lambda *_: None, known=lambda: known)
     audit.run()
     assert audit.verdicts["c"].reasons
-    states["c"] = MachineState(0.0, 0.001, 0.6, 0.01, 0.0, 0.001, (), (), (0.0, 13.0))
-    with closing(refolding.Refolding(writer, past_of(writer))) as refolds:
-        whole = Correction("c", 0, 2**62, 0.0, 0.375, 0.0, ())
-        refolds.wait(refolds.decide(CalibrationDecision("c", SOLVER, "", NOW_NS, (whole,))), 20.0)
+    known[:] = whole, {"c": state}
     audit.run()
     assert audit.verdicts["c"].reasons == (Reason.BEYOND_DATA_SHEET,)
     assert audit.verdicts["c"].evidence["gain"] == pytest.approx(1.0, abs=0.02)
-    states.clear()
+    known[1] = {}
     audit.run()
     assert not audit.verdicts["c"].contradicts
     assert not any(audit.verdicts[name].contradicts for name in "abd")
@@ -344,7 +349,9 @@ def test_machines_are_judged_so_often(store, judge_s, times):
     assert len(reports) == times
 
 
-def test_an_audit_that_is_to_end_ends_after_a_row(store):
+def test_an_audit_that_is_to_end_ends_after_what_it_read(store, monkeypatch):
+    monkeypatch.setattr(journal_reader, "BYTES_AT_ONCE", 1)
+    monkeypatch.setattr(journal_reader, "ROWS_AT_ONCE", 1)
     writer, reader = store
     send(writer, [incoming(samples(5), machine=name) for name in "abc"])
     audit = audit_of(writer, reader, lambda *_: None)

@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.fleet.calibration import MachineState
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
+from mapserver.journal.rows import JournalRows
 from mapserver.trust import coarse_map
 from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.judgement import Reason
@@ -157,6 +158,13 @@ def test_a_machine_at_fault_is_no_measure_for_the_others() -> None:
     assert by_right == pytest.approx(1.0, abs=0.01)
 
 
+def test_a_machine_whose_clock_is_off_measures_the_ground_like_any_other() -> None:
+    late = fleet(0, GOOD, GOOD, {"gain": 1.1, "clock_s": -400.0})
+    verdicts = audit(late)
+    assert accused(verdicts) == {"c": (Reason.CLOCK,)}
+    assert verdicts["a"].evidence["gain"] < 0.99
+
+
 def test_gain_and_displacement_of_corrected_samples_are_told_apart() -> None:
     """The gain is corrected, and the offset stays: it is no business of calibration."""
     auditor = Auditor(1.0)
@@ -250,6 +258,21 @@ def test_ten_machines_on_a_large_site_take_little_memory() -> None:
     used = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert used < 30e6
+
+
+def test_many_rows_at_once_are_judged_as_one_by_one() -> None:
+    sent = fleet(2, GOOD, GOOD, GOOD, {"gain": 1.4, "clock_s": 500.0})
+    one_by_one = Auditor(1.0)
+    send(one_by_one, "abcd", sent, 100)
+    batches = [(i % 4, sent[i % 4][first : first + 100]) for first in range(0, len(sent[0]), 100) for i in range(4)]
+    at_once = Auditor(1.0)
+    for part in (batches[:70], batches[70:]):
+        n, none = len(part), np.zeros(len(part), np.int64)
+        lengths = np.array([len(rows) for _, rows in part])
+        samples_of = np.concatenate([rows for _, rows in part])
+        machine = np.array([i for i, _ in part])
+        at_once.add_all(JournalRows(samples_of, lengths, tuple("abcd"), machine, np.arange(n), none, none, none))
+    assert at_once.verdicts() == one_by_one.verdicts()
 
 
 def test_an_auditor_without_samples_has_no_verdicts() -> None:

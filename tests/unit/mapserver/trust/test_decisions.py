@@ -79,6 +79,12 @@ def test_a_machine_beyond_its_data_sheet_is_let_in_by_a_person_alone(reasons):
     assert judged(decisions, Verdict("c", reasons, {}, True), 20) == []
 
 
+def test_a_machine_that_was_handed_back_is_judged_whatever_the_words_were():
+    decisions = TrustDecisions([])
+    decisions.add(TrustDecision("c", True, AUDIT, "beyond_data_sheet", 1))
+    assert judged(decisions, BAD, DISTRUST_AFTER)
+
+
 def test_decisions_come_back_from_events_the_newest_of_each_machine():
     made = [
         TrustDecision("c", False, AUDIT, "gain", 1, {"gain": 1.6}),

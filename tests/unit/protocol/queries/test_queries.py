@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import asdict, fields, replace
 
 import numpy as np
@@ -10,7 +11,14 @@ from protocol.errors import MessageError, QueryError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries import answer_codec as codec
 from protocol.queries import answers
-from protocol.queries.commands import AcceptCommand, TrustCommand, encode_command, parse_command
+from protocol.queries.commands import (
+    MOST_OFF,
+    AcceptCommand,
+    CalibrateCommand,
+    TrustCommand,
+    encode_command,
+    parse_command,
+)
 from protocol.queries.parameters import MAX_TEXT, quoted, selector_of, split_selector
 from protocol.queries.requests import (
     AliveQuery,
@@ -212,6 +220,46 @@ def test_any_parameters(name, parameters):
         assert error.reason in set(Refusal)  # noqa: PT017 - any outcome but another error is right
 
 
+@given(
+    st.builds(CalibrateCommand, wait_s=st.floats(0, 60))
+    | st.builds(CalibrateCommand, st.just("loader-1"), auto=st.just(True), wait_s=st.floats(0, 60))
+    | st.builds(
+        CalibrateCommand,
+        st.just("loader-1"),
+        st.floats(-0.5, 0.5),
+        *[st.none() | st.floats(-0.5, 0.5)] * 2,
+        reason=st.just("levelled; 12 May = today"),
+    )
+)
+def test_calibrate_round_trip(command):
+    assert parse_command("calibrate", split_selector(selector_of(encode_command(command)))) == command
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"machine": "a b", "zero": "0.1"}, "'a b' is not a name"),
+        ({"machine": "a"}, "`machine` comes with one of"),
+        ({"zero": "0.1", "reason": "x"}, "`machine` comes with one of"),
+        ({"auto": "yes"}, "`machine` comes with one of"),
+        ({"machine": "a", "auto": "maybe"}, "none of yes, no"),
+        ({"machine": "a", "zero": "0.1"}, "`reason` is missing"),
+        ({"machine": "a", "zero": "0.1", "auto": "yes", "reason": "x"}, "parameter `auto`"),
+        ({"machine": "a", "zero": "0.51", "reason": "x"}, "`zero`: 0.51 is not between -0.5 and 0.5"),
+        ({"machine": "a", "scale": "-0.91", "reason": "x"}, "`scale`: -0.91 is not between -0.9 and 0.9"),
+        ({"machine": "a", "across": "nan", "reason": "x"}, "`across`"),
+        ({"machine": "a", "gain": "1", "reason": "x"}, "`gain` is not known"),
+        ({"wait": "61"}, "`wait`"),
+    ],
+)
+def test_a_wrong_calibrate_is_refused_by_name(parameters, words):
+    with pytest.raises(QueryError, match=re.escape(words)):
+        parse_command(
+            "calibrate", {name: quoted(value) if name == "reason" else value for name, value in parameters.items()}
+        )
+    assert MOST_OFF == {"zero": 0.5, "scale": 0.9, "across": 0.5}, "as docs/protocol.md says"
+
+
 def test_region_too_large_is_refused():
     check_size(4000, MAX_CELLS // 4000)
     with pytest.raises(QueryError, match="4001") as caught:
@@ -318,6 +366,8 @@ INFO = answers.MapInfo(
     descends=("f" * 16,),
     accepted=(),
     fact=2,
+    decided=3,
+    corrections=2,
     journalled=5,
     merged=5,
     snapshot=0,

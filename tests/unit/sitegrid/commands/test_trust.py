@@ -18,9 +18,10 @@ import zenoh
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import encode_change, encode_changes, encode_error, encode_machine, encode_machines
 from protocol.queries.answers import GroundChange, TrustAnswer
-from protocol.queries.commands import TrustCommand, parse_command
+from protocol.queries.calibration import CalibrationAnswer, CorrectedSpan, MachineCalibration, encode_calibration
+from protocol.queries.commands import CalibrateCommand, TrustCommand, parse_command
 from protocol.queries.parameters import split_selector
-from protocol.queries.requests import ChangesQuery, Freshness, MachinesQuery, parse_query
+from protocol.queries.requests import CalibrationQuery, ChangesQuery, Freshness, MachinesQuery, parse_query
 from protocol.wire import keys
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
@@ -39,9 +40,28 @@ MACHINES = [
 ]
 CHANGE = GroundChange(4, T0, T0 + 60 * 10**9, (10.0, -20.0, 40.0, 12.5), 615, 0.25, 0.008, None, None)
 
+UNKNOWN = dict.fromkeys(("zero", "zero_std", "scale", "scale_std", "across", "across_std"))
+KNOWN = {"zero": 0.0025, "zero_std": 0.0005, "scale": -0.03, "scale_std": 0.005, "across": 0.0, "across_std": 0.001}
+SPANS = (CorrectedSpan(0, T0, 0.1, 0.0, 0.0, 10.0), CorrectedSpan(T0, 2**62, 0.00251, -0.03, 0.0, 10.0))
+BY = ("heights", "crossings")
+CALIBRATION = CalibrationAnswer(
+    STORE,
+    17,
+    3,
+    T0,
+    0.03,
+    "no_slope_both_ways",
+    (
+        MachineCalibration(
+            "a", "person", "levelled", T0, **KNOWN, zero_by=("heights", "crossings"), scale_by=(), spans=SPANS
+        ),
+        MachineCalibration("b", "", "", 0, **UNKNOWN, zero_by=(), scale_by=(), spans=()),
+    ),
+)
+
 
 class FakeServer:
-    """Answers machines, changes and trust on a router of its own, and notes what it was asked."""
+    """Answers machines, calibration, changes and trust on a router of its own, and notes what it was asked."""
 
     def __init__(self) -> None:
         self.endpoint = free_endpoint()
@@ -56,11 +76,12 @@ class FakeServer:
         with query:
             parsed = parse_query(keys.query_of(str(query.key_expr)), split_selector(str(query.parameters)))
             self.asked.append(parsed)
-            machines = isinstance(parsed, MachinesQuery)
-            query.reply(
-                query.key_expr,
-                encode_machines(MACHINES, version()) if machines else encode_changes([CHANGE], version()),
-            )
+            answers = {
+                MachinesQuery: lambda: encode_machines(MACHINES, version()),
+                CalibrationQuery: lambda: encode_calibration(CALIBRATION),
+                ChangesQuery: lambda: encode_changes([CHANGE], version()),
+            }
+            query.reply(query.key_expr, answers[type(parsed)]())
 
     def _on_command(self, query: zenoh.Query) -> None:
         with query:
@@ -68,6 +89,9 @@ class FakeServer:
             self.asked.append(command)
             if command.machine == "nobody":
                 query.reply_err(encode_error(QueryError(Refusal.UNKNOWN_MACHINE, "machine `nobody` is not known")))
+                return
+            if isinstance(command, CalibrateCommand):
+                query.reply(query.key_expr, encode_calibration(CALIBRATION))
                 return
             machine = machine_state(command.machine, trusted=command.trusted is not False)
             query.reply(query.key_expr, encode_machine(TrustAnswer(**vars(machine), store=STORE, merged=17, fact=3)))
@@ -217,6 +241,53 @@ def test_trust_and_distrust_reach_the_server(server: FakeServer, capsys):
     ]
     assert sitegrid(server, "trust", "nobody") == 1
     assert capsys.readouterr().err == "sitegrid: machine `nobody` is not known\n"
+
+
+def test_calibration_is_asked_for_and_said(server: FakeServer, client: Client, capsys):
+    assert client.calibrate(wait_s=2.0) == client.calibration(after=3) == CALIBRATION
+    assert client.correct("a", "levelled", zero=0.004, across=-0.01) == CALIBRATION
+    assert client.calibrate_automatically("a") == CALIBRATION
+    assert sitegrid(server, "calibrate", "--wait", "5") == 0
+    head, first, second, common = capsys.readouterr().out.splitlines()
+    assert head.split("  ")[0] == "machine"
+    assert first.split()[:7] == ["a", "0.0025", "0.0005", "-0.03", "0.005", "0", "0.001"]
+    assert "zero heights+crossings" in first
+    assert "0.00251, -0.03, 0 2025-06-15 15:06:40Z" in first
+    assert first.endswith("person: levelled")
+    assert second.split() == ["b", *["unknown"] * 6, "-", "nothing", "-"]
+    assert common == "nothing shows the mean scale of all machines: no_slope_both_ways"
+    assert sitegrid(server, "query", "calibration", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == plain(CALIBRATION)
+    assert sitegrid(server, "calibrate", "a", "--scale", "-0.03", "--reason", "weighed; 22 t") == 0
+    assert sitegrid(server, "calibrate", "a", "--auto", "--json") == 0
+    assert server.asked == [
+        CalibrateCommand(wait_s=2.0),
+        CalibrationQuery(Freshness(3)),
+        CalibrateCommand("a", 0.004, None, -0.01, reason="levelled"),
+        CalibrateCommand("a", auto=True),
+        CalibrateCommand(wait_s=5.0),
+        CalibrationQuery(),
+        CalibrateCommand("a", None, -0.03, reason="weighed; 22 t"),
+        CalibrateCommand("a", auto=True),
+    ]
+    capsys.readouterr()
+    assert sitegrid(server, "calibrate", "nobody", "--auto") == 1
+    assert capsys.readouterr().err == "sitegrid: machine `nobody` is not known\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--zero", "0.1"], "--zero: is about one machine: name it"),
+        (["--auto"], "--auto: is about one machine: name it"),
+        (["a"], "a: give --zero, --scale, --across or --auto"),
+        (["a", "--zero", "0.1"], "--reason: is missing"),
+        (["a", "--zero", "0.1", "--auto", "--reason", "x"], "--zero: is a person's value"),
+    ],
+)
+def test_a_calibration_that_cannot_be_meant_is_refused_before_anybody_is_asked(words, problem, capsys):
+    assert main(["calibrate", *words]) == 1
+    assert capsys.readouterr().err.startswith(f"sitegrid: {problem}")
 
 
 @pytest.mark.parametrize("words", [["distrust", "b"], ["trust"], ["trust", "b", "--wait", "-1"]])

@@ -1,0 +1,52 @@
+"""Decisions about calibration beside the files of an archive: who folds these files has the map that the server had.
+
+The file is replaced as a whole; the journal, which is the truth, has the same decisions as events.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from mapserver.fleet.decisions import CalibrationDecision, NewerVersionError
+from mapserver.journal.archive import READABLE
+from protocol.errors import StoreError
+from protocol.files import write_whole
+
+FILE = "calibration.json"  # in the folder of an archive
+
+
+def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> None:
+    """Write the decisions of a store, in their order; raises StoreError."""
+    table = {"store": store, "decisions": [decision.body() for decision in decisions]}
+    text = json.dumps({**table, "crc32": _checksum(table)}, indent=1)
+    try:
+        write_whole(folder / FILE, f"{text}\n".encode(), READABLE)
+    except OSError as error:
+        raise StoreError(folder / FILE, f"cannot be written: {error.strerror}") from None
+
+
+def load(folder: Path) -> list[CalibrationDecision]:
+    """Read what `save` wrote, nothing where there is no file; StoreError for damage, and for a newer version."""
+    path = folder / FILE
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, RecursionError) as error:
+        raise StoreError(path, f"cannot be read: {error}") from None
+    if not isinstance(table, dict) or table.pop("crc32", None) != _checksum(table):
+        problem = "is damaged; restore it from a backup, or remove it: the map is made without corrections then"
+        raise StoreError(path, problem)
+    try:
+        return [CalibrationDecision.from_body(body) for body in table["decisions"]]
+    except NewerVersionError as error:
+        raise StoreError(path, f"{error}; fold it with that version") from None
+
+
+def _checksum(table: dict[str, Any]) -> int:
+    """CRC-32 of all values and their names."""
+    return zlib.crc32(json.dumps(table, sort_keys=True).encode())

@@ -1,0 +1,252 @@
+"""Corrections of machines through real processes: asked for, after accidents, refused, folded elsewhere."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapserver.config import ServerConfig
+from mapserver.evidence.grid import Grid
+from mapserver.fleet.correction import LAST_NS, Correction, Corrections
+from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
+from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.journal.journal import Journal
+from mapserver.journal.reader import JournalReader
+from protocol.arrays import Table
+from protocol.site.site_file import load_site
+from protocol.wire.session import free_endpoint
+from sim.config import SimConfig
+from sim.simulator import START_NS
+from sitegrid.process.children import Child, Children
+from tests.integration.site_run import READY_S, SiteRun, kill
+from tests.integration.test_evidence import Senders
+from tests.reference.correction import in_numpy
+from tests.unit.mapserver.data import same, same_evidence
+from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
+
+pytestmark = pytest.mark.processes
+
+DRIVES = {
+    "a": drive(LOW, Errors(zero=0.008), seed=1, seconds=240),
+    "b": drive(RAMP, Errors(zero=-0.006, scale=0.05), seed=2, seconds=240),
+    "c": drive(RAMP_AGAIN, Errors(scale=-0.04), seed=3, seconds=240),
+}
+ASKED = "[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n"  # nothing moves but what a test asks for
+ZERO = 0.02
+
+
+@pytest.fixture
+def site(tmp_path: Path, children: Children) -> SiteRun:
+    run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
+    run.start_router()
+    return run
+
+
+def serve(site: SiteRun) -> Child:
+    (site.folder / "server.toml").write_text(ASKED)
+    return site.start_server("--config", str(site.folder / "server.toml"))
+
+
+def stored(folder: Path, site: SiteRun) -> closing[Store]:
+    return closing(Store(folder, load_site(site.site_file), ServerConfig(), time.time_ns))
+
+
+def folded(site: SiteRun, corrections: Corrections, sent: dict[str, Table]) -> Grid:
+    """The fold of all that was sent from the start, corrected in numpy."""
+    grid = Grid(load_site(site.site_file).cell_m, ServerConfig().fold)
+    for name, rows in sent.items():
+        out = rows.copy()
+        for one in corrections.each:
+            if one.machine == name:
+                hit = (rows["stamp_ns"] >= one.from_ns) & (rows["stamp_ns"] < one.to_ns)
+                out[hit] = in_numpy(rows[hit], one)
+        grid.fold(out, name)
+    return grid
+
+
+def by_person(machine: str) -> Corrections:
+    return Corrections([Correction(machine, 0, LAST_NS, ZERO, 0.0, 0.0, ())])
+
+
+def run(*words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "sitegrid.cli", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=READY_S, check=False)
+
+
+def sample_bytes(journal: Path) -> dict[tuple[str, int], bytes]:
+    with JournalReader(journal) as reader:
+        return {(row.machine, row.first_seq): row.rows.tobytes() for row in reader.read()}
+
+
+def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
+    server, folder = serve(site), site.folder
+    with site.connect() as client:
+        client.info(after=Senders(site, client).send(DRIVES))
+        before = client.region((0, 0, 120, 60), ("resistance",))
+        answered = run("calibrate", "--endpoint", site.endpoint, "--site", site.site, "--json")
+        assert answered.returncode == 0, answered.stderr
+        answer = json.loads(answered.stdout)
+        assert [row["by"] for row in answer["machines"]] == ["solver"] * 3
+        assert answer["machines"][0]["zero"] == pytest.approx(0.008, abs=0.003)
+        info = client.info()
+        assert (info.fact, info.decided, info.corrections >= 3) == (answer["fact"], answer["fact"], True)
+        after = client.region((0, 0, 120, 60), ("resistance",))
+        assert after.version.fact == answer["fact"]
+        assert not np.array_equal(before["resistance"], after["resistance"], equal_nan=True)
+        then = client.region((0, 0, 120, 60), ("resistance",), as_of_ns=info.stamp_ns)
+        assert np.array_equal(then["resistance"], after["resistance"], equal_nan=True), "the past has the facts of now"
+        assert then.version.fact == answer["fact"]
+    server.stop()
+    with stored(folder / "store", site) as store:
+        corrections, live = store.facts.corrections, store.grid
+    assert same(live, folded(site, corrections, DRIVES))
+    again = run("fold", folder / "store", "--site-file", site.site_file, "--out", folder / "again", "--json")
+    assert again.returncode == 0, again.stderr
+    assert sample_bytes(folder / "again" / JOURNAL_FILE) == sample_bytes(folder / "store" / JOURNAL_FILE)
+    with stored(folder / "again", site) as store:
+        assert same(store.grid, live)
+        assert store.facts.corrections == corrections
+
+
+def test_two_servers_with_the_same_facts_have_the_same_map_however_the_samples_came(site: SiteRun):
+    """One corrects at the beginning, live, the other all in the end, in one refold."""
+    grids = []
+    for early in (True, False):
+        server = serve(site)
+        with site.connect() as client:
+            senders = Senders(site, client)
+            for part in np.array_split(np.arange(len(DRIVES["a"])), 3):
+                row = senders.send({name: rows[part[0] : part[-1] + 1] for name, rows in DRIVES.items()})
+                if early and part[0] == 0:
+                    client.correct("a", "levelled", zero=ZERO)
+            if not early:
+                client.info(after=row)
+                client.correct("a", "levelled", zero=ZERO)
+            assert client.info(after=row).fact == 1
+        server.stop()
+        with stored(site.folder / "store", site) as store:
+            grids.append(store.grid)
+        shutil.rmtree(site.folder / "store")
+    assert same(*grids)
+    sent = {name: rows[: len(DRIVES["a"])] for name, rows in DRIVES.items()}
+    assert same(grids[0], folded(site, by_person("a"), sent))
+
+
+def killed_with_a_fact_on_disk(site: SiteRun, server: Child) -> None:
+    """Kill a server right after a decision is on its disk, whether it has folded again or not."""
+    with site.connect() as client:
+        try:
+            client.correct("a", "levelled", zero=ZERO, wait_s=0.0)
+        except Exception as error:  # the answer: it is kept, but the map is not folded yet
+            assert "the decision is kept" in str(error)  # noqa: PT017
+    kill(server)
+
+
+def with_an_old_snapshot(site: SiteRun, server: Child) -> None:
+    """Stop a server, decide, and give it back the snapshot that it had before."""
+    server.stop()
+    old = next(iter((site.folder / "store").glob("snapshot-*")))
+    kept = old.read_bytes()
+    server = serve(site)
+    with site.connect() as client:
+        client.correct("a", "levelled", zero=ZERO)
+    kill(server)
+    for path in (site.folder / "store").glob("snapshot-*"):
+        path.unlink()
+    old.write_bytes(kept)
+
+
+@pytest.mark.parametrize("accident", [killed_with_a_fact_on_disk, with_an_old_snapshot])
+def test_after_an_accident_the_next_start_has_the_fact_in_its_map(
+    site: SiteRun, accident: Callable[[SiteRun, Child], None]
+):
+    server = serve(site)
+    with site.connect() as client:
+        client.info(after=Senders(site, client).send(DRIVES))
+    accident(site, server)
+    server = serve(site)
+    with site.connect() as client:
+        info = client.info()
+        assert (info.fact, info.decided, info.corrections) == (1, 1, 1)
+        assert client.calibration().machines[0].by == PERSON
+    server.stop()
+    with stored(site.folder / "store", site) as store:
+        assert same(store.grid, folded(site, by_person("a"), DRIVES))
+
+
+def test_a_fact_of_a_newer_version_keeps_the_server_from_starting_in_one_line(site: SiteRun):
+    server = serve(site)
+    with site.connect() as client:
+        client.info(after=Senders(site, client).send(DRIVES))
+    server.stop()
+    config, path = load_site(site.site_file), site.folder / "store" / JOURNAL_FILE
+    decision = CalibrationDecision("a", PERSON, "why", 1, by_person("a").each)
+    with closing(Journal(path, config.name, config.frame)) as journal:
+        journal.append_event("calibration", 1, decision.body() | {"version": 2})
+    words = ("--site-file", site.site_file, "--store", site.folder / "store")
+    refused = run("server", "--endpoint", site.endpoint, *words)
+    assert refused.returncode == 1
+    (line,) = refused.stderr.strip().splitlines()
+    assert "version 2, by a newer version of this program; this one knows version 1; open it with that" in line
+    assert run("fold", site.folder / "store", "--out", site.folder / "new").returncode == 1
+    with closing(sqlite3.connect(path)) as database:
+        assert database.execute("SELECT COUNT(*) FROM events").fetchone() == (1,), "it is still there"
+
+
+def test_the_map_of_an_archive_and_its_facts_is_the_live_one(site: SiteRun):
+    pytest.importorskip("pyarrow.parquet")
+    (site.folder / "server.toml").write_text(ASKED.replace("0.0", "0.000001"))
+    server, folder = serve(site), site.folder
+    with site.connect() as client:
+        client.info(after=Senders(site, client).send(DRIVES))
+        client.correct("a", "levelled", zero=ZERO)
+        assert client.info().corrections == 1
+    server.stop()
+    with stored(folder / "store", site) as store:
+        live = store.grid
+    archived = run("fold", folder / "store", "--site-file", site.site_file, "--out", folder / "of-store")
+    assert archived.returncode == 0, archived.stderr
+    with stored(folder / "of-store", site) as store:
+        assert same_evidence(store.grid, live)
+
+
+def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path: Path, children: Children):
+    """It comes with the first acknowledgement of samples, and counts at a standstill or at the end of a tour."""
+    sim = SimConfig(machines=2, seconds=240, speed=10, seed=3, world="fast")
+    site = SiteRun(tmp_path, children, free_endpoint(), sim)
+    one, other = (config.stem for config in site.configs)
+    with site.configs[0].open("a", encoding="utf-8") as text:
+        text.write("[pipeline.estimation]\naccept_calibration = true\n")
+    site.start_router()
+    serve(site).stop()
+    config, path = load_site(site.site_file), tmp_path / "store" / JOURNAL_FILE
+    covariance = ((4e-7, 0.0, 0.0), (0.0, 2e-5, 0.0), (0.0, 0.0, 1e-6))
+    with closing(Journal(path, config.name, config.frame)) as journal:
+        for name in (one, other):
+            offered = Correction(name, 0, LAST_NS, 0.004, 0.03, 0.0, covariance)
+            decision = CalibrationDecision(name, SOLVER, "", START_NS, (offered,))
+            journal.append_event("calibration", START_NS, decision.body())
+    server = serve(site)
+    site.start_agents()
+    site.start_sim()
+    calibrations = {name: report["pipeline"]["ground"]["calibration"] for name, report in site.delivered().items()}
+    assert (calibrations[one]["offers"], calibrations[one]["offer_ns"]) == (1, START_NS)
+    assert "offers" not in calibrations[other]
+    server.stop()
+    with JournalReader(path) as reader:
+        stated = {
+            name: np.concatenate([row.rows["applied_scale"] for row in reader.read() if row.machine == name])
+            for name in (one, other)
+        }
+    assert np.abs(stated[one] - 0.03).min() < 0.015
+    assert np.abs(stated[other] - 0.03).min() > 0.015

@@ -1,0 +1,194 @@
+"""Ledgers that follow the samples, solves in site time, and what people ask of them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig
+from mapserver.evidence.grid import Grid
+from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.correction import corrected
+from mapserver.follower.calibrating import EVERY_NS, Calibrating
+from mapserver.follower.follower import Follower
+from mapserver.ingest.store import JOURNAL_FILE
+from mapserver.ingest.writer import Writer
+from mapserver.journal.archive import FOLDER, archive
+from mapserver.journal.reader import JournalReader
+from protocol.errors import QueryError, Refusal
+from protocol.queries.commands import CalibrateCommand
+from tests.unit.mapserver.data import SITE, WAIT_S, grid_copy, incoming, open_writer, past_of, same, send
+from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, START_NS, Errors, drive
+
+DRIVES = {
+    "a": drive(LOW, Errors(zero=0.008), seed=1, seconds=300),
+    "b": drive(RAMP, Errors(zero=-0.006, scale=0.05), seed=2, seconds=300),
+    "c": drive(RAMP_AGAIN, Errors(scale=-0.04), seed=3, seconds=300),
+}
+S = 10**9
+
+
+def deliver(writer: Writer, first: float = 0.0, last: float = 1.0, batch: int = 150) -> None:
+    """A share of each machine's samples, in batches that take turns."""
+    spans = {name: range(int(first * len(rows)), int(last * len(rows)), batch) for name, rows in DRIVES.items()}
+    for i in range(max(map(len, spans.values()))):
+        for name, starts in spans.items():
+            if i < len(starts):
+                end = min(starts[i] + batch, starts.stop)
+                send(writer, [incoming(DRIVES[name][starts[i] : end], starts[i] + 1, name)])
+
+
+@pytest.fixture
+def writer(tmp_path: Path) -> Iterator[Writer]:
+    config = ServerConfig(store=StoreConfig(archive_after_h=0.0), calibration=CalibrationConfig(automatic=False))
+    with closing(open_writer(tmp_path, config)) as opened:
+        yield opened
+
+
+def calibrating(writer: Writer, *doubtful: str) -> tuple[Calibrating, list[int]]:
+    """A job without a thread, and when it had something decided."""
+    decided: list[int] = []
+
+    def decide(_: Calibration, now_ns: int) -> None:
+        decided.append(now_ns)
+
+    job = Calibrating(writer, past_of(writer), decide, lambda: frozenset(doubtful), threading.Event())
+    return job, decided
+
+
+def solved(writer: Writer, *doubtful: str) -> Calibration:
+    job, _ = calibrating(writer, *doubtful)
+    with closing(job):
+        return job.solve()[0]
+
+
+def test_the_errors_of_machines_are_found(writer):
+    deliver(writer)
+    found_out = solved(writer).machines
+    for name, errors in (("a", Errors(zero=0.008)), ("b", Errors(-0.006, 0.05)), ("c", Errors(0.0, -0.04))):
+        assert found_out[name].zero == pytest.approx(errors.zero, abs=0.002)
+    assert found_out["b"].scale - found_out["c"].scale == pytest.approx(0.09, abs=0.02)
+
+
+def test_followed_live_made_at_a_start_or_from_the_archive_ledgers_are_the_same(writer, tmp_path, monkeypatch):
+    live, _ = calibrating(writer)
+    with closing(live):
+        for share in range(5):
+            deliver(writer, share / 5, (share + 1) / 5)
+            live.run()
+        result = live.solve()[0]
+    assert solved(writer) == result
+    with JournalReader(tmp_path / JOURNAL_FILE) as reader:
+        half = writer.run(lambda store: store.journalled) // 2
+
+        def forget(until: int) -> int:
+            return writer.run(lambda store: store.journal.forget(min(until, half)))
+
+        pytest.importorskip("pyarrow.parquet")
+        next(archive(tmp_path / FOLDER, reader, SITE, 2**62, lambda until: max(forget(until), until)))
+        assert reader.archived_row == half
+    assert solved(writer) == result
+    monkeypatch.setattr("mapserver.follower.calibrating.TURN_SAMPLES", 10)
+    assert solved(writer) == result
+
+
+def test_a_machine_in_doubt_has_no_say(writer):
+    deliver(writer)
+    assert solved(writer, "a").machines["b"] != solved(writer).machines["b"]
+    assert solved(writer, "a").machines["a"].zero == pytest.approx(0.008, abs=0.003)
+
+
+def test_it_solves_in_site_time(tmp_path):
+    with closing(open_writer(tmp_path)) as writer:
+        job, decided = calibrating(writer)
+        with closing(job):
+            rows, seq = DRIVES["a"], 1
+            for until_s in (10, 20, 40, 65, 75, 80, 140, 150):
+                part = rows[seq - 1 :][rows["stamp_ns"][seq - 1 :] <= START_NS + until_s * S]
+                send(writer, [incoming(part, seq, "a")])
+                seq += len(part)
+                job._due_s = 0.0
+                job.run()
+                job.run()
+            assert [round((now_ns - START_NS) / S) for now_ns in decided] == [10, 75, 140]
+            job._due_s = 1e12  # it has used more than its share of the processor
+            send(writer, [incoming(rows[seq - 1 :], seq, "a")])
+            job.run()
+            assert len(decided) == 3
+    assert EVERY_NS == 60 * S
+
+
+def folded(follower: Follower, writer: Writer) -> Grid:
+    """The fold of all samples with the corrections that count."""
+    each = writer.run(lambda store: store.facts.corrections).each
+    grid = Grid(SITE.cell_m, writer.config.fold)
+    for name, rows in DRIVES.items():
+        grid.fold(corrected(rows, [one for one in each if one.machine == name]), name)
+    return grid
+
+
+def test_asked_for_the_map_has_what_is_known_at_once(writer):
+    deliver(writer)
+    before = writer.run(grid_copy)
+    with closing(Follower(writer, lambda _: None, past_of(writer))) as follower:
+        assert follower.calibration().machines[0].spans == ()
+        follower.calibrate(WAIT_S)
+        answer = follower.calibration()
+        a, b, c = answer.machines
+        assert (a.by, a.zero_by != (), answer.fact, answer.merged) == (
+            "solver",
+            True,
+            3,
+            writer.run(lambda s: s.merged),
+        )
+        assert a.spans[-1].zero == pytest.approx(a.zero, abs=1e-5)
+        assert b.spans[-1].scale - c.spans[-1].scale == pytest.approx(0.09, abs=0.02)
+        assert same(writer.run(grid_copy), folded(follower, writer))
+        assert not same(writer.run(grid_copy), before)
+        follower.calibrate(WAIT_S)
+        assert follower.calibration().fact == 3, "nothing new is known"
+
+
+def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
+    deliver(writer)
+    with closing(Follower(writer, lambda _: None, past_of(writer))) as follower:
+        follower.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=WAIT_S))
+        state = follower.calibration().machines[0]
+        assert (state.by, state.reason, state.spans[0].zero, state.spans[0].from_ns) == (
+            "person",
+            "levelled",
+            0.00812,
+            0,
+        )
+        follower.calibrate(WAIT_S)
+        assert follower.calibration().machines[0].spans == state.spans, "a person is not overruled"
+        assert follower.calibration().machines[1].by == "solver"
+        assert same(writer.run(grid_copy), folded(follower, writer))
+        follower.correct(CalibrateCommand("a", auto=True, wait_s=WAIT_S))
+        assert follower.calibration().machines[0].spans == ()
+        follower.calibrate(WAIT_S)
+        assert follower.calibration().machines[0].by == "solver"
+        with pytest.raises(QueryError, match="`z` has sent nothing; known: a, b, c") as refused:
+            follower.correct(CalibrateCommand("z", auto=True))
+        assert refused.value.reason == Refusal.UNKNOWN_MACHINE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("automatic", "machines"), [(True, 3), (False, 0)])
+def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, machines):
+    config = ServerConfig(store=StoreConfig(archive_after_h=0.0), calibration=CalibrationConfig(automatic))
+    with closing(open_writer(tmp_path, config)) as writer:
+        follower = Follower(writer, lambda _: None, past_of(writer))
+        with closing(follower):
+            for share in range(4):
+                deliver(writer, share / 4, (share + 1) / 4)
+                follower._calibrating._due_s = 0.0
+                follower._calibrating.run()
+            follower._refolding.wait(follower._refolding._decided, WAIT_S)
+            assert follower.calibration().solved_ns > 0
+            assert sum(bool(each.spans) for each in follower.calibration().machines) == machines
+            assert same(writer.run(grid_copy), folded(follower, writer))
