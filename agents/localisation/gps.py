@@ -198,17 +198,23 @@ class Receivers(ModalSensors[Fix]):
             self._drift_m2[sensor.name] = _drift_m2(fix)
             if sensor.name not in self._confirmed:  # a receiver brings its own unknown error
                 change = self._joining(fix, error)
-            # nobody knows whether receiver or filter went wrong, unless others tell: the motion will show
-            opens = (error,) if self._is_outvoted(fix) else (measurements.PLACE, error)
+            if self._is_outvoted(fix):
+                opens = (error,)
+            elif not self._votes(fix):  # nobody tells whether receiver or filter went wrong: the motion will show
+                opens = (measurements.PLACE, error)
         R = np.diag(self._white(fix))
         gate = sensor.gate(GATE_SIGMA)
         return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
 
     def _is_outvoted(self, fix: Fix) -> bool:
         """Whether as many other receivers agree with the filter as do not: then a refused one errs, not the filter."""
-        since_ns = fix.stamp_ns - AGREED_NS
-        votes = [accepted for name, (ns, accepted) in self._judged.items() if ns > since_ns and name != fix.sensor.name]
+        votes = self._votes(fix)
         return sum(votes) > votes.count(False)
+
+    def _votes(self, fix: Fix) -> list[bool]:
+        """Of each other receiver that is heard: whether it agrees with the filter."""
+        since_ns = fix.stamp_ns - AGREED_NS
+        return [accepted for name, (ns, accepted) in self._judged.items() if ns > since_ns and name != fix.sensor.name]
 
     def _joining(self, fix: Fix, states: slice) -> Change:
         """What gives the receiver's error its first value, by those of the receivers before it."""
