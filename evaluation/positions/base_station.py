@@ -260,9 +260,11 @@ def failing(made: Sequence[Correction], case: str, middle_ns: int) -> Iterator[C
 def arrivals(readings: Sequence[Reading], made: Sequence[Correction], link_s: float) -> list[Reading]:
     """Readings and corrections in the order in which they come to a machine, from its first reading on."""
     link_ns = round(link_s * 1e9)
-    late = [(c.stamp_ns + link_ns, c) for c in made if c.stamp_ns + link_ns > readings[0].stamp_ns]
-    own: list[tuple[int, Reading]] = [(r.stamp_ns, r) for r in readings]
-    return [reading for _, reading in sorted([*own, *late], key=lambda item: item[0])]
+
+    def at_ns(reading: Reading) -> int:
+        return reading.stamp_ns + (link_ns if isinstance(reading, Correction) else 0)
+
+    return sorted([*readings, *(c for c in made if at_ns(c) > readings[0].stamp_ns)], key=at_ns)
 
 
 def _later(errors: dict[str, GpsErrors]) -> dict[str, GpsErrors]:
