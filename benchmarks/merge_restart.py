@@ -22,6 +22,7 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES
 from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.journal.facts import NO_FACTS
 from mapserver.journal.journal import Journal
 from mapserver.journal.rows import Admission
 from protocol.arrays import Table
@@ -87,7 +88,7 @@ def build(folder: Path, rows: int, tail_rows: int, in_row: int = BATCH) -> None:
         if number <= rows - tail_rows:
             grid.fold(batch, name)
         if number == rows - tail_rows:
-            snapshot.save(folder, number, grid.state(), SITE.cell_m, CONFIG.fold)
+            snapshot.save(folder, number, grid.state(), SITE.cell_m, CONFIG.fold, NO_FACTS.of_evidence())
         if number % IN_ONE_COMMIT == 0:
             journal.commit()
             journal.begin()

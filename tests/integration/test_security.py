@@ -99,7 +99,7 @@ class Guarded:
     def batch(self, machine: str) -> bytes:
         """One sample of a machine, as its agent sends it, in a spool of its own."""
         rows = np.ones(1, SAMPLE_DTYPE)
-        rows["cov_xy_m2"] = 0.0
+        rows["cov_xy_m2"] = rows["applied_zero"] = rows["applied_scale"] = 0.0
         return encode_batch(SampleBatch(machine, time.time_ns(), 1, rows, load_site(self.site_file).frame))
 
 
