@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -41,9 +41,10 @@ class Decisions:
         decisions._conclude(number)
         return decisions
 
-    def add(self, decision: Decision, number: int) -> None:
-        """Have one more decision count. number: of its event."""
-        self._take(decision)
+    def add(self, decisions: Iterable[Decision], number: int) -> None:
+        """Have more decisions count. number: of the last one's event."""
+        for decision in decisions:
+            self._take(decision)
         self._conclude(number)
 
     def offer(self, machine: str) -> dict[str, Any] | None:

@@ -130,11 +130,15 @@ class Journal(JournalQueries):
 
     def append_event(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> int:
         """Commit an event, outside of any other transaction; returns its number."""
-        text = json.dumps(body, allow_nan=False)
+        return self.append_events([(kind, stamp_ns, body)])
+
+    def append_events(self, events: Iterable[tuple[str, int, Mapping[str, Any]]]) -> int:
+        """Commit events (kind, stamp_ns, body), all or none, outside of any other transaction; returns the last number."""
         with self._transaction():
-            number = self._number(_LAST_EVENT) + 1
-            values = (number, kind, stamp_ns, text)
-            self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
+            number = self._number(_LAST_EVENT)
+            for number, (kind, stamp_ns, body) in enumerate(events, number + 1):
+                values = (number, kind, stamp_ns, json.dumps(body, allow_nan=False))
+                self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
             self._changed[EVENT] = number
         return number
 
