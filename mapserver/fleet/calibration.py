@@ -242,9 +242,9 @@ def _states(
 
 
 def state_of(correction: Correction) -> MachineState:
-    """What a correction in force says of its machine, where nothing has been solved yet."""
+    """What a correction by the solver says of its machine, where nothing has been solved yet."""
     k = correction.scale / (1 - correction.scale)
-    zero_std, scale_std, across_std = np.sqrt(np.diag(correction.covariance or np.zeros((3, 3)))).tolist()
+    zero_std, scale_std, across_std = np.sqrt(np.diag(correction.covariance)).tolist()
     return MachineState(
         zero=correction.zero,
         zero_std=zero_std,

@@ -94,6 +94,10 @@ class CalibrationDecisions:
             )
         return self._corrections
 
+    def of_solver(self) -> dict[str, Correction]:
+        """The newest correction of each machine that the solver decided, whatever people did."""
+        return {machine: spans[-1] for machine, spans in self._spans[SOLVER].items() if spans}
+
     def newest(self, machine: str) -> CalibrationDecision | None:
         """The decision that a machine's newest correction comes from, None where it has none."""
         by = PERSON if self._spans[PERSON].get(machine) else SOLVER

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import Corrections
+from mapserver.fleet.correction import Correction, Corrections
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import JOURNAL_FILE, Store
@@ -73,6 +73,11 @@ class Refolding:
         """Those that decisions come to, also of machines that are left out."""
         with self._changed:
             return self._decisions.calibration.corrections
+
+    def solver_corrections(self) -> dict[str, Correction]:
+        """The newest of each machine that the solver decided."""
+        with self._changed:
+            return self._decisions.calibration.of_solver()
 
     def calibration(self, machine: str) -> CalibrationDecision | None:
         """The newest decision about the calibration of a machine that counts."""

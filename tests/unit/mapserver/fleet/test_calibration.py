@@ -548,5 +548,3 @@ def test_a_correction_says_of_its_machine_what_the_solve_said() -> None:
         )
         assert (state.zero_std, state.scale_std) == pytest.approx((known.zero_std, known.scale_std), rel=1e-3)
         assert (state.beyond[1] > FAULT_SIGMAS[1]) == (name == "again")
-    by_hand = state_of(Correction("a", 0, 1, 0.03, 0.375, 0.0, ()))
-    assert by_hand.beyond == pytest.approx((0.03 / ZERO_STD, 0.6 / SCALE_STD))
