@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.fleet import decisions as calibration
-from mapserver.fleet.correction import LAST_NS, Corrections
+from mapserver.fleet.correction import LAST_NS, NO_SHARE, Corrections
 from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions, NewerVersionError
 from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalQueries
@@ -54,6 +54,8 @@ class Decisions:
         """
         newest, decision = self.facts.corrections.newest(machine), self.calibration.newest(machine)
         if not newest or not decision or newest.to_ns < LAST_NS or not newest.covariance:
+            return None
+        if newest.most_share == NO_SHARE:  # a calibration is of a sensor that measures something
             return None
         (zz, zs, _), (_, ss, _), _ = newest.covariance
         offer = CalibrationOffer(machine, decision.stamp_ns, newest.zero, newest.scale, zz, ss, zs)
