@@ -226,7 +226,7 @@ def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: 
 
 
 def _decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
-    """Those of all sources, each history once; of a copy, or a store and its archive, what goes on after the same begin.
+    """Those of all sources, each history once; of those that begin alike, as of a store and its archive, what goes on.
 
     A decision that was made twice counts twice: who corrects, takes that back, and corrects again, has corrected.
     """

@@ -133,14 +133,18 @@ class Journal(JournalQueries):
         return self.append_events([(kind, stamp_ns, body)])
 
     def append_events(self, events: Iterable[tuple[str, int, Mapping[str, Any]]]) -> int:
-        """Commit events (kind, stamp_ns, body), all or none, outside of any other transaction; returns the last number."""
+        """Commit events (kind, stamp_ns, body), all or none, outside of other transactions; returns the last number.
+
+        The number is 0 where there never was an event.
+        """
+        texts = [(kind, stamp_ns, json.dumps(body, allow_nan=False)) for kind, stamp_ns, body in events]
         with self._transaction():
-            number = self._number(_LAST_EVENT)
-            for number, (kind, stamp_ns, body) in enumerate(events, number + 1):
-                values = (number, kind, stamp_ns, json.dumps(body, allow_nan=False))
+            for text in texts:
+                number = self._number(_LAST_EVENT) + 1
+                values = (number, *text)
                 self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
-            self._changed[EVENT] = number
-        return number
+                self._changed[EVENT] = number
+            return self._number(_LAST_EVENT)
 
     def note_shortfall(self, shortfall: Shortfall) -> None:
         """Keep what is missing as an event; no file that proves it is needed from then on."""
