@@ -51,8 +51,9 @@ class LocalisationConfig:
     filter: ekf or ukf. profile: "paper" takes GPS errors as white, and runs filterpy's filters (extra `paper`);
     "default" estimates a slow error of each receiver, a bias of each yaw gyro and the wheels' scale, with our own.
     start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. It counts
-    once: after a pause or a jump of the clock the machine may be anywhere. slip, slip_soft: wheel slip per traction on firm ground, and how much it rises with the rolling resistance; of the tyres.
-    lag_s: how long places of the past are smoothed by what comes after them, 0 for not at all; "paper" never smooths.
+    once: after a pause or a jump of the clock the machine may be anywhere. slip, slip_soft: wheel slip per traction on
+    firm ground, and how much it rises with the rolling resistance; of the tyres. lag_s: how long places of the past are
+    smoothed by what comes after them, 0 for not at all; "paper" never smooths.
     """
 
     filter: str = "ukf"
