@@ -130,8 +130,7 @@ class Positioning:
         smoothed: list[SmoothedPose] = []
         restarts = False
         for reading in readings:
-            decision = self._order.decide(reading)
-            if decision is Decision.REFUSE:
+            if (decision := self._order.decide(reading)) is Decision.REFUSE:
                 continue
             if decision is Decision.RESTART:
                 smoothed += self._restart()
