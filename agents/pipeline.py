@@ -130,8 +130,7 @@ class Positioning:
         smoothed: list[SmoothedPose] = []
         restarts = False
         for reading in readings:
-            decision = self._order.decide(reading)
-            if decision is Decision.REFUSE:
+            if (decision := self._order.decide(reading)) is Decision.REFUSE:
                 continue
             if decision is Decision.RESTART:
                 smoothed += self._restart()
@@ -145,13 +144,14 @@ class Positioning:
             poses = self.localiser.update(taken, self.dead_reckoning)
         except DivergedError:
             self._counters["filter_restarts"] += 1
-            self._config = replace(self._config, start=())  # a start that was configured is far behind by now
             smoothed += self._restart()
             poses, restarts = [], True
         return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts)
 
     def _restart(self) -> list[SmoothedPose]:
         """Start again, and keep the counts; returns the smoothed poses that remained."""
+        if self.localiser.is_aligned:  # a start that was configured is far behind by now
+            self._config = replace(self._config, start=())
         self._counters.update(self.localiser.counters)
         smoothed = self.localiser.take_smoothed() + self.remaining()
         self._start()

@@ -99,7 +99,8 @@ class Calibrator:
         self._aged_ns, self._offer_ns = start.stamp_ns, start.offer_ns
         self._past: deque[_Stretch] = deque(maxlen=KEPT)
         self._stretch: list[Balance] = []  # of the present stretch
-        self._excluded: list[float] = []  # innovations, since the last that passed the gate
+        # innovations of tours, and of all else, since the last that passed the gate
+        self._excluded: dict[bool, list[float]] = {True: [], False: []}
 
     @property
     def calibration(self) -> Calibration:
@@ -133,7 +134,7 @@ class Calibrator:
 
     def add_tour(self, tour: Tour) -> None:
         """Add a closed tour."""
-        self._learn(tour.stamp_ns, tour.zero, 0.0, tour.std**2, RELOCK_TOURS)
+        self._learn(tour.stamp_ns, tour.zero, 0.0, tour.std**2, is_tour=True)
         self.counters["tours"] += 1
 
     def take(self, offer: CalibrationOffer, now_ns: int) -> None:
@@ -187,8 +188,8 @@ class Calibrator:
                 partner, nearest_m = other, distance_m
         return partner
 
-    def _learn(self, stamp_ns: int, measured: float, share: float, variance: float, relock: int = RELOCK) -> None:
-        """Filter measured = zero + scale * share + noise. relock: how many excluded in a row are right."""
+    def _learn(self, stamp_ns: int, measured: float, share: float, variance: float, *, is_tour: bool = False) -> None:
+        """Filter measured = zero + scale * share + noise."""
         self.age(stamp_ns)
         h: Floats = np.array([1.0, share])
         Ph = self._P @ h
@@ -196,14 +197,16 @@ class Calibrator:
         innovation = measured - float(h @ self._x)
         if innovation**2 > GATE_SIGMA**2 * S:
             self.counters["off"] += 1
-            self._excluded.append(innovation)
-            if len(self._excluded) >= relock:
-                self._P[0, 0] += float(np.mean(np.square(self._excluded)))
-                self._excluded.clear()
-                self.counters["relocked"] += 1
-            return
-        self._excluded.clear()
-        self._x = self._x + Ph / S * innovation
-        self._P = self._P - np.outer(Ph, Ph) / S
-        self._stamp_ns = stamp_ns
-        self._passages += 1
+            excluded = self._excluded[is_tour]
+            excluded.append(innovation)
+            if len(excluded) < (RELOCK_TOURS if is_tour else RELOCK):
+                return
+            self._P[0, 0] += float(np.mean(np.square(excluded)))
+            self.counters["relocked"] += 1
+        else:
+            self._x = self._x + Ph / S * innovation
+            self._P = self._P - np.outer(Ph, Ph) / S
+            self._stamp_ns = stamp_ns
+            self._passages += 1
+        for excluded in self._excluded.values():
+            excluded.clear()

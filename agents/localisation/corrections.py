@@ -24,16 +24,17 @@ from agents.localisation.filters.belief import Belief, Change, Conditioned, Meas
 from agents.localisation.filters.motion import GpsError, map_from_base
 from agents.localisation.filters.state import ATTITUDE, VELOCITY, Layout
 from agents.localisation.gps import Fix
-from agents.localisation.site_share import SiteShareEstimator
+from agents.localisation.site_share import WAIT_S, SiteShareEstimator
 from protocol.arrays import Floats
 from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import Correction
 
-MAX_AGE_S = 30.0  # older ones are refused: by then a slow GPS error has mostly become another one
+MAX_AGE_S = float(WAIT_S)  # older ones are refused: nobody judges what they have in common with the machine any more
+SILENT_S = 30.0  # without a correction for so long none is used: a slow GPS error has mostly become another one
 MAX_AHEAD_S = 10.0  # so far ahead of the machine's own readings they wait for these; beyond that a clock is wrong
 REPEATS = 5  # the same error so often in a row is no measurement any more
 GATE_SIGMA = 4.0  # as of fixes
-MEAN_NS = 1_000_000_000  # corrections of so long are one measurement,
+MEAN_NS, DUE_NS = 1_000_000_000, 900_000_000  # corrections of so long are one measurement, once these are together,
 REFUSALS = 3  # and so many refused ones in a row are a base that has jumped
 LEAST_SHARE = 0.05  # a smaller one is none
 UNKNOWN = GpsError(1.0, 45.0)  # the slow error of a base that was not heard yet: any will do
@@ -73,8 +74,8 @@ class Corrections:
             self._why = f"the last one was {reason.replace('_', ' ')}"
             return
         self._why = ""
-        ahead = [c for c in self._waiting if c.stamp_ns > now_ns]
-        self._waiting = [*ahead, correction]
+        recent = [c for c in self._waiting if now_ns - c.stamp_ns <= MAX_AGE_S * 1e9]  # a link brings many at once
+        self._waiting = [*recent, correction]
 
     def follow(self, belief: Belief) -> None:
         """Follow the machine by its believed velocity, which wheels and gyros show: dead reckoning in `map`."""
@@ -119,7 +120,7 @@ class Corrections:
             self._share.add_correction(correction)
         self._due += due
         newest = max(self._due, key=lambda c: c.stamp_ns)
-        if newest.stamp_ns - self._measured_to_ns < MEAN_NS:
+        if newest.stamp_ns - self._measured_to_ns < DUE_NS:
             return None
         recent = [c for c in self._due if c.stamp_ns > newest.stamp_ns - MEAN_NS]
         self._due, self._measured_to_ns = [], newest.stamp_ns
@@ -137,6 +138,8 @@ class Corrections:
 
     def confirm(self, result: Conditioned) -> None:
         """Note what the filter made of a measurement."""
+        if not math.isfinite(result.nis):
+            return
         self._accepted |= result.accepted
         self._why = "" if result.accepted else "the filter refuses them: the base jumped, or was moved"
         self._refused = 0 if result.accepted else self._refused + 1
@@ -150,7 +153,7 @@ class Corrections:
         newest, share = self._newest, self._share.share
         age_s = (now_ns - newest.stamp_ns) * 1e-9 if newest else None
         why = self._why
-        if age_s is not None and age_s > MAX_AGE_S:
+        if age_s is not None and age_s > SILENT_S:
             why = f"the last one is {age_s:.0f} s old"
         elif not why and not self._accepted:
             why = "the machine does not know its heading yet"

@@ -95,6 +95,7 @@ class Receivers(ModalSensors[Fix]):
         self._monitors = {name: InnovationMonitor() for name in self._sensors}
         self._judged: dict[str, tuple[int, bool]] = {}  # stamp of the last fix of each, and whether it was accepted
         self._refused: Counter[str] = Counter()  # in a row
+        self._off_m: dict[str, list[Floats]] = {}  # innovations of these, since the last relock
         self._jumps: dict[str, tuple[int, float]] = {}  # stamp, and how far off the receiver was by itself [m2]
         self._shifts: dict[str, Floats] = {}  # of relative ones, and how unsure the believed antenna was then [m2]
         self._anchor_m2: dict[str, float] = {}
@@ -152,15 +153,20 @@ class Receivers(ModalSensors[Fix]):
         super().confirm(fix, result)
         name = fix.sensor.name
         self._monitors[name].note(result, self._believed_error(name, result.belief))
-        if not math.isfinite(result.nis):
-            return
+        if fix.sensor.mode == DIFFERENTIAL or not math.isfinite(result.nis):
+            return  # a velocity says nothing of the place
         self._judged[name] = (fix.stamp_ns, result.accepted)
         if not result.accepted:
             self._refused[name] += 1
-            if self._refused[name] % RELOCK == 0 and self._is_outvoted(fix):
+            self._off_m.setdefault(name, []).append(result.innovation)
+            if self._refused[name] % RELOCK:
+                return
+            del self._off_m[name]
+            if self._is_outvoted(fix):
                 self._jumps[name] = (fix.stamp_ns, float((result.innovation**2).mean()))
             return
         self._refused[name] = 0
+        self._off_m.pop(name, None)
         if name in self._jumps and fix.stamp_ns - self._jumps[name][0] > FADED * fix.sensor.drift_time_s * 1e9:
             del self._jumps[name]
         if len(self._compared) > 1 and name in self._compared:
@@ -200,7 +206,8 @@ class Receivers(ModalSensors[Fix]):
                 change = self._joining(fix, error)
             if self._is_outvoted(fix):
                 opens = (error,)
-            elif not self._votes(fix):  # nobody tells whether receiver or filter went wrong: the motion will show
+            elif not self._votes(fix) and self._has_jumped(fix.sensor.name, _mean(self._white(fix))):
+                # nobody tells whether receiver or filter went wrong: the motion will show
                 opens = (measurements.PLACE, error)
         R = np.diag(self._white(fix))
         gate = sensor.gate(GATE_SIGMA)
@@ -210,6 +217,17 @@ class Receivers(ModalSensors[Fix]):
         """Whether as many other receivers agree with the filter as do not: then a refused one errs, not the filter."""
         votes = self._votes(fix)
         return sum(votes) > votes.count(False)
+
+    def _has_jumped(self, name: str, white_m2: float) -> bool:
+        """Whether refused fixes get no further off: one jump did it, of the receiver or the place.
+
+        Else the motion is wrong, as with a wheel that is stuck or a machine that is carried, and will show nothing.
+        """
+        off_m, half = self._off_m.get(name), RELOCK // 2
+        if not off_m:
+            return True
+        first_m, last_m = (math.hypot(*np.mean(part, axis=0)) for part in (off_m[:half], off_m[-half:]))
+        return last_m - first_m < GATE_SIGMA * math.sqrt(2 * white_m2 / half)
 
     def _votes(self, fix: Fix) -> list[bool]:
         """Of each other receiver that is heard: whether it agrees with the filter."""

@@ -6,9 +6,9 @@ metres to for ever. So each absolute heading has a state for it, a Gauss-Markov 
 error is learnt, and without GPS the heading is held to within what the error may have changed since. The profile
 `paper` takes orientations as they are, with white errors, and their tilt too.
 
-Differential: successive orientations make
-an angular rate. Relative: the heading is turned so that the first one agrees with the believed heading; roll and pitch
-stay, since gravity gives them. Differential and relative ones are measurements of their own stamps.
+Differential: successive orientations make an angular rate. Relative: the heading is turned so that the first one agrees
+with the believed heading; roll and pitch stay, since gravity gives them. Differential and relative ones are
+measurements of their own stamps.
 """
 
 import math

@@ -50,9 +50,10 @@ class LocalisationConfig:
 
     filter: ekf or ukf. profile: "paper" takes GPS errors as white, and runs filterpy's filters (extra `paper`);
     "default" estimates a slow error of each receiver, a bias of each yaw gyro and the wheels' scale, with our own.
-    start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. slip,
-    slip_soft: wheel slip per traction on firm ground, and how much it rises with the rolling resistance; of the tyres.
-    lag_s: how long places of the past are smoothed by what comes after them, 0 for not at all; "paper" never smooths.
+    start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. It counts
+    once: after a pause or a jump of the clock the machine may be anywhere. slip, slip_soft: wheel slip per traction on
+    firm ground, and how much it rises with the rolling resistance; of the tyres. lag_s: how long places of the past are
+    smoothed by what comes after them, 0 for not at all; "paper" never smooths.
     """
 
     filter: str = "ukf"
@@ -106,7 +107,7 @@ class Localiser:
         turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
         self._model = MotionModel(layout, on_plane, self._gps_errors(), turn_error_radps=turn_error)
         self._fusion: Fusion | None = None
-        self._placed_ns = 0  # stamp of the newest fix or velocity by GPS
+        self._placed_ns = 0  # stamp of the newest fix or velocity by GPS that was accepted
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
         self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
@@ -192,11 +193,7 @@ class Localiser:
     def _filter_own(self, fusion: Fusion, event: Event) -> list[Belief]:
         """Beliefs that an event of the machine's own sensors changed."""
         if not isinstance(event, FilterStep):
-            self._placed_ns = event.stamp_ns
-        if isinstance(event, Measurement):
-            return fusion.add([event])
-        if isinstance(event, Fix):
-            return self._filter_modal(fusion, self._receivers, event)
+            return self._place(fusion, event)
         absolute = self._references.measurements(event, fusion.belief)
         errors = self._references.errors
         layout = fusion.model.layout
@@ -213,6 +210,16 @@ class Localiser:
             inertial, wheels = ([_considering(m, considers) for m in several] for several in (inertial, wheels))
         measurements = [*inertial, *absolute, *turn, *wheels]
         return beliefs + (fusion.add(measurements) if measurements else [])
+
+    def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:
+        """Beliefs that a fix or a velocity by GPS changed."""
+        if isinstance(event, Fix):
+            name, beliefs = event.sensor.name, self._filter_modal(fusion, self._receivers, event)
+        else:
+            name, beliefs = event.sensor, fusion.add([event])
+        if beliefs and fusion.last[name].accepted:
+            self._placed_ns = max(self._placed_ns, event.stamp_ns)
+        return beliefs
 
     def _correct(self, fusion: Fusion, corrections: Corrections, event: Event) -> list[Belief]:
         """Beliefs that a base station's corrections changed, as of what the event shows."""

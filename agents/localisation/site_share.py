@@ -18,6 +18,7 @@ three times too large after a second, and made shares of 0.8 into 0.85 to 0.88.
 """
 
 import math
+from collections import Counter
 
 import numpy as np
 
@@ -37,8 +38,8 @@ TURN_STD, TURN_TIME_S = 0.02, 60.0  # of 0.01 to 0.02 each, which change within 
 UNKNOWN_M2 = 10.0**2  # of q and d at first
 WAIT_S = 5  # a span is judged so much later: links hold corrections up, and with the stamps wrong by 2 s none is alike
 SILENT_NS = 10_000_000_000  # a receiver without fixes for so long makes room for another
-GATE_SIGMA = 4.0  # corrections further off under every candidate tell nothing of a share,
-RELOCK = 3  # and after so many spans of them in a row the base counts as another one; a few more, and they look likely
+GATE_SIGMA = 4.0  # fixes and corrections further off under every candidate tell nothing of a share,
+RELOCK = 3  # and after so many spans of them in a row something else has jumped; a few more, and they look likely
 STATES = 10
 Q, E, B, D, M = (slice(i, i + 2) for i in range(0, STATES, 2))
 AXES = 2
@@ -83,7 +84,7 @@ class SiteShareEstimator:
         self._P = np.zeros((len(CANDIDATES), STATES, STATES))
         self._machine, self._base = GpsError(1.0, 45.0), GpsError(1.0, 45.0)
         self._receiver, self._heard_ns = "", 0
-        self._refused = 0
+        self._refused: Counter[str] = Counter()  # spans in a row
         self._spans: dict[int, _Span] = {}  # those that wait, by their numbers
         self._newest = self._filtered = 0  # numbers of spans
 
@@ -136,9 +137,9 @@ class SiteShareEstimator:
         self._predict(dt_s, span)
         lasts, likelihood = math.exp(-dt_s / LASTS_S), np.zeros(len(CANDIDATES))
         if span.fixes.count:
-            likelihood += self._condition(Q, E, span.fixes)[0]
+            likelihood += self._gated("fixes", E, Q, span.fixes)
         if span.corrections.count:
-            likelihood += self._condition_on_correction(span.corrections)
+            likelihood += self._gated("corrections", B, D, span.corrections)
         weights = (lasts * self._weights + (1 - lasts) * self._at_first) * np.exp(likelihood - likelihood.max())
         self._weights = weights / weights.sum()
 
@@ -164,18 +165,21 @@ class SiteShareEstimator:
         self._P[:, E, B] += of_both
         self._P[:, B, E] += of_both
 
-    def _condition_on_correction(self, mean: _Mean) -> Floats:
-        """Log-likelihood of a correction; none of one that no candidate can explain: the base jumped, or was moved."""
+    def _gated(self, what: str, slow: slice, free: slice, mean: _Mean) -> Floats:
+        """Log-likelihood of a mean; none of one that no candidate can explain: an outlier, or something jumped.
+
+        After a few of these the free state is opened: the base was moved, or dead reckoning lost its place.
+        """
         before = self._x, self._P
-        likelihood, nis = self._condition(B, D, mean)
+        likelihood, nis = self._condition(slow, free, mean)
         if nis.min() <= AXES * GATE_SIGMA**2:
-            self._refused = 0
+            self._refused[what] = 0
             return likelihood
         self._x, self._P = before
-        self._refused += 1
-        if self._refused >= RELOCK:
-            self._refused = 0
-            self._P[:, D, D] += UNKNOWN_M2 * np.eye(AXES)
+        self._refused[what] += 1
+        if self._refused[what] >= RELOCK:
+            self._refused[what] = 0
+            self._P[:, free, free] += UNKNOWN_M2 * np.eye(AXES)
         return np.zeros(len(CANDIDATES))
 
     def _condition(self, first: slice, second: slice, mean: _Mean) -> tuple[Floats, Floats]:

@@ -73,16 +73,16 @@ def draw_plan(scenario: Scenario, models: Sequence[MachineModel], start: FleetSt
         for config, route, colour in zip(scenario.route, routes, colours, strict=True)
     ]
     axes = Axes(Bounds(0.0, 0.0, ground.width_m, ground.depth_m), px_per_m)
-    return compose(image, axes, scenario.description, soils, lines, _note(scenario, step_m))
+    return compose(image, axes, scenario.description, soils, lines, _notes(scenario, step_m))
 
 
-def _note(scenario: Scenario, step_m: float) -> str:
+def _notes(scenario: Scenario, step_m: float) -> list[str]:
     notes = [f"contours every {step_m:g} m"] if scenario.ground.ramp else []
     if any(leg.reverse for config in scenario.route for leg in config.leg):
         notes.append("dashed: in reverse")
     if scenario.change:
         notes.append("hatched: will change")
-    return "; ".join(notes)
+    return notes
 
 
 # --- the ground ------------------------------------------------------------------------------------------------------

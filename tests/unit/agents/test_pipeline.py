@@ -221,6 +221,20 @@ def test_long_pause_starts_localisation_anew_and_keeps_the_counts() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("jump_s", "reason"), [(3600, "gap_restarts"), (-3600, "clock_back_restarts")])
+def test_a_start_that_is_told_counts_once(jump_s: int, reason: str) -> None:
+    """Behind a pause or a jump of the clock the machine is elsewhere, and waits for fixes to show it where."""
+    made, jump_ns = drive([Leg(4, 1.0), Leg(26)], VEHICLE), START_NS + 20 * SECOND
+    located = Positioning(SITE, VEHICLE, PipelineConfig(LocalisationConfig(start=START, lag_s=0.0)))
+    located.step([r for r in made.readings if r.stamp_ns <= jump_ns])
+    assert located.pose
+    later = [replace(r, stamp_ns=r.stamp_ns + jump_s * SECOND) for r in made.readings if r.stamp_ns > jump_ns]
+    located.step([r for r in later if not isinstance(r, Gps)])
+    assert located.counters[reason] == 1
+    assert located.pose is None
+
+
+@pytest.mark.slow
 def test_machine_without_imu_or_torque_gives_samples_without_resistance_or_slope() -> None:
     made = drive([Leg(4, 0.5), Leg(20)], VEHICLE, without=("imu", "torque"))
     rows = Pipeline(SITE, VEHICLE, PipelineConfig()).step(made.readings).pending

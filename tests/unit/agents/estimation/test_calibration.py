@@ -426,6 +426,20 @@ def test_one_tour_that_is_far_off_is_excluded_and_three_that_agree_are_right() -
     assert (calibrator.counters["off"], calibrator.counters["relocked"]) == (module.RELOCK_TOURS, 1)
 
 
+def test_stretches_that_were_excluded_do_not_make_a_tour_right() -> None:
+    """A border of zones counts after twelve of them in a row, a bridge after three tours: neither helps the other."""
+    course = Course(Calibrator(replace(UNCALIBRATED, covariance=((1e-6, 0.0), (0.0, 1e-4)))), zero=0.05)
+    for _ in range(module.RELOCK - 1):
+        course.drive(module.STRETCH_M, known_c_rr=0.04)
+    calibrator = course.calibrator
+    before = calibrator.counters["off"]
+    for i in range(module.RELOCK_TOURS - 1):
+        calibrator.add_tour(tour(0.03, 90.0 * i))
+    assert calibrator.counters["off"] == before + module.RELOCK_TOURS - 1
+    assert before >= module.RELOCK_TOURS
+    assert (calibrator.counters["relocked"], calibrator.calibration.zero) == (0, 0.0)
+
+
 def test_what_is_applied_can_be_stated_in_a_sample() -> None:
     """A sensor that is worse than any: its samples would be refused."""
     for sign in (1.0, -1.0):

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.localisation.corrections import MAX_AGE_S, MAX_AHEAD_S, REFUSALS, REPEATS
+from agents.localisation.corrections import MAX_AGE_S, MAX_AHEAD_S, REFUSALS, REPEATS, Corrections
+from agents.localisation.filters.belief import Belief, Conditioned
+from agents.localisation.filters.state import Layout
 from agents.localisation.localiser import LocalisationConfig
 from agents.localisation.site_share import SiteShareEstimator
 from agents.pipeline import Pipeline, PipelineConfig, Positioning
@@ -224,6 +226,68 @@ def test_base_that_falls_silent_is_reported_and_fades(made: Drive, readings: lis
     assert located.pose
     assert sure.pose
     assert located.pose.covariance_m2[0, 0] > 1.2 * sure.pose.covariance_m2[0, 0]
+
+
+# --- how they come in ------------------------------------------------------------------------------------------------
+
+LAYOUT = Layout(1, True, 2, 0, True)
+
+
+def believed(t_s: float) -> Belief:
+    return Belief(START_NS + round(t_s * 1e9), np.zeros(LAYOUT.n), np.eye(LAYOUT.n))
+
+
+@pytest.fixture
+def judged(monkeypatch: pytest.MonkeyPatch) -> list[Correction]:
+    """Corrections of which the share is estimated."""
+    taken: list[Correction] = []
+    monkeypatch.setattr(SiteShareEstimator, "add_correction", lambda _, correction: taken.append(correction))
+    return taken
+
+
+def test_all_that_a_link_held_up_count_when_they_come_at_once(judged: list[Correction]) -> None:
+    """25 of them, of 5 s; and none waits for ever where nothing of the machine's own comes in."""
+    taking = Corrections(BASE, LAYOUT)
+    made = [correction(5 + 0.2 * i, 0.1 * i, 0.0) for i in range(25)]
+    for one in made:
+        taking.take(one, believed(10.0).stamp_ns)
+    measurement = taking.measurement(believed(10.0))
+    assert judged == made
+    assert measurement
+    assert measurement.z[0] == pytest.approx(0.1 * 22)  # the mean of the last second
+    assert taking.measurement(believed(10.05)) is None
+    for i in range(500):
+        taking.take(correction(11 + 0.2 * i, 0.1 * i, 0.0), believed(11 + 0.2 * i).stamp_ns)
+    taking.measurement(believed(111.0))
+    assert len(judged) < 25 + 5 * MAX_AGE_S + 2
+
+
+def test_corrections_that_nobody_could_judge_are_not_used(readings: list[Reading]) -> None:
+    """They come in later than the share waits for them: it would stay what it is before anything is known."""
+    located = locate(with_base(machine()), mixed(readings, corrections(ramp, 50), link_s=MAX_AGE_S + 1))
+    report = located.localiser.base_report()
+    assert report
+    assert (report["used"], report["why_not"]) == (False, "the last one was too old")
+
+
+@pytest.mark.parametrize("gap_s", [1.0, 0.999, 0.95])
+def test_each_correction_of_one_a_second_counts(gap_s: float, judged: list[Correction]) -> None:
+    taking, made = Corrections(BASE, LAYOUT), [correction(gap_s * (i + 1), 0.1 * i, 0.0) for i in range(10)]
+    measured = []
+    for one in made:
+        taking.take(one, one.stamp_ns)
+        measured.append(taking.measurement(replace(believed(0.0), stamp_ns=one.stamp_ns + 1)))
+    assert [m.z[0] for m in measured if m] == pytest.approx([c.east_m for c in made])
+
+
+def test_results_that_could_not_be_computed_say_nothing_of_a_base() -> None:
+    taking, belief = Corrections(BASE, LAYOUT), believed(1.0)
+    before = taking.report(belief.stamp_ns)
+    nothing = Conditioned(belief, np.full(2, np.nan), np.full((2, 2), np.nan), math.nan, accepted=False)
+    for _ in range(2 * REFUSALS):
+        taking.confirm(nothing)
+    assert taking.report(belief.stamp_ns) == before
+    assert not taking.counters
 
 
 def test_corrections_of_another_base_are_readings_of_an_unknown_sensor() -> None:

@@ -17,7 +17,7 @@ from agents.localisation.gps import Receivers
 from agents.localisation.localiser import _layout_of
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Gps, Reading
+from protocol.machine.readings import Encoder, Gps, Reading
 from tests.unit.agents.drives import (
     PROJECTION,
     S_BEND,
@@ -299,6 +299,57 @@ def test_a_second_receiver_says_at_once_which_it_was(share: float, engine: str) 
         for belief in beliefs[1:]:
             assert math.dist(belief.x[:2], second) < 1.0
             assert outside(belief, second) < 1
+
+
+# --- motion that is wrong: no jump, and nothing that would show whose it was ------------------------------------------
+
+TURNS = (Leg(4, 1.0), *[Leg(3, 0.0, rate) for rate in (0.3, -0.2, 0.25, -0.35)])  # 16 s
+WRONG_S = 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_lone_receiver_is_followed_where_the_wheels_are_stuck(engine: str) -> None:
+    """The encoder still sends, always the same: dead reckoning stands still, and fixes get further and further off."""
+    vehicle = sharing(1, None)
+    made = drive([*TURNS, Leg(64)], vehicle)
+    stuck = next(r for r in made.readings if isinstance(r, Encoder) and after(r, WRONG_S))
+    readings = [
+        replace(stuck, stamp_ns=r.stamp_ns) if isinstance(r, Encoder) and after(r, WRONG_S) else r
+        for r in made.readings
+    ]
+    poses = localiser(vehicle, filter=engine, lag_s=0.0).run(readings)
+    assert max(math.dist((p.x_m, p.y_m), made.at(p.stamp_ns)[:2]) for p in poses) < 20.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed_mps", [3.0, 10.0])
+def test_a_lone_receiver_is_followed_where_the_machine_is_carried(speed_mps: float) -> None:
+    """On a trailer, for 40 s, with its wheels at rest; after that it is where the fixes say."""
+    vehicle, carried_s = sharing(1, None), 40.0
+    made = drive([*TURNS, Leg(4, -1.0), Leg(60)], vehicle)
+
+    def north_m(stamp_ns: int) -> float:
+        return speed_mps * min(max((stamp_ns - START_NS) * 1e-9 - WRONG_S, 0.0), carried_s)
+
+    readings = [
+        replace(r, lat_deg=r.lat_deg + north_m(r.stamp_ns) / 111_200) if isinstance(r, Gps) else r
+        for r in made.readings
+    ]
+    poses = localiser(vehicle, filter="ekf", lag_s=0.0).run(readings)
+    off_m = [math.dist((p.x_m, p.y_m - north_m(p.stamp_ns)), made.at(p.stamp_ns)[:2]) for p in poses]
+    assert max(off_m) < 6.0 * speed_mps
+    assert off_m[-1] < 5.0  # what is left passes the gate, and is shared as ever
+
+
+def test_a_receiver_without_a_place_does_not_vote_on_it() -> None:
+    """The filter has gone astray, or the machine was carried: a velocity agrees with either."""
+    vehicle = changed_sensor(sharing(2, None), "gps-2", mode="differential")
+    jump = np.array([24.0, -32.0])
+    errors = returning(2, jump, 60)
+    errors[:, 1] = 0.0  # heard all the time
+    belief = each_second(vehicle, errors, np.zeros(2))[-1]
+    assert math.dist(belief.x[:2], jump) < 2.0
 
 
 def test_results_that_could_not_be_computed_say_nothing_of_a_receiver() -> None:

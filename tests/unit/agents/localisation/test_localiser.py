@@ -370,6 +370,21 @@ def test_without_gps_the_motion_teaches_nothing_that_it_does_not_show(engine: st
     assert max(turned) < 0.06  # noise of the gyro, and a step in which it turns at 0.35 rad/s
 
 
+def test_fixes_that_are_refused_are_as_no_gps() -> None:
+    made = drive(BENDS, VEHICLE)
+    outliers = [r.stamp_ns for r in made.readings if isinstance(r, Gps) and after(r, 4)][::10]
+    heard = [r for r in made.readings if not (isinstance(r, Gps) and after(r, 4)) or r.stamp_ns in outliers]
+    off = [replace(r, force_y_mps2=r.force_y_mps2 + 0.8) if isinstance(r, Imu) else r for r in heard]
+    readings = [moved(r, 60) if isinstance(r, Gps) and after(r, 4) else r for r in off]
+    located = localiser(VEHICLE, start=START)
+    located.run(r for r in readings if not after(r, 10))
+    learnt = slice(GYRO_BIAS, Layout(imus=1, wheel_scale=True).wheel_scales.stop)
+    before = state(located)[learnt].tolist()
+    located.run(r for r in readings if after(r, 10))
+    assert located.counters["gps-1_gated"] == len(outliers) == 9
+    assert state(located)[learnt].tolist() == before
+
+
 def test_without_gps_a_standstill_still_shows_the_gyro_bias() -> None:
     vehicle = machine(receivers=0)
     made = drive([*BENDS, Leg(4, -1.0), Leg(6)], vehicle, without=("torque",))

@@ -108,6 +108,18 @@ def test_jump_of_a_base_says_nothing_of_the_share() -> None:
         assert jumps.share == pytest.approx(true.share, abs=0.05)
 
 
+@pytest.mark.slow
+def test_outliers_of_fixes_and_a_machine_that_was_carried_say_nothing_of_the_share() -> None:
+    machine, base = errors(0.95, 420, 5)
+    true, seconds = SiteShareEstimator(), np.arange(420)
+    follow(true, machine, base, 5)
+    once, often, carried = seconds == 400, seconds % 60 == 40, seconds >= 400
+    for wrong, off_m in ((once, 5.0), (once, 80.0), (often, 5.0), (carried, 10.0), (carried, 60.0)):
+        estimator = SiteShareEstimator()
+        follow(estimator, machine + [off_m, 0.0] * wrong[:, None], base, 5)
+        assert estimator.share == pytest.approx(true.share, abs=0.05)
+
+
 def test_nothing_is_taken_for_half_a_chance_of_nothing() -> None:
     assert 0.2 < SiteShareEstimator().share < 0.5
 
