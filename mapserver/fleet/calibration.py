@@ -6,27 +6,40 @@ gain may then be let in again.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
-from mapserver.fleet.ledger import EPOCH_NS
-from mapserver.fleet.observability import CommonScale, Observed, observe
+from mapserver.fleet.ledger import EPOCH_NS, Stated, newest, stated
+from mapserver.fleet.observability import OBSERVED, CommonScale, Observed, observe
 from mapserver.fleet.passages import Epochs, sound
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, against, estimate, problem
-from protocol.arrays import Bools, Floats, Table
+from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.site.site_config import KnownGround
 
 # Errors of the model: no evidence makes a zero or a scale surer than this.
 ZERO_FLOOR, SCALE_FLOOR = 0.0004, 0.004
+# Of a scale that was observed once, and is not seen any more: temperature, tyres and oil change it by so much. Surer
+# than what counts as observed, so that it counts until something contradicts it.
+REMEMBERED_STD = 0.02
 FAULTY_SIGMAS = 3.0  # of the data sheet: a scale so far off is worse than anything that a slope may hide
 FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a zero, and a scale of 30 %, that no sensor of its kind has
 SURE = 2.0  # standard deviations by which an estimate must be beyond a limit
 KNOWN = CommonScale(True, 0.0, "")  # of machines that are solved together: what their estimate says is all there is
 # A sensor that measures less than half or more than twice of the drive force has no gain: it is stuck, or on its head.
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
+# Where only the difference of machines is known, nobody can be named: then none may be further off than this, in
+# standard deviations of the data sheet, or nothing is applied. Between two sound machines that is one case in 200.
+UNNAMED_SIGMAS = 2.0
+# A solve takes so many epochs of all machines together, the newest: time and memory grow with the cube and the square of
+# them (1500: about 10 s and 0.5 GB).
+MOST_EPOCHS = 1500
+# Machines at fault are taken out one by one, or by this share of the machines, so that a large fleet is not solved
+# dozens of times.
+AT_ONCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -50,29 +63,50 @@ class MachineState:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a solve says: corrections in the order of stamps, states of all machines, and their common scale."""
+    """What a solve says: corrections in the order of stamps, states of all machines, and their common scale.
+
+    stated: by machine and number of the epoch, what the machine applied itself.
+    """
 
     corrections: tuple[Correction, ...]
     machines: Mapping[str, MachineState]
     common: CommonScale
+    stated: Mapping[str, Mapping[int, Stated]] = field(default_factory=dict)
 
 
 def calibrate(
     ledgers: Mapping[str, Table],
     excluded: Collection[str] = (),
     areas: Sequence[KnownGround] = (),
-    priors: Mapping[str, Prior] | None = None,
+    remembered: Mapping[str, Prior] | None = None,
 ) -> Calibration:
     """Solve for all machines.
 
     ledgers: stays by machine, as `Ledger.stays` has them. excluded: machines without a say, beside those that are at
-    fault. areas: whose c_rr the site states. priors: of machines of which more is known than their data sheet.
+    fault. areas: whose c_rr the site states. remembered: what was observed of machines before; it counts for those whose
+    scale these stays do not show for sure, unless slopes contradict each other now.
     """
-    priors = priors or {}
-    known = {name: stays for name, table in ledgers.items() if len(stays := sound(table))}
-    trusted = {name: table for name, table in known.items() if name not in excluded}
-    if not trusted:
+    sane = {name: stays for name, table in ledgers.items() if len(stays := sound(table))}
+    most = max(1, MOST_EPOCHS // max(len(sane), 1))
+    known = {name: newest(table, most) for name, table in sane.items()}
+    if not set(known) - set(excluded):
         return Calibration((), {}, CommonScale(False, SCALE_STD, "no_machine"))
+    solved, contradiction = _solved(known, excluded, areas, {})
+    states = solved.machines
+    silent = {name: prior for name, prior in (remembered or {}).items() if is_unsure(states.get(name))}
+    if silent and not contradiction:
+        solved, _ = _solved(known, excluded, areas, silent)
+    return replace(solved, stated={name: stated(table) for name, table in known.items()})
+
+
+def _solved(
+    known: Mapping[str, Table],
+    excluded: Collection[str],
+    areas: Sequence[KnownGround],
+    priors: Mapping[str, Prior],
+) -> tuple[Calibration, str]:
+    """What a solve with these priors says, and why slopes contradict each other, "" if they do not."""
+    trusted = {name: table for name, table in known.items() if name not in excluded}
     pb, result = _common_ground(trusted, areas, priors)
     observed = observe(pb, result)
     corrections, states = _said(pb, result, observed)
@@ -81,7 +115,7 @@ def calibrate(
         alone = against(own, pb, result)
         more, state = _said(own, alone, observe(own, alone), observed.common)
         corrections, states = corrections + more, states | state
-    return Calibration(tuple(corrections), dict(sorted(states.items())), observed.common)
+    return Calibration(tuple(corrections), dict(sorted(states.items())), observed.common), result.edges
 
 
 def _common_ground(
@@ -94,8 +128,9 @@ def _common_ground(
     """
     left = dict(trusted)
     first = pb, result = _estimated(left, areas, priors)
-    while odd := _oddest(pb, result):
-        del left[odd]
+    while odd := _oddest(pb, result, math.ceil(AT_ONCE * len(trusted))):
+        for name in odd:
+            del left[name]
         if 2 * len(left) <= len(trusted):
             return first
         pb, result = _estimated(left, areas, priors)
@@ -109,11 +144,10 @@ def _estimated(
     return pb, estimate(pb)
 
 
-def _oddest(pb: Problem, result: Estimate) -> str:
-    """The machine that is furthest beyond what its data sheet may mean, "" for none."""
-    far = _beyond(pb, result) / ((FAULT_SIGMAS[0], FAULTY_SIGMAS) if result.edges else FAULT_SIGMAS)
-    worst = int(np.argmax(far.max(axis=1)))
-    return pb.names[worst] if far[worst].max() > 1 else ""
+def _oddest(pb: Problem, result: Estimate, most: int) -> list[str]:
+    """The machines that are furthest beyond what their data sheets may mean, `most` at most."""
+    far = (_beyond(pb, result) / ((FAULT_SIGMAS[0], FAULTY_SIGMAS) if result.edges else FAULT_SIGMAS)).max(axis=1)
+    return [pb.names[index] for index in np.argsort(-far, kind="stable")[:most].tolist() if far[index] > 1]
 
 
 def _beyond(pb: Problem, result: Estimate, others_std: float = 0.0) -> Floats:
@@ -154,7 +188,7 @@ def _applied(pb: Problem, result: Estimate, observed: Observed, others: CommonSc
     """Scales count where the evidence shows them, and where they are so far off that any value is better than none.
 
     There the estimate itself is taken: what is not observed of it is no more than what the data sheet leaves open. But
-    not where slopes contradict each other: nobody knows then who is far off.
+    not where slopes contradict each other, or half of the machines are far off: nobody knows then who is.
     """
     scales = np.arange(pb.layout.scales.start, pb.layout.scales.stop)
     absolute = observed.absolute & others.observed
@@ -162,6 +196,9 @@ def _applied(pb: Problem, result: Estimate, observed: Observed, others: CommonSc
     if result.edges:
         beyond[:, 1] *= absolute
     far = beyond[:, 1] > FAULTY_SIGMAS
+    if 2 * far.sum() >= len(far) > 1:
+        beyond[:, 1] *= absolute
+        far &= absolute
     x, left = observed.x.copy(), observed.covariance.copy()
     x[scales] = np.where(absolute, x[scales], np.where(far, result.x[scales], 0.0))
     for index, at in enumerate(scales.tolist()):
@@ -169,8 +206,26 @@ def _applied(pb: Problem, result: Estimate, observed: Observed, others: CommonSc
             left[at, :] = left[:, at] = 0.0
             left[at, at] = covariance[at, at] if far[index] else SCALE_STD**2
     zeros = np.arange(len(pb.epochs.number))
+    if len(unnamed := _unnamed(pb, x[zeros], np.diag(covariance)[zeros])):
+        at = np.flatnonzero(np.isin(pb.epochs.machine, unnamed))
+        x[at], beyond[unnamed, 0] = 0.0, 0.0
+        left[at, :] = left[:, at] = 0.0
+        left[at, at] = ZERO_STD**2
     left[zeros, zeros] += moved(pb.epochs, x[zeros], left[zeros, zeros])
     return _Applied(x, left, absolute | far, beyond)
+
+
+def _unnamed(pb: Problem, zero: Floats, variance: Floats) -> Ints:
+    """Machines of which only differences are known, where these are too large for sound ones: who is off cannot be said.
+
+    zero, variance: of all epochs (e,).
+    """
+    machines = len(pb.names)
+    known, off = np.zeros(machines, np.bool_), np.zeros(machines)
+    np.logical_or.at(known, pb.epochs.machine, variance < OBSERVED * ZERO_STD**2)
+    np.maximum.at(off, pb.epochs.machine, np.abs(zero))
+    some = np.flatnonzero(~known)
+    return some if machines > 1 and (off[some] > UNNAMED_SIGMAS * ZERO_STD).any() else some[:0]
 
 
 def moved(epochs: Epochs, zero: Floats, variance: Floats) -> Floats:
@@ -239,6 +294,22 @@ def _states(
             scale_by=shown[name]["scale"],
             beyond=(float(applied.beyond[index, 0]), float(applied.beyond[index, 1])),
         )
+    return out
+
+
+def is_unsure(state: MachineState | None) -> bool:
+    """Whether what was remembered of a scale is surer than what a solve without it says."""
+    return state is not None and state.scale_std > REMEMBERED_STD
+
+
+def remembered_of(corrections: Iterable[Correction]) -> dict[str, Prior]:
+    """What earlier solves observed of machines, by their newest corrections. A zero wanders, and is not remembered."""
+    out = {}
+    for one in corrections:
+        if one.most_share >= ANY_SHARE and one.covariance:
+            state = state_of(one)
+            variance = max(state.scale_std, REMEMBERED_STD) ** 2
+            out[one.machine] = Prior(0.0, state.scale, ((ZERO_STD**2, 0.0), (0.0, variance)))
     return out
 
 

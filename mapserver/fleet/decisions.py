@@ -15,6 +15,7 @@ from typing import Any
 
 from mapserver.fleet.calibration import Calibration
 from mapserver.fleet.correction import ANY_SHARE, LAST_NS, Correction, Corrections
+from mapserver.fleet.ledger import EPOCH_NS, Stated
 
 KIND = "calibration"
 VERSION = 1  # of the event; what a newer one means is not known here
@@ -94,9 +95,9 @@ class CalibrationDecisions:
             )
         return self._corrections
 
-    def of_solver(self) -> dict[str, Correction]:
+    def of_solver(self) -> list[Correction]:
         """The newest correction of each machine that the solver decided, whatever people did."""
-        return {machine: spans[-1] for machine, spans in self._spans[SOLVER].items() if spans}
+        return [spans[-1] for spans in self._spans[SOLVER].values() if spans]
 
     def newest(self, machine: str) -> CalibrationDecision | None:
         """The decision that a machine's newest correction comes from, None where it has none."""
@@ -129,7 +130,8 @@ class CalibrationDecisions:
             if self._spans[PERSON].get(machine):
                 continue
             changed = [one for one in spans if asked or not self._is_frozen(one)]
-            changed = [one for one in changed if self._replaces(one, asked=asked)]
+            stated = calibration.stated.get(machine, {})
+            changed = [one for one in changed if self._replaces(one, stated, asked=asked)]
             if changed and due:
                 decisions.append(CalibrationDecision(machine, SOLVER, "", now_ns, tuple(changed)))
         return decisions
@@ -161,13 +163,14 @@ class CalibrationDecisions:
         counts = at(self._spans[SOLVER].get(one.machine, []), one.from_ns)
         return counts is not None and self._watched_ns > self._seen[one.machine, one.from_ns] + FROZEN_NS
 
-    def _replaces(self, one: Correction, *, asked: bool) -> bool:
+    def _replaces(self, one: Correction, stated: Mapping[int, Stated], *, asked: bool) -> bool:
         """Whether a correction is to replace what counts at its beginning."""
         counts = at(self._spans[SOLVER].get(one.machine, []), one.from_ns)
         key = one.machine, one.from_ns
         if asked:
             return counts is None or _values(counts) != _values(one)
-        self._differs[key] = self._differs.get(key, 0) + 1 if differs(one, counts) else 0
+        applied = stated.get(one.from_ns // EPOCH_NS, Stated())
+        self._differs[key] = self._differs.get(key, 0) + 1 if differs(one, counts, applied) else 0
         return self._differs[key] >= IN_A_ROW
 
 
@@ -188,15 +191,23 @@ def at(spans: Sequence[Correction], stamp_ns: int) -> Correction | None:
     return spans[index] if index >= 0 and stamp_ns < spans[index].to_ns else None
 
 
-def differs(one: Correction, counts: Correction | None) -> bool:
-    """Whether a correction differs from what counts by more than it is unsure, and by enough to be seen."""
-    zero, scale, across, most_share = _values(counts) if counts else (0.0, 0.0, 0.0, ANY_SHARE)
+def differs(one: Correction, counts: Correction | None, stated: Stated = Stated()) -> bool:
+    """Whether a correction differs from what is taken off now by more than it is unsure, and by enough to be seen.
+
+    counts: None where samples stay as they were sent, with what the machine applied itself. Where the correction does
+    not know the scale, that stays applied.
+    """
+    if counts:
+        zero, scale, across = (abs(a - b) for a, b in zip(_values(one)[:3], _values(counts)[:3], strict=True))
+    else:
+        zero, across = math.hypot(one.zero - stated.zero, stated.zero_std), abs(one.across)
+        scale = math.hypot(one.scale - stated.scale, stated.scale_std) if one.most_share >= ANY_SHARE else 0.0
     zero_std, scale_std, across_std = (math.sqrt(one.covariance[i][i]) for i in range(3))
     return (
-        abs(one.zero - zero) > max(zero_std, LEAST_ZERO)
-        or abs(one.scale - scale) > max(scale_std, LEAST_SCALE)
-        or abs(one.across - across) > max(across_std, LEAST_ZERO)
-        or (counts is not None and one.most_share != most_share)
+        zero > max(zero_std, LEAST_ZERO)
+        or scale > max(scale_std, LEAST_SCALE)
+        or across > max(across_std, LEAST_ZERO)
+        or (counts is not None and one.most_share != counts.most_share)
     )
 
 

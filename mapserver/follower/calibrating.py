@@ -9,12 +9,13 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
 from mapserver.evidence.fold_config import is_foldable
-from mapserver.fleet.calibration import Calibration, MachineState, calibrate
+from mapserver.fleet.calibration import Calibration, MachineState, calibrate, remembered_of
+from mapserver.fleet.correction import Correction
 from mapserver.fleet.ledger import Ledger
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
@@ -35,7 +36,8 @@ log = logging.getLogger("mapserver.follower.calibrating")
 class Calibrating:
     """Ledgers of all machines, and what they come to. solved: the last solve, and the site's now then [ns].
 
-    decide: is given each solve and the site's now [ns]. doubtful: machines that are to have no say now.
+    decide: is given each solve and the site's now [ns]. doubtful: machines that are to have no say now. earlier: the
+    newest corrections that the solver decided.
     """
 
     name = "calibration"
@@ -46,10 +48,12 @@ class Calibrating:
         past: Past,
         decide: Decide,
         doubtful: Callable[[], frozenset[str]],
+        earlier: Callable[[], Iterable[Correction]],
         ending: threading.Event,
     ) -> None:
         self.solved: tuple[Calibration, int] = calibrate({}), 0
         self._writer, self._past, self._decide, self._doubtful, self._ending = writer, past, decide, doubtful, ending
+        self._earlier = earlier
         self._reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ledgers: dict[str, Ledger] = {}
         self._followed = 0
@@ -94,7 +98,8 @@ class Calibrating:
         began_s, self._solved_ns = time.thread_time(), now_ns
         try:
             stays = {name: ledger.stays() for name, ledger in self._ledgers.items()}
-            solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground)
+            remembered = remembered_of(self._earlier())
+            solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground, remembered)
             self.solved = solved, now_ns
         finally:
             took_s = time.thread_time() - began_s

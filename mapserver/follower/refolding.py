@@ -74,7 +74,7 @@ class Refolding:
         with self._changed:
             return self._decisions.calibration.corrections
 
-    def solver_corrections(self) -> dict[str, Correction]:
+    def solver_corrections(self) -> list[Correction]:
         """The newest of each machine that the solver decided."""
         with self._changed:
             return self._decisions.calibration.of_solver()

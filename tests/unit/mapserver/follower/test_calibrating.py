@@ -58,7 +58,7 @@ def calibrating(writer: Writer, *doubtful: str) -> tuple[Calibrating, list[int]]
     def decide(_: Calibration, now_ns: int) -> None:
         decided.append(now_ns)
 
-    job = Calibrating(writer, past_of(writer), decide, lambda: frozenset(doubtful), threading.Event())
+    job = Calibrating(writer, past_of(writer), decide, lambda: frozenset(doubtful), list, threading.Event())
     return job, decided
 
 
