@@ -15,7 +15,7 @@ from typing import Any
 
 from mapserver.fleet.calibration import Calibration
 from mapserver.fleet.correction import ANY_SHARE, LAST_NS, Correction, Corrections
-from mapserver.fleet.ledger import EPOCH_NS, Stated
+from mapserver.fleet.ledger import EPOCH_NS, NOTHING_STATED, Stated
 
 KIND = "calibration"
 VERSION = 1  # of the event; what a newer one means is not known here
@@ -169,7 +169,7 @@ class CalibrationDecisions:
         key = one.machine, one.from_ns
         if asked:
             return counts is None or _values(counts) != _values(one)
-        applied = stated.get(one.from_ns // EPOCH_NS, Stated())
+        applied = stated.get(one.from_ns // EPOCH_NS, NOTHING_STATED)
         self._differs[key] = self._differs.get(key, 0) + 1 if differs(one, counts, applied) else 0
         return self._differs[key] >= IN_A_ROW
 
@@ -191,7 +191,7 @@ def at(spans: Sequence[Correction], stamp_ns: int) -> Correction | None:
     return spans[index] if index >= 0 and stamp_ns < spans[index].to_ns else None
 
 
-def differs(one: Correction, counts: Correction | None, stated: Stated = Stated()) -> bool:
+def differs(one: Correction, counts: Correction | None, stated: Stated = NOTHING_STATED) -> bool:
     """Whether a correction differs from what is taken off now by more than it is unsure, and by enough to be seen.
 
     counts: None where samples stay as they were sent, with what the machine applied itself. Where the correction does

@@ -22,9 +22,10 @@ _PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
 
 
 class Ledger:
-    """Stays of one machine. cell_m: edge of the cells."""
+    """Stays of one machine. cell_m: edge of the cells. epochs: how many it remembers, which may become fewer."""
 
     def __init__(self, cell_m: float = CELL_M) -> None:
+        self.epochs = EPOCHS
         self._cell_m = cell_m
         self._stays: Table = np.zeros(0, STAY)
         self._pending: list[Table] = []
@@ -45,7 +46,8 @@ class Ledger:
 
     def stays(self) -> Table:
         """All stays, by their keys."""
-        self._merge()
+        if self._pending or len(np.unique(epochs_of(self._stays))) > self.epochs:
+            self._merge()
         return self._stays
 
     def _merge(self) -> None:
@@ -57,16 +59,19 @@ class Ledger:
         if self._pending:
             whole = merged(whole, np.concatenate(self._pending))
         self._pending, self._waiting = [], 0
-        self._stays = newest(whole, EPOCHS).copy()
+        self._stays = newest(whole, self.epochs).copy()
 
 
 class Stated(NamedTuple):
-    """What a machine applied itself in one epoch: zero and scale, and by how much they changed (standard deviations)."""
+    """What a machine applied itself in one epoch: zero and scale; zero_std, scale_std: how much they changed."""
 
     zero: float = 0.0
     scale: float = 0.0
     zero_std: float = 0.0
     scale_std: float = 0.0
+
+
+NOTHING_STATED = Stated()
 
 
 def epochs_of(table: Table) -> Ints:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from mapserver.fleet.calibration import MachineState
 from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, Correction, Corrections
 from mapserver.fleet.decisions import PERSON, CalibrationDecision
+from mapserver.fleet.machine_state import MachineState
 from protocol.queries.calibration import CorrectedSpan, MachineCalibration
 from protocol.queries.commands import CalibrateCommand
 

@@ -8,8 +8,8 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from mapserver.fleet.calibration import MachineState, state_of
 from mapserver.fleet.correction import Corrections
+from mapserver.fleet.machine_state import MachineState, state_of
 from mapserver.follower.calibrating import Calibrating
 from mapserver.follower.calibration_state import calibration_of, decided_by_person
 from mapserver.follower.checkpointing import Checkpointing

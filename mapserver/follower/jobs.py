@@ -20,8 +20,8 @@ from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.evidence.timeline import Block, TimedPage
-from mapserver.fleet.calibration import MachineState
 from mapserver.fleet.correction import UNCORRECTED, Corrections
+from mapserver.fleet.machine_state import MachineState
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import REMEMBERED_STD, Calibration, calibrate, remembered_of
+from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, NO_SHARE, Correction
 from mapserver.fleet.decisions import EVERY_NS, CalibrationDecisions
 from mapserver.fleet.ledger import Ledger, newest, stated
+from mapserver.fleet.machine_state import REMEMBERED_STD, remembered_of
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from protocol.arrays import Floats, Table
 from tests.unit.mapserver.fleet.drives import (

@@ -12,8 +12,8 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.calibration import MachineState
 from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
+from mapserver.fleet.machine_state import MachineState
 from mapserver.follower import follower, refolding
 from mapserver.follower.follower import Follower
 from mapserver.follower.jobs import Archiving, Audit
