@@ -39,13 +39,15 @@ AT_ONCE = 0.1
 class Calibration:
     """What a solve says: corrections in the order of stamps, states of all machines, and their common scale.
 
-    stated: by machine and number of the epoch, what the machine applied itself.
+    stated: by machine and number of the epoch, what the machine applied itself. begins_ns: by machine, from when on
+    there may be samples of it.
     """
 
     corrections: tuple[Correction, ...]
     machines: Mapping[str, MachineState]
     common: CommonScale
     stated: Mapping[str, Mapping[int, Stated]] = field(default_factory=dict)
+    begins_ns: Mapping[str, int] = field(default_factory=dict)
 
 
 def calibrate(
@@ -90,7 +92,8 @@ def joined(parts: Sequence[Calibration]) -> Calibration:
     applied = {name: of_machine for part in parts for name, of_machine in part.stated.items()}
     corrections = tuple(one for part in parts for one in part.corrections)
     common = max((part.common for part in parts), key=lambda common: (not common.observed, common.std))
-    return Calibration(corrections, dict(sorted(states.items())), common, applied)
+    begins_ns = {name: begin_ns for part in parts for name, begin_ns in part.begins_ns.items()}
+    return Calibration(corrections, dict(sorted(states.items())), common, applied, begins_ns)
 
 
 def _solved(

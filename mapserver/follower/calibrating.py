@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -59,6 +60,7 @@ class Calibrating:
         self._earlier = earlier
         self._reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ledgers: dict[str, Ledger] = {}
+        self._begins_ns: dict[str, int] = {}  # by machine, from when on there may be samples of it
         self._followed = 0
         self._passed_over = 0  # rows that could not be read, at the next attempt
         self._parts: dict[Group, Calibration] = {}  # the last solve of each group
@@ -113,6 +115,7 @@ class Calibrating:
             stays = {name: self._ledgers[name].stays() for name in names}
             remembered = remembered_of(self._earlier())
             solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground, remembered)
+            solved = replace(solved, begins_ns={name: self._begins_ns[name] for name in names})
             self._parts = {some: part for some, part in self._parts.items() if some in together} | {names: solved}
             self.solved = joined([*self._parts.values()]), now_ns
         finally:
@@ -154,9 +157,13 @@ class Calibrating:
         machine[~is_foldable(rows.samples, self._past.config)] = -1
         for index, name in enumerate(rows.machines):
             own = rows.samples.view(RAW_SAMPLE)[machine == index].view(SAMPLE_DTYPE)
+            if not len(own):
+                continue
             if name not in self._ledgers:
                 self._ledgers[name] = Ledger()
                 self._share_room()
+            first_ns = 0 if self._from_ns else int(own["stamp_ns"].min())  # what was before the last days is not read
+            self._begins_ns[name] = min(first_ns, self._begins_ns.get(name, first_ns))
             self._ledgers[name].add(own)
 
     def _share_room(self) -> None:

@@ -18,7 +18,7 @@ def calibration_of(
 
     decision: its newest one. state: of the last solve. corrections: those that count in the map.
     """
-    spans = [one for one in corrections.each if one.machine == machine][-MOST_SPANS:]
+    spans = corrections.spans_of(machine)[-MOST_SPANS:]
     return MachineCalibration(
         name=machine,
         by=decision.by if decision else "",

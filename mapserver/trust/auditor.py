@@ -48,11 +48,11 @@ Pairs = dict[tuple[str, str], dict[Reason, Judgement]]  # of the first of two ma
 class Verdict:
     """What is known of one machine.
 
-    reasons: empty unless it contradicts all others. agrees: in what it was seen to agree with them. evidence: plain values; what could not be compared is missing.
-    cells, gain, offset_east_m, offset_north_m, offset_std_m, agreement [-], spread and spread_of_others (of the levels)
-    against the map of all others in good standing; clock_s: ahead of the others; zero, torque_gain, their standard
-    deviations and what shows them: of the calibration; excess: by reason, 1 at its limit;
-    agrees_with, disagrees_with, undecided_with: machines.
+    reasons: empty unless it contradicts all others. agrees: in what it is seen to agree with them. evidence: plain
+    values; what could not be compared is missing. cells, gain, offset_east_m, offset_north_m, offset_std_m,
+    agreement [-], spread and spread_of_others (of the levels) against the map of all others in good standing; clock_s:
+    ahead of the others; zero, torque_gain, their standard deviations and what shows them: of the calibration; excess:
+    by reason, 1 at its limit; agrees_with, disagrees_with, undecided_with: machines.
     """
 
     machine: str

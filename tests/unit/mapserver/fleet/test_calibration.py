@@ -12,7 +12,7 @@ import pytest
 from mapserver.fleet.applied_part import FAULT_SIGMAS, moved
 from mapserver.fleet.calibration import SCALE_FLOOR, ZERO_FLOOR, Calibration, calibrate
 from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, corrected
-from mapserver.fleet.decisions import differs
+from mapserver.fleet.hysteresis import differs
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.machine_state import MachineState, state_of
 from mapserver.fleet.passages import Epochs, passages

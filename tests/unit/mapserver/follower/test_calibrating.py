@@ -306,3 +306,16 @@ def test_a_large_fleet_is_solved_in_groups_that_take_turns(writer, monkeypatch):
         assert {*job.states()} == set(DRIVES)
         assert {*job.solve()[0].machines} == set(DRIVES)
         assert {ledger.epochs for ledger in job._ledgers.values()} == {2}
+
+
+def test_it_says_from_when_on_there_may_be_samples_of_a_machine(writer):
+    deliver(writer, last=0.5)
+    job, _ = calibrating(writer)
+    with closing(job):
+        assert job.solve()[0].begins_ns == dict.fromkeys(DRIVES, 0), "what was days before it began is not read"
+        rows = drive(LOW, seconds=20.0, start_s=1000.0)
+        send(writer, [incoming(rows[10:], 1, "d")])
+        first_ns = int(rows["stamp_ns"][10])
+        assert job.solve()[0].begins_ns == dict.fromkeys(DRIVES, 0) | {"d": first_ns}
+        send(writer, [incoming(rows[:10], 1, "d", spool_id=8)])
+        assert job.solve()[0].begins_ns["d"] == int(rows["stamp_ns"][0]), "and late ones count"
