@@ -8,10 +8,11 @@ import sys
 import time
 from argparse import Namespace
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -132,10 +133,10 @@ def _sources(path: Path, selection: Selection, opened: ExitStack) -> Iterator[Sa
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
     if not files:
         raise ConfigError(path, f"holds neither Parquet files nor a {JOURNAL_FILE}")
+    decisions = archived_decisions.load(files[0].parent)
     for file in map(ArchiveFile, files):
         header, site, rows = file.header, file.header.site, file.read(selection=in_time)
         contents = (frozenset(header.machines), file.samples, file.first_received_ns, rows, (header.store,))
-        decisions = archived_decisions.load(file.path.parent)
         yield SampleSource(file.path, site.name, header.frame, site, *contents, decisions=decisions)
 
 
@@ -218,11 +219,25 @@ def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: 
         copier.excluded["time"] += max(0, total - done)  # whole batches and files that were passed over
         copier.finish({spool: watermark.seq for source in sources for spool, watermark in source.watermarks.items()})
         journal.commit()
-        for decision in dict.fromkeys(decision for source in sources for decision in source.decisions):
-            journal.append_event(*plain(decision))
+        journal.append_events(map(plain, _decisions(source.decisions for source in sources)))
     if not copier.kept.total():
         raise ConfigError("sitegrid fold", f"no sample is left: {json.dumps(copier.excluded)} are excluded")
     return copier
+
+
+def _decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
+    """Those of all sources, each history once; of those that begin alike, as of a store and its archive, what goes on.
+
+    A decision that was made twice counts twice: who corrects, takes that back, and corrects again, has corrected.
+    """
+    out: list[CalibrationDecision] = []
+    taken: list[Sequence[CalibrationDecision]] = []
+    for history in histories:
+        if history not in taken:
+            same = takewhile(lambda pair: pair[0] == pair[1], zip(out, history, strict=False))
+            out += history[sum(1 for _ in same) :]
+            taken.append(history)
+    return out
 
 
 def _lines(summary: Mapping[str, Any]) -> list[str]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, Correction
+from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.observability import CommonScale, Observed, observe
 from mapserver.fleet.passages import Epochs, sound
@@ -187,15 +187,16 @@ def moved(epochs: Epochs, zero: Floats, variance: Floats) -> Floats:
 
 
 def _corrections(pb: Problem, applied: _Applied) -> list[Correction]:
-    """One correction for each epoch; the newest of a machine holds on. None of a machine that measures no force."""
+    """One correction for each epoch; the newest of a machine holds on. What measures no force has no scale."""
     layout, epochs = pb.layout, pb.epochs
     out = []
     for epoch, (machine, number) in enumerate(zip(epochs.machine.tolist(), epochs.number.tolist(), strict=True)):
         at = np.array([epoch, layout.scales.start + machine, layout.lateral.start + machine])
         newest = epoch + 1 == len(epochs.number) or epochs.machine[epoch + 1] != machine
         zero, k, across = applied.x[at].tolist()
+        most_share = ANY_SHARE if applied.scaled[machine] else LEVEL_SHARE
         if not LEAST_GAIN < 1 + k < MOST_GAIN:
-            continue
+            k, most_share = 0.0, NO_SHARE
         out.append(
             Correction(
                 machine=pb.names[machine],
@@ -205,7 +206,7 @@ def _corrections(pb: Problem, applied: _Applied) -> list[Correction]:
                 scale=round(k / (1 + k), DIGITS),
                 across=round(across, DIGITS),
                 covariance=_covariance(applied.covariance[np.ix_(at, at)]),
-                most_share=ANY_SHARE if applied.scaled[machine] else LEVEL_SHARE,
+                most_share=most_share,
             )
         )
     return out
@@ -242,9 +243,9 @@ def _states(
 
 
 def state_of(correction: Correction) -> MachineState:
-    """What a correction in force says of its machine, where nothing has been solved yet."""
+    """What a correction by the solver says of its machine, where nothing has been solved yet."""
     k = correction.scale / (1 - correction.scale)
-    zero_std, scale_std, across_std = np.sqrt(np.diag(correction.covariance or np.zeros((3, 3)))).tolist()
+    zero_std, scale_std, across_std = np.sqrt(np.diag(correction.covariance)).tolist()
     return MachineState(
         zero=correction.zero,
         zero_std=zero_std,

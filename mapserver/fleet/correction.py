@@ -36,8 +36,9 @@ UNIT_VECTORS: Floats = HEADING_TABLE / _UNIT  # exact: a power of two
 _PER_RAD = HEADINGS / (2 * np.pi)
 # Where a machine's scale is not known, its share of drive force times that error is the larger part of a sample's error
 # from this share on (data sheets: 0.0045 of zero, 0.045 of scale). To take the zero alone off there would exchange one
-# wrong value for another, so that samples on slopes stay as they are.
-LEVEL_SHARE, ANY_SHARE = 0.1, 100.0
+# wrong value for another, so that samples on slopes stay as they are. NO_SHARE: of a sensor that measures no force no
+# resistance is corrected at all.
+NO_SHARE, LEVEL_SHARE, ANY_SHARE = 0.0, 0.1, 100.0
 LAST_NS = 2**62  # a correction without an end ends then
 DIGITS = 5  # a correction is rounded to 1e-5 before it is used: it is a fact, not a solver's floats
 _C_LOW, _C_HIGH = LIMITS["c_rr"]
@@ -50,8 +51,8 @@ class Correction:
 
     zero of the balance [-], which is also how much too low the slope ahead is; scale: k / (1 + k) of the drive force;
     across: how much too high the slope to the left is. All rounded to DIGITS. covariance (3, 3): of what is left, in
-    this order. most_share: c_rr of a sample with a larger share of drive force over weight stays as it was; see
-    LEVEL_SHARE.
+    this order. most_share: c_rr of a sample with a larger share of drive force over weight stays as it was; less than
+    ANY_SHARE where the scale is not known, and then what the machine itself applied of a scale stays applied.
     """
 
     machine: str
@@ -108,7 +109,8 @@ class Corrections:
         """Samples (n,) without their machines' errors; those that no correction covers stay bytes as they were.
 
         machines: names; machine (n,): index of each sample's in them. Corrections count from what was measured, so of
-        them only what a sample does not state as applied is taken off. Values leave the limits of a sample by nothing:
+        them only what a sample does not state as applied is taken off; where the machine knows a scale and the
+        correction does not, the machine's counts. Values leave the limits of a sample by nothing:
         they end there.
         """
         if not any(name in self._places for name in machines) or not len(rows):
@@ -161,7 +163,8 @@ def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, unit
         if at < first or row.stamp_ns >= spans[at, 1]:
             continue
         applied = np.float64(row.applied_scale)
-        zero, scale = values[at, 0] - np.float64(row.applied_zero), values[at, 1] - applied
+        zero = values[at, 0] - np.float64(row.applied_zero)
+        scale = values[at, 1] - applied if values[at, 3] >= ANY_SHARE else 0.0
         across = values[at, 2]
         unit = heading_index(np.float64(row.heading_rad))
         ahead_e, ahead_n = units[unit, 0], units[unit, 1]

@@ -71,15 +71,17 @@ class CalibrationDecision:
 
 
 class CalibrationDecisions:
-    """The corrections that count. newest_ns: when the solver decided last, None for never."""
+    """The corrections that count. decided_ns: the site's now when the solver decided last, None for never."""
 
     def __init__(self, decisions: Iterable[CalibrationDecision] = ()) -> None:
         self._spans: dict[str, dict[str, list[Correction]]] = {SOLVER: {}, PERSON: {}}  # by machine, in order of time
         self._newest: dict[tuple[str, str], CalibrationDecision] = {}
         self._corrections: Corrections | None = None
-        self._seen: dict[tuple[str, int], int] | None = None  # the site's now when an epoch was first solved for
+        self._seen: dict[tuple[str, int], int] = {}  # when an epoch was first solved for, as _watched_ns counts
+        self._watched_ns = 0  # site time without its jumps, since the first judgement
+        self._judged_ns: int | None = None  # the site's now in the last one
         self._differs: dict[tuple[str, int], int] = {}  # how often in a row
-        self.newest_ns: int | None = None
+        self.decided_ns: int | None = None
         for decision in decisions:
             self.add(decision)
 
@@ -91,6 +93,10 @@ class CalibrationDecisions:
                 one for name in {*self._spans[SOLVER], *self._spans[PERSON]} for one in self._of(name)
             )
         return self._corrections
+
+    def of_solver(self) -> dict[str, Correction]:
+        """The newest correction of each machine that the solver decided, whatever people did."""
+        return {machine: spans[-1] for machine, spans in self._spans[SOLVER].items() if spans}
 
     def newest(self, machine: str) -> CalibrationDecision | None:
         """The decision that a machine's newest correction comes from, None where it has none."""
@@ -107,7 +113,7 @@ class CalibrationDecisions:
             self._differs.pop((one.machine, one.from_ns), None)
         self._newest[decision.by, decision.machine] = decision
         if decision.by == SOLVER:
-            self.newest_ns = max(decision.stamp_ns, self.newest_ns or 0)
+            self.decided_ns = decision.stamp_ns
         self._corrections = None
 
     def judge(self, calibration: Calibration, now_ns: int, *, asked: bool = False) -> list[CalibrationDecision]:
@@ -117,12 +123,12 @@ class CalibrationDecisions:
         """
         proposed = _by_machine(calibration.corrections)
         self._see(proposed, now_ns)
-        due = asked or self.newest_ns is None or not self.newest_ns <= now_ns < self.newest_ns + EVERY_NS
+        due = asked or self.decided_ns is None or not self.decided_ns <= now_ns < self.decided_ns + EVERY_NS
         decisions = []
         for machine, spans in proposed.items():
             if self._spans[PERSON].get(machine):
                 continue
-            changed = [one for one in spans if asked or not self._is_frozen(one, now_ns)]
+            changed = [one for one in spans if asked or not self._is_frozen(one)]
             changed = [one for one in changed if self._replaces(one, asked=asked)]
             if changed and due:
                 decisions.append(CalibrationDecision(machine, SOLVER, "", now_ns, tuple(changed)))
@@ -136,17 +142,24 @@ class CalibrationDecisions:
         return spans
 
     def _see(self, proposed: Mapping[str, Sequence[Correction]], now_ns: int) -> None:
-        """Note when epochs are first seen; those that a server begins with, at their own time."""
-        begins = self._seen is None
+        """Note when epochs are first seen; those that a server begins with are as old as they are for their machine.
+
+        Site time may jump, where a clock is wrong or at night. In what was jumped over nobody learned anything.
+        """
+        begins = self._judged_ns is None
+        self._watched_ns += min(max(now_ns - (self._judged_ns or now_ns), 0), EVERY_NS)
+        self._judged_ns = now_ns
         self._seen = {
-            (machine, one.from_ns): (self._seen or {}).get((machine, one.from_ns), one.from_ns if begins else now_ns)
+            (machine, one.from_ns): self._seen.get(
+                (machine, one.from_ns), self._watched_ns - begins * (spans[-1].from_ns - one.from_ns)
+            )
             for machine, spans in proposed.items()
             for one in spans
         }
 
-    def _is_frozen(self, one: Correction, now_ns: int) -> bool:
+    def _is_frozen(self, one: Correction) -> bool:
         counts = at(self._spans[SOLVER].get(one.machine, []), one.from_ns)
-        return counts is not None and now_ns > (self._seen or {})[one.machine, one.from_ns] + FROZEN_NS
+        return counts is not None and self._watched_ns > self._seen[one.machine, one.from_ns] + FROZEN_NS
 
     def _replaces(self, one: Correction, *, asked: bool) -> bool:
         """Whether a correction is to replace what counts at its beginning."""

@@ -80,12 +80,12 @@ class Calibrating:
             while not self._follow(TURN_SAMPLES) and not self._ending.is_set():
                 pass
             now_ns = self._now_ns()
-            return self._solve(now_ns), now_ns
+            return (self.solved[0] if self._ending.is_set() else self._solve(now_ns)), now_ns
 
-    def close(self) -> None:
-        """Close the journal; nothing may run any more."""
-        with self._turn:
-            self._reader.close()
+    def close(self, wait_s: float = 0.0) -> None:
+        """Close the journal. A solve that takes longer ends with the process: what it says is of no use any more."""
+        if self._turn.acquire(timeout=wait_s):
+            self._reader.close()  # and keep the turn: nothing runs any more
 
     def _now_ns(self) -> int:
         return self._writer.run(lambda store: store.newest_ns)

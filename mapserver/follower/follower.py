@@ -116,6 +116,8 @@ class Follower:
             solved, now_ns = self._calibrating.solve()
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None
+        if self._ending.is_set():
+            raise QueryError(Refusal.AFTER_TIMEOUT, "the server is stopping, and nothing is decided; ask again later")
         number = self._refolding.calibrate(solved, now_ns, asked=True)
         self._refolding.wait(number, wait_s)
 
@@ -126,16 +128,18 @@ class Follower:
         following, calibrating = self._threads
         following.join()
         self._checkpointing.close()
+        end_s = time.monotonic() + END_S
         calibrating.join(END_S)
-        if not calibrating.is_alive():  # else it ends with the process: what it solves is of no use any more
-            self._calibrating.close()
+        self._calibrating.close(max(0.0, end_s - time.monotonic()))
         self._reader.close()
 
     def _known(self) -> tuple[Corrections, Mapping[str, MachineState]]:
-        """Corrections that are decided, and what is known of machines: by the last solve, else by their corrections."""
-        corrections, solved = self._refolding.corrections(), self._calibrating.states()
-        newest = {one.machine: one for one in corrections.each if one.machine not in solved}
-        return corrections, {name: state_of(one) for name, one in newest.items()} | dict(solved)
+        """Corrections that are decided, and what is known of machines: by the last solve, else by an earlier one.
+
+        What a person takes off was not measured, and says nothing of what is broken.
+        """
+        earlier = {name: state_of(one) for name, one in self._refolding.solver_corrections().items()}
+        return self._refolding.corrections(), earlier | dict(self._calibrating.states())
 
     def _require_known(self, machine: str) -> None:
         sent = self._writer.run(lambda store: store.machines())

@@ -12,12 +12,12 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import Corrections
+from mapserver.fleet.correction import Correction, Corrections
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import JOURNAL_FILE, Store
@@ -49,6 +49,7 @@ class Refolding:
         self._wanted = self._decisions.facts
         self._changed = threading.Condition()  # its holder never waits for the writer, which takes it
         self._decided = self._folded = 0  # decisions kept since the start, and so many of them that the map follows
+        self._gave_up = False  # the last fold, for another one
         self._problem = ""  # of the last fold, until one succeeds
         self._ending = False
         self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
@@ -73,6 +74,11 @@ class Refolding:
         with self._changed:
             return self._decisions.calibration.corrections
 
+    def solver_corrections(self) -> dict[str, Correction]:
+        """The newest of each machine that the solver decided."""
+        with self._changed:
+            return self._decisions.calibration.of_solver()
+
     def calibration(self, machine: str) -> CalibrationDecision | None:
         """The newest decision about the calibration of a machine that counts."""
         with self._changed:
@@ -89,6 +95,7 @@ class Refolding:
     def calibrate(self, solved: Calibration, stamp_ns: int, *, asked: bool = False) -> int:
         """Decide what the solver may decide, or all that it would where a person asks; returns a number to wait for.
 
+        While the map does not follow what is decided, the solver waits: folds of a large site take longer than it.
         Raises QueryError as `decide` does; the solver then decides the same the next time.
         """
         return self._write(lambda store: self._calibrate(store, solved, stamp_ns, asked=asked))
@@ -98,7 +105,7 @@ class Refolding:
 
         Raises QueryError where it cannot be written: nothing has changed then.
         """
-        return self._write(lambda store: self._keep(store, decision))
+        return self._write(lambda store: self._keep(store, [decision]))
 
     def wait(self, number: int, wait_s: float) -> None:
         """Wait until a decision, which is kept, counts in the map; QueryError after wait_s."""
@@ -132,30 +139,25 @@ class Refolding:
     def _judge(self, store: Store, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
         with self._changed:
             decisions = self._decisions.trust.judge(verdicts, stamp_ns)
-        for decision in decisions:
-            self._keep(store, decision)
+        self._keep(store, decisions)
 
     def _calibrate(self, store: Store, solved: Calibration, stamp_ns: int, *, asked: bool) -> int:
         with self._changed:
             decisions = self._decisions.calibration.judge(solved, stamp_ns, asked=asked)
-        for decision in decisions:
-            self._keep(store, decision)
-        with self._changed:
-            return self._decided
+            waits = not asked and self._folded < self._decided
+        return self._keep(store, () if waits else decisions)
 
-    def _keep(self, store: Store, decision: Decision) -> int:
-        facts = store.decide(decision)
-        if isinstance(decision, TrustDecision):
-            values = (decision.machine, decision.trusted, decision.by, decision.reason)
-            log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
-        else:
-            spans = (decision.machine, len(decision.corrections), decision.by, decision.reason)
-            log.info("calibration machine=%s spans=%d by=%s reason=%r", *spans)
+    def _keep(self, store: Store, decisions: Sequence[Decision]) -> int:
+        """Keep decisions; returns how many there are by now, since the start."""
+        facts = store.decide(*decisions) if decisions else None
+        for decision in decisions:
+            _log(decision)
         with self._changed:
-            self._decisions.add(decision, facts.number)
-            self._wanted = facts
-            self._decided += 1
-            self._changed.notify_all()
+            if facts:
+                self._decisions.add(decisions, facts.number)
+                self._wanted = facts
+                self._decided += len(decisions)
+                self._changed.notify_all()
             return self._decided
 
     def _run(self) -> None:
@@ -164,6 +166,7 @@ class Refolding:
         while decided := self._next():
             number, facts = decided
             follows, problem = self._attempt(facts)
+            self._gave_up = not follows and not problem
             with self._changed:
                 self._problem = problem
                 if follows:
@@ -231,5 +234,17 @@ class Refolding:
         return (grid, last) if fold_samples(grid, samples, lambda: self._superseded(facts)) else None
 
     def _superseded(self, facts: Facts) -> bool:
-        """Whether what is being folded is not wanted any more."""
-        return self._ending or self._wanted != facts
+        """Whether a fold is to be given up, since other facts are wanted meanwhile.
+
+        Never two in a row: where decisions come faster than folds, the map would not follow for ever.
+        """
+        return self._ending or (self._wanted != facts and not self._gave_up)
+
+
+def _log(decision: Decision) -> None:
+    if isinstance(decision, TrustDecision):
+        values = (decision.machine, decision.trusted, decision.by, decision.reason)
+        log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)
+    else:
+        spans = (decision.machine, len(decision.corrections), decision.by, decision.reason)
+        log.info("calibration machine=%s spans=%d by=%s reason=%r", *spans)

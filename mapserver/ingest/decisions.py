@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from mapserver.fleet import decisions as calibration
-from mapserver.fleet.correction import LAST_NS, Corrections
+from mapserver.fleet.correction import LAST_NS, NO_SHARE, Corrections
 from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions, NewerVersionError
 from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalQueries
@@ -41,9 +41,10 @@ class Decisions:
         decisions._conclude(number)
         return decisions
 
-    def add(self, decision: Decision, number: int) -> None:
-        """Have one more decision count. number: of its event."""
-        self._take(decision)
+    def add(self, decisions: Iterable[Decision], number: int) -> None:
+        """Have more decisions count. number: of the last one's event."""
+        for decision in decisions:
+            self._take(decision)
         self._conclude(number)
 
     def offer(self, machine: str) -> dict[str, Any] | None:
@@ -53,6 +54,8 @@ class Decisions:
         """
         newest, decision = self.facts.corrections.newest(machine), self.calibration.newest(machine)
         if not newest or not decision or newest.to_ns < LAST_NS or not newest.covariance:
+            return None
+        if newest.most_share == NO_SHARE:  # a calibration is of a sensor that measures something
             return None
         (zz, zs, _), (_, ss, _), _ = newest.covariance
         offer = CalibrationOffer(machine, decision.stamp_ns, newest.zero, newest.scale, zz, ss, zs)

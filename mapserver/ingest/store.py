@@ -174,12 +174,12 @@ class Store:
         self._count_decisions()
         self.snapshot_row = self._snapshot_samples = 0  # what is on disk was folded with other facts
 
-    def decide(self, decision: Decision) -> Facts:
-        """Keep a decision with the journal; returns the facts that the map is to follow.
+    def decide(self, *decisions: Decision) -> Facts:
+        """Keep decisions with the journal, all or none; returns the facts that the map is to follow.
 
-        It counts at once, unless the map has to be folded again for it.
+        They count at once, unless the map has to be folded again for them.
         """
-        self._decisions.add(decision, self.journal.append_event(*plain(decision)))
+        self._decisions.add(decisions, self.journal.append_events(map(plain, decisions)))
         self._count_decisions()
         return self._decisions.facts
 

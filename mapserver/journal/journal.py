@@ -130,13 +130,21 @@ class Journal(JournalQueries):
 
     def append_event(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> int:
         """Commit an event, outside of any other transaction; returns its number."""
-        text = json.dumps(body, allow_nan=False)
+        return self.append_events([(kind, stamp_ns, body)])
+
+    def append_events(self, events: Iterable[tuple[str, int, Mapping[str, Any]]]) -> int:
+        """Commit events (kind, stamp_ns, body), all or none, outside of other transactions; returns the last number.
+
+        The number is 0 where there never was an event.
+        """
+        texts = [(kind, stamp_ns, json.dumps(body, allow_nan=False)) for kind, stamp_ns, body in events]
         with self._transaction():
-            number = self._number(_LAST_EVENT) + 1
-            values = (number, kind, stamp_ns, text)
-            self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
-            self._changed[EVENT] = number
-        return number
+            for text in texts:
+                number = self._number(_LAST_EVENT) + 1
+                values = (number, *text)
+                self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
+                self._changed[EVENT] = number
+            return self._number(_LAST_EVENT)
 
     def note_shortfall(self, shortfall: Shortfall) -> None:
         """Keep what is missing as an event; no file that proves it is needed from then on."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapserver.fleet.correction import HEADINGS, UNIT_VECTORS, Correction
+from mapserver.fleet.correction import ANY_SHARE, HEADINGS, UNIT_VECTORS, Correction
 from protocol.arrays import Table
 from protocol.machine.samples import LIMITS
 
@@ -17,7 +17,8 @@ def in_numpy(rows: Table, c: Correction) -> Table:
     d = np.where(rows["speed_mps"] >= 0, 1.0, -1.0)
     c_rr = rows["c_rr"].astype(np.float64)
     applied = rows["applied_scale"].astype(np.float64)
-    zero, scale = c.zero - rows["applied_zero"].astype(np.float64), c.scale - applied
+    zero = c.zero - rows["applied_zero"].astype(np.float64)
+    scale = c.scale - applied if c.most_share >= ANY_SHARE else 0.0
     share = (d * c_rr + (east * unit[:, 0] + north * unit[:, 1])) / (1.0 - applied)
     level = np.abs(share) <= c.most_share
     new = np.where(level, np.clip(c_rr - d * (zero + scale * share), *LIMITS["c_rr"]), c_rr)

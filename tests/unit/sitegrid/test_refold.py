@@ -171,6 +171,33 @@ def test_corrections_go_with_the_samples_and_the_map_is_the_live_one(tmp_path: P
         assert same_evidence(again.grid, live)
 
 
+def test_a_correction_that_was_taken_back_and_given_again_counts(tmp_path: Path):
+    source = make_store(tmp_path / "source", archived=9)
+    back = CalibrationDecision("b", PERSON, "", T0 + 700 * S, ())
+    decided = [FACTS[1], back, FACTS[1]]
+    with closing(Store(source, SITE, ServerConfig(), time.time_ns)) as opened_store:
+        opened_store.decide(*decided)
+        archived_decisions.save(source / FOLDER, opened_store.identity.id, decided[:2])  # a little behind
+    with closing(Store(source, SITE, ServerConfig(), time.time_ns)) as opened_store:
+        live = opened_store.grid
+    for i, paths in enumerate(([source], [source, source / FOLDER], [source / FOLDER])):
+        out = tmp_path / str(i)
+        assert run(*paths, "--out", out) == 0
+        with closing(opened(out)) as new:
+            assert same_evidence(new.grid, live) == (i < 2)
+            assert new.fact == (3 if i < 2 else 2)
+
+
+def test_decisions_beside_an_archive_are_read_once(tmp_path: Path, monkeypatch):
+    source = make_store(tmp_path / "source", archived=9)
+    decide(source)
+    read: list[Path] = []
+    load = archived_decisions.load
+    monkeypatch.setattr(archived_decisions, "load", lambda folder: read.append(folder) or load(folder))
+    assert run(source / FOLDER, "--out", tmp_path / "new") == 0
+    assert read == [source / FOLDER]
+
+
 def test_corrections_are_beside_the_files_of_an_archive_too(tmp_path: Path):
     source = make_store(tmp_path / "source", archived=9)
     live = decide(source)

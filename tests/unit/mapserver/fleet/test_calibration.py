@@ -19,7 +19,8 @@ from mapserver.fleet.calibration import (
     moved,
     state_of,
 )
-from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, corrected
+from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, corrected
+from mapserver.fleet.decisions import differs
 from mapserver.fleet.ledger import EPOCH_NS
 from mapserver.fleet.passages import Epochs, passages
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
@@ -393,12 +394,16 @@ def test_of_slopes_that_contradict_each_other_nobody_is_at_fault() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, 3.0])
-def test_a_sensor_that_measures_no_force_is_corrected_by_nothing(factor: float) -> None:
+def test_of_a_sensor_that_measures_no_force_slopes_alone_are_corrected(factor: float) -> None:
     rows = fleet()
     share = rows["low"]["c_rr"].copy()
     rows["low"]["c_rr"] += (factor - 1) * share
     result = solve(rows)
-    assert {each.machine for each in result.corrections} == {"ramp", "again"}
+    own = [each for each in result.corrections if each.machine == "low"]
+    assert corrected(rows["low"], own)["c_rr"].tobytes() == rows["low"]["c_rr"].tobytes()
+    assert [each.zero for each in own] == pytest.approx([FLEET["low"][1].zero] * len(own), abs=0.0016)
+    earlier = Correction("low", 0, LAST_NS, 0.004, 0.4, 0.0, own[0].covariance)
+    assert differs(own[-1], earlier), "what was taken off before its sensor broke does not hold on"
     assert result.machines["low"].beyond[1] > FAULT_SIGMAS[1]
     check(result.machines["ramp"], FLEET["ramp"][1])
 
@@ -548,5 +553,3 @@ def test_a_correction_says_of_its_machine_what_the_solve_said() -> None:
         )
         assert (state.zero_std, state.scale_std) == pytest.approx((known.zero_std, known.scale_std), rel=1e-3)
         assert (state.beyond[1] > FAULT_SIGMAS[1]) == (name == "again")
-    by_hand = state_of(Correction("a", 0, 1, 0.03, 0.375, 0.0, ()))
-    assert by_hand.beyond == pytest.approx((0.03 / ZERO_STD, 0.6 / SCALE_STD))

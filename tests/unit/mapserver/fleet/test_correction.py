@@ -9,6 +9,7 @@ from mapserver.fleet.correction import (
     ANY_SHARE,
     HEADINGS,
     LEVEL_SHARE,
+    NO_SHARE,
     Correction,
     Corrections,
     corrected,
@@ -157,11 +158,27 @@ def test_samples_without_a_stated_calibration_are_what_was_measured() -> None:
 def test_a_correction_counts_from_what_was_measured_whatever_was_applied() -> None:
     raw = drive(RAMP, Errors(0.006, 0.08, -0.004), seed=4)
     sent = calibrated_by_itself(raw, *at_standstills(len(raw), 2))
-    for c in (correction(0.006, 0.08, -0.004), correction(0.0), correction(0.004, most=LEVEL_SHARE)):
+    for c in (correction(0.006, 0.08, -0.004), correction(0.0)):
         one, other = corrected(raw, [c]), corrected(sent, [c])
-        level = np.abs(raw["grade_e"]) < 0.02 if c.most_share == LEVEL_SHARE else np.ones(len(raw), np.bool_)
-        assert np.abs(one["c_rr"] - other["c_rr"])[level].max() < 5e-5
+        assert np.abs(one["c_rr"] - other["c_rr"]).max() < 5e-5
         assert np.abs(one["grade_e"] - other["grade_e"]).max() < 5e-5
+
+
+def test_where_only_the_machine_knows_its_scale_that_stays_applied() -> None:
+    errors, true = Errors(0.006, 0.2), drive(LOW, seed=4, late=False)
+    raw = drive(LOW, errors, seed=4, late=False)
+    sent = calibrated_by_itself(raw, np.zeros(len(raw)), np.full(len(raw), 0.2 / 1.2))
+    out = corrected(sent, [correction(errors.zero, most=LEVEL_SHARE)])
+    firm = raw["c_rr"] < 0.09  # on sand the share is larger than that
+    assert np.abs(out["c_rr"] - true["c_rr"])[firm].max() < 0.006  # noise, which is scaled too
+    assert np.abs(np.mean((out["c_rr"] - true["c_rr"])[firm])) < 1e-4
+
+
+def test_of_a_sensor_that_measures_no_force_slopes_alone_are_corrected() -> None:
+    rows = drive(RAMP, Errors(0.004), seed=1)
+    out = corrected(rows, [correction(0.004, most=NO_SHARE)])
+    assert out["c_rr"].tobytes() == rows["c_rr"].tobytes()
+    assert out["grade_e"].tobytes() == corrected(rows, [correction(0.004)])["grade_e"].tobytes()
 
 
 def test_a_correction_that_a_machine_has_applied_itself_changes_nothing() -> None:

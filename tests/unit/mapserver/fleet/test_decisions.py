@@ -61,6 +61,11 @@ class Solver:
         self.now_ns += after_ns
         return sum(len(decision.corrections) for decision in made)
 
+    def watches(self, time_ns: int, *corrections: Correction) -> None:
+        """So long, while solves say nothing new."""
+        for _ in range(time_ns // EVERY_NS):
+            self.hears(*corrections, after_ns=EVERY_NS)
+
     def zero(self, epoch: float = 1000, machine: str = "a") -> float | None:
         own = [each for each in self.decisions.corrections.each if each.machine == machine]
         counts = at(own, round(epoch * EPOCH_NS))
@@ -112,6 +117,33 @@ def test_the_solver_decides_at_most_once_in_ten_minutes_of_site_time_unless_it_i
     assert [started_anew.hears(one(0.2)) for _ in range(11)] == [0] * 10 + [1], "its last decision is on disk"
 
 
+def test_the_limit_holds_after_a_clock_was_ahead():
+    solver = Solver()
+    for _ in range(2):
+        solver.hears(one(0.002))
+    solver.now_ns += 23 * 3600 * 10**9
+    for _ in range(2):
+        solver.hears(one(0.004))
+    solver.now_ns -= 23 * 3600 * 10**9
+    counts = [solver.hears(one(0.006 + 0.002 * (minute // 2))) for minute in range(24)]
+    assert np.flatnonzero(counts).tolist() == [1, 11, 21]
+
+
+def test_while_a_clock_is_ahead_and_after_a_night_what_is_half_learned_is_learned_on():
+    solver = Solver()
+    solver.watches(2 * EVERY_NS, one(0.002))
+    solver.now_ns += 23 * 3600 * 10**9
+    assert [solver.hears(one(0.004)) for _ in range(2)] == [0, 1]
+
+
+def test_a_server_that_starts_while_a_clock_is_ahead_freezes_nothing_new():
+    solver = Solver(CalibrationDecision("a", SOLVER, "", 1, (one(0.002), one(0.002, 990))))
+    solver.now_ns += 23 * 3600 * 10**9
+    assert [solver.hears(one(0.004)) for _ in range(2)] == [0, 1]
+    old = Solver(CalibrationDecision("a", SOLVER, "", 1, (one(0.002, 900),)))
+    assert [old.hears(one(0.004, 900), one(0.002, 1000)) for _ in range(2)] == [0, 0]
+
+
 def test_machines_are_decided_each_by_itself():
     solver = Solver()
     solver.hears(one(0.003), one(0.004, machine="b"))
@@ -132,9 +164,7 @@ def test_epochs_are_decided_each_by_itself_and_what_follows_keeps_the_newest():
 
 def test_an_old_epoch_keeps_its_correction_unless_a_person_asks():
     solver = Solver()
-    for _ in range(2):
-        solver.hears(one(0.003))
-    solver.now_ns += FROZEN_NS
+    solver.watches(FROZEN_NS + 2 * EVERY_NS, one(0.003))
     later = one(0.001, 1000 + FROZEN_NS // EPOCH_NS)
     for _ in range(3):
         assert solver.hears(one(0.03), later) <= 1
@@ -150,7 +180,7 @@ def test_samples_that_come_hours_late_are_corrected():
     late = one(0.004, machine="late")
     assert [solver.hears(one(0.003), late, after_ns=EVERY_NS) for _ in range(2)] == [1, 1]
     assert solver.zero(machine="late") == 0.004
-    solver.now_ns += FROZEN_NS
+    solver.watches(FROZEN_NS + EVERY_NS, one(0.003), late)
     assert [solver.hears(one(0.003), one(0.04, machine="late")) for _ in range(3)] == [0] * 3
 
 

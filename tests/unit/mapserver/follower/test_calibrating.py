@@ -11,8 +11,10 @@ import pytest
 
 from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import corrected
+from mapserver.follower import calibrating as calibrating_module
+from mapserver.follower import follower
 from mapserver.follower.calibrating import EVERY_NS, Calibrating
 from mapserver.follower.follower import Follower
 from mapserver.ingest.store import JOURNAL_FILE
@@ -134,10 +136,10 @@ def folded(follower: Follower, writer: Writer) -> Grid:
 def test_asked_for_the_map_has_what_is_known_at_once(writer):
     deliver(writer)
     before = writer.run(grid_copy)
-    with closing(Follower(writer, lambda _: None, past_of(writer))) as follower:
-        assert follower.calibration().machines[0].spans == ()
-        follower.calibrate(WAIT_S)
-        answer = follower.calibration()
+    with closing(Follower(writer, lambda _: None, past_of(writer))) as site:
+        assert site.calibration().machines[0].spans == ()
+        site.calibrate(WAIT_S)
+        answer = site.calibration()
         a, b, c = answer.machines
         assert (a.by, a.zero_by != (), answer.fact, answer.merged) == (
             "solver",
@@ -147,33 +149,33 @@ def test_asked_for_the_map_has_what_is_known_at_once(writer):
         )
         assert a.spans[-1].zero == pytest.approx(a.zero, abs=1e-5)
         assert b.spans[-1].scale - c.spans[-1].scale == pytest.approx(0.09, abs=0.02)
-        assert same(writer.run(grid_copy), folded(follower, writer))
+        assert same(writer.run(grid_copy), folded(site, writer))
         assert not same(writer.run(grid_copy), before)
-        follower.calibrate(WAIT_S)
-        assert follower.calibration().fact == 3, "nothing new is known"
+        site.calibrate(WAIT_S)
+        assert site.calibration().fact == 3, "nothing new is known"
 
 
 def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
     deliver(writer)
-    with closing(Follower(writer, lambda _: None, past_of(writer))) as follower:
-        follower.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=WAIT_S))
-        state = follower.calibration().machines[0]
+    with closing(Follower(writer, lambda _: None, past_of(writer))) as site:
+        site.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=WAIT_S))
+        state = site.calibration().machines[0]
         assert (state.by, state.reason, state.spans[0].zero, state.spans[0].from_ns) == (
             "person",
             "levelled",
             0.00812,
             0,
         )
-        follower.calibrate(WAIT_S)
-        assert follower.calibration().machines[0].spans == state.spans, "a person is not overruled"
-        assert follower.calibration().machines[1].by == "solver"
-        assert same(writer.run(grid_copy), folded(follower, writer))
-        follower.correct(CalibrateCommand("a", auto=True, wait_s=WAIT_S))
-        assert follower.calibration().machines[0].spans == ()
-        follower.calibrate(WAIT_S)
-        assert follower.calibration().machines[0].by == "solver"
+        site.calibrate(WAIT_S)
+        assert site.calibration().machines[0].spans == state.spans, "a person is not overruled"
+        assert site.calibration().machines[1].by == "solver"
+        assert same(writer.run(grid_copy), folded(site, writer))
+        site.correct(CalibrateCommand("a", auto=True, wait_s=WAIT_S))
+        assert site.calibration().machines[0].spans == ()
+        site.calibrate(WAIT_S)
+        assert site.calibration().machines[0].by == "solver"
         with pytest.raises(QueryError, match="`z` has sent nothing; known: a, b, c") as refused:
-            follower.correct(CalibrateCommand("z", auto=True))
+            site.correct(CalibrateCommand("z", auto=True))
         assert refused.value.reason == Refusal.UNKNOWN_MACHINE
 
 
@@ -182,13 +184,55 @@ def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
 def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, machines):
     config = ServerConfig(store=StoreConfig(archive_after_h=0.0), calibration=CalibrationConfig(automatic))
     with closing(open_writer(tmp_path, config)) as writer:
-        follower = Follower(writer, lambda _: None, past_of(writer))
-        with closing(follower):
+        site = Follower(writer, lambda _: None, past_of(writer))
+        with closing(site):
             for share in range(4):
                 deliver(writer, share / 4, (share + 1) / 4)
-                follower._calibrating._due_s = 0.0
-                follower._calibrating.run()
-            follower._refolding.wait(follower._refolding._decided, WAIT_S)
-            assert follower.calibration().solved_ns > 0
-            assert sum(bool(each.spans) for each in follower.calibration().machines) == machines
-            assert same(writer.run(grid_copy), folded(follower, writer))
+                site._calibrating._due_s = 0.0
+                site._calibrating.run()
+            site._refolding.wait(site._refolding._decided, WAIT_S)
+            assert site.calibration().solved_ns > 0
+            assert sum(bool(each.spans) for each in site.calibration().machines) == machines
+            assert same(writer.run(grid_copy), folded(site, writer))
+
+
+def test_what_a_person_takes_off_is_no_measured_fault(writer, monkeypatch):
+    deliver(writer)
+    with closing(Follower(writer, lambda _: None, past_of(writer))) as site:
+        monkeypatch.setattr(site._calibrating, "states", dict)  # nothing is solved yet
+        site.correct(CalibrateCommand("a", zero=0.03, scale=0.4, reason="known to read too much", wait_s=WAIT_S))
+        corrections, known = site._known()
+        assert corrections.newest("a") is not None
+        assert known == {}
+        site.calibrate(WAIT_S)
+        assert {*site._known()[1]} == {"b", "c"}, "of what the solver decided, the deviation is known"
+
+
+def test_the_end_does_not_wait_for_a_solve_that_a_person_asked_for(writer, monkeypatch):
+    deliver(writer, last=0.1)
+    monkeypatch.setattr(follower, "END_S", 0.1)
+    solving, may_end = threading.Event(), threading.Event()
+
+    def slow(*_: object) -> Calibration:
+        solving.set()
+        assert may_end.wait(WAIT_S)
+        return calibrate({})
+
+    site = Follower(writer, lambda _: None, past_of(writer))
+    monkeypatch.setattr(calibrating_module, "calibrate", slow)
+    problems: list[str] = []
+
+    def ask() -> None:
+        with pytest.raises(QueryError) as refused:
+            site.calibrate(WAIT_S)
+        problems.append(str(refused.value))
+
+    asks, ends = threading.Thread(target=ask), threading.Thread(target=site.close)
+    asks.start()
+    assert solving.wait(WAIT_S)
+    ends.start()
+    ends.join(WAIT_S / 2)
+    assert not ends.is_alive()
+    may_end.set()
+    asks.join(WAIT_S)
+    assert problems == ["the server is stopping, and nothing is decided; ask again later"]

@@ -11,6 +11,10 @@ from typing import Any
 import pytest
 
 from mapserver.evidence.grid import Grid
+from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.correction import LAST_NS, Correction
+from mapserver.fleet.decisions import EVERY_NS
+from mapserver.fleet.observability import CommonScale
 from mapserver.follower import refolding
 from mapserver.follower.refolding import Refolding
 from mapserver.ingest.store import JOURNAL_FILE, Store
@@ -141,6 +145,44 @@ def test_decisions_during_a_fold_are_folded_together_and_the_old_fold_is_given_u
         assert fold.without == [{"b"}, {"b", "c", "d"}]
         assert fold.came_to_an_end == [False, True]
         assert same(writer.run(grid_copy), map_without("bcd", 5))
+
+
+def solved(zero: float) -> Calibration:
+    sure = ((1e-7, 0.0, 0.0), (0.0, 1e-5, 0.0), (0.0, 0.0, 1e-7))
+    return Calibration((Correction("a", NOW_NS, LAST_NS, zero, 0.0, 0.0, sure),), {}, CommonScale(True, 0.0, ""))
+
+
+def test_the_solver_decides_nothing_new_until_the_map_follows_unless_it_is_asked(writer, fold):
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        refolds.calibrate(solved(0.001), NOW_NS, asked=True)
+        fold.wait(1)
+        for due in range(1, 10):  # far more often than a map can be folded
+            assert refolds.calibrate(solved(0.002), NOW_NS + due * EVERY_NS) == 1
+        assert refolds.calibrate(solved(0.003), NOW_NS, asked=True) == 2
+        fold.may_go_on.set()
+        refolds.wait(2, WAIT_S)
+        for due in (10, 11):
+            number = refolds.calibrate(solved(0.004), NOW_NS + due * EVERY_NS)
+        refolds.wait(number, WAIT_S)
+        newest = refolds.facts().corrections.newest("a")
+        assert (number, newest and newest.zero) == (3, 0.004)
+
+
+def test_decisions_that_come_faster_than_folds_do_not_keep_the_map_from_following(writer, monkeypatch):
+    folds: list[bool] = []
+
+    def fold(*arguments: Any) -> bool:
+        refolds.calibrate(solved(0.001 * (len(folds) + 1)), NOW_NS, asked=True)  # during each fold
+        folds.append(refolding_fold(*arguments))
+        return folds[-1]
+
+    refolding_fold = refolding.fold_history
+    monkeypatch.setattr(refolding, "fold_history", fold)
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        refolds.wait(refolds.decide(decision("b")), WAIT_S)
+        wait_for(lambda: len(folds) >= 6)
+        assert folds[:6] == [False, True] * 3
+        assert refolds.facts().excluded == {"b"}
 
 
 def test_a_decision_that_leaves_the_same_machines_out_lets_the_fold_go_on(writer, fold):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mapserver.evidence import snapshot
-from mapserver.fleet.correction import LAST_NS, Correction
+from mapserver.fleet.correction import LAST_NS, NO_SHARE, Correction
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.store import Store
 from mapserver.journal.facts import NO_FACTS, Facts
@@ -510,6 +510,12 @@ def test_a_machine_is_offered_what_is_taken_off_its_newest_samples(store):
 @pytest.mark.parametrize("span", [(0, NOW_NS, 0.004, COVARIANCE), (0, LAST_NS, 0.004, ())])
 def test_what_has_ended_or_is_of_unknown_quality_is_not_offered(store, span):
     store.decide(calibrated("a", span))
+    assert offered(store) is None
+
+
+def test_a_machine_whose_sensor_measures_no_force_is_offered_nothing(store):
+    stuck = Correction("a", 0, LAST_NS, 0.004, 0.0, 0.0, COVARIANCE, NO_SHARE)
+    store.decide(CalibrationDecision("a", SOLVER, "", NOW_NS, (stuck,)))
     assert offered(store) is None
 
 
