@@ -258,17 +258,17 @@ def test_a_relative_receiver_does_not_make_a_wrong_start_sure() -> None:
 
 @pytest.mark.slow
 def test_a_restart_takes_a_new_reference() -> None:
-    vehicle = of_gps("relative")
+    vehicle = of_gps("relative", receivers=2)  # the absolute one shows where it is after the restart
     first, second = drive(S_BEND, vehicle), drive(S_BEND, vehicle)
     gap_ns = 1000 * SECOND
-    later = [replace(r, stamp_ns=r.stamp_ns + gap_ns) for r in moved(second.readings, 300.0)]
-    config = PipelineConfig(localisation=LocalisationConfig(start=START, slip=0.0, slip_soft=0.0))
+    later = [replace(r, stamp_ns=r.stamp_ns + gap_ns) for r in moved(second.readings, 300.0, "gps-2")]
+    config = PipelineConfig(localisation=LocalisationConfig(slip=0.0, slip_soft=0.0))
     pipeline = Pipeline(SITE, vehicle, config)
     pipeline.step([*first.readings, *later])
     pose = pipeline.pose
     assert pose.stamp_ns > START_NS + gap_ns
     assert math.dist((pose.x_m, pose.y_m), second.at(pose.stamp_ns - gap_ns)[:2]) < 0.6
-    assert pipeline.health()["counters"].get("gps-1_gated", 0) == 0
+    assert pipeline.health()["counters"].get("gps-2_gated", 0) == 0
 
 
 def test_relative_fixes_are_those_of_the_paper_s_transform_seen_from_the_shared_map() -> None:
