@@ -3,6 +3,7 @@
 Exit codes: 0 ok, 1 failed, 2 usage, 130 interrupted. The commands are the modules of `sitegrid.commands`.
 """
 
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -17,6 +18,8 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a shell ignores it in background
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Linear algebra here is small, or in the background of something that must not wait: it gets no more than one core.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is loaded
     from sitegrid.door import run
 
     return run(sys.argv[1:] if words is None else words)

@@ -17,7 +17,7 @@ Only + - * / and a table of headings: kernels and machines would differ in the l
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,21 +65,59 @@ class Correction:
     most_share: float = ANY_SHARE
 
 
+class _Spans:
+    """Corrections of one machine, in order of time, and the same in numbers: spans (k, 2) and values (k, 4)."""
+
+    def __init__(self, each: Iterable[Correction]) -> None:
+        self.each = tuple(sorted(each, key=lambda one: one.from_ns))
+        self.spans = np.array([(one.from_ns, one.to_ns) for one in self.each], np.int64).reshape(-1, 2)
+        values = [(one.zero, one.scale, one.across, one.most_share) for one in self.each]
+        self.values = np.array(values, np.float64).reshape(-1, 4)
+
+
 class Corrections:
     """Corrections of all machines as one value: equal ones change every sample alike.
 
-    each: by machine and time; the spans of one machine do not overlap.
+    The spans of one machine do not overlap. There may be many: what is changed for one machine costs nothing for the
+    others.
     """
 
     def __init__(self, each: Iterable[Correction] = ()) -> None:
-        self.each = tuple(sorted(each, key=lambda one: (one.machine, one.from_ns)))
-        self._spans = np.array([(one.from_ns, one.to_ns) for one in self.each], np.int64).reshape(-1, 2)
-        values = [(one.zero, one.scale, one.across, one.most_share) for one in self.each]
-        self._values = np.array(values, np.float64).reshape(-1, 4)
+        by_machine: dict[str, list[Correction]] = {}
+        for one in each:
+            by_machine.setdefault(one.machine, []).append(one)
+        self._take({machine: _Spans(own) for machine, own in by_machine.items()})
+
+    def replaced(self, machines: Mapping[str, Sequence[Correction]]) -> Corrections:
+        """The same but for all corrections of some machines."""
+        return self._with(self._machines | {name: _Spans(each) for name, each in machines.items()})
+
+    def without(self, machines: Collection[str]) -> Corrections:
+        """Those of the other machines."""
+        return self._with({name: own for name, own in self._machines.items() if name not in machines})
+
+    def _with(self, machines: Mapping[str, _Spans]) -> Corrections:
+        out = Corrections()
+        out._take(machines)
+        return out
+
+    def _take(self, machines: Mapping[str, _Spans]) -> None:
+        self._machines = {name: machines[name] for name in sorted(machines) if machines[name].each}
+        parts, first = [*self._machines.values()], 0
+        self._spans = np.concatenate([np.zeros((0, 2), np.int64), *(own.spans for own in parts)])
+        self._values = np.concatenate([np.zeros((0, 4)), *(own.values for own in parts)])
         self._places: dict[str, tuple[int, int]] = {}  # of each machine's: the first, and the end
-        for at, one in enumerate(self.each):
-            self._places[one.machine] = self._places.get(one.machine, (at, at))[0], at + 1
+        for name, own in self._machines.items():
+            self._places[name] = first, (first := first + len(own.each))
         self._key = self.digest()
+
+    @property
+    def each(self) -> tuple[Correction, ...]:
+        """All, by machine and time."""
+        return tuple(one for own in self._machines.values() for one in own.each)
+
+    def __len__(self) -> int:
+        return len(self._spans)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Corrections) and self._key == other._key
@@ -92,26 +130,30 @@ class Corrections:
 
         Where a span is cut in two, it is another word, which does no harm: it says when evidence may be used again.
         """
-        early = self._spans[:, 0] < before_ns
-        if not early.any():
-            return ""
-        hashed = hashlib.blake2b(digest_size=8)
-        hashed.update(np.minimum(self._spans[early], before_ns).tobytes() + self._values[early].tobytes())
-        hashed.update("/".join(one.machine for one, hit in zip(self.each, early, strict=True) if hit).encode())
-        return hashed.hexdigest()
+        hashed, some = hashlib.blake2b(digest_size=8), False
+        for name, own in self._machines.items():
+            if early := int(np.searchsorted(own.spans[:, 0], before_ns)):
+                some = True
+                hashed.update(f"{name}/{early}/".encode())
+                hashed.update(np.minimum(own.spans[:early], before_ns).tobytes() + own.values[:early].tobytes())
+        return hashed.hexdigest() if some else ""
+
+    def spans_of(self, machine: str) -> tuple[Correction, ...]:
+        """Those of one machine, in order of time."""
+        own = self._machines.get(machine)
+        return own.each if own else ()
 
     def newest(self, machine: str) -> Correction | None:
         """The last one of a machine; None for none."""
-        _, end = self._places.get(machine, (0, 0))
-        return self.each[end - 1] if end else None
+        own = self._machines.get(machine)
+        return own.each[-1] if own else None
 
     def applied(self, rows: Table, machines: Sequence[str], machine: Ints) -> Table:
         """Samples (n,) without their machines' errors; those that no correction covers stay bytes as they were.
 
         machines: names; machine (n,): index of each sample's in them. Corrections count from what was measured, so of
         them only what a sample does not state as applied is taken off; where the machine knows a scale and the
-        correction does not, the machine's counts. Values leave the limits of a sample by nothing:
-        they end there.
+        correction does not, the machine's counts. Values leave the limits of a sample by nothing: they end there.
         """
         if not any(name in self._places for name in machines) or not len(rows):
             return rows

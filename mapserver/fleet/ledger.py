@@ -5,10 +5,14 @@ Sums of integers, so that any order and any batching of the samples give the sam
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import NamedTuple
+
 import numpy as np
 
-from mapserver.fleet.stays import SLOT_NS, SLOT_SHIFT, STAY, merged, stays
-from protocol.arrays import Table
+from mapserver.fleet.stays import SLOT_NS, SLOT_SHIFT, STAY, VALUE_UNITS, merged, stays
+from protocol.arrays import Ints, Table
+from protocol.machine.samples import APPLIED
 
 CELL_M = 2.0  # about one standard deviation of a position
 EPOCH_SLOTS = 30  # 300 s, the length of the map's time buckets
@@ -18,9 +22,10 @@ _PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
 
 
 class Ledger:
-    """Stays of one machine. cell_m: edge of the cells."""
+    """Stays of one machine. cell_m: edge of the cells. epochs: how many it remembers, which may become fewer."""
 
     def __init__(self, cell_m: float = CELL_M) -> None:
+        self.epochs = EPOCHS
         self._cell_m = cell_m
         self._stays: Table = np.zeros(0, STAY)
         self._pending: list[Table] = []
@@ -41,7 +46,8 @@ class Ledger:
 
     def stays(self) -> Table:
         """All stays, by their keys."""
-        self._merge()
+        if self._pending or len(np.unique(epochs_of(self._stays))) > self.epochs:
+            self._merge()
         return self._stays
 
     def _merge(self) -> None:
@@ -53,7 +59,41 @@ class Ledger:
         if self._pending:
             whole = merged(whole, np.concatenate(self._pending))
         self._pending, self._waiting = [], 0
-        epochs = (whole["key"] >> SLOT_SHIFT) // EPOCH_SLOTS
-        newest = np.unique(epochs)[-EPOCHS:]
-        start = int(np.searchsorted(epochs, newest[0])) if len(newest) else 0
-        self._stays = whole[start:].copy()
+        self._stays = newest(whole, self.epochs).copy()
+
+
+class Stated(NamedTuple):
+    """What a machine applied itself in one epoch: zero and scale; zero_std, scale_std: how much they changed."""
+
+    zero: float = 0.0
+    scale: float = 0.0
+    zero_std: float = 0.0
+    scale_std: float = 0.0
+
+
+NOTHING_STATED = Stated()
+
+
+def epochs_of(table: Table) -> Ints:
+    """The epoch of each stay, in EPOCH_NS since 1970."""
+    return np.asarray((table["key"] >> SLOT_SHIFT) // EPOCH_SLOTS, np.int64)
+
+
+def newest(table: Table, epochs: int) -> Table:
+    """The stays of the newest epochs, so many; all are in the order of their keys."""
+    each = epochs_of(table)
+    kept = np.unique(each)[-epochs:]
+    return table[int(np.searchsorted(each, kept[0])) if len(kept) else 0 :]
+
+
+def stated(table: Table) -> Mapping[int, Stated]:
+    """What was applied by epoch, over all samples."""
+    numbers, which = np.unique(epochs_of(table), return_inverse=True)
+    n = np.bincount(which, table["n"])
+    means, spreads = [], []
+    for name in APPLIED:
+        each = table[name] / (table["n"] * float(VALUE_UNITS))
+        means.append(np.bincount(which, each * table["n"]) / n)
+        spreads.append(np.sqrt(np.bincount(which, (each - means[-1][which]) ** 2 * table["n"]) / n))
+    values = np.stack([*means, *spreads], axis=1).tolist()
+    return {number: Stated(*row) for number, row in zip(numbers.tolist(), values, strict=True)}

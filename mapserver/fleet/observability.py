@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapserver.fleet import sources as src
-from mapserver.fleet.solver import SCALE_STD, Estimate, Problem, inverse
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Problem, inverse
 from protocol.arrays import Bools, Floats, Ints
 
 OBSERVED = 0.25  # of the prior's variance: half its standard deviation
 WEAK = 0.01  # of the weight of data sheets: evidence has to do without
-CALIBRATED = "calibrated"  # the machine knows its own calibration: by reversing, or by known ground
+REMEMBERED = "remembered"  # an earlier solve showed it
 # By which a source is named: each alone, beside the ground that all share.
 NAMED = (src.SAME_GROUND, src.CROSSINGS, src.HEIGHTS, src.EDGES, src.KNOWN_GROUND)
 
@@ -60,7 +60,7 @@ def observe(pb: Problem, result: Estimate) -> Observed:
 
 
 def observed_part(result: Estimate) -> tuple[Floats, Floats]:
-    """The estimate projected on observed directions, and the covariance of what it leaves.
+    """The estimate projected on observed directions, from what is known beforehand; the covariance of what it leaves.
 
     With L L' the prior's information, directions are eigenvectors of L' P L, whose eigenvalues are ratios of variances.
     """
@@ -69,7 +69,8 @@ def observed_part(result: Estimate) -> tuple[Floats, Floats]:
     shown = ratios < OBSERVED
     left = np.where(shown, ratios, 1.0)  # of the prior's variance
     units = np.linalg.solve(lower.T, directions)
-    applied = units[:, shown] @ (directions[:, shown].T @ (lower.T @ result.x))
+    before = np.linalg.solve(result.prior.matrix, result.prior.vector)
+    applied = before + units[:, shown] @ (directions[:, shown].T @ (lower.T @ (result.x - before)))
     return applied, (units * left) @ units.T
 
 
@@ -89,13 +90,15 @@ def _by(pb: Problem, result: Estimate) -> dict[str, dict[str, tuple[str, ...]]]:
     present = [name for name in NAMED if name in result.information]
     variances = {name: np.diag(result.covariance(*{name, src.SAME_GROUND})) for name in present}
     before = np.diag(inverse(result.prior.matrix))
-    own = [CALIBRATED if p.covariance[1][1] < OBSERVED * SCALE_STD**2 else "" for p in pb.priors]
+    data_sheet = {"zero": ZERO_STD**2, "scale": SCALE_STD**2}
     out = {}
     for index, name in enumerate(pb.names):
         epochs = np.flatnonzero(pb.epochs.machine == index)
         shown = {"zero": epochs, "scale": np.array([layout.scales.start + index])}
+        own = dict(zip(shown, np.diag(pb.priors[index].covariance).tolist(), strict=True))
         out[name] = {
-            what: tuple(filter(None, [own[index], *_shown(variances, before, at)])) for what, at in shown.items()
+            what: (*([REMEMBERED] if own[what] < OBSERVED * data_sheet[what] else []), *_shown(variances, before, at))
+            for what, at in shown.items()
         }
     return out
 

@@ -81,7 +81,7 @@ def passages(ledgers: Mapping[str, Table]) -> tuple[Passages, Epochs, Ints]:
 def _in_order(table: Table, machine: int, epoch: Ints) -> Passages:
     """Passages of one machine. cell: its number, not yet an index."""
     slot = st.slot(table["key"])
-    sums = {name: table[name].astype(np.float64) for name in st.SUMS}
+    sums = {name: table[name].astype(np.float64) for name in st.MEASURED}
     start_s = (slot - slot.min(initial=0)) * (st.SLOT_NS * 1e-9)
     time_s = start_s + sums["time"] / sums["n"] / st.PLACE_UNITS
     order = np.lexsort((table["key"], time_s))

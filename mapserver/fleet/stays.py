@@ -14,6 +14,7 @@ import numpy as np
 
 from mapserver.fleet.correction import HEADING_TABLE, heading_index, measured
 from protocol.arrays import Ints, Table
+from protocol.machine.samples import APPLIED
 
 SLOT_NS = 10_000_000_000
 VALUE_UNITS = 100_000  # per unit of c_rr and of slope
@@ -26,15 +27,16 @@ HEADING_UNITS = 1 << (20 - _HEADING_SHIFT)
 
 # n samples, of which `known` have c_rr. Sums: ms since the slot began; mm from the cell's corner; c_rr, gradient east,
 # gradient north in VALUE_UNITS; cosine and sine of the heading in HEADING_UNITS; speed in mm/s; distance driven in mm.
-SUMS = ("n", "known", "time", "x", "y", "c_rr", "east", "north", "cosine", "sine", "speed", "distance")
+# What the machine stated as applied, in VALUE_UNITS, has no part in what was measured.
+MEASURED = ("n", "known", "time", "x", "y", "c_rr", "east", "north", "cosine", "sine", "speed", "distance")
+SUMS = (*MEASURED, *APPLIED)
 STAY = np.dtype([("key", "<i8"), *((name, "<i4") for name in SUMS)])
 
 
 def stays(rows: Table, cell_m: float) -> Table:
     """Stays (k,) of samples (n,) of one machine that have a slope, by their keys; of what it measured."""
-    rows = measured(rows)
     keys, sums = np.empty(len(rows), np.int64), np.empty((len(rows), len(SUMS)), np.int32)
-    used = _measure(rows, cell_m, HEADING_TABLE, keys, sums)
+    used = _measure(measured(rows), rows, cell_m, HEADING_TABLE, keys, sums)
     return summed(keys[:used], sums[:used])
 
 
@@ -80,8 +82,11 @@ def direction(keys: Ints) -> Ints:
 
 
 @numba.njit(cache=True, nogil=True)
-def _measure(rows: Any, cell_m: float, headings: Any, keys: Any, sums: Any) -> int:
-    """Keys and sums of single samples; returns how many there are: without a slope a sample shows nothing."""
+def _measure(rows: Any, sent: Any, cell_m: float, headings: Any, keys: Any, sums: Any) -> int:
+    """Keys and sums of single samples; returns how many there are: without a slope a sample shows nothing.
+
+    rows: as measured; sent: the same as they came in.
+    """
     used = 0
     for i in range(len(rows)):
         row = rows[i]
@@ -106,5 +111,7 @@ def _measure(rows: Any, cell_m: float, headings: Any, keys: Any, sums: Any) -> i
         out[8], out[9] = headings[unit, 0] >> _HEADING_SHIFT, headings[unit, 1] >> _HEADING_SHIFT
         out[10] = np.int32(np.rint(abs(np.float64(row.speed_mps)) * PLACE_UNITS))
         out[11] = np.int32(np.rint(np.float64(row.distance_m) * PLACE_UNITS))
+        out[12] = np.int32(np.rint(np.float64(sent[i].applied_zero) * VALUE_UNITS))
+        out[13] = np.int32(np.rint(np.float64(sent[i].applied_scale) * VALUE_UNITS))
         used += 1
     return used

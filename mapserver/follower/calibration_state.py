@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from mapserver.fleet.calibration import MachineState
 from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, Correction, Corrections
 from mapserver.fleet.decisions import PERSON, CalibrationDecision
+from mapserver.fleet.machine_state import MachineState
 from protocol.queries.calibration import CorrectedSpan, MachineCalibration
 from protocol.queries.commands import CalibrateCommand
 
@@ -18,7 +18,7 @@ def calibration_of(
 
     decision: its newest one. state: of the last solve. corrections: those that count in the map.
     """
-    spans = [one for one in corrections.each if one.machine == machine][-MOST_SPANS:]
+    spans = corrections.spans_of(machine)[-MOST_SPANS:]
     return MachineCalibration(
         name=machine,
         by=decision.by if decision else "",

@@ -8,8 +8,8 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from mapserver.fleet.calibration import MachineState, state_of
 from mapserver.fleet.correction import Corrections
+from mapserver.fleet.machine_state import MachineState, state_of
 from mapserver.follower.calibrating import Calibrating
 from mapserver.follower.calibration_state import calibration_of, decided_by_person
 from mapserver.follower.checkpointing import Checkpointing
@@ -45,7 +45,9 @@ class Follower:
         self._reader = reader = JournalReader(writer.folder / JOURNAL_FILE)
         self._ending = threading.Event()
         self._refolding = Refolding(writer, past)
-        self._calibrating = Calibrating(writer, past, self._refolding.calibrate, self._doubtful, self._ending)
+        refolding = self._refolding
+        earlier = refolding.solver_corrections
+        self._calibrating = Calibrating(writer, past, refolding.calibrate, self._doubtful, earlier, self._ending)
         self._audit = Audit(writer, reader, self._refolding.judge, self._known, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
@@ -138,7 +140,7 @@ class Follower:
 
         What a person takes off was not measured, and says nothing of what is broken.
         """
-        earlier = {name: state_of(one) for name, one in self._refolding.solver_corrections().items()}
+        earlier = {one.machine: state_of(one) for one in self._refolding.solver_corrections()}
         return self._refolding.corrections(), earlier | dict(self._calibrating.states())
 
     def _require_known(self, machine: str) -> None:

@@ -20,8 +20,8 @@ from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.evidence.timeline import Block, TimedPage
-from mapserver.fleet.calibration import MachineState
 from mapserver.fleet.correction import UNCORRECTED, Corrections
+from mapserver.fleet.machine_state import MachineState
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
@@ -33,6 +33,7 @@ from protocol.queries.answers import GroundChange
 
 LOOK_BLOCKS = 256  # for changes, at a time: the writer copies their pages, and batches wait meanwhile
 LOOK_S = 60.0  # between two looks for rows that are old enough: files are of whole hours
+KEEP_S = 3600.0  # between two looks for decisions, where no file is new
 Report = Callable[[Mapping[str, Verdict], int], None]
 Known = Callable[[], tuple[Corrections, Mapping[str, MachineState]]]
 Publish = Callable[[GroundChange], None]
@@ -144,7 +145,7 @@ class Archiving:
     def __init__(self, writer: Writer, reader: JournalReader, ending: threading.Event) -> None:
         self._writer, self._reader, self._ending = writer, reader, ending
         self._due_s = 0.0
-        self._kept = 0  # number of the last decision that is beside the files
+        self._kept, self._keep_s = 0, 0.0  # number of the last decision that is beside the files; next time to look
 
     def run(self) -> None:
         """Move the next hour of old rows, where it is time: an hour a turn, so that the end need not wait."""
@@ -159,10 +160,15 @@ class Archiving:
             self._writer.run(lambda store: store.journal.shrink())
             log.info("archived file=%s", path.name)
             self._due_s = 0.0  # there may be more hours
-        self._keep_decisions(folder)
+        if path or time.monotonic() >= self._keep_s:
+            self._keep_decisions(folder)
 
     def _keep_decisions(self, folder: Path) -> None:
-        """Have those about calibration beside the files, where there are any."""
+        """Have those about calibration beside the files, where there are any.
+
+        All are written again each time: those about archived hours, which are of use there, seldom change.
+        """
+        self._keep_s = time.monotonic() + KEEP_S
         newest = self._writer.run(lambda store: store.fact)
         if folder.exists() and newest != self._kept:
             archived_decisions.save(folder, self._writer.store_id, calibrations(self._reader))

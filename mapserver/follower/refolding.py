@@ -74,7 +74,7 @@ class Refolding:
         with self._changed:
             return self._decisions.calibration.corrections
 
-    def solver_corrections(self) -> dict[str, Correction]:
+    def solver_corrections(self) -> list[Correction]:
         """The newest of each machine that the solver decided."""
         with self._changed:
             return self._decisions.calibration.of_solver()
@@ -145,6 +145,7 @@ class Refolding:
         with self._changed:
             decisions = self._decisions.calibration.judge(solved, stamp_ns, asked=asked)
             waits = not asked and self._folded < self._decided
+            store.confirm(self._decisions.calibration.confirmed, stamp_ns)
         return self._keep(store, () if waits else decisions)
 
     def _keep(self, store: Store, decisions: Sequence[Decision]) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapserver.fleet import decisions as calibration
-from mapserver.fleet.correction import LAST_NS, NO_SHARE, Corrections
+from mapserver.fleet.correction import LAST_NS, NO_SHARE
 from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions, NewerVersionError
 from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalQueries
@@ -50,16 +50,16 @@ class Decisions:
     def offer(self, machine: str) -> dict[str, Any] | None:
         """What a machine may take for its own calibration, as an acknowledgement has it; None for nothing.
 
-        It is what is taken off its newest samples.
+        It is what is taken off its newest samples, dated when the solver said so last: machines take no old one.
         """
-        newest, decision = self.facts.corrections.newest(machine), self.calibration.newest(machine)
-        if not newest or not decision or newest.to_ns < LAST_NS or not newest.covariance:
+        newest = self.facts.corrections.newest(machine)
+        if not newest or newest.to_ns < LAST_NS or not newest.covariance:
             return None
         if newest.most_share == NO_SHARE:  # a calibration is of a sensor that measures something
             return None
         (zz, zs, _), (_, ss, _), _ = newest.covariance
-        offer = CalibrationOffer(machine, decision.stamp_ns, newest.zero, newest.scale, zz, ss, zs)
-        return encode_offer(offer)
+        as_of_ns = self.calibration.as_of_ns(machine)
+        return encode_offer(CalibrationOffer(machine, as_of_ns, newest.zero, newest.scale, zz, ss, zs))
 
     def _take(self, decision: Decision) -> None:
         if isinstance(decision, CalibrationDecision):
@@ -70,7 +70,7 @@ class Decisions:
     def _conclude(self, number: int) -> None:
         excluded, corrections = self.trust.distrusted, self.calibration.corrections
         if excluded:  # what is taken off samples that do not count changes no map
-            corrections = Corrections(one for one in corrections.each if one.machine not in excluded)
+            corrections = corrections.without(excluded)
         self.facts = Facts(excluded, corrections, number)
 
 

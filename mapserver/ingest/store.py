@@ -8,7 +8,7 @@ import socket
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -183,6 +183,10 @@ class Store:
         self._count_decisions()
         return self._decisions.facts
 
+    def confirm(self, machines: Iterable[str], now_ns: int) -> None:
+        """Date what is offered to machines: the solver says the same of them now [site's]."""
+        self._decisions.calibration.confirm(machines, now_ns)
+
     def accept(self, store: str, reason: str) -> None:
         """Take the place of another store for good, since a person says so: its runs are taken on here."""
         if store != self.identity.id and store not in self.accepted:
@@ -204,7 +208,7 @@ class Store:
             "accepted": sorted(self.accepted),
             "fact": self.fact,
             "decided": self._decisions.facts.number,
-            "corrections": len(self.facts.corrections.each),
+            "corrections": len(self.facts.corrections),
             "journalled": self.journalled,
             "merged": self.merged,
             "snapshot": self.snapshot_row,

@@ -22,7 +22,7 @@ FILE = "calibration.json"  # in the folder of an archive
 def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> None:
     """Write the decisions of a store, in their order; raises StoreError."""
     table = {"store": store, "decisions": [decision.body() for decision in decisions]}
-    text = json.dumps({**table, "crc32": _checksum(table)}, indent=1)
+    text = json.dumps({**table, "crc32": _checksum(table)}, separators=(",", ":"))
     try:
         write_whole(folder / FILE, f"{text}\n".encode(), READABLE)
     except OSError as error:

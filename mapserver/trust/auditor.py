@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
-from mapserver.fleet.calibration import MachineState
+from mapserver.fleet.machine_state import MachineState
 from mapserver.journal.rows import JournalRows
 from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
 from mapserver.trust.comparison import ComparedMap, Difference, compare, reverse
@@ -48,17 +48,18 @@ Pairs = dict[tuple[str, str], dict[Reason, Judgement]]  # of the first of two ma
 class Verdict:
     """What is known of one machine.
 
-    reasons: empty unless it contradicts all others. evidence: plain values; what could not be compared is missing.
-    cells, gain, offset_east_m, offset_north_m, offset_std_m, agreement [-], spread and spread_of_others (of the levels)
-    against the map of all others in good standing; clock_s: ahead of the others; zero, torque_gain, their standard
-    deviations and what shows them: of the calibration; excess: by reason, 1 at its limit;
-    agrees_with, disagrees_with, undecided_with: machines.
+    reasons: empty unless it contradicts all others. agrees: in what it is seen to agree with them. evidence: plain
+    values; what could not be compared is missing. cells, gain, offset_east_m, offset_north_m, offset_std_m,
+    agreement [-], spread and spread_of_others (of the levels) against the map of all others in good standing; clock_s:
+    ahead of the others; zero, torque_gain, their standard deviations and what shows them: of the calibration; excess:
+    by reason, 1 at its limit; agrees_with, disagrees_with, undecided_with: machines.
     """
 
     machine: str
     reasons: tuple[Reason, ...]
     evidence: Mapping[str, Any]
     contradicts: bool
+    agrees: frozenset[Reason] = frozenset()
 
 
 class Auditor:
@@ -120,7 +121,8 @@ class Auditor:
             evidence = (
                 _measured(difference) | lead | _calibrated(known[i]) | {"excess": excess} | _sides(names, votes, i)
             )
-            verdicts[names[i]] = Verdict(names[i], reasons, evidence, bool(reasons))
+            agrees = frozenset(r for r, j in judgements.items() if j.state == AGREE)
+            verdicts[names[i]] = Verdict(names[i], reasons, evidence, bool(reasons), agrees)
         return verdicts
 
     def _pairs(self, names: Sequence[str], maps: Sequence[ComparedMap]) -> Pairs:

@@ -1,8 +1,10 @@
 """Which machines the map trusts: decisions by the audit and by people, kept with their reasons as journal events.
 
 A machine's newest decision counts. One made by a person stands until a person hands it back to the audit; the audit
-waits for the same verdict several times, so that a doubtful machine does not go in and out. A machine beyond its data
-sheet comes back by a person alone: its corrected samples agree, but something in it is broken.
+waits for the same verdict several times, so that a doubtful machine does not go in and out. To come back, a machine has
+to be seen to agree with the others in all that it was excluded for: that nothing contradicts it is not enough, since
+after a correction all evidence is looked at anew. One beyond its data sheet comes back by a person alone: its corrected
+samples agree, but something in it is broken.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ class TrustDecisions:
     def _judge(self, verdict: Verdict, stamp_ns: int) -> TrustDecision | None:
         machine, now = verdict.machine, self._newest.get(verdict.machine)
         trusted = now is None or now.trusted
-        if (now and _stands(now)) or verdict.contradicts != trusted:
+        if (now and _stands(now)) or not (verdict.contradicts if trusted else _agrees(verdict, now)):
             self._in_a_row.pop(machine, None)
             return None
         self._in_a_row[machine] = self._in_a_row.get(machine, 0) + 1
@@ -69,6 +71,13 @@ class TrustDecisions:
             return None
         reason = ", ".join(verdict.reasons) if trusted else "agrees with the others again"
         return TrustDecision(machine, not trusted, AUDIT, reason, stamp_ns, dict(verdict.evidence))
+
+
+def _agrees(verdict: Verdict, decision: TrustDecision | None) -> bool:
+    """Whether a machine is seen to agree in what it was excluded for; in anything at all, where that has no name."""
+    words = decision.reason.split(", ") if decision else []
+    named = {reason for reason in Reason if reason in words}
+    return not verdict.contradicts and bool(verdict.agrees) and named <= verdict.agrees
 
 
 def _stands(decision: TrustDecision) -> bool:

@@ -10,7 +10,8 @@ from math import hypot, log, sqrt
 
 import numpy as np
 
-from mapserver.fleet.calibration import FAULT_SIGMAS, MachineState
+from mapserver.fleet.applied_part import FAULT_SIGMAS
+from mapserver.fleet.machine_state import MachineState
 from mapserver.trust.comparison import CELLS_PER_DRAW, ZERO_ERROR, Difference, Gain
 from mapserver.trust.shift import Shift
 from protocol.arrays import Ints

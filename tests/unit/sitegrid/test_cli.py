@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -49,6 +50,16 @@ def test_each_command_has_help_and_a_module(command: str, capsys):
     assert end.value.code == 0
     assert "--json" in capsys.readouterr().out
     assert (Path(cli.__file__).parent / "commands" / f"{command}.py").exists()
+
+
+@pytest.mark.parametrize(("set_to", "is_then"), [(None, "1"), ("3", "3")])
+def test_linear_algebra_gets_one_core_unless_told_otherwise(set_to, is_then, monkeypatch):
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    if set_to:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", set_to)
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    assert os.environ["OPENBLAS_NUM_THREADS"] == is_then
 
 
 def test_help_imports_only_the_base_install():

@@ -9,19 +9,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import (
-    FAULT_SIGMAS,
-    SCALE_FLOOR,
-    ZERO_FLOOR,
-    Calibration,
-    MachineState,
-    calibrate,
-    moved,
-    state_of,
-)
+from mapserver.fleet.applied_part import FAULT_SIGMAS, moved
+from mapserver.fleet.calibration import SCALE_FLOOR, ZERO_FLOOR, Calibration, calibrate
 from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, corrected
-from mapserver.fleet.decisions import differs
+from mapserver.fleet.hysteresis import differs
 from mapserver.fleet.ledger import EPOCH_NS
+from mapserver.fleet.machine_state import MachineState, state_of
 from mapserver.fleet.passages import Epochs, passages
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
 from protocol.arrays import Floats, Table
@@ -491,14 +484,14 @@ def test_cells_at_the_edge_of_known_ground_are_not_known() -> None:
     assert outside.any()
 
 
-def test_a_machine_that_calibrates_itself_pins_the_others() -> None:
+def test_a_machine_that_is_known_pins_the_others() -> None:
     rows = {"a": drive(OPEN, Errors(0.0), seconds=200.0, closed=False, site=concrete)}
     rows |= {"b": drive(OPEN, Errors(0.007), seconds=200.0, closed=False, site=concrete, seed=1)}
     pinned = Prior(0.0, 0.0, ((0.0005**2, 0.0), (0.0, 0.005**2)))
-    result = solve(rows, priors={"a": pinned})
-    assert result.machines["a"].zero_by == ("calibrated",)
+    result = solve(rows, remembered={"a": pinned})
+    assert result.machines["a"].zero_by == ("remembered",)
     sure = Prior(0.0, 0.0, ((1e-12, 0.0), (0.0, 1e-12)))  # no evidence makes a zero surer than the model
-    state = solve(rows, priors={"a": sure}).machines["a"]
+    state = solve(rows, remembered={"a": sure}).machines["a"]
     assert (state.zero_std, state.scale_std) == pytest.approx((ZERO_FLOOR, SCALE_FLOOR), rel=0.05)
     assert (ZERO_FLOOR, SCALE_FLOOR) == (0.0004, 0.004)
     assert result.machines["b"].zero == pytest.approx(0.007, abs=0.0015)

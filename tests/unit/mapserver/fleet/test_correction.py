@@ -15,7 +15,7 @@ from mapserver.fleet.correction import (
     corrected,
     measured,
 )
-from mapserver.fleet.stays import SUMS, stays
+from mapserver.fleet.stays import MEASURED, stays
 from protocol.arrays import Floats, Table
 from protocol.machine.samples import APPLIED, LIMITS, SAMPLE_DTYPE
 from tests.reference.correction import in_numpy
@@ -197,7 +197,7 @@ def test_the_ledger_of_a_machine_that_calibrates_itself_is_that_of_one_that_does
     for name in ("c_rr", "east", "north"):
         assert np.abs(one[name] - other[name]).max() <= 5 * one["n"].max(), name
         assert np.abs(one[name] - blind[name]).max() > 100 * one["n"].max(), name
-    for name in set(SUMS) - {"c_rr", "east", "north"}:
+    for name in set(MEASURED) - {"c_rr", "east", "north"}:
         assert (one[name] == other[name]).all(), name
 
 

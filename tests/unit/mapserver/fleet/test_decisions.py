@@ -1,7 +1,9 @@
 """Which corrections count: hysteresis of the solver, people above it, events, and spans painted over each other."""
 
 import json
+import time
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,17 +13,16 @@ from mapserver.fleet.calibration import Calibration
 from mapserver.fleet.correction import LAST_NS, LEVEL_SHARE, Correction, Corrections
 from mapserver.fleet.decisions import (
     EVERY_NS,
-    FROZEN_NS,
     PERSON,
     SOLVER,
     CalibrationDecision,
     CalibrationDecisions,
     NewerVersionError,
-    at,
-    paint,
 )
-from mapserver.fleet.ledger import EPOCH_NS
+from mapserver.fleet.hysteresis import FROZEN_NS
+from mapserver.fleet.ledger import EPOCH_NS, Stated
 from mapserver.fleet.observability import CommonScale
+from mapserver.fleet.spans import at, paint
 
 SURE = ((2.5e-7, 0.0, 0.0), (0.0, 2.5e-5, 0.0), (0.0, 0.0, 2.5e-7))  # 0.5e-3, 0.5 %, 0.5e-3
 NOW_NS = 1000 * EPOCH_NS
@@ -43,7 +44,8 @@ def one(
 
 
 def solved(*corrections: Correction) -> Calibration:
-    return Calibration(corrections, {}, CommonScale(True, 0.005, ""))
+    begins_ns = {one.machine: LAST_NS for one in corrections}
+    return Calibration(corrections, {}, CommonScale(True, 0.005, ""), begins_ns=begins_ns)
 
 
 class Solver:
@@ -244,3 +246,78 @@ def test_the_order_in_which_machines_are_decided_is_no_matter():
         for name, zero in zip("abc", (1, 2, 3), strict=True)
     ]
     assert CalibrationDecisions(made).corrections == CalibrationDecisions(made[::-1]).corrections
+
+
+# --- where a machine's first correction begins, what is confirmed, and many of them -----------------------------------
+
+
+@pytest.mark.parametrize(
+    ("begins", "expected"), [({}, 0), ({"a": 900 * EPOCH_NS}, 900), ({"a": 1002 * EPOCH_NS}, 1000)]
+)
+def test_the_first_correction_of_a_machine_is_that_of_all_its_samples_before(begins, expected):
+    decisions = CalibrationDecisions()
+    calibration = replace(solved(one(0.003, 1000), one(0.005, 1001)), begins_ns=begins)
+    for decision in decisions.judge(calibration, NOW_NS, asked=True):
+        decisions.add(decision)
+    assert [each.from_ns // EPOCH_NS for each in decisions.corrections.each] == [expected, 1001]
+    later = replace(solved(one(0.003, 1002), one(0.01, 1003)), begins_ns=begins)
+    for decision in decisions.judge(later, NOW_NS, asked=True):
+        decisions.add(decision)
+    assert [each.from_ns // EPOCH_NS for each in decisions.corrections.each] == [expected, 1001, 1002, 1003]
+
+
+def test_before_what_the_machine_knows_itself_nothing_is_corrected():
+    calibration = solved(one(0.003, 1000), one(0.02, 1001))
+    calibration = replace(calibration, begins_ns={}, stated={"a": {1000: Stated(0.003), 1001: Stated(0.003)}})
+    decisions = CalibrationDecisions()
+    for minute in range(2):
+        for decision in decisions.judge(calibration, NOW_NS + minute):
+            decisions.add(decision)
+    assert [each.from_ns // EPOCH_NS for each in decisions.corrections.each] == [1001]
+
+
+def test_what_the_solver_says_again_is_as_of_now():
+    solver = Solver()
+    for _ in range(2):
+        solver.hears(one(0.003))
+    assert solver.decisions.as_of_ns("a") == NOW_NS + 60 * 10**9
+    solver.watches(6 * EVERY_NS, one(0.0031))
+    assert solver.decisions.as_of_ns("a") == solver.now_ns - EVERY_NS, "the same in an hour"
+    said_ns = solver.decisions.as_of_ns("a")
+    solver.hears(one(0.009))
+    assert solver.decisions.as_of_ns("a") == said_ns, "in doubt"
+    old = CalibrationDecision("a", SOLVER, "", solver.now_ns, (one(0.1, 990, to_ns=991 * EPOCH_NS),))
+    solver.decisions.add(old)
+    assert solver.decisions.as_of_ns("a") == said_ns, "a decision about earlier samples says nothing of these"
+    solver.decisions.add(person(0.02))
+    assert solver.decisions.as_of_ns("a") == NOW_NS
+
+
+def test_neighbours_that_do_the_same_become_one():
+    spans = []
+    for first, zero in ((0, 0.1), (3, 0.1), (6, 0.2), (4, 0.1), (5, 0.2), (1, 0.2), (1, 0.1)):
+        paint(spans, Correction("a", first, first + (3 if first % 3 == 0 else 1), zero, 0.0, 0.0, ((float(first),),)))
+    assert [(each.from_ns, each.to_ns, each.zero) for each in spans] == [(0, 5, 0.1), (5, 9, 0.2)]
+
+
+@pytest.mark.slow
+def test_a_year_of_corrections_costs_a_decision_next_to_nothing():
+    zeros = np.round(np.random.default_rng(0).normal(0, 0.01, 10_000), 5)
+    many = [[one(z, i, machine=f"m{m}", to_ns=(i + 1) * EPOCH_NS) for i, z in enumerate(zeros)] for m in range(10)]
+    made = [CalibrationDecision(own[0].machine, SOLVER, "", 0, tuple(own)) for own in many]
+    decisions = CalibrationDecisions(made)
+    assert len(decisions.corrections) > 99_000
+    began_s = time.process_time()
+    for i in range(10):
+        decisions.add(CalibrationDecision("m1", SOLVER, "", 9, (one(0.1 * i, 9_999, machine="m1"),)))
+        assert decisions.corrections.newest("m1").zero == 0.1 * i
+    assert (time.process_time() - began_s) / 10 < 0.08
+    assert decisions.corrections == Corrections(one for one in decisions.corrections.each)
+
+
+def test_judgements_forget_what_is_solved_no_more():
+    decisions = CalibrationDecisions()
+    for hour in range(100):
+        some = [one(0.001 * i, 12 * hour + i, to_ns=LAST_NS) for i in range(12)]
+        decisions.judge(solved(*some), NOW_NS + hour * 3600 * 10**9)
+    assert len(decisions._hysteresis._epochs["a"]) == 12

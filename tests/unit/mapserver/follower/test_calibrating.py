@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig
 from mapserver.evidence.grid import Grid
+from mapserver.fleet import calibration
 from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import corrected
+from mapserver.fleet.ledger import Ledger
 from mapserver.follower import calibrating as calibrating_module
 from mapserver.follower import follower
 from mapserver.follower.calibrating import EVERY_NS, Calibrating
@@ -21,6 +25,7 @@ from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.reader import JournalReader
+from protocol.arrays import Table
 from protocol.errors import QueryError, Refusal
 from protocol.queries.commands import CalibrateCommand
 from tests.unit.mapserver.data import SITE, WAIT_S, grid_copy, incoming, open_writer, past_of, same, send
@@ -58,7 +63,7 @@ def calibrating(writer: Writer, *doubtful: str) -> tuple[Calibrating, list[int]]
     def decide(_: Calibration, now_ns: int) -> None:
         decided.append(now_ns)
 
-    job = Calibrating(writer, past_of(writer), decide, lambda: frozenset(doubtful), threading.Event())
+    job = Calibrating(writer, past_of(writer), decide, lambda: frozenset(doubtful), list, threading.Event())
     return job, decided
 
 
@@ -236,3 +241,81 @@ def test_the_end_does_not_wait_for_a_solve_that_a_person_asked_for(writer, monke
     may_end.set()
     asks.join(WAIT_S)
     assert problems == ["the server is stopping, and nothing is decided; ask again later"]
+
+
+# --- what cannot be read, and large fleets ----------------------------------------------------------------------------
+
+
+def test_rows_that_cannot_be_read_do_not_keep_the_others_from_counting(writer, tmp_path):
+    deliver(writer)
+    whole = solved(writer)
+    damaged = writer.run(lambda store: store.journal.last_row) // 3
+    with closing(sqlite3.connect(tmp_path / JOURNAL_FILE)) as db, db:
+        (record,) = db.execute("SELECT record FROM journal WHERE row = ?", (damaged,)).fetchone()
+        flipped = record[:-1] + bytes([record[-1] ^ 1])
+        db.execute("UPDATE journal SET record = ? WHERE row = ?", (flipped, damaged))
+    job, _ = calibrating(writer)
+    with closing(job):
+        without = job.solve()[0]
+    assert {*without.machines} == set(DRIVES)
+    assert without != whole
+    for name, state in whole.machines.items():
+        assert without.machines[name].zero == pytest.approx(state.zero, abs=2 * state.zero_std)
+
+
+def test_what_fails_on_its_entry_is_not_counted_twice(writer, monkeypatch):
+    deliver(writer)
+    whole = solved(writer)
+    job, _ = calibrating(writer)
+    add, failing = Ledger.add, iter([False, True])
+
+    def fails_once(ledger: Ledger, rows: Table) -> None:
+        if next(failing, False):
+            raise MemoryError
+        add(ledger, rows)
+
+    with closing(job):
+        monkeypatch.setattr(Ledger, "add", fails_once)
+        with pytest.raises(MemoryError):
+            job.run()
+        job.solve()
+        for name, ledger in job._ledgers.items():
+            table = ledger.stays()
+            assert int(table["n"].sum()) <= len(DRIVES[name]), name
+    assert {*job.states()} <= {*whole.machines}
+
+
+def test_a_large_fleet_is_solved_in_groups_that_take_turns(writer, monkeypatch):
+    monkeypatch.setattr(calibration, "MOST_MACHINES", 2)
+    monkeypatch.setattr(calibration, "MOST_EPOCHS", 4)
+    deliver(writer)
+    together: list[set[str]] = []
+
+    def note(stays: Mapping[str, Table], *more: Any) -> Calibration:
+        together.append({*stays})
+        return calibrate(stays, *more)
+
+    monkeypatch.setattr(calibrating_module, "calibrate", note)
+    job, _ = calibrating(writer)
+    together.clear()
+    with closing(job):
+        for _ in range(2):
+            job._solved_ns, job._due_s = 0, 0.0
+            job.run()
+        assert together == [{"a", "c"}, {"b"}]
+        assert {*job.states()} == set(DRIVES)
+        assert {*job.solve()[0].machines} == set(DRIVES)
+        assert {ledger.epochs for ledger in job._ledgers.values()} == {2}
+
+
+def test_it_says_from_when_on_there_may_be_samples_of_a_machine(writer):
+    deliver(writer, last=0.5)
+    job, _ = calibrating(writer)
+    with closing(job):
+        assert job.solve()[0].begins_ns == dict.fromkeys(DRIVES, 0), "what was days before it began is not read"
+        rows = drive(LOW, seconds=20.0, start_s=1000.0)
+        send(writer, [incoming(rows[10:], 1, "d")])
+        first_ns = int(rows["stamp_ns"][10])
+        assert job.solve()[0].begins_ns == dict.fromkeys(DRIVES, 0) | {"d": first_ns}
+        send(writer, [incoming(rows[:10], 1, "d", spool_id=8)])
+        assert job.solve()[0].begins_ns["d"] == int(rows["stamp_ns"][0]), "and late ones count"

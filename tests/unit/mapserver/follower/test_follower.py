@@ -12,13 +12,15 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.calibration import MachineState
 from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
+from mapserver.fleet.decisions import CalibrationDecision
+from mapserver.fleet.machine_state import MachineState
 from mapserver.follower import follower, refolding
 from mapserver.follower.follower import Follower
 from mapserver.follower.jobs import Archiving, Audit
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
+from mapserver.journal import archived_decisions
 from mapserver.journal import reader as journal_reader
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.reader import JournalReader
@@ -260,6 +262,28 @@ def test_rows_that_are_old_enough_move_to_the_archive_and_the_map_stays(store, t
     with closing(open_store(tmp_path / "copy")) as again:  # folded from archive and journal
         assert same(again.grid, folded(rows))
     assert same(writer.run(grid_copy), folded(rows))
+
+
+def test_decisions_are_written_beside_the_archive_with_a_new_file_or_once_in_an_hour(store, tmp_path):
+    writer, reader = store
+    folder = tmp_path / "store" / FOLDER
+    job = archiving(writer, reader, 1.0)
+
+    def decide(zero: float) -> list[float]:
+        """What is beside the archive after one more decision and a run of the job."""
+        correction = Correction("a", 0, 2**62, zero, 0.0, 0.0, ())
+        decision = CalibrationDecision("a", "person", "why", NOW_NS, (correction,))
+        writer.run(lambda store: store.adopt(store.grid, store.merged, store.decide(decision)))
+        job._due_s = 0.0
+        job.run()
+        return [each.corrections[0].zero for each in archived_decisions.load(folder)]
+
+    assert decide(0.001) == [], "there is no archive"
+    send(writer, [incoming(samples(5))])
+    assert decide(0.002) == [0.001, 0.002]
+    assert decide(0.003) == [0.001, 0.002]
+    job._keep_s = 0.0  # an hour later
+    assert decide(0.004) == [0.001, 0.002, 0.003, 0.004]
 
 
 def test_where_nothing_was_old_enough_it_looks_again_only_later(store):

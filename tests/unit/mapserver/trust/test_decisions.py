@@ -8,7 +8,7 @@ from mapserver.trust.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER
 from mapserver.trust.judgement import Reason
 
 BAD = Verdict("c", (Reason.GAIN, Reason.OFFSET), {"gain": 1.6}, True)
-GOOD = Verdict("c", (), {"gain": 1.0}, False)
+GOOD = Verdict("c", (), {"gain": 1.0}, False, frozenset({Reason.GAIN, Reason.OFFSET, Reason.DISAGREES}))
 
 
 def judged(decisions: TrustDecisions, verdict: Verdict, times: int) -> list[TrustDecision]:
@@ -50,6 +50,24 @@ def test_a_machine_that_agrees_again_is_trusted_again_but_later():
     assert decision.trusted
     assert decisions.distrusted == frozenset()
     assert TRUST_AFTER > DISTRUST_AFTER
+
+
+@pytest.mark.parametrize("agrees", [(), (Reason.GAIN,), (Reason.OFFSET, Reason.DISAGREES, Reason.CLOCK)])
+def test_a_machine_of_which_nothing_shows_that_it_agrees_again_stays_out(agrees):
+    decisions = TrustDecisions([])
+    judged(decisions, BAD, DISTRUST_AFTER)
+    silent = Verdict("c", (), {"cells": 0}, False, frozenset(agrees))
+    assert judged(decisions, silent, 3 * TRUST_AFTER) == []
+    assert judged(decisions, GOOD, TRUST_AFTER - 1) == []
+    assert judged(decisions, silent, 1) == []
+    assert judged(decisions, GOOD, TRUST_AFTER - 1) == [], "four in a row"
+
+
+def test_a_machine_that_was_excluded_in_words_comes_back_once_it_agrees_in_anything():
+    decisions = TrustDecisions([])
+    decisions.add(TrustDecision("c", False, AUDIT, "left to the audit", 1))
+    assert judged(decisions, Verdict("c", (), {}, False), 20) == []
+    assert judged(decisions, Verdict("c", (), {}, False, frozenset({Reason.STUCK})), TRUST_AFTER)
 
 
 @pytest.mark.parametrize("trusted", [True, False])

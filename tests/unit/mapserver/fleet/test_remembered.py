@@ -1,0 +1,184 @@
+"""What was observed once stays, until something contradicts it; what nobody can be named for is not applied."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from mapserver.fleet.calibration import Calibration, calibrate
+from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, NO_SHARE, Correction
+from mapserver.fleet.decisions import EVERY_NS, CalibrationDecisions
+from mapserver.fleet.ledger import Ledger, newest, stated
+from mapserver.fleet.machine_state import REMEMBERED_STD, remembered_of
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD
+from protocol.arrays import Floats, Table
+from tests.unit.mapserver.fleet.drives import (
+    LOW,
+    OPEN,
+    RAMP,
+    RAMP_AGAIN,
+    START_NS,
+    Errors,
+    drive,
+    height_slope,
+    ledgers,
+    soils,
+)
+
+S = 10**9
+ERRORS = {"a": Errors(0.0, 0.2), "b": Errors(0.002, 0.0), "c": Errors(0.004, 0.03)}
+ROUTES = {"a": RAMP, "b": RAMP_AGAIN, "c": RAMP}
+SURE = ((1.6e-7, 0.0, 0.0), (0.0, 1.6e-5, 0.0), (0.0, 0.0, 1.6e-7))
+KNOWN = [Correction(name, 0, 1, 0.0, e.scale / (1 + e.scale), 0.0, SURE) for name, e in ERRORS.items()]
+
+
+def level(seed: int = 7) -> dict[str, Table]:
+    return ledgers({name: drive(LOW, e, seed=seed + i) for i, (name, e) in enumerate(ERRORS.items())})
+
+
+def scales(result: Calibration) -> dict[str, float]:
+    return {name: state.scale for name, state in result.machines.items()}
+
+
+def test_a_scale_that_was_observed_stays_where_nothing_shows_it_any_more() -> None:
+    """On a ramp for 15 minutes, then on the level, until no evidence of the ramp is left."""
+    sites, decisions = {name: Ledger() for name in ERRORS}, CalibrationDecisions()
+    for quarter in range(3):
+        for i, (name, ledger) in enumerate(sites.items()):
+            route = LOW if quarter else ROUTES[name]
+            rows = drive(route, ERRORS[name], seconds=900.0, seed=10 * quarter + i, start_s=900.0 * quarter)
+            ledger.add(rows)
+        stays = {name: newest(ledger.stays(), 3) for name, ledger in sites.items()}
+        for minute in range(2):
+            solved = calibrate(stays, remembered=remembered_of(decisions.of_solver()))
+            now_ns = START_NS + 900 * (quarter + 1) * S + 60 * minute * S
+            for decision in decisions.judge(solved, now_ns):
+                decisions.add(decision)
+        for one in decisions.corrections.each:
+            assert one.most_share == ANY_SHARE
+            assert one.scale == pytest.approx(ERRORS[one.machine].scale / (1 + ERRORS[one.machine].scale), abs=0.02)
+    assert not calibrate(stays).common.observed, "these stays alone show nothing of it"
+    assert solved.machines["a"].scale_by == ("remembered",)
+    assert solved.machines["a"].scale_std < REMEMBERED_STD, "what three remember together is surer"
+
+
+def test_evidence_of_now_counts_more_than_what_is_remembered() -> None:
+    rows = {name: drive(ROUTES[name], Errors(0.0, 0.04), seed=i) for i, name in enumerate(ERRORS)}
+    alone, known = (calibrate(ledgers(rows), remembered=remembered_of(some)) for some in ([], KNOWN))
+    assert alone == known, "a sure one does without"
+    mended = level() | ledgers({"a": drive(LOW, Errors(), seed=7)})
+    assert calibrate(mended, remembered=remembered_of(KNOWN)).machines["a"].scale < 0.15, "and a weak one pulls"
+
+
+def test_what_slopes_contradict_now_is_not_remembered() -> None:
+    def paved(x_m: Floats, y_m: Floats, heading: Floats) -> Floats:
+        return soils(x_m, y_m, heading) - 0.02 * (height_slope(x_m) > 0)
+
+    rows = {name: drive(ROUTES[name], Errors(), site=paved, seed=i) for i, name in enumerate(ERRORS)}
+    result = calibrate(ledgers(rows), remembered=remembered_of(KNOWN))
+    assert result.common.reason == "ground_changes_with_slope"
+    assert {one.most_share for one in result.corrections} == {LEVEL_SHARE}
+
+
+def test_only_scales_that_were_observed_are_remembered() -> None:
+    unsure = [
+        Correction("a", 0, 1, 0.01, 0.0, 0.0, SURE, LEVEL_SHARE),
+        Correction("b", 0, 1, 0.01, 0.0, 0.0, SURE, NO_SHARE),
+    ]
+    assert remembered_of(unsure) == {}
+    prior = remembered_of(KNOWN)["a"]
+    assert (prior.zero, prior.scale) == pytest.approx((0.0, 0.2))
+    assert np.sqrt(np.diag(prior.covariance)) == pytest.approx([ZERO_STD, REMEMBERED_STD])
+    far = Correction("a", 0, 1, 0.0, 0.375, 0.0, ((1e-7, 0, 0), (0, 0.04, 0), (0, 0, 1e-7)))
+    assert remembered_of([far])["a"].covariance[1][1] == pytest.approx(0.04)
+    assert REMEMBERED_STD < SCALE_STD / 2, "it counts as observed"
+
+
+def test_a_gain_that_is_remembered_has_no_say_on_the_level() -> None:
+    bad = [Correction("a", 0, 1, 0.0, 0.375, 0.0, SURE), *KNOWN[1:]]
+    rows = level() | ledgers({"a": drive(LOW, Errors(0.0, 0.6), seed=7)})
+    result = calibrate(rows, remembered=remembered_of(bad))
+    assert result.machines["a"].beyond[1] > 6.7
+    assert scales(result) == pytest.approx({"a": 0.6, "b": 0.0, "c": 0.03}, abs=0.02)
+
+
+# --- what the machines stated ----------------------------------------------------------------------------------------
+
+
+def applied(rows: Table, zero: Floats | float) -> Table:
+    """What a machine sends that takes this zero off itself."""
+    out = rows.copy()
+    out["c_rr"] -= np.sign(rows["speed_mps"]) * zero
+    out["grade_e"] += zero * np.cos(rows["heading_rad"])
+    out["grade_n"] += zero * np.sin(rows["heading_rad"])
+    out["applied_zero"] = zero
+    return out
+
+
+def decided(rows: Mapping[str, Table]) -> CalibrationDecisions:
+    """After three solves."""
+    solved, decisions = calibrate(ledgers(rows)), CalibrationDecisions()
+    for i in range(3):
+        for decision in decisions.judge(solved, START_NS + i * EVERY_NS):
+            decisions.add(decision)
+    return decisions
+
+
+def test_a_machine_that_applied_nonsense_is_corrected_though_its_sensor_is_good() -> None:
+    true = drive(LOW, Errors(), seconds=900.0)
+    corrections = decided({"a": applied(true, 0.02)}).corrections
+    right = corrections.applied(applied(true, 0.02), ["a"], np.zeros(len(true), np.int64))
+    firm = true["c_rr"] < 0.07  # where the scale is not known, samples of large shares stay as they are
+    assert abs(np.mean((right["c_rr"] - true["c_rr"])[firm])) < 0.001
+    assert decided({"a": true}).corrections.each == ()
+
+
+def test_a_machine_that_knows_its_zero_is_left_alone() -> None:
+    rows = drive(LOW, Errors(0.012), seconds=900.0, seed=2)
+    known = calibrate(ledgers({"a": rows})).machines["a"].zero
+    assert decided({"a": rows}).corrections.each != ()
+    assert decided({"a": applied(rows, known)}).corrections.each == ()
+
+
+def test_a_machine_that_changes_its_mind_within_an_epoch_is_corrected() -> None:
+    rows = drive(LOW, Errors(0.012), seconds=900.0)
+    to_and_fro = 0.012 + 0.006 * np.where(np.arange(len(rows)) // 100 % 2, 1.0, -1.0)
+    table = ledgers({"a": applied(rows, to_and_fro)})["a"]
+    for each in stated(table).values():
+        assert (each.zero, each.zero_std) == pytest.approx((0.012, 0.006), abs=0.001)
+        assert (each.scale, each.scale_std) == (0.0, 0.0)
+    assert decided({"a": applied(rows, to_and_fro)}).corrections.each != ()
+
+
+# --- nobody can be named ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("errors", [Errors(11 * ZERO_STD), Errors(-6 * ZERO_STD), Errors(0.0, 15 * SCALE_STD)])
+def test_of_two_machines_that_contradict_each_other_none_is_corrected(errors: Errors) -> None:
+    rows = {
+        name: drive(OPEN, own, seconds=200.0, closed=False, seed=i)
+        for i, (name, own) in enumerate({"good": Errors(), "bad": errors}.items())
+    }
+    result = calibrate(ledgers(rows))
+    for state in result.machines.values():
+        assert (state.zero, state.scale) == pytest.approx((0.0, 0.0), abs=0.001)
+        assert (state.zero_by, state.scale_by) == ((), ())
+        assert max(state.beyond[0] / 5.0, state.beyond[1] / 6.7) < 1, "and nobody is accused"
+
+
+def test_of_two_sound_machines_the_difference_is_shared() -> None:
+    rows = {
+        name: drive(OPEN, Errors(zero), seconds=200.0, closed=False, seed=i)
+        for i, (name, zero) in enumerate({"one": 0.004, "other": -0.004}.items())
+    }
+    machines = calibrate(ledgers(rows)).machines
+    assert machines["one"].zero - machines["other"].zero == pytest.approx(0.008, abs=0.001)
+
+
+def test_a_closed_tour_names_the_machine_that_is_off() -> None:
+    rows = {"good": drive(LOW, Errors()), "bad": drive(LOW, Errors(11 * ZERO_STD), seed=1)}
+    machines = calibrate(ledgers(rows)).machines
+    assert machines["bad"].zero == pytest.approx(11 * ZERO_STD, abs=0.002)
+    assert machines["good"].zero == pytest.approx(0.0, abs=0.002)
